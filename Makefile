@@ -1,0 +1,43 @@
+# Everything runs in .venv, built here on first use; again when setup.py changes.
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pep517
+
+# A shell that has sourced a ROS workspace, or runs inside another venv, must not leak into .venv.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.PHONY: demo test check bag clean
+
+## the main job on the shipped bag, live
+demo: .venv/demo.stamp
+	$(BIN)/rov-ident demo
+
+## style, types, then all tests
+test: check
+	$(BIN)/python -m pytest -n 2 --timeout 300
+
+## style and types
+check: .venv/test.stamp
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+## the shipped bag, anew
+bag: .venv/demo.stamp
+	$(BIN)/rov-ident simulate --config config/bluerov2_heavy.yaml --manoeuvre demo --out bags/demo.mcap
+
+clean:
+	rm -rf .venv build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+
+# The stamps are written last: an interrupted installation is taken up again.
+.venv/demo.stamp: setup.py
+	@echo "Installing rov_ident into .venv (about a minute, 1 GB) ..." >&2
+	$(PYTHON) -m venv .venv
+	$(PIP) --editable '.[wheels]'
+	@touch $@
+
+.venv/test.stamp: .venv/demo.stamp
+	@echo "Installing the test tools into .venv ..." >&2
+	$(PIP) --editable '.[wheels,test]'
+	@touch $@

@@ -1,0 +1,48 @@
+"""Both estimators on a recorded dive.
+
+ros2 launch rov_ident replay.launch.py bag:=dive.mcap config:=my_vehicle.yaml
+
+The nodes stay up when the bag has ended, so that their results can be read and saved.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
+
+
+def generate_launch_description() -> LaunchDescription:
+    share = FindPackageShare("rov_ident")
+    shipped = PathJoinSubstitution([share, "config", "bluerov2_heavy.yaml"])
+    arguments = [
+        DeclareLaunchArgument("bag", description="an .mcap file or a rosbag2 directory"),
+        DeclareLaunchArgument(
+            "namespace", default_value="", description="namespace of the topics in the bag"
+        ),
+        DeclareLaunchArgument("config", default_value=shipped, description="parameter file"),
+        DeclareLaunchArgument("rate", default_value="1.0", description="speed of the replay"),
+        # On their first start the nodes compile for this computer.
+        DeclareLaunchArgument(
+            "delay", default_value="10.0", description="seconds for the nodes to come up"
+        ),
+    ]
+    nodes = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(
+            PathJoinSubstitution([share, "launch", "identify.launch.py"])
+        ),
+        launch_arguments={
+            "namespace": LaunchConfiguration("namespace"),
+            "config": LaunchConfiguration("config"),
+            "use_sim_time": "true",
+        }.items(),
+    )
+    play = ExecuteProcess(
+        cmd=[
+            *("ros2", "bag", "play", LaunchConfiguration("bag"), "--clock"),
+            *("--rate", LaunchConfiguration("rate")),
+            *("--delay", LaunchConfiguration("delay")),
+        ],
+        output="screen",
+    )
+    return LaunchDescription([*arguments, nodes, play])

@@ -1,0 +1,151 @@
+"""Names of the hydrodynamic coefficients: the grammar, and each name's place in the equations.
+
+SNAME derivatives with their usual signs (SNAME 1950; Fossen 2021, ch. 6 and 8):
+
+=============  ==========================================  ============================
+name           term on the hydrodynamic side of the axis    example
+=============  ==========================================  ============================
+``A_bdot``     added mass, ``M = M_RB - sym(A_bdot)``       ``X_udot``, ``Y_rdot``
+``A_b``        linear damping ``A_b b``                     ``X_u``, ``N_v``
+``A_bb``       ``|b| b``, or ``b b`` where mirror symmetry  ``X_uu``; ``X_vv``, ``M_rr``
+               makes the term even
+``A_bc``       plain product ``b c``                        ``Y_uv``
+``A_b_abs_c``  ``b |c|``                                    ``Y_v_abs_r``
+=============  ==========================================  ============================
+
+A *term* is the product of two entries of the extended velocity ``[1, nu, |nu|]``, so that every
+velocity coefficient is a row and two indices: simulator, regressor and Kalman filter loop over
+one table, and a new name in the grammar needs no new equation.
+"""
+
+import re
+from dataclasses import dataclass
+
+from rov_ident.errors import UserError
+
+AXES = "XYZKMN"
+VELOCITIES = "uvwpqr"
+LINEAR = slice(0, 3)
+ANGULAR = slice(3, 6)
+
+# Even under port-starboard or up-down mirror symmetry, hence a plain square.
+EVEN = frozenset(
+    "X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split()
+)
+
+# Places in the extended velocity [1, nu, |nu|] of model.extended_velocity.
+ONE = 0
+PLAIN = 1
+ABSOLUTE = 7
+EXTENDED_SIZE = 13
+
+_GRAMMAR = re.compile(
+    r"(?P<axis>[XYZKMN])_(?P<first>[uvwpqr])(?:(?P<dot>dot)|_abs_(?P<abs>[uvwpqr])|(?P<second>[uvwpqr]))?"
+)
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One coefficient: its place in the model, unit and meaning.
+
+    ``row`` is the axis (0..5). For added mass ``column`` is the velocity it multiplies and
+    ``left = right = -1``; otherwise the term is ``extended[left] * extended[right]``.
+    """
+
+    name: str
+    row: int
+    column: int
+    left: int
+    right: int
+    unit: str
+    meaning: str
+
+    @property
+    def is_added_mass(self) -> bool:
+        return self.left < 0
+
+    @property
+    def is_diagonal(self) -> bool:
+        """Of an axis's own motion (``X_udot``, ``X_u``, ``X_uu``): never positive for a hull."""
+        if self.is_added_mass:
+            return self.row == self.column
+        own = PLAIN + self.row
+        return (self.left, self.right) in ((ONE, own), (ABSOLUTE + self.row, own))
+
+    @property
+    def place(self) -> tuple[int, ...]:
+        """Equal for two names of the same term (``Y_rdot``/``N_vdot``, ``Y_uv``/``Y_vu``)."""
+        if self.is_added_mass:
+            return (-1, min(self.row, self.column), max(self.row, self.column))
+        return (self.row, min(self.left, self.right), max(self.left, self.right))
+
+
+def parse(name: str) -> Coefficient:
+    """The coefficient called ``name``.
+
+    Raises
+    ------
+    UserError
+        If the name is not in the grammar.
+    """
+    match = _GRAMMAR.fullmatch(name)
+    if match is None:
+        raise UserError(
+            f"'{name}' is not a hydrodynamic coefficient: use names such as X_udot, X_u, X_uu, "
+            "Y_uv or Y_v_abs_r (`rov-ident coefficients` prints them all)"
+        )
+    row = AXES.index(match["axis"])
+    first = VELOCITIES.index(match["first"])
+    force = "N" if row < 3 else "N m"
+    axis = f"{'force' if row < 3 else 'moment'} {match['axis']}"
+    b = match["first"]
+    if match["dot"]:
+        unit = ("kg", "kg m", "kg m2")[(row >= 3) + (first >= 3)]
+        meaning = f"added mass: {axis} per d{b}/dt"
+        return Coefficient(name, row, first, -1, -1, unit, meaning)
+    if match["abs"]:
+        second, c = VELOCITIES.index(match["abs"]), match["abs"]
+        if first == second:
+            raise UserError(f"'{name}' is written {match['axis']}_{b}{b}")
+        left, right, formula = ABSOLUTE + second, PLAIN + first, f"{b} |{c}|"
+    elif match["second"]:
+        second, c = VELOCITIES.index(match["second"]), match["second"]
+        if first != second:
+            left, right, formula = PLAIN + first, PLAIN + second, f"{b} {c}"
+        elif name in EVEN:
+            left, right, formula = PLAIN + first, PLAIN + first, f"{b}^2"
+        else:
+            left, right, formula = ABSOLUTE + first, PLAIN + first, f"|{b}| {b}"
+    else:
+        second, left, right, formula = first, ONE, PLAIN + first, b
+    meaning = f"{'linear damping' if left == ONE else 'quadratic term'}: {axis} = {name} {formula}"
+    order = [first] if left == ONE else [first, second]
+    return Coefficient(name, row, first, left, right, _unit(force, order), meaning)
+
+
+def _unit(force: str, velocities: list[int]) -> str:
+    """``force`` over the product of the velocities, e.g. ``N s2/m2``, ``N m s2/(m rad)``."""
+    metres = sum(v < 3 for v in velocities)
+    radians = len(velocities) - metres
+    seconds = "s" if len(velocities) == 1 else f"s{len(velocities)}"
+    below = [
+        base if count == 1 else f"{base}{count}"
+        for base, count in (("m", metres), ("rad", radians))
+        if count
+    ]
+    return f"{force} {seconds}/" + (below[0] if len(below) == 1 else f"({' '.join(below)})")
+
+
+def catalogue() -> list[Coefficient]:
+    """Every coefficient of the grammar, one name a term, by axis within kind."""
+    names = [f"{a}_{b}dot" for a in AXES for b in VELOCITIES]
+    names += [f"{a}_{b}" for a in AXES for b in VELOCITIES]
+    names += [f"{a}_{b}{b}" for a in AXES for b in VELOCITIES]
+    pairs = [(b, c) for i, b in enumerate(VELOCITIES) for c in VELOCITIES[i + 1 :]]
+    names += [f"{a}_{b}{c}" for a in AXES for b, c in pairs]
+    names += [f"{a}_{b}_abs_{c}" for a in AXES for b in VELOCITIES for c in VELOCITIES if b != c]
+    unique: dict[tuple[int, ...], Coefficient] = {}
+    for name in names:
+        coefficient = parse(name)
+        unique.setdefault(coefficient.place, coefficient)
+    return list(unique.values())

@@ -1,0 +1,158 @@
+"""What an estimator knows before and after: prior, estimate, and what physics allows of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.excitation import WORKING_SPEED, authority
+from rov_ident.model import Array, Model
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The coefficients to estimate, before any data.
+
+    ``estimated`` (n,) are their indices into theta; mean and std (n,) in their own units.
+    ``negative`` (n,) marks those that no passive hull has positive.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimated: NDArray[np.int64]
+    mean: Array
+    std: Array
+    negative: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Coefficients with their covariance (n, n), at ``t`` seconds."""
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    t: float
+
+    @property
+    def std(self) -> Array:
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def prior_of(config: Config) -> Prior:
+    """The prior that a configuration states.
+
+    The standard deviation of a coefficient is relative to its value, but not less than a share of
+    what such a term would weigh at working speed: a published zero means "not known", not "exactly
+    zero".
+    """
+    model = config.model
+    index = [model.names.index(name) for name in config.estimate]
+    scale = typical(model)
+    std = np.array(
+        [
+            config.prior.std.get(
+                name, config.prior.relative_std * max(abs(model.theta[i]), 0.2 * scale[i])
+            )
+            for name, i in zip(config.estimate, index, strict=True)
+        ]
+    )
+    chosen = [model.coefficients[i] for i in index]
+    return Prior(
+        tuple(config.estimate),
+        tuple(c.unit for c in chosen),
+        np.array(index, dtype=np.int64),
+        model.theta[index],
+        std,
+        np.array([c.is_diagonal for c in chosen], dtype=bool),
+    )
+
+
+def typical(model: Model) -> Array:
+    """(m,) the size at which each term alone would take its axis's whole working wrench."""
+    wrench, inertia = authority(model), np.diag(model.body.mass_matrix)
+    speed = np.concatenate([[1.0], WORKING_SPEED, WORKING_SPEED])
+    sizes = [
+        np.sqrt(inertia[c.row] * inertia[c.column])
+        if c.is_added_mass
+        else wrench[c.row] / (speed[c.left] * speed[c.right])
+        for c in model.coefficients
+    ]
+    return np.array(sizes)
+
+
+def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
+    """The values (n,) nearest the estimate, in its own metric, that a passive hull can have.
+
+    Signs first: while a diagonal derivative is positive, the worst is held at zero and the others
+    move as their correlation with it says. Then, should couplings still make the mass matrix
+    indefinite or the damping feed energy, the set is drawn back towards the prior just as far as
+    needed.
+    """
+    values, p = estimate.values.copy(), estimate.covariance
+    at_zero: list[int] = []
+    while True:
+        wrong = np.where(prior.negative & (values > 0.0), values / np.maximum(estimate.std, 1e-300), 0)
+        wrong[at_zero] = 0.0
+        if not wrong.any():
+            break
+        at_zero.append(int(np.argmax(wrong)))
+        gain = np.linalg.lstsq(p[np.ix_(at_zero, at_zero)], p[at_zero], rcond=None)[0]
+        values = estimate.values - estimate.values[at_zero] @ gain
+        values[at_zero] = 0.0
+    if is_passive(model, prior, values):
+        return values
+    low, high = 0.0, 1.0  # share of the way from the prior to the estimate
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        if is_passive(model, prior, prior.mean + middle * (values - prior.mean)):
+            low = middle
+        else:
+            high = middle
+    return prior.mean + low * (values - prior.mean)
+
+
+def is_passive(model: Model, prior: Prior, values: Array) -> bool:
+    """Whether M is positive definite and the damping takes energy out in every direction.
+
+    Linear damping: its symmetric part is positive semidefinite. Quadratic damping: checked along
+    fixed directions of motion; products of two velocities (lift) may do work of either sign and
+    are left out.
+    """
+    theta = model.theta.copy()
+    theta[prior.estimated] = values
+    candidate = model.with_theta(theta)
+    if not np.isfinite(theta).all() or np.linalg.eigvalsh(candidate.mass_matrix)[0] <= 0.0:
+        return False
+    diagonal = [c.is_diagonal or c.is_added_mass for c in model.coefficients]
+    if all(diagonal):
+        return bool((theta <= 0.0).all())
+    return _takes_energy(candidate)
+
+
+_DIRECTIONS = np.random.default_rng(0).standard_normal((200, 6))
+
+
+def _takes_energy(model: Model) -> bool:
+    linear = model.damping_matrix(np.zeros(6))
+    if np.linalg.eigvalsh(linear + linear.T)[0] < -1e-9 * np.abs(linear).max():
+        return False
+    dissipating = [
+        i
+        for i, c in enumerate(model.coefficients)
+        if not c.is_added_mass and (c.left == 0 or c.left >= 7)
+    ]
+    theta = np.zeros_like(model.theta)
+    theta[dissipating] = model.theta[dissipating]
+    damping = model.with_theta(theta)
+    for direction in _DIRECTIONS:
+        nu = direction * WORKING_SPEED
+        if nu @ (damping.damping_matrix(nu) - linear) @ nu < -1e-12:
+            return False
+    return True
+
+
+def named(names: tuple[str, ...], values: Array) -> Mapping[str, float]:
+    return dict(zip(names, values.tolist(), strict=True))

@@ -1,0 +1,56 @@
+"""Compilation of the numerical kernels, and where the compiled code is kept.
+
+numba renews a cached function when its own file changes, not when a function it calls does.
+The cache therefore lies in a folder named after the contents of all modules with kernels: a stale
+kernel cannot be run, and a new version does not disturb a running one.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _cache_folder() -> Path:
+    """A writable folder for these exact kernels; ``ROV_IDENT_CACHE`` overrides its root."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        source = path.read_bytes()
+        if b"rov_ident.jit import" in source:
+            digest.update(source)
+    root = Path(
+        os.environ.get("ROV_IDENT_CACHE")
+        or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rov_ident"
+    )
+    folder = root / digest.hexdigest()[:16]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.gettempdir()) / f"rov_ident-{os.getuid()}-{digest.hexdigest()[:16]}"
+
+
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
+# One thread for BLAS: the matrices are 30 x 30, and a node shares its computer with a pilot's.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numba  # noqa: E402  (reads NUMBA_CACHE_DIR when imported)
+
+
+def kernel(function: F) -> F:
+    """Compile for this machine on first call and keep the result on disk."""
+    compiled: F = numba.njit(cache=True, error_model="numpy")(function)
+    return compiled
+
+
+def inlined(function: F) -> F:
+    """Compile into its caller, so that constants passed by the caller unroll its loops."""
+    compiled: F = numba.njit(inline="always", error_model="numpy")(function)
+    return compiled

@@ -1,0 +1,319 @@
+"""The 6-DOF equations of motion, written once.
+
+In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 8.1; Kirchhoff)::
+
+    p   = M nu                                      momentum of body and added water
+    tau = M nu_dot + C(nu) nu - d(nu) + g           with  C(nu) nu = [omega x p1; omega x p2 + v x p1]
+    M   = M_RB - sym(added-mass coefficients)
+    d   = sum of  coefficient * extended[left] * extended[right],  extended = [1, nu, |nu|]
+    g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
+
+``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, centre
+of gravity anywhere, off-diagonal terms included, and does no work by construction.
+
+The same few functions serve every use: :func:`generalized_force` evaluates ``C nu - d`` for a bundle
+of states side by side ("lanes": one for simulation and one row of the regressor, sixteen for sigma
+points, so that the compiler can use vector instructions), :func:`columns` gives the same forces per
+unit of each coefficient (the regressor), and the forward dynamics solve the inverse ones.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.coefficients import EXTENDED_SIZE, Coefficient, parse
+from rov_ident.errors import UserError
+from rov_ident.jit import inlined, kernel
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class Structure(NamedTuple):
+    """Which coefficients a model has, as tables the kernels loop over.
+
+    The parameter vector theta holds the ``len(mass_row)`` added-mass coefficients first, then one
+    for each term ``extended[left] * extended[right]`` on axis ``row``.
+    """
+
+    mass_row: Indices
+    mass_column: Indices
+    row: Indices
+    left: Indices
+    right: Indices
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """What the vehicle weighs and where, about the body origin, SI, forward-starboard-down.
+
+    mass [kg]; weight and buoyancy [N]; cog and cob (3,) [m]; inertia (3, 3) [kg m2] about the
+    centre of gravity.
+    """
+
+    mass: float
+    weight: float
+    buoyancy: float
+    cog: Array
+    cob: Array
+    inertia: Array
+
+    @property
+    def mass_matrix(self) -> Array:
+        """M_RB (6, 6) about the body origin (Fossen 2021, eq. 3.49)."""
+        s = skew(self.cog)
+        return np.block(
+            [
+                [self.mass * np.eye(3), -self.mass * s],
+                [self.mass * s, self.inertia - self.mass * s @ s],
+            ]
+        )
+
+    @property
+    def restoring(self) -> Array:
+        """(6, 3): the gravity and buoyancy wrench is ``restoring @ k``, k the unit vector down."""
+        lever = self.weight * self.cog - self.buoyancy * self.cob
+        return np.vstack([(self.weight - self.buoyancy) * np.eye(3), skew(lever)])
+
+
+@dataclass(frozen=True)
+class Model:
+    """A rigid body and its hydrodynamic coefficients: all that the equations of motion need.
+
+    ``coefficients`` are in the order of the parameter vector ``theta`` (added mass first).
+    """
+
+    body: RigidBody
+    coefficients: tuple[Coefficient, ...]
+    theta: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coefficients)
+
+    @property
+    def structure(self) -> Structure:
+        mass = [c for c in self.coefficients if c.is_added_mass]
+        terms = [c for c in self.coefficients if not c.is_added_mass]
+        return Structure(
+            np.array([c.row for c in mass], dtype=np.int64),
+            np.array([c.column for c in mass], dtype=np.int64),
+            np.array([c.row for c in terms], dtype=np.int64),
+            np.array([c.left for c in terms], dtype=np.int64),
+            np.array([c.right for c in terms], dtype=np.int64),
+        )
+
+    def with_theta(self, theta: Array) -> "Model":
+        return Model(self.body, self.coefficients, np.asarray(theta, dtype=float))
+
+    def with_values(self, values: Mapping[str, float]) -> "Model":
+        """The same structure with some coefficients replaced by name."""
+        theta = self.theta.copy()
+        for name, value in values.items():
+            theta[self.names.index(name)] = value
+        return self.with_theta(theta)
+
+    @property
+    def mass_matrix(self) -> Array:
+        """M (6, 6): rigid body and added mass."""
+        m = np.ascontiguousarray(self.body.mass_matrix[:, :, None])
+        add_added_mass(self.structure, self.theta[:, None], m)
+        return m[:, :, 0]
+
+    def coriolis_force(self, nu: Array) -> Array:
+        """C(nu) nu (6,)."""
+        return coriolis(self.mass_matrix @ nu, np.asarray(nu, dtype=float))
+
+    def damping_matrix(self, nu: Array) -> Array:
+        """D(nu) (6, 6) with ``d(nu) = -D(nu) nu``: each term's second factor is its velocity."""
+        extended = _extended(nu)
+        matrix = np.zeros((6, 6))
+        for c, value in zip(self.coefficients, self.theta, strict=True):
+            if not c.is_added_mass:
+                matrix[c.row, c.right - 1] -= value * extended[c.left]
+        return matrix
+
+    def coriolis_matrix(self, nu: Array) -> Array:
+        """Skew-symmetric C(nu) (6, 6) with ``C(nu) nu`` = :meth:`coriolis_force`."""
+        p = self.mass_matrix @ nu
+        upper = -skew(p[:3])
+        return np.block([[np.zeros((3, 3)), upper], [upper, -skew(p[3:])]])
+
+    def restoring_force(self, down: Array) -> Array:
+        """g (6,), on the left-hand side of the equations; ``down`` is k in body axes."""
+        return -self.body.restoring @ down
+
+    def wrench(self, nu: Array, nu_dot: Array, down: Array) -> Array:
+        """The thruster wrench (6,) that this motion takes: the inverse dynamics."""
+        h = _force_of_one(self.structure, self.mass_matrix, self.theta, np.asarray(nu, dtype=float))
+        return self.mass_matrix @ nu_dot + h + self.restoring_force(down)
+
+    def acceleration(self, nu: Array, tau: Array, down: Array) -> Array:
+        """nu_dot (6,) under the thruster wrench tau: the forward dynamics."""
+        h = _force_of_one(self.structure, self.mass_matrix, self.theta, np.asarray(nu, dtype=float))
+        return np.linalg.solve(self.mass_matrix, tau - h - self.restoring_force(down))
+
+    def regressor(self, nu: Array, nu_dot: Array) -> Array:
+        """Y (6, n): ``wrench = M_RB nu_dot + C_RB nu + g + Y theta``."""
+        structure, n = self.structure, len(self.theta)
+        momentum, force = np.zeros((6, n)), np.zeros((6, n))
+        columns(structure, np.asarray(nu_dot, dtype=float), momentum, force)
+        of_acceleration = momentum.copy()
+        columns(structure, np.asarray(nu, dtype=float), momentum, force)
+        return of_acceleration + force
+
+
+def build(body: RigidBody, values: Mapping[str, float]) -> Model:
+    """The model with the named coefficients, in the order of theta.
+
+    ``Y_rdot`` and ``N_vdot`` name the same entry of the symmetric added mass: given both, they must
+    agree, and the first is kept.
+
+    Raises
+    ------
+    UserError
+        For a name outside the grammar, a term given twice, or values that no passive hull has.
+    """
+    by_place: dict[tuple[int, ...], Coefficient] = {}
+    for name, value in values.items():
+        coefficient = parse(name)
+        known = by_place.setdefault(coefficient.place, coefficient)
+        if known is not coefficient and not (known.is_added_mass and values[known.name] == value):
+            raise UserError(f"coefficients.{name} and coefficients.{known.name} are the same term: keep one")
+        if coefficient.is_diagonal and value > 0:
+            raise UserError(
+                f"coefficients.{name} is {value}, but it must not be positive: damping and added mass "
+                "are negative derivatives (SNAME signs)"
+            )
+    coefficients = sorted(by_place.values(), key=lambda c: not c.is_added_mass)
+    theta = np.array([float(values[c.name]) for c in coefficients])
+    model = Model(body, tuple(coefficients), theta)
+    if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0:
+        raise UserError(
+            "the mass matrix (rigid body plus added mass) is not positive definite: "
+            "check vehicle.mass, vehicle.inertia and the added-mass coefficients"
+        )
+    return model
+
+
+def skew(a: Sequence[float] | Array) -> Array:
+    """S(a) (3, 3) with ``S(a) b = a x b``."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+# ------------------------------------------------------------------ kernels
+#
+# ``lanes`` is passed as a literal by a caller that inlines these, so that the inner loops either
+# vanish (one lane) or become vector instructions (sixteen).
+
+
+@inlined
+def extend(lanes, nu, extended):  # type: ignore[no-untyped-def]
+    """[1, nu, |nu|] (13, lanes) from nu (6, lanes)."""
+    for k in range(lanes):
+        extended[0, k] = 1.0
+    for i in range(6):
+        for k in range(lanes):
+            extended[1 + i, k] = nu[i, k]
+            extended[7 + i, k] = abs(nu[i, k])
+
+
+@inlined
+def add_coriolis(lanes, p, nu, h):  # type: ignore[no-untyped-def]
+    """h += C(nu) nu, from the momentum p = M nu; all (6, lanes)."""
+    for k in range(lanes):
+        h[0, k] += nu[4, k] * p[2, k] - nu[5, k] * p[1, k]
+        h[1, k] += nu[5, k] * p[0, k] - nu[3, k] * p[2, k]
+        h[2, k] += nu[3, k] * p[1, k] - nu[4, k] * p[0, k]
+        h[3, k] += nu[4, k] * p[5, k] - nu[5, k] * p[4, k] + nu[1, k] * p[2, k] - nu[2, k] * p[1, k]
+        h[4, k] += nu[5, k] * p[3, k] - nu[3, k] * p[5, k] + nu[2, k] * p[0, k] - nu[0, k] * p[2, k]
+        h[5, k] += nu[3, k] * p[4, k] - nu[4, k] * p[3, k] + nu[0, k] * p[1, k] - nu[1, k] * p[0, k]
+
+
+@inlined
+def generalized_force(lanes, structure, mass, theta, nu, h, p, extended):  # type: ignore[no-untyped-def]
+    """h = C(nu) nu - d(nu) (6, lanes).
+
+    mass (6, 6, lanes), theta (n, lanes), nu (6, lanes); p (6, lanes) and extended (13, lanes) are
+    work space.
+    """
+    for i in range(6):
+        for k in range(lanes):
+            h[i, k] = 0.0
+            p[i, k] = mass[i, 0, k] * nu[0, k]
+        for j in range(1, 6):
+            for k in range(lanes):
+                p[i, k] += mass[i, j, k] * nu[j, k]
+    add_coriolis(lanes, p, nu, h)
+    extend(lanes, nu, extended)
+    first = len(structure.mass_row)
+    for term in range(len(structure.row)):
+        row, left, right = structure.row[term], structure.left[term], structure.right[term]
+        for k in range(lanes):
+            h[row, k] -= theta[first + term, k] * extended[left, k] * extended[right, k]
+
+
+@kernel
+def add_added_mass(structure, theta, mass):  # type: ignore[no-untyped-def]
+    """mass (6, 6, lanes) += M_A: each coefficient enters its entry and the mirrored one."""
+    lanes = mass.shape[2]
+    for c in range(len(structure.mass_row)):
+        i, j = structure.mass_row[c], structure.mass_column[c]
+        for k in range(lanes):
+            mass[i, j, k] -= theta[c, k]
+            if i != j:
+                mass[j, i, k] -= theta[c, k]
+
+
+@kernel
+def columns(structure, nu, momentum, force):  # type: ignore[no-untyped-def]
+    """The regressor's two parts: per unit of each coefficient, momentum and force (6, n).
+
+    ``wrench = d/dt(momentum @ theta) + force @ theta + known``: the derivative is left to the
+    caller, who may differentiate, filter or integrate by parts. Both arrays are overwritten.
+    """
+    momentum[:] = 0.0
+    force[:] = 0.0
+    one, h, p = nu.reshape(6, 1), np.zeros((6, 1)), np.zeros((6, 1))
+    first = len(structure.mass_row)
+    for c in range(first):
+        i, j = structure.mass_row[c], structure.mass_column[c]
+        p[:] = 0.0
+        p[i, 0] = -nu[j]
+        p[j, 0] = -nu[i]
+        h[:] = 0.0
+        add_coriolis(1, p, one, h)
+        momentum[:, c] = p[:, 0]
+        force[:, c] = h[:, 0]
+    extended = np.empty((EXTENDED_SIZE, 1))
+    extend(1, one, extended)
+    for term in range(len(structure.row)):
+        left, right = structure.left[term], structure.right[term]
+        force[structure.row[term], first + term] = -extended[left, 0] * extended[right, 0]
+
+
+@kernel
+def coriolis(p, nu):  # type: ignore[no-untyped-def]
+    """C(nu) nu (6,) from the momentum p = M nu (6,)."""
+    h = np.zeros((6, 1))
+    add_coriolis(1, p.reshape(6, 1), nu.reshape(6, 1), h)
+    return h[:, 0]
+
+
+@kernel
+def _force_of_one(structure, mass, theta, nu):  # type: ignore[no-untyped-def]
+    """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,) -> (6,)."""
+    h, p = np.empty((6, 1)), np.empty((6, 1))
+    extended = np.empty((EXTENDED_SIZE, 1))
+    one_mass = np.ascontiguousarray(mass).reshape(6, 6, 1)
+    generalized_force(1, structure, one_mass, theta.reshape(-1, 1), nu.reshape(6, 1), h, p, extended)
+    return h[:, 0]
+
+
+def _extended(nu: Array) -> Array:
+    extended = np.empty((EXTENDED_SIZE, 1))
+    extend(1, np.asarray(nu, dtype=float).reshape(6, 1), extended)
+    return extended[:, 0]

@@ -1,0 +1,180 @@
+"""An online estimator as a node, a replay and an offline fit all use it: messages in, reports out."""
+
+import enum
+import math
+from collections import Counter
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident import rls, ukf
+from rov_ident.config import Config
+from rov_ident.estimate import Estimate, physical, prior_of
+from rov_ident.messages import Array, Message
+from rov_ident.samples import Sampler
+
+Kind = Literal["rls", "ukf"]
+ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
+
+EXCITATION_TIME = 30.0  # s; of motion over which the present excitation is judged
+_EXCITED = 0.05  # share of the prior variance that this motion alone would remove
+_CONVERGED = 0.1  # standard deviation relative to the value, or to the prior's, from which it counts
+_QUANTILE = 1.959963984540054  # of the normal distribution, 97.5 %
+
+
+class Level(enum.IntEnum):
+    """As in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True)
+class Report:
+    """The coefficients as they may be published: finite, and physical as a whole.
+
+    Arrays are (n,) in the order of ``names``; covariance (n, n). ``stamp`` [ns] is the time of the
+    last sample used, 0 before the first. ``excitation`` is the share of the prior variance that the
+    motion of the last half minute would remove by itself.
+    """
+
+    stamp: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    std: Array
+    lower: Array
+    upper: Array
+    covariance: Array
+    excitation: Array
+    levels: tuple[Level, ...]
+    messages: tuple[str, ...]
+
+
+class OnlineEstimator:
+    """Sampler and estimator in one: :meth:`push` messages, ask for a :meth:`report` at any time.
+
+    ``counts`` tells how many messages and samples were used and, by reason, refused.
+    """
+
+    def __init__(self, config: Config, kind: Kind) -> None:
+        self.config = config
+        self.kind = kind
+        self.prior = prior_of(config)
+        self._module = ESTIMATORS[kind]
+        self._task = self._module.problem(config)
+        self.sampler = Sampler(config)
+        self.enabled = True
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the prior; the input buffers and counts go on."""
+        self._state = self._module.init(self._task)
+        self._last_t = math.nan
+        self._gained = np.zeros(len(self.prior.names))  # recent information over the prior's
+        self._variance = self._estimate().std ** 2
+        self._sample_counts: Counter[str] = Counter()
+        self._safe = self.prior.mean.copy()
+
+    @property
+    def counts(self) -> Counter[str]:
+        return self.sampler.counts + self._sample_counts
+
+    @property
+    def state(self) -> object:
+        """The estimator's state, for a checkpoint or a comparison."""
+        return self._state
+
+    def push(self, role: str, message: Message) -> NDArray[np.void]:
+        """Take one message as it is on the wire; INFO (k,) of the samples this completed."""
+        return self.take(self.sampler.push(role, message))
+
+    def flush(self) -> NDArray[np.void]:
+        """The input has ended or stopped: use what still waits for a late topic."""
+        return self.take(self.sampler.flush())
+
+    def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
+        """Fold samples (k,) into the estimate unless disabled; INFO (k,)."""
+        if len(samples) == 0 or not self.enabled:
+            return np.zeros(0, dtype=self._module.INFO)
+        self._state, info = self._module.fold(self._task, self._state, samples)
+        self._last_t = float(samples["t"][-1])
+        for reason, count in zip(*np.unique(info["reason"], return_counts=True), strict=True):
+            self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += int(count)
+        self._watch(float(samples["dt"].sum()))
+        return info
+
+    def _watch(self, elapsed: float) -> None:
+        """Information gained per coefficient, fading over EXCITATION_TIME."""
+        variance = self._module.variance(self._task, self._state)
+        gained = self.prior.std**2 * (1.0 / variance - 1.0 / self._variance)
+        self._gained *= math.exp(-elapsed / EXCITATION_TIME)
+        self._gained += np.maximum(gained, 0.0)
+        self._variance = variance
+
+    def _estimate(self) -> Estimate:
+        estimate: Estimate = self._module.estimate(self._task, self._state, self.prior)
+        return estimate
+
+    def report(self) -> Report:
+        """The present coefficients, made physical, with their state in words."""
+        raw = self._estimate()
+        values = physical(self.config.model, self.prior, raw)
+        diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
+        if diverged:
+            values, std = self._safe, self.prior.std
+            covariance = np.diag(std**2)
+        else:
+            self._safe, std, covariance = values, raw.std, raw.covariance
+        excitation = self._gained / (1.0 + self._gained)
+        words = [
+            self._judge(i, values, std, raw.values, excitation, diverged)
+            for i in range(len(values))
+        ]
+        # A bound cuts the interval too: no part of it is physically possible.
+        upper = values + _QUANTILE * std
+        upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
+        return Report(
+            self._stamp(),
+            self.prior.names,
+            self.prior.units,
+            values,
+            std,
+            values - _QUANTILE * std,
+            upper,
+            covariance,
+            excitation,
+            tuple(level for level, _ in words),
+            tuple(text for _, text in words),
+        )
+
+    def _stamp(self) -> int:
+        if math.isnan(self._last_t) or self.sampler.origin is None:
+            return 0
+        return self.sampler.origin + round(self._last_t * 1e9)
+
+    def _judge(
+        self,
+        i: int,
+        values: Array,
+        std: Array,
+        raw: Array,
+        excitation: Array,
+        diverged: bool,
+    ) -> tuple[Level, str]:
+        if diverged:
+            return Level.ERROR, "diverged: the last good value is held, call reset"
+        if abs(raw[i] - values[i]) > 2.0 * std[i]:
+            return Level.ERROR, "held at its physical bound: the data contradict it"
+        excited = excitation[i] >= _EXCITED
+        known = std[i] <= _CONVERGED * max(abs(values[i]), self.prior.std[i])
+        if known:
+            return Level.OK, "converged" if excited else "converged, held: not excited now"
+        if excited:
+            return Level.WARN, "converging"
+        return Level.WARN, "not excited: held, the motion does not show it"

@@ -1,0 +1,536 @@
+"""From messages to samples: one clock, one set of axes, one filter for every channel.
+
+Topics come at their own rates and phases. A :class:`Sampler` waits until every topic has reached an
+instant (or is ``grace`` seconds behind), then emits one sample for it. The instants are those of the
+IMU messages while there is an IMU, else those of the odometry. Everything is decided by the stamps,
+never by arrival, so that a bag gives the same samples live, replayed and offline.
+
+What a sample holds, and why (docs/samples.md has the measurements):
+
+* ``wrench`` is the *mean* over the interval that ends at the sample. A demand holds from its stamp
+  to the next one; a value picked at the sample's instant would look like a delay of half a period.
+* ``nu`` is the best estimate of the body velocity: odometry and the integrated IMU are weighed
+  by a Kalman filter on the kinematics alone (no model of the vehicle). Such a filter is
+  complementary, what it takes from one source it leaves of the other, so it adds noise but no
+  lag. Without an IMU ``nu`` is the odometry as it came.
+* ``odometry``, ``gyro`` and ``increment`` (the IMU's change of velocity over the interval) are the
+  same measurements one by one with independent noise, for a filter that does its own weighing.
+"""
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.attitude import rotation, turned
+from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
+from rov_ident.frames import FrameDefaults, quaternion_from_euler, to_core
+from rov_ident.jit import kernel
+from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
+
+SAMPLE = np.dtype(
+    [
+        ("t", "f8"),  # s since the first message
+        ("dt", "f8"),  # s since the previous sample
+        ("restart", "?"),  # the interval before this sample is not known: filters begin anew
+        ("measured", "?"),  # an odometry message belongs to this sample
+        ("nu", "f8", (6,)),
+        ("down", "f8", (3,)),  # unit, body axes
+        ("wrench", "f8", (6,)),  # N, N m: mean over dt, after the input effects
+        ("odometry", "f8", (6,)),  # m/s, rad/s; NaN: not measured
+        ("odometry_variance", "f8", (6,)),
+        ("gyro", "f8", (3,)),  # rad/s, bias removed; NaN: not measured
+        ("gyro_variance", "f8"),
+        ("increment", "f8", (3,)),  # m/s over dt, bias, gravity and Coriolis removed; NaN: none
+        ("increment_variance", "f8"),
+    ],
+    align=True,
+)
+
+ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
+_MERGE = 0.05  # s; an odometry message is carried to the IMU message that follows this closely
+_MAX_GAP = 0.5  # s without a measurement: restart rather than bridge
+_MAX_JUMP = 10.0  # s; a stamp this far ahead, or 1 s back, is another clock (a bag starting over)
+_WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
+
+_KINEMATICS = np.dtype(
+    [
+        ("known", "?"),  # an odometry message has been seen since the last restart
+        ("inertial", "?"),  # an IMU message has
+        ("q", "f8", (4,)),
+        ("attitude_variance", "f8"),  # rad2
+        ("v", "f8", (3,)),
+        ("rate", "f8", (3,)),  # rad/s, bias removed
+        ("slow_rate", "f8", (3,)),  # for the angular acceleration of the lever arm
+        ("acceleration", "f8", (3,)),  # m/s2 at the origin, body axes
+        ("gyro_bias", "f8", (3,)),
+        ("gyro_bias_variance", "f8"),
+        ("accelerometer_bias", "f8", (3,)),
+        ("p_vv", "f8"),
+        ("p_vb", "f8"),
+        ("p_bb", "f8"),
+    ],
+    align=True,
+)
+
+_SETTINGS = np.dtype(
+    [
+        ("gravity", "f8"),
+        ("odometry_lever", "f8", (3,)),
+        ("imu_lever", "f8", (3,)),
+        ("imu_rotation", "f8", (3, 3)),  # sensor axes -> body axes
+        ("odometry_variance", "f8", (6,)),
+        ("attitude_variance", "f8"),
+        ("gyro_variance", "f8"),
+        ("accelerometer_variance", "f8"),
+        ("gyro_bias_variance", "f8"),
+        ("accelerometer_bias_variance", "f8"),
+        ("gate", "f8"),
+    ],
+    align=True,
+)
+
+
+class Sampler:
+    """Merges the three topics into samples; the only part of the estimation that waits.
+
+    ``counts`` holds how many messages of each kind were taken or, by reason, refused; bad data
+    never raises. ``origin`` is the stamp [ns] of t = 0.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._defaults: FrameDefaults = config.frames
+        self._grace = config.grace
+        self._hold = config.timeout
+        self._effects = [
+            (EFFECTS[name].step, EFFECTS[name].start, dict(parameters))
+            for name, parameters in config.effects.items()
+            if EFFECTS[name].place == "input"
+        ]
+        self._settings = _settings(config)
+        self.counts: Counter[str] = Counter()
+        self.origin: int | None = None
+        self._frame_ids: dict[str, tuple[str, ...]] = {}
+        self._last_stamp: dict[str, int] = {}
+        self._suspect: int | None = None
+        self._clear()
+
+    def _clear(self) -> None:
+        """Forget the buffered messages and the motion, not the clock's origin."""
+        self._queues: dict[str, deque[tuple[float, Message]]] = {
+            ODOMETRY: deque(),
+            IMU: deque(),
+            WRENCH: deque(),
+        }
+        self._newest: dict[str, float] = {}
+        self._first = math.nan
+        self._previous = math.nan  # time of the last sample
+        self._seen_imu = -math.inf
+        self._kinematics = np.zeros(1, dtype=_KINEMATICS)
+        self._kinematics["gyro_bias_variance"] = self._settings["gyro_bias_variance"]
+        self._demand: Array | None = None
+        self._demand_time = -math.inf
+        self._input_states: list[Array] = []
+
+    # -------------------------------------------------------------- messages in
+
+    def push(self, role: str, message: Message) -> NDArray[np.void]:
+        """Take a message as it is on the wire; the samples (k,) of SAMPLE that are now complete."""
+        reason = self._refusal(role, message)
+        if reason:
+            self.counts[f"{role}: {reason}"] += 1
+            return _NONE
+        if self.origin is None:
+            self.origin = message.stamp
+        t = (message.stamp - self.origin) * 1e-9
+        last = self._last_stamp.get(role)
+        if last is not None:
+            step = (message.stamp - last) * 1e-9
+            if step < -1.0 or step > _MAX_JUMP:
+                if not self._is_new_clock(message.stamp):
+                    self.counts[f"{role}: stamp jumps"] += 1
+                    return _NONE
+                done = self.flush()
+                self.counts["clock: jumps, buffers restarted"] += 1
+                self._clear()
+                self._last_stamp.clear()
+                self._last_stamp[role] = message.stamp
+                self._enqueue(role, t, message)
+                return done
+            if step <= 0.0:
+                self.counts[f"{role}: {'duplicate' if step == 0.0 else 'backward'} stamp"] += 1
+                return _NONE
+        self._last_stamp[role] = message.stamp
+        if t < self._previous:
+            self.counts[f"{role}: too late"] += 1
+            if role != WRENCH:
+                return _NONE
+        self._enqueue(role, t, message)
+        return self._complete(final=False)
+
+    def flush(self) -> NDArray[np.void]:
+        """The samples (k,) still waiting for a topic that will not come: the input has ended."""
+        return self._complete(final=True)
+
+    def _enqueue(self, role: str, t: float, message: Message) -> None:
+        if math.isnan(self._first):
+            self._first = t
+        self.counts[role] += 1
+        self._newest[role] = t
+        self._queues[role].append((t, to_core(message, self._defaults)))
+
+    def _is_new_clock(self, stamp: int) -> bool:
+        """A single wild stamp is an error; two in a row that agree are another clock."""
+        suspect, self._suspect = self._suspect, stamp
+        return suspect is not None and abs(stamp - suspect) * 1e-9 < 1.0
+
+    def _refusal(self, role: str, message: Message) -> str:
+        """Why the message cannot be used, or an empty string."""
+        if message.stamp <= 0:
+            return "zero stamp"
+        frames: tuple[str, ...]
+        if isinstance(message, Odometry):
+            frames = (message.frame_id, message.child_frame_id)
+            squared = float(message.orientation @ message.orientation)
+            values = (message.linear, message.angular, message.position)
+            if not 0.5 < squared < 2.0:  # NaN too
+                return "orientation is not a unit quaternion"
+        elif isinstance(message, Imu):
+            frames = (message.frame_id,)
+            values = (message.angular_velocity, message.linear_acceleration)
+        else:
+            frames = (message.frame_id,)
+            values = (message.force, message.torque)
+        for value in values:
+            # one comparison refuses NaN, infinities and values no vehicle reaches
+            if not float(value @ value) < 1e12:
+                return "not finite or absurdly large"
+        if frames[-1] in _WORLD_FRAMES:
+            return f"frame '{frames[-1]}' is a world frame, body axes are needed"
+        if self._frame_ids.setdefault(role, frames) != frames:
+            return f"frame changed from {self._frame_ids[role]} to {frames}"
+        return ""
+
+    # -------------------------------------------------------------- samples out
+
+    def _complete(self, final: bool) -> NDArray[np.void]:
+        samples = []
+        odometry, imu = self._queues[ODOMETRY], self._queues[IMU]
+        while odometry or imu:
+            merged = bool(
+                odometry
+                and imu
+                and imu[0][0] >= odometry[0][0]
+                and imu[0][0] - odometry[0][0] <= _MERGE
+                and not (len(odometry) > 1 and odometry[1][0] <= imu[0][0])
+            )
+            take_imu = merged or not odometry or bool(imu and imu[0][0] < odometry[0][0])
+            t = imu[0][0] if take_imu else odometry[0][0]
+            if not (final or self._reached(t)):
+                break
+            message = imu.popleft()[1] if take_imu else None
+            pose = odometry.popleft() if merged or not take_imu else None
+            sample = self._sample(t, pose, message)
+            if sample is not None:
+                samples.append(sample)
+        return np.concatenate(samples) if samples else _NONE
+
+    def _reached(self, t: float) -> bool:
+        """Whether no topic can still bring a message at or before t (or it is not worth waiting)."""
+        horizon = max(self._newest.values())
+        if horizon - t > self._grace:
+            return True
+        for role in (ODOMETRY, IMU, WRENCH):
+            newest = self._newest.get(role, self._first)
+            silent = t - newest > self._grace
+            if newest < t and not silent:
+                return False
+            if role not in self._newest and t - self._first <= self._grace:
+                return False
+        return True
+
+    def _sample(
+        self, t: float, pose: tuple[float, Message] | None, imu: Message | None
+    ) -> NDArray[np.void] | None:
+        dt = t - self._previous
+        restart = not 0.0 < dt <= _MAX_GAP
+        wrench = self._mean_wrench(self._previous if not restart else t, t)
+        self._previous = t
+        sample = np.zeros(1, dtype=SAMPLE)
+        row = sample[0]
+        row["t"], row["dt"], row["restart"] = t, 0.0 if restart else dt, restart
+        odometry, shift = _ABSENT, 0.0
+        if pose is not None:
+            assert isinstance(pose[1], Odometry)
+            shift = t - pose[0]
+            odometry = np.concatenate(
+                [pose[1].orientation, pose[1].linear, pose[1].angular, pose[1].twist_variance]
+            )
+        inertial, gyro, specific = imu is not None, _ZERO, _ZERO
+        if isinstance(imu, Imu):
+            gyro, specific = imu.angular_velocity, imu.linear_acceleration
+            self._seen_imu = t
+        if restart:
+            self._kinematics["known"] = False
+            self._kinematics["inertial"] = False
+        if t - self._seen_imu > _MERGE and self._kinematics["inertial"][0]:
+            self._kinematics["inertial"] = False
+            self.counts["imu: gap, odometry alone"] += 1
+        taken = fuse(
+            self._kinematics, self._settings, sample, pose is not None, shift, odometry, inertial,
+            gyro, specific,
+        )  # fmt: skip
+        if pose is not None and not taken:
+            self.counts["odom: outlier against the IMU"] += 1
+        if not self._kinematics["known"][0]:
+            self.counts["sample: no odometry yet"] += 1
+            self._previous = math.nan
+            return None
+        if wrench is None:
+            self.counts["sample: no wrench"] += 1
+            self._previous = math.nan
+            return None
+        row["wrench"] = wrench
+        return sample
+
+    def _mean_wrench(self, start: float, end: float) -> Array | None:
+        """Mean of the acting wrench (6,) over the interval; None where no demand is known."""
+        queue = self._queues[WRENCH]
+        total, now = np.zeros(6), start
+        while queue and queue[0][0] <= end:
+            at, message = queue.popleft()
+            assert isinstance(message, Wrench)
+            if self._demand is not None and at > now:
+                total += self._act(at - now) * (at - now)
+                now = at
+            elif self._demand is None:
+                start = now = max(at, start)
+            self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
+        if self._demand is None or end - self._demand_time > self._hold:
+            self._demand = None
+            self._input_states = []
+            return None
+        acting = self._act(end - now)
+        return acting if end <= start else (total + acting * (end - now)) / (end - start)
+
+    def _act(self, dt: float) -> Array:
+        """The wrench (6,) that acts, in the mean over dt, when the present demand is held."""
+        wrench = self._demand
+        assert wrench is not None
+        if self._effects and not self._input_states:
+            self._input_states = [start(wrench) for _, start, _ in self._effects]
+        for i, (step, _, parameters) in enumerate(self._effects):
+            self._input_states[i], wrench = step(self._input_states[i], wrench, dt, **parameters)
+        return wrench
+
+
+def _settings(config: Config) -> NDArray[np.void]:
+    settings = np.zeros(1, dtype=_SETTINGS)
+    row = settings[0]
+    row["gravity"] = config.gravity
+    row["odometry_lever"] = config.odometry.position
+    row["imu_lever"] = config.imu.position
+    roll, pitch, yaw = config.imu.rotation
+    row["imu_rotation"] = rotation(quaternion_from_euler(roll, pitch, yaw))
+    row["odometry_variance"] = np.repeat(
+        [config.odometry.linear_std**2, config.odometry.angular_std**2], 3
+    )
+    row["attitude_variance"] = config.odometry.attitude_std**2
+    row["gyro_variance"] = config.imu.gyro_std**2
+    row["accelerometer_variance"] = config.imu.accelerometer_std**2
+    row["gyro_bias_variance"] = config.imu.gyro_bias_std**2
+    row["accelerometer_bias_variance"] = config.imu.accelerometer_bias_std**2
+    row["gate"] = config.odometry.gate
+    return settings
+
+
+_NONE = np.zeros(0, dtype=SAMPLE)
+_ABSENT = np.full(16, math.nan)
+_ZERO = np.zeros(3)
+
+_BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
+_LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU's lever arm
+
+
+@kernel
+def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, gyro, specific):  # type: ignore[no-untyped-def]
+    """One instant of the kinematic filter; fills the sample; whether the odometry was taken.
+
+    Velocity and accelerometer bias share one 2 x 2 covariance for the three axes, as their noise is
+    isotropic::
+
+        v_dot = f - b + g k - omega x v,   z = v + lever arm,   b a slow random walk
+
+    ``odometry`` is [orientation 4, linear 3, angular 3, variance 6], measured ``shift`` seconds
+    before the sample; ``gyro`` and ``specific`` (force) are in sensor axes.
+    """
+    k, s, out = kinematics[0], settings[0], sample[0]
+    dt = out.dt
+    nan = np.nan
+    started = k.inertial
+    for i in range(3):
+        out.gyro[i] = nan
+        out.increment[i] = nan
+        out.odometry[i] = nan
+        out.odometry[3 + i] = nan
+    variance = np.empty(6)
+    for i in range(6):
+        given = has_odometry and odometry[10 + i] > 0.0
+        variance[i] = odometry[10 + i] if given else s.odometry_variance[i]
+        out.odometry_variance[i] = variance[i]
+    r_linear = (variance[0] + variance[1] + variance[2]) / 3.0
+    r_angular = (variance[3] + variance[4] + variance[5]) / 3.0
+
+    # attitude, by the rate known so far; the odometry's own rate if there is no IMU
+    rate = np.empty(3)
+    if has_imu:
+        for i in range(3):
+            rate[i] = (
+                s.imu_rotation[i, 0] * gyro[0]
+                + s.imu_rotation[i, 1] * gyro[1]
+                + s.imu_rotation[i, 2] * gyro[2]
+                - k.gyro_bias[i]
+            )
+    else:
+        for i in range(3):
+            rate[i] = odometry[7 + i] if has_odometry else k.rate[i]
+    mean_rate = rate.copy()
+    if k.known and dt > 0.0:
+        for i in range(3):
+            mean_rate[i] = 0.5 * (rate[i] + k.rate[i])
+    if k.known:
+        k.q[:] = turned(k.q, mean_rate * dt)
+        k.attitude_variance += s.gyro_variance * dt * dt + 1e-8 * dt
+    if has_odometry:
+        q = turned(odometry[:4] / np.sqrt(np.sum(odometry[:4] ** 2)), rate * shift)
+        if not k.known or not k.inertial:
+            k.q[:] = q
+            k.attitude_variance = s.attitude_variance
+        else:
+            gain = k.attitude_variance / (k.attitude_variance + s.attitude_variance)
+            k.attitude_variance *= 1.0 - gain
+            # vector part of conj(k.q) * q: half the rotation from one to the other
+            a, b = k.q, q
+            e = np.empty(3)
+            e[0] = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
+            e[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
+            e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
+            sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
+            k.q[:] = turned(k.q, 2.0 * sign * gain * e)
+    down = rotation(k.q)[2]
+
+    # acceleration of the origin from the IMU, and the velocity it predicts
+    acceleration = np.zeros(3)
+    if has_imu:
+        w, lever = rate, s.imu_lever
+        turn = np.zeros(3)
+        if k.inertial and dt > 0.0:
+            blend = dt / (_LEVER_TIME + dt)
+            for i in range(3):
+                turn[i] = (rate[i] - k.slow_rate[i]) / (_LEVER_TIME + dt)
+                k.slow_rate[i] += blend * (rate[i] - k.slow_rate[i])
+        else:
+            k.slow_rate[:] = rate
+        cross = np.empty(3)
+        cross[0] = w[1] * lever[2] - w[2] * lever[1]
+        cross[1] = w[2] * lever[0] - w[0] * lever[2]
+        cross[2] = w[0] * lever[1] - w[1] * lever[0]
+        for i in range(3):
+            j, m = (i + 1) % 3, (i + 2) % 3
+            force = (
+                s.imu_rotation[i, 0] * specific[0]
+                + s.imu_rotation[i, 1] * specific[1]
+                + s.imu_rotation[i, 2] * specific[2]
+            )
+            acceleration[i] = (
+                force
+                - k.accelerometer_bias[i]
+                + s.gravity * down[i]
+                - (turn[j] * lever[m] - turn[m] * lever[j])
+                - (w[j] * cross[m] - w[m] * cross[j])
+                - (w[j] * k.v[m] - w[m] * k.v[j])
+            )
+    if k.known and has_imu and k.inertial and dt > 0.0:
+        # The thrust steps between two samples of the IMU, no one knows when: a change of
+        # acceleration is known to half the interval, with a uniform error.
+        change = 0.0
+        for i in range(3):
+            out.increment[i] = 0.5 * dt * (acceleration[i] + k.acceleration[i])
+            k.v[i] += out.increment[i]
+            change += (acceleration[i] - k.acceleration[i]) ** 2 / 3.0
+        noise = (s.accelerometer_variance + change / 12.0) * dt * dt
+        out.increment_variance = noise
+        k.p_vv += -2.0 * dt * k.p_vb + dt * dt * k.p_bb + noise
+        k.p_vb -= dt * k.p_bb
+        k.p_bb += s.accelerometer_bias_variance * dt / _BIAS_TIME
+        k.gyro_bias_variance += s.gyro_bias_variance * dt / _BIAS_TIME
+
+    # odometry: velocity at the origin, carried to the sample's instant
+    taken = has_odometry
+    if has_odometry:
+        v, angular, lever = np.empty(3), odometry[7:10], s.odometry_lever
+        for i in range(3):
+            j, m = (i + 1) % 3, (i + 2) % 3
+            v[i] = (
+                odometry[4 + i]
+                - (angular[j] * lever[m] - angular[m] * lever[j])
+                + shift * acceleration[i]
+            )
+        if not k.known or not (has_imu and started):
+            k.v[:] = v
+            k.p_vv = r_linear
+            k.p_vb = 0.0
+            k.p_bb = s.accelerometer_bias_variance
+        else:
+            total = k.p_vv + r_linear
+            surprise = 0.0
+            for i in range(3):
+                surprise += (v[i] - k.v[i]) ** 2
+            # a filter that refuses for long is wrong itself: its variance grows until it agrees
+            taken = surprise <= 3.0 * s.gate**2 * total
+            if taken:
+                gain, bias_gain = k.p_vv / total, k.p_vb / total
+                for i in range(3):
+                    innovation = v[i] - k.v[i]
+                    k.v[i] += gain * innovation
+                    k.accelerometer_bias[i] += bias_gain * innovation
+                k.p_bb -= bias_gain * k.p_vb
+                k.p_vb *= 1.0 - gain
+                k.p_vv *= 1.0 - gain
+            else:
+                k.p_vv += r_linear
+        if taken:
+            for i in range(3):
+                out.odometry[i] = v[i]
+                if not has_imu:
+                    out.odometry[3 + i] = angular[i]
+        if has_imu:
+            gain = k.gyro_bias_variance / (k.gyro_bias_variance + r_angular + s.gyro_variance)
+            k.gyro_bias_variance *= 1.0 - gain
+            back = min(shift / dt, 1.0) if k.inertial and dt > 0.0 else 0.0
+            for i in range(3):
+                then = rate[i] + back * (k.rate[i] - rate[i])
+                k.gyro_bias[i] += gain * (then - angular[i])
+        k.known = True
+    if has_imu:
+        k.inertial = True
+        out.gyro_variance = s.gyro_variance
+        for i in range(3):
+            out.gyro[i] = rate[i]
+            k.acceleration[i] = acceleration[i]
+    out.measured = taken
+    for i in range(3):
+        k.rate[i] = rate[i]
+        out.nu[i] = k.v[i]
+        out.nu[3 + i] = rate[i]
+        out.down[i] = down[i]
+    return taken
+
+
+def describe(counts: Mapping[str, int]) -> list[str]:
+    """The refusals among a sampler's counts, in words, most frequent first."""
+    refused = {name: n for name, n in counts.items() if ":" in name and n}
+    return [f"{name} ({n})" for name, n in sorted(refused.items(), key=lambda item: -item[1])]

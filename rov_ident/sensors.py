@@ -1,0 +1,226 @@
+"""What the sensors of a simulated vehicle publish: rates, noise, delays, all drawn from one seed."""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
+from rov_ident.excitation import manoeuvre
+from rov_ident.frames import (
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
+from rov_ident.model import skew
+from rov_ident.samples import IMU, ODOMETRY, WRENCH
+from rov_ident.simulate import Trajectory, simulate
+
+START = 1_000_000_000  # ns; stamp of the first instant: zero would read as "no stamp"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Rates in Hz (an ``imu_rate`` of zero: no IMU), noise as standard deviations of one sample.
+
+    ``wrench_std`` is relative to the wrench. ``delay`` (s) and ``jitter`` (s, standard deviation of
+    it) put off the arrival of a message, never its stamp; ``drop`` is the share of messages lost.
+    """
+
+    odometry_rate: float = 20.0
+    imu_rate: float = 100.0
+    wrench_rate: float = 50.0
+    linear_std: float = 0.008
+    angular_std: float = 0.004
+    position_std: float = 0.01
+    attitude_std: float = 0.002
+    accelerometer_std: float = 0.03
+    gyro_std: float = 0.003
+    accelerometer_bias_std: float = 0.0
+    gyro_bias_std: float = 0.0
+    wrench_std: float = 0.01
+    delay: float = 0.0
+    jitter: float = 0.0
+    drop: float = 0.0
+
+    def scaled(self, factor: float) -> "Suite":
+        """The same sensors with all noise multiplied."""
+        noisy = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return dataclasses.replace(
+            self, **{k: factor * v for k, v in noisy.items() if k.endswith("_std")}
+        )
+
+
+@dataclass(frozen=True)
+class Dive:
+    """A simulated dive: the true motion at all instants, and the messages in order of arrival.
+
+    ``messages`` holds (arrival [ns], role, message), in ROS axes.
+    """
+
+    truth: Trajectory
+    demand: Array  # (N, 6), held from each instant of the truth to the next
+    messages: list[tuple[int, str, Message]]
+
+
+def dive(
+    config: Config,
+    name: str = "steps",
+    duration: float = 180.0,
+    suite: Suite | None = None,
+    seed: int = 0,
+) -> Dive:
+    """Drive the configured vehicle through a manoeuvre and measure it.
+
+    Raises
+    ------
+    UserError
+        If there is no such manoeuvre, or the simulation diverges.
+    """
+    suite = suite or Suite()
+    rng = np.random.default_rng(seed)
+    demand_t = np.arange(0.0, duration, 1.0 / suite.wrench_rate)
+    demand = manoeuvre(name, config.model, demand_t, rng)
+    return measure(config, demand_t, demand, duration, suite, rng)
+
+
+def measure(
+    config: Config,
+    demand_t: Array,
+    demand: Array,
+    duration: float,
+    suite: Suite,
+    rng: np.random.Generator,
+) -> Dive:
+    """Simulate under a wrench demanded from each of ``demand_t`` (K,) to the next, and measure."""
+    # Every topic starts at a phase of its own, as real drivers do.
+    odometry_t = _clock(suite.odometry_rate, duration, rng)
+    imu_t = _clock(suite.imu_rate, duration, rng)
+    t = np.unique(np.concatenate([demand_t, odometry_t, imu_t, np.arange(0.0, duration, 0.005)]))
+    held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
+    truth = simulate(config.model, t, _acting(config, t, held))
+    down = quaternion_to_matrix(truth.orientation)[:, 2, :]
+
+    messages: list[tuple[int, str, Message]] = []
+    variance = np.repeat([suite.linear_std**2, suite.angular_std**2], 3)
+    lever = np.array(config.odometry.position)
+    for i in np.searchsorted(t, odometry_t):
+        nu = truth.nu[i]
+        noise = rng.standard_normal(12)
+        tilt = quaternion_from_rotation_vector(suite.attitude_std * noise[:3])
+        messages.append(
+            _stamped(
+                t[i],
+                ODOMETRY,
+                Odometry(
+                    0,
+                    "odom_ned",
+                    "base_link_frd",
+                    _coarse(truth.position[i] + suite.position_std * noise[3:6]),
+                    _coarse(quaternion_multiply(truth.orientation[i], tilt)),
+                    _coarse(nu[:3] + np.cross(nu[3:], lever) + suite.linear_std * noise[6:9]),
+                    _coarse(nu[3:] + suite.angular_std * noise[9:]),
+                    variance,
+                ),
+            )
+        )
+    imu_lever = np.array(config.imu.position)
+    mounting = _mounting(config)
+    accelerometer_bias = suite.accelerometer_bias_std * rng.standard_normal(3)
+    gyro_bias = suite.gyro_bias_std * rng.standard_normal(3)
+    for i in np.searchsorted(t, imu_t):
+        nu, nu_dot = truth.nu[i], truth.nu_dot[i]
+        spin = skew(nu[3:])
+        acceleration = nu_dot[:3] + spin @ nu[:3] - config.gravity * down[i]
+        acceleration = acceleration + (skew(nu_dot[3:]) + spin @ spin) @ imu_lever
+        noise = rng.standard_normal(6)
+        messages.append(
+            _stamped(
+                t[i],
+                IMU,
+                Imu(
+                    0,
+                    "imu_link_frd",
+                    np.array([1.0, 0.0, 0.0, 0.0]),
+                    _coarse(mounting.T @ nu[3:] + gyro_bias + suite.gyro_std * noise[:3]),
+                    _coarse(
+                        mounting.T @ acceleration
+                        + accelerometer_bias
+                        + suite.accelerometer_std * noise[3:]
+                    ),
+                    np.full(3, suite.gyro_std**2),
+                    np.full(3, suite.accelerometer_std**2),
+                ),
+            )
+        )
+    for at, wrench in zip(demand_t, demand, strict=True):
+        measured = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
+        message = Wrench(0, "base_link_frd", measured[:3], measured[3:])
+        messages.append(_stamped(at, WRENCH, message))
+
+    keep = rng.random(len(messages)) >= suite.drop
+    late = suite.delay + suite.jitter * np.abs(rng.standard_normal(len(messages)))
+    arrived = [
+        (message[2].stamp + round(1e9 * lag), message[1], message[2])
+        for message, kept, lag in zip(messages, keep, late, strict=True)
+        if kept
+    ]
+    # A topic keeps its order, however late its messages are.
+    newest: dict[str, int] = {}
+    ordered = []
+    for arrival, role, message in sorted(arrived, key=lambda m: m[2].stamp):
+        newest[role] = max(arrival, newest.get(role, 0))
+        ordered.append((newest[role], role, message))
+    ordered.sort(key=lambda m: m[0])
+    return Dive(truth, held, ordered)
+
+
+def _acting(config: Config, t: Array, demand: Array) -> Array:
+    """The wrench (N, 6) that acts from each instant to the next, after the input effects."""
+    for name, parameters in config.effects.items():
+        effect = EFFECTS[name]
+        if effect.place != "input":
+            continue
+        acting = demand.copy()
+        state = effect.start(demand[0])
+        for i, dt in enumerate(np.diff(t)):
+            state, acting[i] = effect.step(state, demand[i], dt, **parameters)
+        demand = acting
+    return demand
+
+
+def _mounting(config: Config) -> Array:
+    """IMU axes -> body axes (3, 3)."""
+    from rov_ident.frames import quaternion_from_euler
+
+    return quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+
+
+def _clock(rate: float, duration: float, rng: np.random.Generator) -> Array:
+    """Instants of a topic, on whole microseconds."""
+    if rate <= 0.0:
+        return np.zeros(0)
+    return np.round(np.arange(rng.random() / rate, duration, 1.0 / rate), 6)
+
+
+def _coarse(values: Array) -> Array:
+    """As a sensor gives them, in single precision: another computer's last bit does not show."""
+    return values.astype(np.float32).astype(np.float64)
+
+
+def _stamped(t: float, role: str, message: Message) -> tuple[int, str, Message]:
+    stamp = START + round(1e9 * t)
+    return stamp, role, message._replace(stamp=stamp)
+
+
+def samples_of(config: Config, run: Dive) -> Iterator[np.ndarray]:
+    """The samples (k,) of a dive as an estimator configured so would see them."""
+    from rov_ident.samples import Sampler
+
+    sampler = Sampler(config)
+    for _, role, message in run.messages:
+        yield sampler.push(role, message)
+    yield sampler.flush()

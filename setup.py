@@ -1,0 +1,57 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "rov_ident"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(include=[package_name, f"{package_name}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        (f"share/{package_name}/config", glob("config/*.yaml")),
+        (f"share/{package_name}/launch", glob("launch/*.launch.py")),
+    ],
+    python_requires=">=3.10",
+    # docs/dependencies.md says what each is for.
+    install_requires=[
+        "setuptools",
+        "numpy>=1.26",
+        "numba>=0.61",
+        "scipy>=1.11",
+        "filterpy>=1.4.5",
+        "mcap>=1.2",
+        "rosbags>=0.10",
+        "PyYAML>=6.0",
+        "rich>=13",
+        "matplotlib>=3.8",
+    ],
+    extras_require={
+        # On a ROS 2 machine rclpy and the messages come from apt; these wheels stand in elsewhere.
+        "wheels": ["ros-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces"],
+        "test": [
+            "pytest",
+            "pytest-timeout",
+            "pytest-xdist",
+            "hypothesis",
+            "mcap-ros2-support",
+            "ruff",
+            "mypy",
+            "types-PyYAML",
+        ],
+    },
+    zip_safe=True,
+    maintainer="rov_ident maintainers",
+    maintainer_email="maintainers@users.noreply.github.com",
+    description="Online identification of the hydrodynamic coefficients of underwater vehicles.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "rls_node = rov_ident.nodes.rls_node:main",
+            "ukf_node = rov_ident.nodes.ukf_node:main",
+            "rov-ident = rov_ident.cli:main",
+        ],
+    },
+)

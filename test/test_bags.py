@@ -1,0 +1,448 @@
+"""Bags on real files: read back with the peers' readers, cut, damaged, killed."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader as RosbagsReader
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
+
+from rov_ident import cdr
+from rov_ident.bags import Bag, BagWriter, read_messages, select_topics
+from rov_ident.errors import UserError
+from rov_ident.messages import Imu, Odometry, Wrench
+
+STEP = 20_000_000  # ns
+
+
+def odometry(stamp, x=0.0):
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    zero = np.zeros(3)
+    return Odometry(stamp, "odom", "base_link", np.array([x, 0, 0]), level, zero, zero, np.zeros(6))
+
+
+def imu(stamp):
+    return Imu(stamp, "imu_link", np.array([1.0, 0, 0, 0]), *np.eye(3), np.zeros(3))
+
+
+def wrench(stamp):
+    return Wrench(stamp, "base_link", np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
+
+
+def entries(count, namespace=""):
+    """(topic, type, stamp, data) of three topics, as a vehicle publishes them."""
+    for k in range(count):
+        stamp = 10**9 + k * STEP
+        for name, type_name, message in (
+            ("odom", cdr.ODOMETRY_TYPE, odometry(stamp, float(k))),
+            ("imu/data", cdr.IMU_TYPE, imu(stamp + 1)),
+            ("thruster_wrench", cdr.WRENCH_TYPE, wrench(stamp + 2)),
+        ):
+            yield f"{namespace}/{name}", type_name, message.stamp, cdr.encode(message)
+
+
+def write(path, rows, **options):
+    with BagWriter(path, **options) as writer:
+        for row in rows:
+            writer.write(*row)
+    return path
+
+
+def write_mcap(path, rows, **options):
+    """The same by the mcap library, for the forms of file that BagWriter does not write."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, **options)
+        writer.start(profile="ros2")
+        channels = {}
+        for topic, type_name, stamp, data in rows:
+            if topic not in channels:
+                schema = writer.register_schema(type_name, "ros2msg", b"")
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic], stamp, data, stamp)
+        writer.finish()
+    return path
+
+
+@pytest.fixture(params=["dive.mcap", "dive"])
+def bag_path(request, tmp_path):
+    return write(tmp_path / request.param, entries(3000))
+
+
+# --- round trips ----------------------------------------------------------------------------
+
+
+def test_what_is_written_is_read(bag_path):
+    bag = Bag(bag_path)
+    assert {topic: tuple(info) for topic, info in bag.topics.items()} == {
+        "/odom": (cdr.ODOMETRY_TYPE, 3000),
+        "/imu/data": (cdr.IMU_TYPE, 3000),
+        "/thruster_wrench": (cdr.WRENCH_TYPE, 3000),
+    }
+    assert [tuple(raw) for raw in bag.iter_raw()] == list(entries(3000))
+    assert not bag.truncated
+    assert bag.damage is None
+    assert [raw.topic for raw in bag.iter_raw(["/imu/data"])] == ["/imu/data"] * 3000
+
+
+def test_messages_come_decoded_with_their_role(bag_path):
+    bag = Bag(bag_path)
+    messages = list(read_messages(bag, select_topics(bag)))
+    assert [role for role, _ in messages[:4]] == ["odom", "imu", "wrench", "odom"]
+    assert messages[3][1].position[0] == 1.0
+    assert [type(m) for _, m in messages[:3]] == [Odometry, Imu, Wrench]
+    without_imu = read_messages(bag, {"odom": "/odom", "imu": None, "wrench": "/thruster_wrench"})
+    assert [role for role, _ in without_imu] == ["odom", "wrench"] * 3000
+
+
+def test_rosbags_reads_it(bag_path):
+    reader = RosbagsReader(bag_path) if bag_path.is_dir() else AnyReader([bag_path])
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with reader:
+        assert reader.message_count == 9000
+        rows = list(reader.messages())
+        assert [(c.topic, c.msgtype, t, bytes(d)) for c, t, d in rows] == list(entries(3000))
+        last = store.deserialize_cdr(rows[-3][2], cdr.ODOMETRY_TYPE)
+        assert last.pose.pose.position.x == 2999.0
+
+
+def test_mcap_ros2_support_reads_it_from_the_schema_text(bag_path):
+    path = next(bag_path.glob("*.mcap")) if bag_path.is_dir() else bag_path
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().library == "rov_ident"
+        assert reader.get_header().profile == "ros2"
+        decoded = list(reader.iter_decoded_messages())
+    assert len(decoded) == 9000
+    assert decoded[2].decoded_message.wrench.torque.z == 6.0
+    assert decoded[-3].decoded_message.header.frame_id == "odom"
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_by_rosbags(tmp_path, storage):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    path = tmp_path / "dive"
+    with RosbagsWriter(path, version=9, storage_plugin=storage) as writer:
+        connections = {}
+        for topic, type_name, stamp, data in entries(10):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=store)
+            writer.write(connections[topic], stamp, data)
+    if storage == StoragePlugin.SQLITE3:
+        with pytest.raises(UserError, match="ros2 bag convert"):
+            Bag(path)
+    else:
+        assert [tuple(raw) for raw in Bag(path).iter_raw()] == list(entries(10))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"use_chunking": False},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE},
+        {"use_statistics": False},
+        {"repeat_channels": False},
+        {"enable_crcs": False},
+        {"chunk_size": 1000},
+    ],
+)
+def test_every_form_of_mcap(tmp_path, options):
+    path = write_mcap(tmp_path / "dive.mcap", entries(2000), **options)
+    bag = Bag(path)
+    assert bag.topics["/odom"].message_count == 2000
+    assert [tuple(raw) for raw in bag.iter_raw()] == list(entries(2000))
+    assert not bag.truncated
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_messages_come_in_order_of_log_time(tmp_path, chunking):
+    rows = list(entries(3000))
+    shuffled = rows.copy()
+    random.Random(3).shuffle(shuffled)
+    path = write_mcap(tmp_path / "dive.mcap", shuffled, chunk_size=100_000, use_chunking=chunking)
+    assert [tuple(raw) for raw in Bag(path).iter_raw()] == rows
+
+
+def test_messages_of_equal_time_keep_their_order(tmp_path):
+    rows = [("/odom", cdr.ODOMETRY_TYPE, 5, cdr.encode(odometry(k))) for k in range(5000)]
+    path = write_mcap(tmp_path / "dive.mcap", rows, chunk_size=50_000)
+    assert [tuple(raw) for raw in Bag(path).iter_raw()] == rows
+
+
+def test_a_directory_of_several_files(tmp_path):
+    rows = list(entries(1200))
+    directory = tmp_path / "dive"
+    directory.mkdir()
+    for k in range(12):
+        write(directory / f"dive_{k}.mcap", rows[k * 300 : (k + 1) * 300])
+    bag = Bag(directory)
+    assert [tuple(raw) for raw in bag.iter_raw()] == rows
+    assert bag.topics["/odom"].message_count == 1200
+
+
+def test_bytes_are_reproducible(tmp_path):
+    first = write(tmp_path / "a.mcap", entries(500))
+    time.sleep(0.01)
+    second = write(tmp_path / "b.mcap", entries(500))
+    assert first.read_bytes() == second.read_bytes()
+    assert Bag(first).sha256 == Bag(second).sha256
+    other = write(tmp_path / "c.mcap", entries(501))
+    assert Bag(other).sha256 != Bag(first).sha256
+
+
+def test_latched_topics_say_so(tmp_path):
+    path = tmp_path / "dive"
+    with BagWriter(path) as writer:
+        writer.add_topic("/odom", cdr.ODOMETRY_TYPE, latched=True)
+        writer.write("/odom", cdr.ODOMETRY_TYPE, 5, cdr.encode(odometry(5)))
+        writer.write("/other", cdr.ODOMETRY_TYPE, 5, cdr.encode(odometry(5)))
+    with RosbagsReader(path) as reader:
+        profiles = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
+    assert profiles["/odom"][0].durability.name == "TRANSIENT_LOCAL"
+    assert profiles["/other"] == []
+
+
+# --- damage ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunking", [True, False])
+def test_a_file_cut_anywhere_gives_what_is_complete(tmp_path, chunking):
+    rows = list(entries(2000))
+    whole = write_mcap(
+        tmp_path / "whole.mcap", rows, chunk_size=20_000, use_chunking=chunking
+    ).read_bytes()
+    cut = tmp_path / "cut.mcap"
+    numbers = random.Random(7)
+    for size in [*(numbers.randrange(len(whole) // 4, len(whole)) for _ in range(30)), -1]:
+        cut.write_bytes(whole[:size])
+        bag = Bag(cut)
+        got = [tuple(raw) for raw in bag.iter_raw()]
+        # Nothing is lost where only the summary at the end is cut.
+        assert bag.truncated == (got != rows)
+        assert got == rows[: len(got)]
+        assert sum(info.message_count for info in bag.topics.values()) == len(got)
+        # Of an evenly filled file the share that is read is about the share that is left.
+        assert len(got) / len(rows) > size / len(whole) - 0.06
+
+
+def test_zeros_left_by_a_power_cut_end_the_file(tmp_path):
+    whole = write_mcap(tmp_path / "whole.mcap", entries(500), chunk_size=20_000).read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: len(whole) // 2] + bytes(100_000))
+    bag = Bag(cut)
+    assert bag.lost_bytes > 90_000
+    assert "killed" in bag.damage
+    assert sum(1 for _ in bag.iter_raw()) > 0
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_a_damaged_chunk_is_passed_over(tmp_path, summary):
+    rows = list(entries(2000))
+    path = write_mcap(
+        tmp_path / "dive.mcap", rows, chunk_size=50_000, compression=CompressionType.NONE
+    )
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF  # within the messages of some chunk
+    path.write_bytes(data if summary else data[:-1])
+    bag = Bag(path)
+    got = [tuple(raw) for raw in bag.iter_raw()]
+    assert bag.damaged_chunks == 1
+    assert "1 damaged" in bag.damage
+    assert 0.9 * len(rows) < len(got) < len(rows)
+    assert set(got) < set(rows)
+
+
+@pytest.mark.parametrize("name", ["dive.mcap", "dive"])
+def test_a_killed_recorder_leaves_a_readable_bag(tmp_path, name):
+    path = tmp_path / name
+    program = textwrap.dedent(
+        f"""
+        import sys, time
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from test_bags import entries
+        from rov_ident.bags import BagWriter
+        writer = BagWriter({str(path)!r}, crash_safe=True)
+        begin = time.monotonic()
+        for k, row in enumerate(entries(10**6)):
+            writer.write(*row)
+            if k == 300:
+                time.sleep(1.1)
+            elif k > 300:
+                print(k, flush=True)
+                time.sleep(0.001)
+        """
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    for _ in range(50):
+        process.stdout.readline()
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    bag = Bag(path)
+    got = [tuple(raw) for raw in bag.iter_raw()]
+    assert bag.truncated
+    assert len(got) >= 300
+    assert got == list(entries(1000))[: len(got)]
+
+
+def test_undecodable_messages_are_given_as_none(tmp_path):
+    rows = list(entries(2))
+    rows[1] = (*rows[1][:3], rows[1][3][:-20])
+    bag = Bag(write(tmp_path / "dive.mcap", rows))
+    messages = list(read_messages(bag, select_topics(bag)))
+    assert [(role, message is None) for role, message in messages[:3]] == [
+        ("odom", False),
+        ("imu", True),
+        ("wrench", False),
+    ]
+
+
+# --- wrong files ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"t_s,u,v\n0,1,2\n", "not an MCAP"),
+        (b"SQLite format 3\0....", "ros2 bag convert"),
+        (b"#ROSBAG V2.0\n", "rosbags-convert"),
+        (b"\x89MCAP0\r\n", "killed"),
+    ],
+)
+def test_a_file_that_is_no_bag(tmp_path, content, words):
+    path = tmp_path / "dive.mcap"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        Bag(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_place_where_nothing_is(tmp_path):
+    with pytest.raises(UserError, match=r"nowhere\.mcap cannot be read"):
+        Bag(tmp_path / "nowhere.mcap")
+    with pytest.raises(UserError, match=r"no \.mcap file"):
+        Bag(tmp_path)
+
+
+def test_a_bag_without_messages(tmp_path):
+    path = tmp_path / "dive.mcap"
+    with BagWriter(path) as writer:
+        writer.add_topic("/odom", cdr.ODOMETRY_TYPE)
+    with pytest.raises(UserError, match="no ROS 2 message"):
+        Bag(path)
+
+
+def test_bad_metadata(tmp_path):
+    path = write(tmp_path / "dive", entries(3))
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text()
+    metadata.write_text(text.replace("compression_mode: ''", "compression_mode: FILE"))
+    with pytest.raises(UserError, match="compressed by rosbag2"):
+        Bag(path)
+    metadata.write_text(text.replace("dive_0.mcap", "dive_1.mcap"))
+    with pytest.raises(UserError, match=r"dive_1\.mcap cannot be read"):
+        Bag(path)
+    metadata.write_text("{")
+    with pytest.raises(UserError, match="metadata"):
+        Bag(path)
+    metadata.unlink()
+    assert sum(1 for _ in Bag(path).iter_raw()) == 9
+
+
+# --- writing --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["dive.mcap", "dive"])
+def test_an_exception_leaves_nothing_behind(tmp_path, name):
+    with pytest.raises(TypeError):
+        write(tmp_path / name, [*entries(1), None])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_old_file_stays_until_the_new_one_is_complete(tmp_path):
+    path = write(tmp_path / "dive.mcap", entries(3))
+    with BagWriter(path) as writer:
+        writer.write(*next(entries(1)))
+        assert sum(1 for _ in Bag(path).iter_raw()) == 9
+    assert sum(1 for _ in Bag(path).iter_raw()) == 1
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    write(tmp_path / "dive", entries(3))
+    with pytest.raises(UserError, match="exists already"):
+        BagWriter(tmp_path / "dive")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written"):
+        BagWriter(tmp_path / "file" / "dive.mcap")
+
+
+def test_an_unknown_type_is_refused(tmp_path):
+    with (
+        pytest.raises(UserError, match="no_msgs/msg/Nothing"),
+        BagWriter(tmp_path / "dive.mcap") as writer,
+    ):
+        writer.write("/odom", "no_msgs/msg/Nothing", 1, b"")
+
+
+# --- choice of topics -----------------------------------------------------------------------
+
+
+def bag_of(tmp_path, **topics):
+    types = {"odom": cdr.ODOMETRY_TYPE, "imu": cdr.IMU_TYPE, "wrench": cdr.WRENCH_TYPE}
+    rows = [(topic, types[kind], 1, b"") for kind, names in topics.items() for topic in names]
+    return Bag(write(tmp_path / "dive.mcap", rows))
+
+
+def test_topics_in_a_namespace_by_name_and_by_type(tmp_path):
+    bag = bag_of(
+        tmp_path,
+        odom=["/rov/odom", "/rov/odom/filtered"],
+        imu=["/rov/imu/data", "/rov/imu/raw"],
+        wrench=["/rov/tau"],
+    )
+    assert select_topics(bag) == {
+        "odom": "/rov/odom",
+        "imu": "/rov/imu/data",
+        "wrench": "/rov/tau",
+    }
+    chosen = select_topics(bag, {"odom": "rov/odom/filtered", "imu": ""})
+    assert chosen["odom"] == "/rov/odom/filtered"
+    assert chosen["imu"] == "/rov/imu/data"
+
+
+def test_imu_may_be_absent(tmp_path):
+    assert select_topics(bag_of(tmp_path, odom=["/odom"], wrench=["/w"]))["imu"] is None
+
+
+@pytest.mark.parametrize(
+    ("topics", "overrides", "words"),
+    [
+        ({"odom": ["/odom"]}, {}, "no thruster_wrench topic.*/odom"),
+        ({"wrench": ["/thruster_wrench"]}, {}, "no odom topic"),
+        ({"odom": ["/a/odom", "/b/odom"], "wrench": ["/w"]}, {}, "several.*/a/odom, /b/odom"),
+        ({"odom": ["/o"], "wrench": ["/v", "/w"]}, {}, "several.*/v, /w"),
+        ({"wrench": ["/odom", "/w"]}, {}, "/odom in .* is geometry_msgs/msg/WrenchStamped"),
+        ({"odom": ["/o"], "wrench": ["/w"]}, {"odom": "/x"}, "no messages on /x"),
+        ({"odom": ["/o"], "wrench": ["/w"]}, {"odom": "/w"}, "/w in .* is geometry_msgs"),
+        ({"odom": ["/o"], "wrench": ["/w"]}, {"odometry": "/o"}, "odometry is not an input"),
+    ],
+)
+def test_a_choice_that_cannot_be_made(tmp_path, topics, overrides, words):
+    bag = bag_of(tmp_path, **topics)
+    with pytest.raises(UserError, match=words):
+        select_topics(bag, overrides)
