@@ -180,7 +180,11 @@ class ImuSensor:
         (0.0, 0.0, 0.0), "roll, pitch, yaw of the sensor axes from the body axes", "rad"
     )
     accelerometer_std: float = option(
-        0.03, "noise of an acceleration, where the message gives none", "m/s2", lower=POSITIVE
+        1.0,
+        "trust in the integrated acceleration between odometry messages: noise, vibration and "
+        "thrust that steps between two samples (docs/samples.md shows how it was chosen)",
+        "m/s2",
+        lower=POSITIVE,
     )
     gyro_std: float = option(
         0.003, "noise of an angular rate, where the message gives none", "rad/s", lower=POSITIVE
@@ -198,6 +202,9 @@ class WrenchNoise:
     """`wrench`: how well the thruster wrench is known."""
 
     relative_std: float = option(0.01, "standard deviation relative to the wrench", lower=0.0)
+    correlation_time: float = option(
+        0.02, "how long an error of the wrench lasts: the period of its topic", "s", lower=POSITIVE
+    )
     floor_std: Vector = option(
         (0.0,) * 6, "standard deviation at zero wrench: X Y Z, K M N", "N, N m", lower=0.0
     )
@@ -232,13 +239,14 @@ class Ukf:
         5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
     )
     process_std: Vector = option(
-        (0.02, 0.02, 0.02, 0.02, 0.02, 0.02),
-        "density of the acceleration noise: surge sway heave, roll pitch yaw",
+        (0.003, 0.003, 0.003, 0.003, 0.003, 0.003),
+        "density of the acceleration that the model does not explain, besides the noise of the "
+        "wrench: surge sway heave, roll pitch yaw",
         "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
         lower=0.0,
     )
     random_walk: float = option(
-        0.02, "drift of a coefficient relative to its value", "1/sqrt(h)", lower=0.0
+        0.005, "drift of a coefficient relative to its value", "1/sqrt(h)", lower=0.0
     )
 
 

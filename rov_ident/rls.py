@@ -13,6 +13,10 @@ The information is kept as a triangular root R of ``R'R = sum of Phi' Phi / sigm
 it keeps half the digits that the covariance form loses), in coefficients scaled by their prior
 standard deviation about their prior value: the prior is the unit matrix.
 
+*Rows* count where the thrusters drive their axis. Where the residual is larger than the wrench, the
+motion has other causes (a tether, waves, the wash of another axis) which are correlated with it,
+and least squares would turn that into coefficients.
+
 *Forgetting* touches only directions that the present motion excites (subspace-of-information
 forgetting, Lai and Bernstein 2024): unexcited ones keep their information, so nothing winds up.
 
@@ -59,6 +63,7 @@ _PATIENCE = 1.0  # s; outliers that go on for longer are the vehicle having chan
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 2.0  # its value from which old data are forgotten; 1 is expected
 _FORGETTING_TIME = 5.0  # s; memory while surprised
+_DRIVE_TIME = 20.0  # s; memory of how strongly an axis is driven
 _NOISE_TIME = 60.0  # s; memory of the residual's variance
 _EXCITED = 0.01  # a row with less information than this, relative to the prior, excites nothing
 
@@ -80,6 +85,8 @@ _SCALARS = np.dtype(
         ("t", "f8"),
         ("since_update", "f8"),
         ("variance", "f8", (6,)),  # of the filtered residual
+        ("wrench", "f8", (6,)),  # filtered once
+        ("drive", "f8", (6,)),  # its mean square of late
         ("surprise", "f8"),  # normalised innovation squared, averaged: 1 when all is well
         ("refused", "f8"),  # s of uninterrupted outliers
         ("updates", "i8"),
@@ -119,7 +126,7 @@ def problem(config: Config) -> Problem:
     settings["gate"] = config.rls.gate
     settings["forgetting_factor"] = config.rls.forgetting_factor
     settings["variable"] = config.rls.forgetting == "variable"
-    settings["lag"] = 2.0 / config.rls.filter_corner
+    settings["lag"] = 6.0 / config.rls.filter_corner
     settings["floor"] = 1e-3 * authority(model)
     return Problem(
         settings,
@@ -278,11 +285,15 @@ def _step(task, state, sample, info, momentum, force, now, rows):  # type: ignor
             before = w * last[i, j] + x[i, j]
             x[i, j] = a * x[i, j] + b0 * u[i, j] + b1 * now[0, i, j]
             if j == n:
-                x[i, j] += (1.0 - a) * sample.wrench[i]  # constant over the interval
+                x[i, j] += (1.0 - a) * sample.wrench[i]
+                x[i, j] += 0.5 * dt * (b1 - b0) * sample.wrench_slope[i]
             after = w * now[1, i, j] + x[i, j]
             y[i, j] = a * y[i, j] + b0 * before + b1 * after
             u[i, j] = now[0, i, j]
             last[i, j] = now[1, i, j]
+    for i in range(6):
+        c.wrench[i] = a * c.wrench[i] + (1.0 - a) * sample.wrench[i]
+        c.drive[i] += min(dt / _DRIVE_TIME, 1.0) * (c.wrench[i] ** 2 - c.drive[i])
     c.since_update += dt
 
     deviation = solution(root)
@@ -304,9 +315,12 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
     n = root.shape[0]
     # Rows closer than the filter's memory repeat each other: they count as one.
     repeats = max(1.0, 2.0 / (s.corner * c.since_update))
-    surprise, gated = 0.0, False
+    surprise, driven, gated = 0.0, 0, False
     whitened = np.empty(n)
     for i in range(6):
+        if c.drive[i] <= c.variance[i]:
+            continue
+        driven += 1
         spread = 0.0
         for j in range(n):  # R^-T phi
             total = y[i, j]
@@ -315,7 +329,7 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
             whitened[j] = total / root[j, j]
             spread += whitened[j] ** 2
         info.ratio[i] = info.residual[i] ** 2 / (c.variance[i] + spread)
-        surprise += info.ratio[i] / 6.0
+        surprise += info.ratio[i]
         gated = gated or info.ratio[i] > s.gate**2
     if gated and c.refused < _PATIENCE:
         c.refused += c.since_update
@@ -324,7 +338,9 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
     c.refused = 0.0
     info.reason = USED
     c.updates += 1
-    c.surprise += min(c.since_update / _SURPRISE_TIME, 1.0) * (surprise - c.surprise)
+    if driven > 0:
+        blend = min(c.since_update / _SURPRISE_TIME, 1.0)
+        c.surprise += blend * (surprise / driven - c.surprise)
 
     if s.variable:
         if c.surprise > _SURPRISING:
@@ -333,8 +349,9 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
         info.forgetting = s.forgetting_factor
     for i in range(6):
         weight = 1.0 / np.sqrt(c.variance[i] * repeats)
+        used = weight if c.drive[i] > c.variance[i] else 0.0
         for j in range(n + 1):
-            rows[i, j] = y[i, j] * weight
+            rows[i, j] = y[i, j] * used
     if info.forgetting < 1.0:
         _forget(root, score, deviation, rows, info.forgetting)
     gradient = rows.copy()
@@ -350,7 +367,10 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
             e -= gradient[i, j] * deviation[j]
         for j in range(n):
             g[j] += gradient[i, j] * e
-        e2 = e * e * c.variance[i] * repeats
+        if c.drive[i] > c.variance[i]:
+            e2 = e * e * c.variance[i] * repeats
+        else:
+            e2 = info.residual[i] ** 2
         c.variance[i] = max(c.variance[i] + blend * (e2 - c.variance[i]), s.floor[i] ** 2)
     for a in range(n):
         lagged[a] *= decay

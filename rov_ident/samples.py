@@ -7,14 +7,17 @@ never by arrival, so that a bag gives the same samples live, replayed and offlin
 
 What a sample holds, and why (docs/samples.md has the measurements):
 
-* ``wrench`` is the *mean* over the interval that ends at the sample. A demand holds from its stamp
-  to the next one; a value picked at the sample's instant would look like a delay of half a period.
+* ``wrench`` is the *mean* over the interval that ends at the sample, ``wrench_slope`` its trend in
+  there. A demand holds from its stamp to the next one; a value picked at the sample's instant would
+  look like a delay of half a period, and without the trend a step early in the interval would be
+  taken for one in its middle.
 * ``nu`` is the best estimate of the body velocity: odometry and the integrated IMU are weighed
   by a Kalman filter on the kinematics alone (no model of the vehicle). Such a filter is
   complementary, what it takes from one source it leaves of the other, so it adds noise but no
   lag. Without an IMU ``nu`` is the odometry as it came.
-* ``odometry``, ``gyro`` and ``increment`` (the IMU's change of velocity over the interval) are the
-  same measurements one by one with independent noise, for a filter that does its own weighing.
+* ``odometry`` and ``gyro`` are the same measurements one by one, their noise independent, for a
+  filter that does its own weighing. With a gyro the odometry's own angular rate only serves to find
+  the gyro's bias.
 """
 
 import math
@@ -39,13 +42,13 @@ SAMPLE = np.dtype(
         ("measured", "?"),  # an odometry message belongs to this sample
         ("nu", "f8", (6,)),
         ("down", "f8", (3,)),  # unit, body axes
+        ("down_slope", "f8", (3,)),  # per s, over the interval
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, after the input effects
+        ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
         ("odometry", "f8", (6,)),  # m/s, rad/s; NaN: not measured
         ("odometry_variance", "f8", (6,)),
         ("gyro", "f8", (3,)),  # rad/s, bias removed; NaN: not measured
         ("gyro_variance", "f8"),
-        ("increment", "f8", (3,)),  # m/s over dt, bias, gravity and Coriolis removed; NaN: none
-        ("increment_variance", "f8"),
     ],
     align=True,
 )
@@ -61,6 +64,7 @@ _KINEMATICS = np.dtype(
         ("known", "?"),  # an odometry message has been seen since the last restart
         ("inertial", "?"),  # an IMU message has
         ("q", "f8", (4,)),
+        ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2
         ("v", "f8", (3,)),
         ("rate", "f8", (3,)),  # rad/s, bias removed
@@ -293,18 +297,19 @@ class Sampler:
             self.counts["sample: no wrench"] += 1
             self._previous = math.nan
             return None
-        row["wrench"] = wrench
+        row["wrench"], row["wrench_slope"] = wrench
         return sample
 
-    def _mean_wrench(self, start: float, end: float) -> Array | None:
-        """Mean of the acting wrench (6,) over the interval; None where no demand is known."""
+    def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array] | None:
+        """Mean and slope (6,) of the acting wrench in the interval; None where no demand is known."""
         queue = self._queues[WRENCH]
-        total, now = np.zeros(6), start
+        pieces: list[tuple[float, float, Array]] = []
+        now = start
         while queue and queue[0][0] <= end:
             at, message = queue.popleft()
             assert isinstance(message, Wrench)
             if self._demand is not None and at > now:
-                total += self._act(at - now) * (at - now)
+                pieces.append((now, at, self._act(at - now)))
                 now = at
             elif self._demand is None:
                 start = now = max(at, start)
@@ -314,7 +319,16 @@ class Sampler:
             self._input_states = []
             return None
         acting = self._act(end - now)
-        return acting if end <= start else (total + acting * (end - now)) / (end - start)
+        if not pieces:
+            return acting, _ZERO_WRENCH
+        pieces.append((now, end, acting))
+        length, middle = end - start, 0.5 * (start + end)
+        mean, moment = np.zeros(6), np.zeros(6)
+        for begin, stop, wrench in pieces:
+            share = (stop - begin) / length * wrench
+            mean += share
+            moment += (0.5 * (begin + stop) - middle) * share
+        return mean, 12.0 / length**2 * moment
 
     def _act(self, dt: float) -> Array:
         """The wrench (6,) that acts, in the mean over dt, when the present demand is held."""
@@ -350,6 +364,7 @@ def _settings(config: Config) -> NDArray[np.void]:
 _NONE = np.zeros(0, dtype=SAMPLE)
 _ABSENT = np.full(16, math.nan)
 _ZERO = np.zeros(3)
+_ZERO_WRENCH = np.zeros(6)
 
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
 _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU's lever arm
@@ -373,7 +388,6 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
     started = k.inertial
     for i in range(3):
         out.gyro[i] = nan
-        out.increment[i] = nan
         out.odometry[i] = nan
         out.odometry[3 + i] = nan
     variance = np.empty(6)
@@ -454,15 +468,9 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
                 - (w[j] * k.v[m] - w[m] * k.v[j])
             )
     if k.known and has_imu and k.inertial and dt > 0.0:
-        # The thrust steps between two samples of the IMU, no one knows when: a change of
-        # acceleration is known to half the interval, with a uniform error.
-        change = 0.0
         for i in range(3):
-            out.increment[i] = 0.5 * dt * (acceleration[i] + k.acceleration[i])
-            k.v[i] += out.increment[i]
-            change += (acceleration[i] - k.acceleration[i]) ** 2 / 3.0
-        noise = (s.accelerometer_variance + change / 12.0) * dt * dt
-        out.increment_variance = noise
+            k.v[i] += 0.5 * dt * (acceleration[i] + k.acceleration[i])
+        noise = s.accelerometer_variance * dt * dt
         k.p_vv += -2.0 * dt * k.p_vb + dt * dt * k.p_bb + noise
         k.p_vb -= dt * k.p_bb
         k.p_bb += s.accelerometer_bias_variance * dt / _BIAS_TIME
@@ -527,6 +535,8 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
         out.nu[i] = k.v[i]
         out.nu[3 + i] = rate[i]
         out.down[i] = down[i]
+        out.down_slope[i] = (down[i] - k.down[i]) / dt if dt > 0.0 else 0.0
+        k.down[i] = down[i]
     return taken
 
 

@@ -10,13 +10,14 @@ from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
 from rov_ident.excitation import manoeuvre
 from rov_ident.frames import (
+    quaternion_from_euler,
     quaternion_from_rotation_vector,
     quaternion_multiply,
     quaternion_to_matrix,
 )
 from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
 from rov_ident.model import skew
-from rov_ident.samples import IMU, ODOMETRY, WRENCH
+from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
 from rov_ident.simulate import Trajectory, simulate
 
 START = 1_000_000_000  # ns; stamp of the first instant: zero would read as "no stamp"
@@ -194,8 +195,6 @@ def _acting(config: Config, t: Array, demand: Array) -> Array:
 
 def _mounting(config: Config) -> Array:
     """IMU axes -> body axes (3, 3)."""
-    from rov_ident.frames import quaternion_from_euler
-
     return quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
 
 
@@ -216,10 +215,21 @@ def _stamped(t: float, role: str, message: Message) -> tuple[int, str, Message]:
     return stamp, role, message._replace(stamp=stamp)
 
 
+def odometry_of(t: Array, nu: Array) -> list[tuple[int, str, Message]]:
+    """Velocities (N, 6) at t (N,) as odometry messages without a pose; (arrival, role, message)."""
+    level, origin = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+    return [
+        _stamped(
+            at,
+            ODOMETRY,
+            Odometry(0, "odom_ned", "base_link_frd", origin, level, v[:3], v[3:], np.zeros(6)),
+        )
+        for at, v in zip(t, nu, strict=True)
+    ]
+
+
 def samples_of(config: Config, run: Dive) -> Iterator[np.ndarray]:
     """The samples (k,) of a dive as an estimator configured so would see them."""
-    from rov_ident.samples import Sampler
-
     sampler = Sampler(config)
     for _, role, message in run.messages:
         yield sampler.push(role, message)

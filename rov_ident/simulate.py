@@ -1,6 +1,7 @@
 """Open-loop simulation of the equations of motion."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,18 @@ class Trajectory:
     nu_dot: Array
 
 
+class Guide(NamedTuple):
+    """A measured motion that part of a simulation follows (identification channel by channel).
+
+    ``free`` (6,) marks the velocity components to be simulated; the others are those of ``nu``
+    (N, 6), and with any angular one among them the attitude is that of ``orientation`` (N, 4).
+    """
+
+    free: NDArray[np.bool_]
+    nu: Array
+    orientation: Array
+
+
 def simulate(
     model: Model,
     t: Array,
@@ -32,26 +45,39 @@ def simulate(
     nu: Array | None = None,
     position: Array | None = None,
     orientation: Array | None = None,
+    wrench_slope: Array | None = None,
+    guide: Guide | None = None,
 ) -> Trajectory:
     """Integrate from the first instant of ``t`` (N,), the wrench (N, 6) held from each to the next.
 
     nu (6,), position (3,) and orientation (4,) are the state at ``t[0]``: at rest, at the origin
-    and level by default.
+    and level by default. ``wrench_slope`` (N, 6) lets the wrench change linearly in each interval
+    about its mean. With a ``guide`` only some components are simulated, the others follow it.
 
     Raises
     ------
     UserError
         If the motion does not stay finite: no vehicle moves as this model says.
     """
-    out = np.empty((len(t), 19))
+    n = len(t)
+    out = np.empty((n, 19))
+    if guide is None:
+        guide = Guide(np.ones(6, dtype=bool), np.zeros((n, 6)), np.zeros((n, 4)))
+    free = np.flatnonzero(guide.free)
+    inverse = np.zeros((6, 6))
+    inverse[np.ix_(free, free)] = np.linalg.inv(model.mass_matrix[np.ix_(free, free)])
     _simulate(
         model.structure,
         model.mass_matrix.reshape(6, 6, 1),
-        np.linalg.inv(model.mass_matrix),
+        inverse,
         model.theta.reshape(-1, 1),
         model.body.restoring,
         np.ascontiguousarray(t, dtype=float),
         np.ascontiguousarray(wrench, dtype=float),
+        np.zeros((n, 6)) if wrench_slope is None else np.ascontiguousarray(wrench_slope),
+        guide.free,
+        np.ascontiguousarray(guide.nu),
+        np.ascontiguousarray(guide.orientation),
         np.concatenate(
             [
                 np.zeros(3) if position is None else position,
@@ -72,19 +98,38 @@ def simulate(
 
 
 def open_loop(
-    model: Model, t: Array, wrench: Array, nu: Array, orientation: Array, horizon: float
+    model: Model,
+    t: Array,
+    wrench: Array,
+    nu: Array,
+    orientation: Array,
+    horizon: float,
+    wrench_slope: Array | None = None,
+    free: NDArray[np.bool_] | None = None,
 ) -> Array:
     """Velocities (N, 6) predicted open loop over windows of ``horizon`` seconds.
 
     Each window starts from the measured ``nu`` (N, 6) and ``orientation`` (N, 4) at its first
-    sample; rows whose prediction has left all reason (a diverging model) hold infinity.
+    sample; rows whose prediction has left all reason (a diverging model) hold infinity. Components
+    not marked in ``free`` (6,) follow the measurement.
     """
+    free = np.ones(6, dtype=bool) if free is None else free
+    slope = np.zeros_like(wrench) if wrench_slope is None else wrench_slope
     predicted = np.empty((len(t), 6))
     edges = np.append(np.flatnonzero(np.diff(np.floor((t - t[0]) / horizon), prepend=-1.0)), len(t))
     for first, end in zip(edges[:-1], edges[1:], strict=True):
         window = slice(first, end)
         try:
-            run = simulate(model, t[window], wrench[window], nu[first], None, orientation[first])
+            run = simulate(
+                model,
+                t[window],
+                wrench[window],
+                nu[first],
+                None,
+                orientation[first],
+                slope[window],
+                Guide(free, nu[window], orientation[window]),
+            )
             predicted[window] = run.nu
         except UserError:
             predicted[window] = np.inf
@@ -95,8 +140,14 @@ def open_loop(
 
 
 @kernel
-def _derivative(structure, mass, inverse, theta, restoring, wrench, state, rate, work):  # type: ignore[no-untyped-def]
-    """rate (13,) of state (13,) = position, quaternion, nu; work (31, 1) is scratch."""
+def _derivative(  # type: ignore[no-untyped-def]
+    structure, mass, inverse, theta, restoring, wrench, slope, late, free, pace, state, rate, work
+):
+    """rate (13,) of state (13,) = position, quaternion, nu; work (31, 1) is scratch.
+
+    The wrench is its mean plus ``late`` seconds of its slope; components that are not free change
+    at ``pace`` (6,), whatever it takes.
+    """
     h, p, extended = work[:6], work[6:12], work[12:25]
     nu = work[25:31]
     for i in range(6):
@@ -104,11 +155,14 @@ def _derivative(structure, mass, inverse, theta, restoring, wrench, state, rate,
     generalized_force(1, structure, mass, theta, nu, h, p, extended)
     r = rotation(state[3:7])
     for i in range(6):
-        h[i, 0] = wrench[i] - h[i, 0]
+        h[i, 0] = wrench[i] + late * slope[i] - h[i, 0]
         for j in range(3):
             h[i, 0] += restoring[i, j] * r[2, j]
+        for j in range(6):
+            if not free[j]:
+                h[i, 0] -= mass[i, j, 0] * pace[j]
     for i in range(6):
-        rate[7 + i] = 0.0
+        rate[7 + i] = 0.0 if free[i] else pace[i]
         for j in range(6):
             rate[7 + i] += inverse[i, j] * h[j, 0]
     for i in range(3):
@@ -123,34 +177,43 @@ def _derivative(structure, mass, inverse, theta, restoring, wrench, state, rate,
 
 
 @kernel
-def _simulate(structure, mass, inverse, theta, restoring, t, wrench, start, max_step, out):  # type: ignore[no-untyped-def]
+def _simulate(  # type: ignore[no-untyped-def]
+    structure, mass, inverse, theta, restoring, t, wrench, wrench_slope, free, guide, attitude,
+    start, max_step, out,
+):  # fmt: skip
     """Classical Runge-Kutta; out (N, 19): position, quaternion, nu, nu_dot.
 
     nu_dot is that under the wrench which begins to act at the instant.
     """
     state, stage, slope = start.copy(), np.empty(13), np.empty((4, 13))
-    work = np.empty((31, 1))
+    work, pace = np.empty((31, 1)), np.zeros(6)
     for i in range(len(t)):
-        _derivative(structure, mass, inverse, theta, restoring, wrench[i], state, slope[0], work)
-        for j in range(13):
-            out[i, j] = state[j]
+        span = t[i + 1] - t[i] if i + 1 < len(t) else 1.0
         for j in range(6):
-            out[i, 13 + j] = slope[0, 7 + j]
-        if i + 1 == len(t):
-            break
-        steps = max(1, int(np.ceil((t[i + 1] - t[i]) / max_step - 1e-9)))
-        dt = (t[i + 1] - t[i]) / steps
+            if not free[j]:
+                state[7 + j] = guide[i, j]
+                pace[j] = (guide[min(i + 1, len(t) - 1), j] - guide[i, j]) / span
+                if j >= 3:
+                    state[3:7] = attitude[i]
+        steps = max(1, int(np.ceil(span / max_step - 1e-9)))
+        dt = span / steps
         for n in range(steps):
             for s in range(4):
-                if s == 0 and n == 0:
-                    continue
+                share = 0.0 if s == 0 else (1.0 if s == 3 else 0.5)
                 for j in range(13):
-                    stage[j] = state[j] + (0.0 if s == 0 else (1.0 if s == 3 else 0.5) * dt) * (
-                        slope[s - 1, j]
-                    )
+                    stage[j] = state[j] + share * dt * slope[s - 1, j] if s > 0 else state[j]
+                late = (n + share) * dt - 0.5 * span
                 _derivative(
-                    structure, mass, inverse, theta, restoring, wrench[i], stage, slope[s], work
-                )
+                    structure, mass, inverse, theta, restoring, wrench[i], wrench_slope[i], late,
+                    free, pace, stage, slope[s], work,
+                )  # fmt: skip
+                if n == 0 and s == 0:
+                    for j in range(13):
+                        out[i, j] = state[j]
+                    for j in range(6):
+                        out[i, 13 + j] = slope[0, 7 + j]
+                    if i + 1 == len(t):
+                        return
             for j in range(13):
                 state[j] += dt / 6.0 * (slope[0, j] + 2.0 * (slope[1, j] + slope[2, j]) + slope[3, j])
             length = np.sqrt(state[3] ** 2 + state[4] ** 2 + state[5] ** 2 + state[6] ** 2)

@@ -1,0 +1,328 @@
+"""The command ``rov-ident``: standard output carries results, standard error everything else.
+
+Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
+"""
+
+import argparse
+import dataclasses
+import math
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from rov_ident import config as configuration
+from rov_ident.coefficients import catalogue
+from rov_ident.errors import UserError
+
+ERR = Console(stderr=True, highlight=False)
+OUT = Console(highlight=False, soft_wrap=True)
+
+LIVE = ("rls", "ukf")
+CHANNELS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; the exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        options.run(options)
+    except UserError as error:
+        ERR.print(f"rov-ident {options.command}: {error}", markup=False, soft_wrap=True)
+        return 2
+    except BrokenPipeError:
+        # Whoever read our output has seen enough (`rov-ident coefficients | head`).
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        ERR.print("interrupted")
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="rov-ident",
+        description="Identify the hydrodynamic coefficients of underwater vehicles.",
+    )
+    parser.add_argument("--version", action="version", version=version("rov_ident"))
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    demo = commands.add_parser("demo", help="the main job on the shipped bag, live over DDS")
+    demo.add_argument("--rate", type=_rate, default=4.0, help="speed of the replay (default 4)")
+    demo.add_argument(
+        "--out", type=Path, default=Path("out/demo"), help="folder of the report (out/demo)"
+    )
+    demo.set_defaults(run=_demo)
+
+    replay = commands.add_parser(
+        "replay", help="play a bag into live nodes over DDS and record what they publish"
+    )
+    _bag_and_config(replay)
+    replay.add_argument("--estimator", choices=LIVE, action="append", help="default: both")
+    replay.add_argument(
+        "--rate", type=_rate, default=1.0, help="speed; 0: as fast as the nodes follow (default 1)"
+    )
+    replay.add_argument("--out", type=Path, help="bag to write")
+    replay.set_defaults(run=_replay)
+
+    fit = commands.add_parser("fit", help="identify offline, with the same code as the nodes")
+    fit.add_argument("bags", nargs="+", type=Path, metavar="BAG")
+    fit.add_argument("--config", required=True, type=Path)
+    fit.add_argument("--estimator", choices=LIVE, required=True)
+    fit.add_argument("--json", type=Path, help="write the result here")
+    fit.add_argument(
+        "--save", type=Path, metavar="FILE", help="write a configuration with the fitted values"
+    )
+    fit.set_defaults(run=_fit)
+
+    simulate = commands.add_parser(
+        "simulate",
+        help="simulate open loop: a manoeuvre measured by simulated sensors, or a bag's wrench",
+    )
+    simulate.add_argument("--config", required=True, type=Path)
+    source = simulate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--bag", type=Path, help="drive by the wrench of this bag and compare")
+    source.add_argument("--manoeuvre", help="steps, multisine, single-axis, pilot or rest")
+    simulate.add_argument(
+        "--channels",
+        type=_channels,
+        metavar="surge,sway,...",
+        help="with --bag: simulate these alone, the other velocities and the attitude as measured",
+    )
+    simulate.add_argument("--out", required=True, type=Path, metavar="BAG")
+    simulate.add_argument("--duration", type=_positive, default=180.0, help="s (180)")
+    simulate.add_argument("--seed", type=int, default=0, help="of manoeuvre and noise (0)")
+    simulate.add_argument("--odometry-rate", type=_positive, default=20.0, help="Hz (20)")
+    simulate.add_argument("--imu-rate", type=_rate, default=100.0, help="Hz; 0: no IMU (100)")
+    simulate.add_argument("--wrench-rate", type=_positive, default=50.0, help="Hz (50)")
+    simulate.add_argument("--noise", type=_rate, default=1.0, help="factor on all noise (1)")
+    simulate.add_argument("--delay", type=_rate, default=0.0, help="s until a message arrives (0)")
+    simulate.add_argument("--jitter", type=_rate, default=0.0, help="s, of the delay (0)")
+    simulate.add_argument("--drop", type=_rate, default=0.0, help="share of messages lost (0)")
+    simulate.set_defaults(run=_simulate)
+
+    import_ = commands.add_parser("import", help="turn plain CSV logs into a bag")
+    import_.add_argument("csv", nargs="+", type=Path, metavar="CSV")
+    import_.add_argument("--out", required=True, type=Path, metavar="BAG")
+    import_.add_argument(
+        "--map",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=HEADING",
+        help="headings that are called otherwise (u=surge_speed), constants (w=0), or a YAML file",
+    )
+    import_.add_argument("--body-frame", choices=("frd", "flu"), default="frd")
+    import_.add_argument(
+        "--wrench-timing",
+        choices=("held", "mean", "bin"),
+        default="held",
+        help="a row's wrench holds from its time on, is the mean around it, or of the bin from its "
+        "time to the next row's (default held)",
+    )
+    import_.add_argument(
+        "--mask-rates-above", type=_positive, metavar="RAD_S", help="leave out faster rotations"
+    )
+    import_.set_defaults(run=_import)
+
+    names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
+    names.set_defaults(run=_coefficients)
+    return parser
+
+
+def _bag_and_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bag", type=Path, metavar="BAG")
+    parser.add_argument("--config", required=True, type=Path)
+
+
+def _rate(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _channels(text: str) -> "np.ndarray":
+    names = text.split(",")
+    if unknown := set(names) - set(CHANNELS):
+        raise argparse.ArgumentTypeError(f"no channel {min(unknown)!r}: use {','.join(CHANNELS)}")
+    return np.array([name in names for name in CHANNELS])
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError("must be positive")
+    return value
+
+
+# ------------------------------------------------------------------ commands
+# What a command needs beyond numpy is imported by it: `rov-ident --help` is there at once.
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from rov_ident.demo import demo
+
+    demo(options.out, options.rate, ERR, OUT)
+
+
+def _replay(options: argparse.Namespace) -> None:
+    from rov_ident.nodes.replay import replay
+
+    estimators = options.estimator or LIVE
+    with ERR.status("starting the nodes") as status:
+        result = replay(
+            options.bag,
+            options.config,
+            estimators,
+            options.rate,
+            options.out,
+            lambda name, report: status.update(
+                f"{name}: {sum(level == 0 for level in report.levels)} of {len(report.levels)} "
+                "coefficients converged"
+            ),
+        )
+    for name, report in result.reports.items():
+        table = _table(f"{name}, at the end of {options.bag}", "value", "std", "unit", "state")
+        for row in zip(report.names, report.values, report.std, report.units, report.messages):
+            table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], row[4])
+        OUT.print(table)
+    ERR.print(f"{result.messages} messages in {result.seconds:.1f} s")
+    if result.out:
+        ERR.print(f"recorded: {result.out}")
+
+
+def _fit(options: argparse.Namespace) -> None:
+    from rov_ident.fit import fit_online, write_text
+    from rov_ident.records import read_record
+
+    config = configuration.load(options.config, f"{options.estimator}_node")
+    records = []
+    for path in options.bags:
+        with Progress(console=ERR, transient=True) as progress:
+            bar = progress.add_task(f"reading {path.name}")
+            records.append(
+                read_record(
+                    path, config, lambda k, n: progress.update(bar, completed=k, total=n)
+                )
+            )
+        for note in records[-1].notes:
+            ERR.print(f"{path.name}: {note}", markup=False)
+    fit = fit_online(records, config, options.estimator)
+    table = _table(
+        f"{options.estimator}: {fit.samples} samples, {fit.duration:.1f} s",
+        "value", "std", "unit", "configured", "identifiable",
+    )  # fmt: skip
+    for row in zip(fit.names, fit.values, fit.std, fit.units, fit.identifiable):
+        before = config.model.theta[config.model.names.index(row[0])]
+        yes = "yes" if row[4] else "no: the prior decides"
+        table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
+    OUT.print(table)
+    if options.json:
+        write_text(options.json, fit.to_json())
+    if options.save:
+        bags = ", ".join(path.name for path in options.bags)
+        configuration.dump(
+            config.with_model(fit.model),
+            options.save,
+            comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags}.",
+        )
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    config = configuration.load(options.config)
+    if options.bag:
+        _compare(config, options)
+        return
+    from rov_ident.recording import write_messages
+    from rov_ident.sensors import Suite, dive
+
+    suite = dataclasses.replace(
+        Suite().scaled(options.noise),
+        odometry_rate=options.odometry_rate,
+        imu_rate=options.imu_rate,
+        wrench_rate=options.wrench_rate,
+        delay=options.delay,
+        jitter=options.jitter,
+        drop=options.drop,
+    )
+    run = dive(config, options.manoeuvre, options.duration, suite, options.seed)
+    write_messages(options.out, run.messages)
+    ERR.print(f"{options.out}: {len(run.messages)} messages, {options.duration:g} s")
+
+
+def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
+    """Open-loop simulation of a whole bag beside what it measured."""
+    from rov_ident.recording import write_messages
+    from rov_ident.records import HORIZON, VELOCITIES, predicted, read_record, score
+    from rov_ident.sensors import odometry_of
+
+    record = read_record(options.bag, config)
+    for note in record.notes:
+        ERR.print(f"{options.bag.name}: {note}", markup=False)
+    free = options.channels
+    run = predicted(config.model, record.samples, math.inf, free)
+    if not np.isfinite(run).all():
+        raise UserError(
+            f"the simulation diverges on {options.bag}: check the signs and sizes of the "
+            "coefficients and of the wrench"
+        )
+    write_messages(options.out, odometry_of(record.samples["t"], run))
+    whole = score(config.model, record.samples, math.inf, free)
+    windows = score(config.model, record.samples, HORIZON, free)
+    table = _table(
+        f"open-loop simulation against {options.bag.name}",
+        "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit",
+    )  # fmt: skip
+    for i, name in enumerate(VELOCITIES):
+        if free is not None and not free[i]:
+            continue
+        table.add_row(
+            name, f"{whole.r2[i]:.3f}", f"{whole.rmse[i]:.4f}", f"{windows.rmse[i]:.4f}",
+            "m/s" if i < 3 else "rad/s",
+        )  # fmt: skip
+    OUT.print(table)
+
+
+def _import(options: argparse.Namespace) -> None:
+    from rov_ident.importer import import_csv, parse_columns
+
+    report = import_csv(
+        options.csv,
+        options.out,
+        columns=parse_columns(options.map),
+        body_frame=options.body_frame,
+        mask_rates_above=options.mask_rates_above,
+        wrench_timing=options.wrench_timing,
+    )
+    for note in report.notes:
+        ERR.print(note, markup=False)
+    ERR.print(
+        f"{options.out}: {report.odometry} odometry messages from {report.rows} rows, "
+        f"{report.duration:.1f} s"
+    )
+
+
+def _coefficients(options: argparse.Namespace) -> None:
+    for c in catalogue():
+        OUT.print(f"{c.name:<10} {c.unit:<18} {c.meaning}", markup=False)
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("")
+    for column in columns:
+        left = column in ("unit", "state", "identifiable")
+        table.add_column(column, justify="left" if left else "right")
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,138 @@
+"""Offline fits, all with one type of result."""
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.errors import UserError
+from rov_ident.messages import Array
+from rov_ident.model import Model
+from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator
+from rov_ident.records import HORIZON, VELOCITIES, Record, score
+from rov_ident.samples import Sampler
+
+_IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Coefficients identified from records, whatever the estimator.
+
+    Arrays are (n,) in the order of ``names``; covariance (n, n). ``identifiable`` tells where the
+    data and not the prior made the value. ``rmse`` (6,) is of open-loop windows of HORIZON seconds.
+    """
+
+    estimator: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    covariance: Array
+    identifiable: tuple[bool, ...]
+    model: Model
+    samples: int
+    duration: float
+    rmse: Array
+    provenance: dict[str, Any]
+
+    @property
+    def std(self) -> Array:
+        return np.sqrt(np.diag(self.covariance))
+
+    def to_json(self) -> str:
+        """The machine-readable result; numbers that do not exist are null."""
+        coefficients = {
+            name: {
+                "value": value,
+                "std": std,
+                "unit": unit,
+                "identifiable": identifiable,
+            }
+            for name, value, std, unit, identifiable in zip(
+                self.names,
+                self.values.tolist(),
+                self.std.tolist(),
+                self.units,
+                self.identifiable,
+                strict=True,
+            )
+        }
+        rmse = {
+            name: value if math.isfinite(value) else None
+            for name, value in zip(VELOCITIES, self.rmse.tolist(), strict=True)
+        }
+        result = {
+            "estimator": self.estimator,
+            "coefficients": coefficients,
+            "samples": self.samples,
+            "duration_s": self.duration,
+            "open_loop": {"horizon_s": HORIZON, "rmse": rmse},
+            "provenance": self.provenance,
+        }
+        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+
+
+def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
+    """Fold a recursive estimator over records, one after the other, as the node would.
+
+    Raises
+    ------
+    UserError
+        If the data are too few to say anything.
+    """
+    if kind not in ESTIMATORS:
+        raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")
+    estimator = OnlineEstimator(config, kind)
+    for record in records:
+        estimator.sampler = Sampler(config)
+        estimator.take(record.samples)
+    report = estimator.report()
+    removed = 1.0 - (report.std / estimator.prior.std) ** 2
+    model = config.model.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    samples = sum(len(record.samples) for record in records)
+    squares = [
+        score(model, record.samples).rmse ** 2 * len(record.samples) for record in records
+    ]
+    return Fit(
+        kind,
+        report.names,
+        report.units,
+        report.values,
+        report.covariance,
+        tuple(bool(r > _IDENTIFIABLE) for r in removed),
+        model,
+        samples,
+        sum(record.duration for record in records),
+        np.sqrt(np.sum(squares, axis=0) / samples),
+        {
+            "version": version("rov_ident"),
+            "vehicle": config.name,
+            "bags": [{"file": r.path.name, "sha256": r.sha256} for r in records],
+        },
+    )
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a file whole or not at all.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written there.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UserError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,463 @@
+"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish.
+
+Nothing here computes a coefficient. Timers run on the steady clock, so that a node under
+`use_sim_time` works where nothing publishes `/clock`; a sample's time is its stamp in any case.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Float64MultiArray, UInt64
+from std_srvs.srv import SetBool, Trigger
+
+from rov_ident import config as configuration
+from rov_ident.bags import ROLE_TYPES
+from rov_ident.cdr import DECODERS, encode
+from rov_ident.config import Config
+from rov_ident.errors import UserError
+from rov_ident.frames import from_core
+from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.nodes import parameters
+from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
+from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
+from rov_ident.online import ESTIMATORS, Kind, Level, OnlineEstimator, Report
+from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
+
+_OWN_PARAMETERS = ("save_path", "lockstep")
+_WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
+_DIAGNOSTICS_PERIOD = 1.0  # s
+_ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
+_LOG_PERIOD = 10.0  # s; between two equal complaints
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+# Not worth a warning: regular, or the consequence of something that is named itself.
+_NO_COMPLAINT = {
+    "sample: used",
+    "sample: between updates",
+    "sample: restarted after a gap",
+    "sample: no odometry yet",
+    "sample: no wrench",
+}
+
+
+class EstimatorNode(Node):  # type: ignore[misc]
+    """One online estimator on three topics.
+
+    With the parameter `lockstep` a player sets the pace: messages are acknowledged by their count
+    on `~/received`, coefficients are published by the time of the samples, silence is not taken for
+    the end of the input, but `~/flush` ends it. The node goes when its player does.
+
+    Raises
+    ------
+    UserError
+        If the parameters make no configuration.
+    """
+
+    def __init__(self, kind: Kind) -> None:
+        super().__init__(f"{kind}_node", automatically_declare_parameters_from_overrides=True)
+        config = parameters.declare(self, _OWN_PARAMETERS)
+        self._save_path = self._own_parameter(
+            "save_path", f"{config.name}_{self.get_name()}.yaml", "file that ~/save writes"
+        )
+        self._lockstep = self._own_parameter("lockstep", False, "a player sets the pace")
+        started = time.monotonic()
+        warm_up(config, kind)
+        self._online = OnlineEstimator(config, kind)
+
+        self._undecodable: Counter[str] = Counter()
+        self._received: Counter[str] = Counter()
+        self._silence = dict.fromkeys(INPUTS, 0.0)  # s since the last message
+        self._idle = 0.0  # s since the last sample
+        self._stopped = ""  # why there are no samples
+        self._wrench_frame: str | None = None
+        self._ratios: list[NDArray[np.float64]] = []  # (k, 6) since the last diagnostics
+        self._published_stamp = 0  # ns
+        self._watched = time.monotonic()
+        self._parent = os.getppid()
+        self._seen_counts: Counter[str] = Counter()
+        self._seen_received: Counter[str] = Counter()
+        self._diagnosed = time.monotonic()
+        self._complaint, self._complained = "", 0.0
+
+        self._coefficients = self.create_publisher(DiagnosticArray, "~/coefficients", LATCHED)
+        self._values = self.create_publisher(Float64MultiArray, "~/coefficients/values", LATCHED)
+        self._covariance = self.create_publisher(
+            Float64MultiArray, "~/coefficients/covariance", LATCHED
+        )
+        self._residual = self.create_publisher(WrenchStamped, "~/wrench_residual", STREAM)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_service(Trigger, "~/save", self._save)
+        self.create_service(SetBool, "~/enable", self._enable)
+        if self._lockstep:
+            self._acknowledge = self.create_publisher(UInt64, "~/received", STREAM)
+            self.create_service(Trigger, "~/flush", self._flush)
+
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._publish_timer = self.create_timer(
+            1.0 / config.publish_rate, self._publish_in_time, clock=self._steady
+        )
+        self.create_timer(_WATCH_PERIOD, self._watch, clock=self._steady)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, clock=self._steady)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
+
+        # Last of all: from here on messages come in.
+        qos = QoSProfile(
+            depth=config.qos.depth,
+            reliability=ReliabilityPolicy[config.qos.reliability.upper()],
+        )
+        # Raw: our decoder is fifty times as fast, and the one that reads bags.
+        self._inputs = {
+            role: self.create_subscription(type_, name, partial(self._receive, role), qos, raw=True)
+            for role, (name, type_) in INPUTS.items()
+        }
+        self._publish()
+        self.get_logger().info(
+            f"active after {time.monotonic() - started:.1f} s of compiling: estimating "
+            f"{len(config.estimate)} coefficients of {config.name}"
+        )
+
+    def _own_parameter(self, name: str, default: object, description: str) -> object:
+        if not self.has_parameter(name):
+            descriptor = ParameterDescriptor(description=description, read_only=True)
+            self.declare_parameter(name, default, descriptor)
+        value = self.get_parameter(name).value
+        if type(value) is not type(default):
+            kind = "true or false" if isinstance(default, bool) else "text"
+            raise UserError(f"{name} is {value!r}, but must be {kind}")
+        return value
+
+    @property
+    def _config(self) -> Config:
+        return self._online.config
+
+    # ---------------------------------------------------------------- messages in
+
+    def _receive(self, role: str, data: bytes) -> None:
+        self._received[role] += 1
+        self._silence[role] = 0.0
+        try:
+            message = DECODERS[ROLE_TYPES[role]](data)
+        except ValueError:
+            self._undecodable[f"{role}: bytes that are no {ROLE_TYPES[role]}"] += 1
+        else:
+            info = self._online.push(role, message)
+            # The sampler keeps to the frame of the first message that it takes.
+            if role == WRENCH and self._wrench_frame is None and self._online.counts[WRENCH]:
+                self._wrench_frame = message.frame_id
+            if len(info):
+                self._idle = 0.0
+                self._show(info)
+        count = self._received.total()
+        if self._lockstep and count % _ACKNOWLEDGED_TOGETHER == 0:  # the rest by _watch
+            self._acknowledge.publish(UInt64(data=count))
+
+    def _show(self, info: NDArray[np.void]) -> None:
+        """Publish the residuals of samples, and what is due by their time."""
+        if len(info) == 0:
+            return
+        self._ratios.append(info["ratio"])
+        origin = self._online.sampler.origin or 0
+        residuals = info["residual"]
+        for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)):
+            wrench = Wrench(
+                origin + round(float(info["t"][i]) * 1e9),
+                self._wrench_frame or "",
+                residuals[i, :3],
+                residuals[i, 3:],
+            )
+            frames = self._config.frames
+            self._residual.publish(encode(from_core(wrench, frames.body, frames.world)))
+        if self._lockstep:
+            stamp = origin + round(float(info["t"][-1]) * 1e9)
+            if not 0 <= stamp - self._published_stamp < 1e9 / self._config.publish_rate:
+                self._published_stamp = stamp
+                self._publish()
+
+    # ---------------------------------------------------------------- coefficients out
+
+    def _publish_in_time(self) -> None:
+        if not self._lockstep:
+            self._publish()
+
+    def _publish(self) -> Report:
+        report = self._online.report()
+        if self._stopped:
+            words = tuple(f"{self._stopped}: {text}" for text in report.messages)
+            levels = (Level.STALE,) * len(report.names)
+        elif not self._online.enabled:
+            words = tuple(f"disabled: {text}" for text in report.messages)
+            levels = report.levels
+        else:
+            words, levels = report.messages, report.levels
+        shown = replace(report, messages=words, levels=levels)
+        pairs = np.stack([report.values, report.std], axis=1)
+        names = report.names
+        self._covariance.publish(to_matrix(names, " ".join(names), report.covariance))
+        self._values.publish(to_matrix(names, "value std", pairs))
+        self._coefficients.publish(to_diagnostics(shown, self._config.name))
+        return shown
+
+    # ---------------------------------------------------------------- watching
+
+    def _watch(self) -> None:
+        """Notice that the inputs have stopped, or in lockstep that the player has."""
+        now = time.monotonic()
+        # A node that had no processor for a while must not take its own silence for the inputs'.
+        elapsed = min(now - self._watched, 2.0 * _WATCH_PERIOD)
+        self._watched = now
+        if self._lockstep:
+            if os.getppid() != self._parent:
+                self.context.try_shutdown()
+            elif all(subscription.get_publisher_count() for subscription in self._inputs.values()):
+                self._acknowledge.publish(UInt64(data=self._received.total()))
+            return
+        for role in self._silence:
+            self._silence[role] += elapsed
+        self._idle += elapsed
+        before, self._stopped = self._stopped, ""
+        if self._missing(ODOMETRY) or self._missing(WRENCH):
+            self._stopped = "inputs stopped"
+        elif self._online.enabled and self._idle > self._config.timeout:
+            self._stopped = "no message of the inputs can be used"
+        if self._stopped != before:
+            self._show(self._online.flush())
+            self._publish()
+
+    def _missing(self, role: str) -> bool:
+        return self._silence[role] > self._config.timeout
+
+    def _complaints(self) -> list[str]:
+        """What keeps the inputs from being used, in words."""
+        complaints = []
+        for role, (name, _) in INPUTS.items():
+            if not self._missing(role) or self._lockstep:
+                continue
+            topic = self.resolve_topic_name(name)
+            if self._received[role]:
+                complaints.append(f"no more messages on {topic}: its driver has stopped")
+            elif role == IMU:
+                continue  # it may well have none
+            elif self.count_publishers(topic):
+                complaints.append(
+                    f"no message received on {topic}, though it has a publisher: it is silent, "
+                    "or of another type, or its quality of service does not match qos.reliability"
+                )
+            else:
+                complaints.append(f"no message received on {topic}: remap it or start the driver")
+        counts = self._online.counts + self._undecodable
+        refused = counts - self._seen_counts
+        complaints += describe({k: n for k, n in refused.items() if k not in _NO_COMPLAINT})
+        self._seen_counts = counts
+        return complaints
+
+    def _diagnose(self) -> None:
+        """Publish /diagnostics and log what is wrong."""
+        now = time.monotonic()
+        period, self._diagnosed = now - self._diagnosed, now
+        complaints = self._complaints()
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [self._input_status(complaints, period), self._estimation_status()]
+        self._diagnostics.publish(message)
+        # Without the numbers, which differ each time.
+        complaint = "; ".join(text.partition(" (")[0] for text in complaints)
+        if complaint and (complaint != self._complaint or now - self._complained > _LOG_PERIOD):
+            self.get_logger().warning(complaint)
+            self._complaint, self._complained = complaint, now
+
+    def _input_status(self, complaints: list[str], period: float) -> DiagnosticStatus:
+        values = {}
+        for role, subscription in self._inputs.items():
+            count = self._received[role] - self._seen_received[role]
+            values[f"{role} rate"] = f"{count / period:.1f} Hz"
+            values[f"{role} publishers"] = str(subscription.get_publisher_count())
+        self._seen_received = self._received.copy()
+        values.update({name: str(count) for name, count in sorted(self._seen_counts.items())})
+        stopped = self._missing(ODOMETRY) or self._missing(WRENCH)
+        level = Level.STALE if stopped else Level.WARN if complaints else Level.OK
+        words = "; ".join(complaints) or "all messages are used"
+        return to_status(f"{self.get_name()}: inputs", self._config.name, level, words, values)
+
+    def _estimation_status(self) -> DiagnosticStatus:
+        report = self._online.report()
+        values = {
+            level.name: " ".join(
+                name for name, at in zip(report.names, report.levels, strict=True) if at == level
+            )
+            for level in (Level.OK, Level.WARN, Level.ERROR)
+        }
+        ratios = np.concatenate([np.zeros((0, 6)), *self._ratios])
+        self._ratios.clear()
+        for i, axis in enumerate("XYZKMN"):
+            finite = ratios[np.isfinite(ratios[:, i]), i]
+            if len(finite):
+                values[f"test ratio {axis}"] = f"{finite.mean():.3g}"
+        converged = sum(level == Level.OK for level in report.levels)
+        words = f"{converged} of {len(report.names)} coefficients have converged"
+        if not self._online.enabled:
+            level, words = Level.WARN, f"disabled, {words}"
+        elif Level.ERROR in report.levels:
+            level, words = Level.ERROR, f"{words}, diverged or at a bound: {values['ERROR']}"
+        elif self._stopped:
+            level, words = Level.STALE, f"no samples, coefficients held, {words}"
+        else:
+            level = Level.OK
+        return to_status(f"{self.get_name()}: estimation", self._config.name, level, words, values)
+
+    # ---------------------------------------------------------------- services
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._online.reset()
+        self._publish()
+        self.get_logger().info("reset to the prior")
+        response.success, response.message = True, "back to the prior"
+        return response
+
+    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._online.enabled = request.data
+        self._publish()
+        response.success = True
+        response.message = "estimating" if request.data else "disabled: coefficients are held"
+        self.get_logger().info(response.message)
+        return response
+
+    def _save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Write the configuration with the coefficients as they are now."""
+        report = self._online.report()
+        theta = self._config.model.theta.copy()
+        theta[self._online.prior.estimated] = report.values
+        lines = [f"Written by {self.get_name()}; standard deviations at {report.stamp} ns:"]
+        lines += [
+            f"{name}: {std:.3g} {unit}"
+            for name, std, unit in zip(report.names, report.std, report.units, strict=True)
+        ]
+        path = os.path.abspath(str(self._save_path))
+        try:
+            model = self._config.model.with_theta(theta)
+            configuration.dump(replace(self._config, model=model), path, "\n".join(lines))
+            response.success, response.message = True, f"saved to {path}"
+        except UserError as error:
+            response.success, response.message = False, str(error)
+        self.get_logger().info(response.message)
+        return response
+
+    def _flush(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Use what still waits for a late topic; answers with the stamp [ns] of the last sample."""
+        self._show(self._online.flush())
+        self._diagnose()
+        response.success, response.message = True, str(self._publish().stamp)
+        return response
+
+    def take_leave(self) -> None:
+        used = self._online.counts["sample: used"]
+        self.get_logger().info(f"ended: {used} samples used")
+
+    # ---------------------------------------------------------------- parameters
+
+    def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            parameters.changed(self, _OWN_PARAMETERS, changes)
+        except UserError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, _: list[Parameter]) -> None:
+        # Only settings can change while running: the state stays good.
+        config = parameters.changed(self, _OWN_PARAMETERS)
+        self._online.config = config
+        self._online._task = ESTIMATORS[self._online.kind].problem(config)
+        self.destroy_timer(self._publish_timer)
+        self._publish_timer = self.create_timer(
+            1.0 / self._config.publish_rate, self._publish_in_time, clock=self._steady
+        )
+
+
+def warm_up(config: Config, kind: Kind) -> None:
+    """Compile all kernels, or fetch them compiled, on two seconds of a vehicle at rest."""
+    online = OnlineEstimator(config, kind)
+    level, zero, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(6)
+    for stamp in range(50_000_000, 2_000_000_000, 50_000_000):
+        online.push(WRENCH, Wrench(stamp, "", zero, zero))
+        gravity = np.array([0.0, 0.0, config.gravity])
+        online.push(IMU, Imu(stamp, "", level, zero, gravity, zero, zero))
+        online.push(ODOMETRY, Odometry(stamp, "", "", zero, level, zero, zero, none))
+    online.flush()
+    online.report()
+
+
+def run(kind: Kind) -> int:
+    """A node's whole life; its exit status: 0 after an interrupt, 2 for a bad configuration."""
+    # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
+    # as it is for parting words.
+    for number in _INTERRUPTS:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy gives its RCLError no public name
+        return _refused(kind, _why_unreadable(kind, error))
+    try:
+        _live(kind)
+    except UserError as error:
+        return _refused(kind, str(error))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+def _live(kind: Kind) -> None:
+    """Until interrupted, or shut down by the node itself."""
+    node = EstimatorNode(kind)
+    executor = Executor()
+    executor.add_node(node)
+    # From here on an interrupt waits for the end of a callback.
+    interrupted = threading.Event()
+    for number in _INTERRUPTS:
+        signal.signal(number, lambda *_: interrupted.set())
+    try:
+        # EventsExecutor.spin() never comes back from an interrupt.
+        while rclpy.ok() and not interrupted.is_set():
+            executor.spin_once(timeout_sec=0.5)
+    finally:
+        node.take_leave()
+        executor.shutdown()
+        node.destroy_node()
+
+
+def _refused(kind: Kind, sentence: str) -> int:
+    print(f"{kind}_node: {sentence}", file=sys.stderr)
+    return 2
+
+
+def _why_unreadable(kind: Kind, error: Exception) -> str:
+    """What is wrong with the parameter file that rclpy could not read."""
+    for option, path in pairwise(sys.argv):
+        if option == "--params-file":
+            try:
+                configuration.load(path, f"{kind}_node")
+            except UserError as reason:
+                return str(reason)
+    if "same type" in str(error):
+        return "ROS 2 wants the numbers of a list written alike: [0.0, 0.02, 1.0], not [0, 0.02, 1]"
+    return str(error).partition(", at ")[0]

@@ -1,0 +1,99 @@
+"""The configuration as ROS 2 parameters: declared, described, changed while running."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from rov_ident import coefficients, config
+from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
+
+_LARGEST_INTEGER = 2**31 - 1
+_DECLARED = {p.key: p for p in config.VEHICLE_PARAMETERS + config.PARAMETERS}
+
+
+def declare(node: Node, own: Iterable[str]) -> Config:
+    """Check what the node was started with, and declare every parameter with its description.
+
+    The node declares its overrides by itself, so that names that nobody knows are seen and
+    refused. Those called in ``own`` are the node's and are left alone.
+
+    Raises
+    ------
+    UserError
+        One sentence naming the key and what to change.
+    """
+    given = {
+        name: parameter.value
+        for name, parameter in node.get_parameters_by_prefix("").items()
+        if name not in own
+    }
+    checked = config.from_parameters(given)
+    for key, declared in _DECLARED.items():
+        value = given.pop(key, declared.default)
+        _redeclare(node, key, _as_declared(declared.type, value), _descriptor(declared))
+    for key, value in given.items():
+        description = _open_description(key)
+        if description:
+            _redeclare(node, key, float(value), _described(description, read_only=True))
+    return checked
+
+
+def changed(node: Node, own: Iterable[str], changes: Iterable[RosParameter] = ()) -> Config:
+    """The configuration of the node's parameters with these changes; raises as above."""
+    values = {name: p.value for name, p in node.get_parameters_by_prefix("").items()}
+    values.update({change.name: change.value for change in changes})
+    return config.from_parameters(
+        {name: v for name, v in values.items() if name not in own and v not in (None, [])}
+    )
+
+
+def _redeclare(node: Node, key: str, value: Any, descriptor: ParameterDescriptor) -> None:
+    if node.has_parameter(key):
+        node.undeclare_parameter(key)
+    node.declare_parameter(key, value, descriptor, ignore_override=True)
+
+
+def _as_declared(kind: Any, value: Any) -> Any:
+    """A value in the type ROS should show it in; the file may say 5 for 5.0."""
+    if value is None:
+        return None
+    if kind is config.Vector:
+        return [float(item) for item in value]
+    return list(value) if kind is config.Names else kind(value)
+
+
+def _descriptor(parameter: config.Parameter) -> ParameterDescriptor:
+    unit = f" [{parameter.unit}]" if parameter.unit else ""
+    descriptor = _described(parameter.description + unit, not parameter.live)
+    descriptor.additional_constraints = ", ".join(parameter.choices)
+    low, high = parameter.lower, parameter.upper
+    if parameter.type is float:
+        low, high = max(low, -config.LARGEST), min(high, config.LARGEST)
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    elif parameter.type is int:
+        low, high = max(low, -_LARGEST_INTEGER), min(high, _LARGEST_INTEGER)
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+    return descriptor
+
+
+def _described(description: str, read_only: bool) -> ParameterDescriptor:
+    # Typed dynamically: `ros2 param set ... rls.gate 5` sends a whole number.
+    return ParameterDescriptor(description=description, read_only=read_only, dynamic_typing=True)
+
+
+def _open_description(key: str) -> str:
+    """What a key of an open section means; empty where it is one of ROS's own."""
+    section, _, name = key.partition(".")
+    if section == "coefficients":
+        coefficient = coefficients.parse(name)
+        return f"{coefficient.meaning} [{coefficient.unit}]"
+    if section == "prior":
+        return f"prior standard deviation of {key.rpartition('.')[2]}"
+    if section == "effects":
+        effect, _, parameter = name.partition(".")
+        return next(p.meaning for p in EFFECTS[effect].parameters if p.name == parameter)
+    return ""

@@ -1,0 +1,193 @@
+"""Plays a bag into estimator nodes, in lockstep with them, and records what they publish."""
+
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray, UInt64
+from std_srvs.srv import Trigger
+
+from rov_ident.bags import BagWriter, RawMessage
+from rov_ident.errors import UserError
+from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
+from rov_ident.nodes.conversions import from_diagnostics, to_time
+from rov_ident.online import Report
+
+OnReport = Callable[[str, Report], None]
+
+WINDOW = 64  # messages on their way; less than every queue is deep
+_CLOCK_PERIOD = 25_000_000  # ns, of the bag; as `ros2 bag play --clock`
+_PATIENCE = 60.0  # s; a node silent for longer will not come back
+_START_TIME = 300.0  # s; for a node to compile on a slow computer
+
+_OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
+    "coefficients": (DiagnosticArray, LATCHED),
+    "coefficients/values": (Float64MultiArray, LATCHED),
+    "coefficients/covariance": (Float64MultiArray, LATCHED),
+    "wrench_residual": (WrenchStamped, STREAM),
+}
+
+
+class Player(Node):  # type: ignore[misc]
+    """One bag into the nodes ``{estimator}_node`` of the same DDS domain.
+
+    ``check`` is called while waiting; it raises where waiting is in vain.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        estimators: Iterable[str],
+        writer: BagWriter | None,
+        on_report: OnReport | None,
+        check: Callable[[], None],
+    ) -> None:
+        super().__init__("rov_ident_player", context=context, cli_args=[])
+        self.reports: dict[str, Report] = {}
+        self._estimators = tuple(estimators)
+        self._writer = writer
+        self._on_report = on_report
+        self._check = check
+        self._now = 0  # ns, of the bag
+        self._clock_time: int | None = None
+        self._sent = 0
+        self._acknowledged = dict.fromkeys(self._estimators, -1)
+        self._executor = Executor(context=context)
+        self._executor.add_node(self)
+
+        self._clock = self.create_publisher(Clock, "/clock", STREAM)
+        # All three, even where the bag has no IMU: the nodes wait for a publisher on each.
+        self._inputs = {
+            role: self.create_publisher(type_, name, STREAM)
+            for role, (name, type_) in INPUTS.items()
+        }
+        self._outputs = [self._record("/diagnostics", DiagnosticArray, STREAM)]
+        self._flushes = {}
+        for estimator in self._estimators:
+            node = f"/{estimator}_node"
+            for name, (type_, qos) in _OUTPUTS.items():
+                self._outputs.append(self._record(f"{node}/{name}", type_, qos, estimator))
+            self._flushes[estimator] = self.create_client(Trigger, f"{node}/flush")
+            received = partial(self._take_acknowledgement, estimator)
+            self.create_subscription(UInt64, f"{node}/received", received, STREAM)
+
+    def _record(self, topic: str, type_: type, qos: QoSProfile, estimator: str = "") -> Any:
+        package, _, rest = type_.__module__.partition(".")
+        type_name = f"{package}/{rest.partition('.')[0]}/{type_.__name__}"
+        if self._writer:
+            self._writer.add_topic(topic, type_name, latched=qos is LATCHED)
+        take = partial(self._take_output, topic, type_name, estimator)
+        depth = QoSProfile(
+            depth=STREAM.depth, reliability=qos.reliability, durability=qos.durability
+        )
+        return self.create_subscription(type_, topic, take, depth, raw=True)
+
+    def _take_output(self, topic: str, type_name: str, estimator: str, data: bytes) -> None:
+        if self._writer:
+            self._writer.write(topic, type_name, self._now, data)
+        if topic.endswith("/coefficients"):
+            report = from_diagnostics(deserialize_message(data, DiagnosticArray))
+            self.reports[estimator] = report
+            if self._on_report:
+                self._on_report(estimator, report)
+
+    def _take_acknowledgement(self, estimator: str, count: UInt64) -> None:
+        self._acknowledged[estimator] = count.data
+
+    def destroy_node(self) -> None:
+        # First the executor: it holds on to the publishers.
+        self._executor.shutdown()
+        super().destroy_node()
+
+    # ---------------------------------------------------------------- playing
+
+    def wait_for_nodes(self, start: int) -> None:
+        """Until everything is connected both ways. ``start`` [ns] is the time the bag begins.
+
+        Raises
+        ------
+        UserError
+            If other nodes of the same names, or other publishers of the inputs, are about.
+        """
+        self._now = start
+        self._wait(self._connected, "to start", _START_TIME)
+        for publisher in self._inputs.values():
+            self._refuse_others(publisher.topic_name, 1)
+        for subscription in self._outputs[1:]:
+            self._refuse_others(subscription.topic_name, 1)
+
+    def _connected(self) -> bool:
+        count = len(self._estimators)
+        return (
+            all(p.get_subscription_count() >= count for p in self._inputs.values())
+            and all(s.get_publisher_count() > 0 for s in self._outputs)
+            and all(client.service_is_ready() for client in self._flushes.values())
+            and all(count >= 0 for count in self._acknowledged.values())
+        )
+
+    def _refuse_others(self, topic: str, expected: int) -> None:
+        if self.count_publishers(topic) > expected:
+            raise UserError(
+                f"something else publishes {topic}: stop it, or set ROS_DOMAIN_ID to a free number"
+            )
+
+    def play(self, messages: Iterable[tuple[str, RawMessage]], rate: float) -> int:
+        """Play (role, message) at the recorded pace times ``rate``; 0: as fast as the nodes can.
+
+        Returns how many messages every node has taken: all of them.
+        """
+        began: tuple[float, int] | None = None
+        for role, raw in messages:
+            if rate > 0.0:
+                began = began or (time.monotonic(), raw.log_time)
+                self._spin_until(began[0] + (raw.log_time - began[1]) * 1e-9 / rate)
+            self._wait(self._has_room, "to take messages")
+            self._tick(raw.log_time)
+            self._inputs[role].publish(raw.data)
+            self._sent += 1
+        self._wait(self._all_taken, "to take the last messages")
+        return self._sent
+
+    def finish(self) -> None:
+        """Have the nodes use what they still hold, and wait for their last reports."""
+        for estimator, client in self._flushes.items():
+            future = client.call_async(Trigger.Request())
+            self._wait(future.done, "to finish")
+            stamp = int(future.result().message)
+            self._wait(partial(self._has_report, estimator, stamp), "to report")
+
+    def _tick(self, now: int) -> None:
+        self._now = max(now, self._now)
+        if self._clock_time is None or self._now - self._clock_time >= _CLOCK_PERIOD:
+            self._clock_time = self._now
+            self._clock.publish(Clock(clock=to_time(self._now)))
+
+    def _has_room(self) -> bool:
+        return self._sent - min(self._acknowledged.values()) < WINDOW
+
+    def _all_taken(self) -> bool:
+        return min(self._acknowledged.values()) >= self._sent
+
+    def _has_report(self, estimator: str, stamp: int) -> bool:
+        return estimator in self.reports and self.reports[estimator].stamp == stamp
+
+    def _spin_until(self, end: float) -> None:
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=min(left, 0.5))
+            self._check()
+
+    def _wait(self, ready: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
+        end = time.monotonic() + patience
+        while not ready():
+            self._executor.spin_once(timeout_sec=0.1)
+            self._check()
+            if time.monotonic() > end:
+                raise RuntimeError(f"the nodes took more than {patience:.0f} s {what}")

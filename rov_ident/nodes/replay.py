@@ -1,0 +1,164 @@
+"""A bag through live nodes: their processes, the player, and what comes out."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import rclpy
+from rclpy.context import Context
+from rclpy.signals import SignalHandlerOptions
+
+from rov_ident import config as configuration
+from rov_ident.bags import Bag, BagWriter, RawMessage, select_topics
+from rov_ident.config import Qos
+from rov_ident.errors import UserError
+from rov_ident.nodes.player import OnReport, Player
+from rov_ident.online import ESTIMATORS, Report
+
+_EXIT_TIME = 10.0  # s; for a node to end after an interrupt
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """What the nodes ended with. ``reports`` by estimator; ``messages`` every node has taken."""
+
+    reports: Mapping[str, Report]
+    messages: int
+    seconds: float
+    out: Path | None
+
+
+def replay(
+    bag: str | os.PathLike[str],
+    config_path: str | os.PathLike[str],
+    estimators: Sequence[str] = ("rls",),
+    rate: float = 1.0,
+    out: str | os.PathLike[str] | None = None,
+    on_report: OnReport | None = None,
+) -> ReplayResult:
+    """Play a bag over DDS into live nodes and record what they publish into the bag ``out``.
+
+    ``rate`` is the speed relative to the recording; 0: as fast as the nodes can follow. No message
+    is lost at any rate. Unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this
+    computer: a replayed thruster wrench must not reach a vehicle.
+
+    Raises
+    ------
+    UserError
+        If the bag or configuration cannot be used, or the topics are taken by someone else.
+    """
+    if not 0.0 <= rate < float("inf"):
+        raise UserError(f"rate is {rate}, but must be positive, or 0 for as fast as possible")
+    if unknown := set(estimators) - set(ESTIMATORS):
+        raise UserError(f"{min(unknown)} is no live estimator: use {' or '.join(ESTIMATORS)}")
+    if out is not None and Path(out).resolve() == Path(bag).resolve():
+        raise UserError(f"{out} is the bag to play: give another name for the recording")
+    recorded = Bag(Path(bag))
+    config = configuration.load(config_path)
+    chosen = select_topics(recorded, vars(config.topics))
+    roles = {topic: role for role, topic in chosen.items() if topic}
+    started = time.monotonic()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rov_ident-")))
+        nodes = []
+        for estimator in estimators:
+            name = f"{estimator}_node"
+            # Written anew: it may hold what our reader takes and that of ROS 2 does not.
+            parameters = folder / f"{name}.yaml"
+            settings = replace(
+                configuration.load(config_path, name), qos=Qos(reliability="reliable")
+            )
+            configuration.dump(settings, parameters)
+            nodes.append(stack.enter_context(_Process(name, parameters)))
+
+        def check() -> None:
+            for node in nodes:
+                node.check()
+
+        context = Context()
+        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+        stack.callback(rclpy.try_shutdown, context=context)
+        writer = None
+        if out is not None:
+            writer = stack.enter_context(BagWriter(Path(out), crash_safe=True))
+        player = Player(context, estimators, writer, on_report, check)
+        stack.callback(player.destroy_node)
+        player.wait_for_nodes(next(recorded.iter_raw(roles)).log_time)
+        count = player.play(_by_role(recorded, roles), rate)
+        player.finish()
+        return ReplayResult(
+            dict(player.reports),
+            count,
+            time.monotonic() - started,
+            None if out is None else Path(out),
+        )
+
+
+def _by_role(bag: Bag, roles: Mapping[str, str]) -> Iterator[tuple[str, RawMessage]]:
+    for raw in bag.iter_raw(roles):
+        yield roles[raw.topic], raw
+
+
+class _Process:
+    """A node in a process of its own, gone at the end of the `with` block."""
+
+    def __init__(self, name: str, parameters: Path) -> None:
+        self.name = name
+        command = [sys.executable, "-m", f"rov_ident.nodes.{name}", "--ros-args"]
+        command += ["--params-file", str(parameters), "--log-level", "warn"]
+        command += ["-p", "use_sim_time:=true", "-p", "lockstep:=true"]
+        # A session of its own: Ctrl-C is for us, who then interrupt the node.
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+        )
+        self._last_line = ""
+        self._reader = threading.Thread(target=self._forward, daemon=True)
+        self._reader.start()
+
+    def _forward(self) -> None:
+        """Pass on what the node says on standard error."""
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            self._last_line = line.strip() or self._last_line
+            if not line.startswith(f"{self.name}: "):  # that sentence goes into our exception
+                sys.stderr.write(line)
+
+    def check(self) -> None:
+        """Raise if the node has ended by itself."""
+        status = self._process.poll()
+        if status is None:
+            return
+        self._reader.join(timeout=1.0)
+        if status == 2:
+            raise UserError(self._last_line.removeprefix(f"{self.name}: "))
+        raise RuntimeError(f"{self.name} ended with status {status}: {self._last_line}")
+
+    def wait(self, seconds: float) -> None:
+        """Until the node has ended."""
+        self._process.wait(seconds)
+
+    def __enter__(self) -> "_Process":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self.wait(_EXIT_TIME)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(timeout=1.0)

@@ -1,0 +1,23 @@
+"""Messages in memory into a bag, under the names the nodes listen on."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from rov_ident.bags import ROLE_TYPES, BagWriter
+from rov_ident.cdr import encode
+from rov_ident.messages import Message
+
+TOPICS = {"odom": "/odom", "imu": "/imu/data", "wrench": "/thruster_wrench"}
+
+
+def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]]) -> None:
+    """Write (arrival [ns], role, message in ROS axes) in order of arrival.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be written.
+    """
+    with BagWriter(path) as writer:
+        for arrival, role, message in messages:
+            writer.write(TOPICS[role], ROLE_TYPES[role], arrival, encode(message))

@@ -1,0 +1,203 @@
+"""Live nodes in processes of their own, and a vehicle at the other end of their topics."""
+
+import fcntl
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from rov_ident import config, sensors
+
+HEAVY = Path(__file__).parent.parent / "config" / "bluerov2_heavy.yaml"
+
+
+@pytest.fixture(scope="session")
+def heavy():
+    return config.load(HEAVY)
+
+
+@pytest.fixture(scope="session")
+def short_dive(heavy):
+    """Ten seconds of messages: (arrival, role, message)."""
+    return sensors.dive(heavy, duration=10.0, seed=1).messages
+
+
+_DOMAINS = itertools.cycle(range(10, 100))
+for _ in range(os.getpid() % 90):
+    next(_DOMAINS)
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """A DDS domain that no other test of this computer uses, closed to the network."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    for number in _DOMAINS:  # a new one each time: the last test's may not have gone yet
+        lock = open(Path(tempfile.gettempdir()) / f"rov_ident_domain_{number}", "a")  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield number
+        lock.close()
+        return
+
+
+class Vehicle:
+    """Publishes the inputs of a node and keeps everything that the node publishes."""
+
+    def __init__(self, estimator="rls", roles=("odom", "imu", "wrench")):
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import WrenchStamped
+        from rclpy.signals import SignalHandlerOptions
+        from std_msgs.msg import Float64MultiArray
+
+        from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
+
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = rclpy.create_node("vehicle", context=self.context)
+        self.executor = Executor(context=self.context)
+        self.executor.add_node(self.node)
+        self.estimator = estimator
+        self.publishers = {
+            role: self.node.create_publisher(type_, name, STREAM)
+            for role, (name, type_) in INPUTS.items()
+            if role in roles
+        }
+        self.coefficients, self.values, self.covariance = [], [], []
+        self.residuals, self.diagnostics = [], []
+        name = f"/{estimator}_node"
+        for topic, type_, qos, heard in (
+            (f"{name}/coefficients", DiagnosticArray, LATCHED, self.coefficients),
+            (f"{name}/coefficients/values", Float64MultiArray, LATCHED, self.values),
+            (f"{name}/coefficients/covariance", Float64MultiArray, LATCHED, self.covariance),
+            (f"{name}/wrench_residual", WrenchStamped, STREAM, self.residuals),
+            ("/diagnostics", DiagnosticArray, STREAM, self.diagnostics),
+        ):
+            self.node.create_subscription(type_, topic, heard.append, qos)
+
+    def until(self, ready, seconds=10.0):
+        """Listen until ``ready()``; fails after some seconds."""
+        end = time.monotonic() + seconds
+        while not ready():
+            assert time.monotonic() < end, "nothing of the kind was heard in time"
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def listen(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def connected(self):
+        """Whether both ends know each other: until then topics would overtake one another."""
+        if not all(p.get_subscription_count() for p in self.publishers.values()):
+            return False
+        return all(f"{role} publishers=1" in self.words() for role in self.publishers)
+
+    def publish(self, role, data):
+        self.publishers[role].publish(data)
+
+    def drive(self, messages):
+        """Publish (arrival, role, message) at once; the node's queue holds them."""
+        from rov_ident import cdr
+
+        for _, role, message in messages:
+            self.publish(role, cdr.encode(message))
+
+    def call(self, type_, name, request):
+        client = self.node.create_client(type_, f"/{self.estimator}_node/{name}")
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def words(self):
+        """Everything that /diagnostics has said."""
+        return "\n".join(
+            f"{status.message} " + " ".join(f"{v.key}={v.value}" for v in status.values)
+            for message in self.diagnostics
+            for status in message.status
+        )
+
+    def close(self):
+        import rclpy
+
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def start_node(estimator, parameters, *options):
+    """The process of a node with a parameter file."""
+    command = [sys.executable, "-m", f"rov_ident.nodes.{estimator}_node", "--ros-args"]
+    command += ["--params-file", str(parameters)]
+    for option in options:
+        command += ["-p", option]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def end_node(process, number=signal.SIGINT):
+    """Its exit status and all that it said."""
+    process.send_signal(number)
+    try:
+        _, said = process.communicate(timeout=20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
+    return process.returncode, said
+
+
+@pytest.fixture
+def live(domain):
+    """Starts a node; gives the vehicle that is connected to it. In the end both must end well."""
+    started = []
+
+    def start(*options, estimator="rls", **kwargs):
+        process = start_node(estimator, HEAVY, "qos.reliability:=reliable", *options)
+        vehicle = Vehicle(estimator, **kwargs)
+        started.append((process, vehicle))
+        vehicle.until(vehicle.connected, 120.0)  # it may have to compile
+        vehicle.diagnostics.clear()
+        return vehicle
+
+    yield start
+    for process, vehicle in started:
+        vehicle.close()
+        status, said = end_node(process)
+        assert status == 0, said
+        assert "Traceback" not in said
+
+
+@pytest.fixture
+def heavy_path():
+    return HEAVY
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def children(pid):
+    """The running processes started by a process."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except OSError:
+                continue
+            if parent == pid:
+                found.append(int(entry.name))
+    return [child for child in found if is_alive(child) and os.getpid() != child]

@@ -1,0 +1,262 @@
+"""The live nodes, in their own processes, over DDS."""
+
+import math
+import signal
+import time
+
+import numpy as np
+import pytest
+from conftest import Vehicle, end_node, start_node
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from rov_ident import cdr, config
+from rov_ident.frames import FLIP_BODY, from_core
+from rov_ident.messages import Odometry, Wrench
+from rov_ident.nodes.conversions import from_diagnostics, from_time
+from rov_ident.online import Level, OnlineEstimator
+
+STALE = bytes([Level.STALE])
+
+
+def offline(configuration, messages, kind="rls"):
+    """The estimator that has folded the messages, and its residuals {stamp: (6,)}."""
+    online = OnlineEstimator(configuration, kind)
+    residuals = {}
+    infos = [online.push(role, message) for _, role, message in messages]
+    for row in np.concatenate([*infos, online.flush()]):
+        if np.isfinite(row["residual"]).all():
+            residuals[online.sampler.origin + round(float(row["t"]) * 1e9)] = row["residual"]
+    return online, residuals
+
+
+def in_ros_axes(messages):
+    """The same dive with frame ids that say nothing: FLU and ENU."""
+    for arrival, role, message in messages:
+        if isinstance(message, Odometry):
+            message = message._replace(frame_id="odom", child_frame_id="base_link")
+        else:
+            message = message._replace(frame_id="base_link")
+        yield arrival, role, from_core(message)
+
+
+def all_finite(vehicle):
+    assert all(np.isfinite(m.data).all() for m in vehicle.values + vehicle.covariance)
+    for message in vehicle.coefficients:
+        from_diagnostics(message)  # raises where a number is not finite
+    for message in vehicle.residuals:
+        force, torque = message.wrench.force, message.wrench.torque
+        assert np.isfinite([force.x, force.y, force.z, torque.x, torque.y, torque.z]).all()
+
+
+def is_stale(vehicle):
+    return all(status.level == STALE for status in vehicle.coefficients[-1].status)
+
+
+def test_outputs(live, heavy, short_dive):
+    """Names, keys, order, axes and stamps are the contract's; silence makes everything stale."""
+    messages = list(in_ros_axes(short_dive))
+    reference, residuals = offline(heavy, messages)
+    expected = reference.report()
+    vehicle = live()
+    vehicle.drive(messages)
+    vehicle.until(lambda: from_time(vehicle.coefficients[-1].header.stamp) == expected.stamp)
+    vehicle.until(lambda: is_stale(vehicle))
+    vehicle.listen(0.3)
+
+    assert len(vehicle.coefficients) > 5  # publish_rate
+    last = vehicle.coefficients[-1]
+    assert all(status.message.startswith("inputs stopped: ") for status in last.status)
+    assert {status.hardware_id for status in last.status} == {heavy.name}
+    for status in last.status:
+        assert [v.key for v in status.values][:5] == ["value", "std", "unit", "lower", "upper"]
+    report = from_diagnostics(last)
+    assert report.names == heavy.estimate
+    assert report.units == expected.units
+    for name in ("values", "std", "lower", "upper"):
+        np.testing.assert_array_equal(getattr(report, name), getattr(expected, name), name)
+    assert report.stamp == max(message.stamp for _, role, message in messages if role != "wrench")
+
+    n = len(report.names)
+    values, covariance = vehicle.values[-1], vehicle.covariance[-1]
+    assert [d.size for d in values.layout.dim] == [n, 2]
+    assert [d.label for d in values.layout.dim] == [" ".join(report.names), "value std"]
+    np.testing.assert_array_equal(
+        np.reshape(values.data, (n, 2)), np.stack([report.values, report.std], axis=1)
+    )
+    np.testing.assert_array_equal(np.reshape(covariance.data, (n, n)), expected.covariance)
+
+    # Measured minus model, each sample's once, in the axes of the wrench: forward-left-up.
+    assert len(vehicle.residuals) == len(residuals)
+    for message in vehicle.residuals:
+        assert message.header.frame_id == "base_link"
+        force, torque = message.wrench.force, message.wrench.torque
+        frd = residuals[from_time(message.header.stamp)]
+        np.testing.assert_array_equal([force.x, force.y, force.z], FLIP_BODY * frd[:3])
+        np.testing.assert_array_equal([torque.x, torque.y, torque.z], FLIP_BODY * frd[3:])
+    all_finite(vehicle)
+    vehicle.until(lambda: "no more messages on /odom" in vehicle.words())
+    assert "odom rate=" in vehicle.words()
+    assert "test ratio X=" in vehicle.words()
+
+
+def test_bad_input(live, heavy, short_dive):
+    """Each kind is named in /diagnostics; nothing changes, and nothing published is not finite."""
+    reference, _ = offline(heavy, short_dive)
+    expected = reference.report()
+    vehicle = live()
+    vehicle.drive(short_dive)
+    latest = {role: message for _, role, message in short_dive}
+    odometry, wrench = latest["odom"], latest["wrench"]
+    nan = np.full(3, math.nan)
+    soon = odometry.stamp + 10_000_000
+    for role, message in (
+        ("odom", odometry._replace(stamp=soon, linear=nan)),
+        ("odom", odometry._replace(stamp=soon, orientation=np.zeros(4))),
+        ("odom", odometry._replace(stamp=0)),
+        ("odom", odometry._replace(stamp=odometry.stamp - 500_000_000)),
+        ("odom", odometry),
+        ("imu", latest["imu"]._replace(stamp=soon, linear_acceleration=nan)),
+        ("wrench", wrench._replace(stamp=soon, force=np.array([math.inf, 0.0, 0.0]))),
+        ("wrench", wrench._replace(stamp=soon, frame_id="map")),
+        ("wrench", wrench._replace(stamp=soon, frame_id="base_link")),
+    ):
+        vehicle.publish(role, cdr.encode(message))
+    vehicle.publish("wrench", cdr.encode(wrench)[:40])
+    for words in (
+        "odom: not finite",
+        "imu: not finite",
+        "wrench: not finite",
+        "odom: orientation is not a unit quaternion",
+        "odom: zero stamp",
+        "odom: backward stamp",
+        "odom: duplicate stamp",
+        "'map' is a world frame",
+        "frame changed from",
+        "bytes that are no geometry_msgs/msg/WrenchStamped",
+    ):
+        vehicle.until(lambda words=words: words in vehicle.words())
+    vehicle.until(lambda: is_stale(vehicle))
+    report = from_diagnostics(vehicle.coefficients[-1])
+    assert report.stamp == expected.stamp
+    np.testing.assert_array_equal(report.values, expected.values)
+    np.testing.assert_array_equal(report.std, expected.std)
+    all_finite(vehicle)
+
+
+def test_wrench_alone(live, heavy):
+    """Nothing is learned, the missing topic is named; who joins late gets the last coefficients.
+
+    All that without anyone publishing /clock.
+    """
+    vehicle = live("publish_rate:=0.01", "use_sim_time:=true", roles=["wrench"])
+    for k in range(100):
+        wrench = Wrench(10**9 + k * 20_000_000, "base_link", np.ones(3), np.zeros(3))
+        vehicle.publish("wrench", cdr.encode(wrench))
+    vehicle.until(lambda: "no message received on /odom: remap it or start" in vehicle.words())
+    vehicle.until(lambda: is_stale(vehicle))
+    assert "no message received on /imu/data" not in vehicle.words()
+    all_finite(vehicle)
+
+    late = Vehicle()
+    late.until(lambda: late.coefficients and late.covariance)
+    report = from_diagnostics(late.coefficients[0])
+    late.close()
+    assert report.stamp == 0
+    assert set(report.levels) == {Level.STALE}
+    np.testing.assert_array_equal(report.values, heavy.model.theta)
+
+
+def test_services_and_parameters(live, heavy, short_dive, tmp_path):
+    saved = tmp_path / "saved.yaml"
+    vehicle = live(f"save_path:={saved}", "timeout:=5")
+    middle = len(short_dive) // 2
+    vehicle.drive(short_dive[:middle])
+    vehicle.until(lambda: vehicle.coefficients[-1].header.stamp.sec >= 4)
+
+    assert vehicle.call(SetBool, "enable", SetBool.Request(data=False)).success
+    vehicle.coefficients.clear()
+    vehicle.drive(short_dive[middle:])
+    vehicle.until(lambda: len(vehicle.coefficients) > 3)
+    held = from_diagnostics(vehicle.coefficients[-1])
+    assert held.stamp < 7 * 10**9
+    assert all(text.startswith("disabled: ") for text in held.messages)
+
+    answer = vehicle.call(Trigger, "save", Trigger.Request())
+    assert answer.success and str(saved) in answer.message
+    loaded = config.load(saved)
+    np.testing.assert_array_equal(loaded.model.theta, held.values)
+    assert loaded.name == heavy.name
+
+    assert vehicle.call(Trigger, "reset", Trigger.Request()).success
+    vehicle.coefficients.clear()
+    vehicle.until(lambda: vehicle.coefficients)
+    np.testing.assert_array_equal(
+        from_diagnostics(vehicle.coefficients[-1]).values, heavy.model.theta
+    )
+    assert vehicle.call(SetBool, "enable", SetBool.Request(data=True)).success
+
+    changes = [
+        ("rls.gate", 6, ""),
+        ("publish_rate", 20.0, ""),
+        ("rls.gate", -1, "rls.gate is -1 sigma, but must be positive"),
+        ("rls.forgetting_factor", 2.0, "rls.forgetting_factor"),
+        ("vehicle.mass", 20.0, "read-only"),
+    ]
+    for name, value, refusal in changes:
+        request = SetParameters.Request(
+            parameters=[Parameter(name, value=value).to_parameter_msg()]
+        )
+        result = vehicle.call(SetParameters, "set_parameters", request).results[0]
+        assert result.successful == (refusal == ""), result.reason
+        assert refusal in result.reason
+    vehicle.coefficients.clear()
+    vehicle.listen(1.0)
+    assert len(vehicle.coefficients) > 12
+
+
+@pytest.mark.parametrize(
+    "old, new, sentence",
+    [
+        ("mass: ", "mass: -", "vehicle.mass is -"),
+        ("X_uu: ", "X_ux: ", "coefficients.X_ux"),
+        ("cog: [0.0, 0.0, 0.0]", "cog: [0, 0.0, 0.0]", "written alike"),
+        ("coefficients:", "coefficients", "not valid YAML"),
+    ],
+)
+def test_bad_configuration(domain, heavy_path, tmp_path, old, new, sentence):
+    """One sentence that names the key, and exit status 2."""
+    text = heavy_path.read_text()
+    assert old in text
+    path = tmp_path / "bad.yaml"
+    path.write_text(text.replace(old, new, 1))
+    process = start_node("rls", path)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 2, said
+    last = said.strip().splitlines()[-1]
+    assert last.startswith("rls_node: ") and sentence in last
+    assert "Traceback" not in said
+
+
+def test_terminate(domain, heavy_path):
+    """SIGTERM, too, is a way to end well; with parting words."""
+    process = start_node("rls", heavy_path)
+    vehicle = Vehicle()
+    vehicle.until(vehicle.connected, 120.0)
+    vehicle.close()
+    status, said = end_node(process, signal.SIGTERM)
+    assert status == 0, said
+    assert "ended: 0 samples used" in said
+
+
+def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    process = start_node("rls", heavy_path)
+    time.sleep(3.0)
+    began = time.monotonic()
+    status, said = end_node(process)
+    assert status == 0, said
+    assert time.monotonic() - began < 5.0
+    assert "active" not in said and "Traceback" not in said

@@ -1,0 +1,182 @@
+"""Bags through live nodes: the same numbers as offline, and no process left behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+from conftest import HEAVY, Vehicle, children, is_alive
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+
+from rov_ident import config, sensors
+from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident.errors import UserError
+from rov_ident.nodes.conversions import from_diagnostics
+from rov_ident.nodes.replay import _Process, replay
+from rov_ident.online import ESTIMATORS, Level, OnlineEstimator
+from rov_ident.recording import write_messages
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory, heavy):
+    """Twenty seconds with all that a real recording has: noise, jitter, drops, a pause."""
+    suite = sensors.Suite(delay=0.03, jitter=0.02, drop=0.02)
+    messages = sensors.dive(heavy, duration=20.0, suite=suite, seed=2).messages
+    kept = [m for m in messages if not 9_000_000_000 < m[0] < 11_500_000_000]
+    path = tmp_path_factory.mktemp("bags") / "dive.mcap"
+    write_messages(path, kept)
+    return path
+
+
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory, heavy):
+    """Three seconds without an IMU."""
+    messages = sensors.dive(heavy, duration=3.0, suite=sensors.Suite(imu_rate=0.0)).messages
+    path = tmp_path_factory.mktemp("bags") / "brief.mcap"
+    write_messages(path, messages)
+    return path
+
+
+def offline(path, kind):
+    online = OnlineEstimator(config.load(HEAVY), kind)
+    bag = Bag(path)
+    for role, message in read_messages(bag, select_topics(bag)):
+        online.push(role, message)
+    online.flush()
+    return online.report()
+
+
+def assert_same(live, expected):
+    assert live.stamp == expected.stamp
+    assert live.names == expected.names
+    assert live.levels == expected.levels
+    np.testing.assert_allclose(live.values, expected.values, rtol=1e-9, atol=0.0)
+    np.testing.assert_allclose(live.std, expected.std, rtol=1e-9, atol=0.0)
+
+
+LISTENER = """
+    import json, sys
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    rclpy.init()
+    node = rclpy.create_node("listener")
+    heard = []
+    qos = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(DiagnosticArray, "/rls_node/coefficients", heard.append, qos)
+    while len(heard) < int(sys.argv[1]):
+        rclpy.spin_once(node, timeout_sec=1.0)
+    print(json.dumps([
+        [float(pair.value) for pair in status.values if pair.key in ("value", "std")]
+        for message in heard for status in message.status
+    ]))
+"""
+
+
+def test_live_equals_offline(domain, bag, tmp_path):
+    """Both estimators at once; and every value that was recorded comes back to a subscriber."""
+    out = tmp_path / "out.mcap"
+    shown = []
+    result = replay(bag, HEAVY, tuple(ESTIMATORS), 0.0, out, lambda *report: shown.append(report))
+    assert result.messages == sum(topic.message_count for topic in Bag(bag).topics.values())
+    for kind in ESTIMATORS:
+        assert_same(result.reports[kind], offline(bag, kind))
+        reports = [report for name, report in shown if name == kind]
+        stamps = [report.stamp for report in reports]
+        assert stamps == sorted(stamps)
+        # At publish_rate by the stamps of the samples, whatever the speed.
+        assert 70 < len(reports) < 110
+
+    recorded = Bag(out)
+    for kind in ESTIMATORS:
+        for name in ("coefficients", "coefficients/values", "coefficients/covariance"):
+            assert recorded.topics[f"/{kind}_node/{name}"].message_count == sum(
+                name == kind for name, _ in shown
+            )
+        assert recorded.topics[f"/{kind}_node/wrench_residual"].message_count > 200
+    assert recorded.topics["/diagnostics"].message_count >= 2
+
+    raw = [message.data for message in recorded.iter_raw(["/rls_node/coefficients"])]
+    command = [sys.executable, "-c", textwrap.dedent(LISTENER), str(len(raw))]
+    listener = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    with closing(Vehicle(roles=())) as vehicle:
+        qos = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        publisher = vehicle.node.create_publisher(DiagnosticArray, "/rls_node/coefficients", qos)
+        for data in raw:
+            publisher.publish(data)
+        heard, _ = listener.communicate(timeout=30)
+    expected = [from_diagnostics(deserialize_message(data, DiagnosticArray)) for data in raw]
+    pairs = [pair for r in expected for pair in zip(r.values, r.std, strict=True)]
+    np.testing.assert_array_equal(json.loads(heard), pairs)
+
+
+def test_pace_without_imu(domain, brief):
+    """At twice the speed; a bag without IMU needs no publisher for it from elsewhere."""
+    began = []
+    result = replay(brief, HEAVY, rate=2.0, on_report=lambda *_: began.append(time.monotonic()))
+    assert 1.0 < began[-1] - began[1] < 4.0
+    assert_same(result.reports["rls"], offline(brief, "rls"))
+    assert Level.STALE not in result.reports["rls"].levels
+
+
+def test_topics_taken(domain, brief):
+    """Another publisher of an input would spoil the result: it is refused."""
+    message = r"something else publishes /odom: .*ROS_DOMAIN_ID"
+    with closing(Vehicle(roles=["odom"])), pytest.raises(UserError, match=message):
+        replay(brief, HEAVY, rate=0.0)
+    assert not children(os.getpid())
+
+
+def test_wrong_use(brief, tmp_path):
+    with pytest.raises(UserError, match="rate"):
+        replay(brief, HEAVY, rate=-1.0)
+    with pytest.raises(UserError, match="no live estimator: use rls or ukf"):
+        replay(brief, HEAVY, ("ls",))
+    with pytest.raises(UserError, match="is the bag to play"):
+        replay(brief, HEAVY, out=brief)
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(HEAVY.read_text().replace("mass:", "mas:", 1))
+    with pytest.raises(UserError, match=r"bad\.yaml: vehicle\.mas is an unknown key"):
+        replay(brief, bad)
+
+
+def test_node_refuses(domain, tmp_path):
+    """What a node says before it ends is what the caller hears."""
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(HEAVY.read_text().replace("mass:", "mas:", 1))
+    with _Process("rls_node", bad) as process:
+        process.wait(60.0)
+        with pytest.raises(UserError, match=r"^vehicle\.mas is an unknown key"):
+            process.check()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_no_orphans(domain, bag, tmp_path, number):
+    """However a replay is ended, its nodes end too; what was recorded can be read."""
+    out = tmp_path / "out.mcap"
+    code = f"from rov_ident.nodes.replay import replay; replay({str(bag)!r}, {str(HEAVY)!r}, "
+    code += f"rate=1.0, out={str(out)!r}, on_report=lambda *_: print('report', flush=True))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert process.stdout is not None
+    for _ in range(10):
+        assert process.stdout.readline() == "report\n"
+    (node,) = children(process.pid)
+    process.send_signal(number)
+    process.communicate(timeout=20)
+    assert process.returncode != 0
+    end = time.monotonic() + 10.0
+    while is_alive(node):
+        assert time.monotonic() < end, "the node is still there"
+        time.sleep(0.1)
+    assert Bag(out).topics["/rls_node/coefficients"].message_count >= 1

@@ -1,0 +1,391 @@
+"""Recursive least squares: against a batch textbook form, through windup, gaps and surprises."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import textbook
+from textbook import with_section
+
+from rov_ident import config as configuration
+from rov_ident import rls, sensors
+from rov_ident.estimate import prior_of
+from rov_ident.excitation import manoeuvre
+from rov_ident.samples import SAMPLE
+
+DT = 0.02
+
+
+def driven(config, duration, seed, name="steps", dt=DT, model=None, start=None):
+    """Motion and wrench of a manoeuvre."""
+    t = np.arange(0.0, duration, dt)
+    model = model or config.model
+    wrench = manoeuvre(name, config.model, t, np.random.default_rng(seed))
+    return textbook.drive(model, t, wrench, *(start or ())), wrench
+
+
+def result(config, rows, state=None):
+    task, prior = rls.problem(config), prior_of(config)
+    state, info = rls.fold(task, state or rls.init(task), rows)
+    return rls.estimate(task, state, prior), state, info
+
+
+@pytest.fixture(scope="module")
+def exact(heavy):
+    """A minute without noise: samples (N,)."""
+    return textbook.rows_of(*driven(heavy, 60.0, 11))
+
+
+@pytest.fixture(scope="module")
+def noisy(heavy):
+    motion, wrench = driven(heavy, 60.0, 12)
+    return textbook.rows_of(motion, wrench, np.random.default_rng(0), wrench_std=0.01)
+
+
+def wrong_prior(config, seed=5, spread=0.2):
+    factors = 1.0 + spread * np.random.default_rng(seed).uniform(-1, 1, len(config.model.theta))
+    return textbook.off(config, factors)
+
+
+# ------------------------------------------------------------------ init, step, fold
+
+
+@pytest.mark.parametrize("forgetting", ["variable", "constant"])
+def test_fold_is_step_after_step(heavy, noisy, forgetting):
+    config = with_section(heavy, "rls", forgetting=forgetting, forgetting_factor=0.99)
+    task = rls.problem(config)
+    rows = noisy[:700]
+    folded, info = rls.fold(task, rls.init(task), rows)
+    state, infos = rls.init(task), []
+    for k in range(len(rows)):
+        textbook.read_only(state)
+        before = [part.copy() for part in state]
+        following, one = rls.step(task, state, rows[k : k + 1])
+        assert all(np.array_equal(a, b) for a, b in zip(before, state, strict=True))
+        assert not any(np.shares_memory(a, b) for a, b in zip(state, following, strict=True))
+        state = following
+        infos.append(one)
+    stepped = np.concatenate(infos)
+    for a, b in zip(folded, state, strict=True):
+        assert a.tobytes() == b.tobytes()
+    for name in rls.INFO.names:
+        assert np.array_equal(info[name], stepped[name], equal_nan=name not in ("reason",))
+    halves, _ = rls.fold(task, rls.init(task), rows[:333])
+    halves, _ = rls.fold(task, halves, rows[333:])
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(folded, halves, strict=True))
+
+
+def test_samples_and_problem_are_not_modified(heavy, noisy):
+    task = rls.problem(heavy)
+    textbook.read_only(task)
+    rows = noisy[:200].copy()
+    rows.setflags(write=False)
+    state, info = rls.fold(task, textbook.read_only(rls.init(task)), rows)
+    assert len(info) == 200
+
+
+def test_nothing_learnt_is_the_prior(heavy):
+    task, prior = rls.problem(heavy), prior_of(heavy)
+    estimate = rls.estimate(task, rls.init(task), prior)
+    np.testing.assert_allclose(estimate.values, prior.mean, rtol=1e-14)
+    np.testing.assert_allclose(estimate.covariance, np.diag(prior.std**2), atol=1e-14)
+    np.testing.assert_allclose(rls.variance(task, rls.init(task)), prior.std**2, rtol=1e-12)
+
+
+def test_no_samples(heavy):
+    task = rls.problem(heavy)
+    state, info = rls.fold(task, rls.init(task), np.zeros(0, dtype=SAMPLE))
+    assert len(info) == 0
+    assert all(np.array_equal(a, b) for a, b in zip(state, rls.init(task), strict=True))
+
+
+# ------------------------------------------------------------------ textbook
+
+
+@pytest.mark.parametrize("slope", [False, True])
+def test_equals_batch_least_squares_on_independently_filtered_rows(heavy, exact, slope):
+    """The information is a weighted sum of the rows' outer products, the estimate the minimum.
+
+    The weights themselves (they follow the residual's variance) are read off the information.
+    """
+    config = with_section(wrong_prior(heavy), "rls", forgetting="constant", forgetting_factor=1.0)
+    prior = prior_of(config)
+    rows = exact[:800].copy()
+    if slope:  # any wrench within the interval, as long as both sides use it alike
+        rows["wrench_slope"] = np.random.default_rng(1).standard_normal((len(rows), 6))
+        rows["wrench_slope"] *= [20.0, 20.0, 20.0, 2.0, 2.0, 2.0]
+    phi, y = textbook.regression(config.model, rows, config.rls.filter_corner)
+    phi = phi[:, :, prior.estimated]
+
+    task = rls.problem(config)
+    n = len(prior.names)
+    state, used, weights = rls.init(task), [], []
+    for k in range(len(rows)):
+        before = state.root[:, :n].T @ state.root[:, :n]
+        estimate = rls.estimate(task, state, prior)
+        state, info = rls.step(task, state, rows[k : k + 1])
+        if info["reason"][0] in (rls.USED, rls.WAITING, rls.GATED):
+            residual = y[k] - phi[k] @ estimate.values
+            np.testing.assert_allclose(info["residual"][0], residual, rtol=1e-6, atol=1e-9)
+        gained = state.root[:, :n].T @ state.root[:, :n] - before
+        if info["reason"][0] != rls.USED:
+            assert not gained.any()
+            continue
+        scaled = phi[k] * prior.std
+        outer = np.einsum("ia,ib->abi", scaled, scaled).reshape(n * n, 6)
+        norm = np.linalg.norm(outer, axis=0)
+        norm[norm == 0.0] = 1.0
+        weight = np.linalg.lstsq(outer / norm, gained.ravel(), rcond=1e-13)[0] / norm
+        misfit = np.abs(outer @ weight - gained.ravel()).max()
+        assert misfit < 1e-8 * np.abs(before + gained).max(), f"sample {k}"
+        assert (weight > -1e-9 * np.abs(weight).max()).all()
+        used.append(k)
+        weights.append(np.maximum(weight, 0.0))
+    assert len(used) > 100
+    values, information = textbook.least_squares(
+        phi[used], y[used], np.array(weights), prior.mean, prior.std
+    )
+    np.testing.assert_allclose(
+        state.root[:, :n].T @ state.root[:, :n], information,
+        rtol=1e-7, atol=1e-7 * np.abs(np.diag(information)).min(),
+    )  # fmt: skip
+    found = rls.estimate(task, state, prior).values
+    np.testing.assert_allclose((found - values) / prior.std, 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        rls.variance(task, state), prior.std**2 * np.diag(np.linalg.inv(information)), rtol=1e-6
+    )
+
+
+def test_truth_without_noise(heavy, exact):
+    config = wrong_prior(heavy, spread=0.3)
+    estimate, _, info = result(config, exact)
+    error = np.abs(estimate.values / heavy.model.theta - 1.0)
+    assert error.max() < 0.005, dict(zip(estimate.names, error.round(5), strict=True))
+    assert (info["reason"] != rls.GATED).mean() > 0.9
+
+
+def test_truth_without_noise_of_a_coupled_model(heavy):
+    parameters = configuration.to_parameters(heavy)
+    parameters["coefficients"].update(
+        {"Y_v": -5.0, "N_r": -0.8, "K_p": -0.3, "Y_rdot": 0.4, "Y_r": 0.6, "N_v": 0.3, "X_vv": -20.0}
+    )
+    truth = configuration.from_parameters(parameters)
+    rows = textbook.rows_of(*driven(truth, 90.0, 4))
+    config = wrong_prior(truth, spread=0.2)
+    estimate, _, _ = result(config, rows)
+    prior = prior_of(truth)
+    error = np.abs(estimate.values - truth.model.theta) / np.maximum(
+        np.abs(truth.model.theta), 0.2 * prior.std
+    )
+    assert error.max() < 0.01, dict(zip(estimate.names, error.round(4), strict=True))
+
+
+# ------------------------------------------------------------------ what is estimated
+
+
+def test_only_the_chosen_coefficients_are_estimated(heavy, exact):
+    names = ("Y_vdot", "X_u", "X_uu", "N_rr")
+    config = dataclasses.replace(heavy, estimate=names)
+    factors = np.where([n in names for n in heavy.model.names], 0.8, 1.0)
+    config = dataclasses.replace(textbook.off(config, factors), estimate=names)
+    estimate, _, _ = result(config, exact)
+    assert estimate.names == names
+    truth = [heavy.model.theta[heavy.model.names.index(n)] for n in names]
+    np.testing.assert_allclose(estimate.values, truth, rtol=0.005)
+
+
+def test_coefficients_that_are_not_excited_stay_and_say_so(heavy):
+    """Surge alone says nothing of sway, roll, yaw."""
+    t = np.arange(0.0, 60.0, DT)
+    wrench = manoeuvre("steps", heavy.model, t, np.random.default_rng(2))
+    wrench[:, 1:] = 0.0
+    rows = textbook.rows_of(
+        textbook.drive(heavy.model, t, wrench), wrench, np.random.default_rng(0), wrench_std=0.01
+    )
+    config = wrong_prior(heavy)
+    prior = prior_of(config)
+    estimate, _, _ = result(config, rows)
+    for name in ("Y_vv", "K_pp", "N_rr", "M_qq"):
+        i = prior.names.index(name)
+        assert abs(estimate.values[i] - prior.mean[i]) < 0.5 * prior.std[i], name
+        assert estimate.std[i] > 0.5 * prior.std[i], name
+    i = prior.names.index("X_uu")
+    assert estimate.values[i] == pytest.approx(heavy.model.theta[i], rel=0.05)
+
+
+# ------------------------------------------------------------------ gaps and outliers
+
+
+def test_a_gap_has_no_transient(heavy, exact):
+    """Restart in the middle of a fast motion: the residual is as small as ever."""
+    rows = exact.copy()
+    for k in (700, 1500, 2311):
+        assert np.abs(rows["nu"][k, :3]).max() > 0.05
+        rows["dt"][k], rows["restart"][k] = 0.0, True
+    whole, _, quiet = result(heavy, exact)
+    estimate, _, info = result(heavy, rows)
+    assert (info["reason"] == rls.RESTARTED).sum() == 4
+    assert (info["reason"] == rls.GATED).sum() == (quiet["reason"] == rls.GATED).sum()
+    usual, worst = np.nanmax(np.abs(quiet["residual"]), 0), np.nanmax(np.abs(info["residual"]), 0)
+    assert (worst < 3.0 * usual + 1e-6).all()
+    np.testing.assert_allclose(estimate.values, whole.values, rtol=0.005)
+
+
+def test_a_start_in_motion_without_a_restart_mark(heavy, exact):
+    """A fresh state (after a reset) amid a stream of samples: no transient either."""
+    rows = exact[900:1600]
+    assert not rows["restart"].any()
+    marked = rows.copy()
+    marked["dt"][0], marked["restart"][0] = 0.0, True
+    wanted, _, _ = result(heavy, marked)
+    estimate, _, _ = result(heavy, rows)
+    np.testing.assert_allclose(estimate.values, wanted.values, rtol=0.005)
+    np.testing.assert_allclose(estimate.std, wanted.std, rtol=0.05)
+
+
+@pytest.mark.parametrize("field", ["nu", "wrench", "dt", "down", "wrench_slope"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_not_finite_changes_nothing(heavy, noisy, field, bad):
+    task = rls.problem(heavy)
+    rows = noisy[:300].copy()
+    state, _ = rls.fold(task, rls.init(task), rows)
+    sample = noisy[300:301].copy()
+    sample[field] = bad
+    after, info = rls.step(task, state, sample)
+    assert rls.REASONS[info["reason"][0]] == "not finite"
+    assert all(np.array_equal(a, b) for a, b in zip(state, after, strict=True))
+
+
+def test_outliers_are_refused(heavy, noisy):
+    """Now and then a wrench that never acted."""
+    clean, _, _ = result(heavy, noisy)
+    rows = noisy.copy()
+    rng = np.random.default_rng(8)
+    hit = rng.choice(np.arange(600, len(rows)), 5, replace=False)
+    rows["wrench"][hit] += rng.choice([-1, 1], (5, 6)) * [2000, 2000, 2000, 200, 200, 200]
+    estimate, _, info = result(heavy, rows)
+    gated = np.flatnonzero(info["reason"] == rls.GATED)
+    assert len(gated) >= 5
+    for k in hit:
+        assert ((gated >= k) & (gated < k + 10)).any(), "refused soon after"
+    prior = prior_of(heavy)
+    assert (np.abs(estimate.values - clean.values) < 0.1 * prior.std).all()
+
+
+def test_residual_is_measured_minus_model(heavy):
+    """A force that the model does not know shows with its own sign, and the others stay small."""
+    config = dataclasses.replace(heavy, estimate=("N_rr",))
+    t = np.arange(0.0, 20.0, DT)
+    wrench = manoeuvre("steps", heavy.model, t, np.random.default_rng(2))
+    extra = np.array([5.0, 0.0, -3.0, 0.0, 0.0, 0.0])
+    motion = textbook.drive(heavy.model, t, wrench)
+    rows = textbook.rows_of(motion, wrench + extra)
+    _, _, info = result(config, rows)
+    np.testing.assert_allclose(info["residual"][500:, :3], extra[:3] * np.ones((500, 1)), atol=0.3)
+
+
+# ------------------------------------------------------------------ windup
+
+
+@pytest.fixture(scope="module")
+def learnt(heavy, noisy):
+    """State, estimate and task after a good minute under constant forgetting 0.98."""
+    config = with_section(heavy, "rls", forgetting="constant", forgetting_factor=0.98)
+    estimate, state, _ = result(config, noisy)
+    return config, rls.problem(config), state, estimate
+
+
+@pytest.mark.parametrize("motion", ["rest", "one axis"])
+def test_no_windup(heavy, learnt, motion):
+    """1e5 samples without information (or on one axis): what is not excited stays as it is."""
+    config, task, state, known = learnt
+    prior = prior_of(config)
+    count, rng = 100_000, np.random.default_rng(3)
+    if motion == "rest":
+        rows = textbook.held_at_rest(heavy.model, textbook.resting(count, DT, rng))
+        unexcited = np.ones(len(prior.names), dtype=bool)
+    else:
+        t = np.arange(0.0, 200.0, DT)
+        wrench = manoeuvre("steps", heavy.model, t, rng)
+        wrench[:, 1:] = 0.0
+        one = textbook.rows_of(textbook.drive(heavy.model, t, wrench), wrench, rng)
+        rows = np.tile(one, count // len(one))
+        rows["restart"][:: len(one)] = True
+        unexcited = np.array([n[0] in "YKN" for n in prior.names])
+    after, info = rls.fold(task, state, rows)
+    then = rls.estimate(task, after, prior)
+    assert np.isfinite(then.values).all() and np.isfinite(then.covariance).all()
+    assert np.linalg.eigvalsh(then.covariance / np.outer(prior.std, prior.std))[0] > -1e-9
+    assert (then.std < 2.0 * prior.std).all(), "not less sure than before any data"
+    assert (rls.variance(task, after) < 4.0 * prior.std**2).all()
+    moved = np.abs(then.values - known.values)[unexcited] / known.std[unexcited]
+    assert (moved < 2.0).all(), dict(zip(np.array(prior.names)[unexcited], moved.round(1)))
+    grown = np.sqrt(rls.variance(task, after) / rls.variance(task, state))[unexcited]
+    # noise alone excites a little
+    assert (grown < 1.5).all() and (grown > 0.5).all(), grown.round(2)
+
+    # and it still learns
+    rows = textbook.rows_of(*driven(heavy, 30.0, 77), np.random.default_rng(4), wrench_std=0.01)
+    again = rls.estimate(task, rls.fold(task, after, rows)[0], prior)
+    fresh = rls.estimate(task, rls.fold(task, rls.init(task), rows)[0], prior)
+    worse = np.abs(again.values - heavy.model.theta) - np.abs(fresh.values - heavy.model.theta)
+    assert (worse < 0.25 * prior.std).all()
+
+
+def test_follows_a_change(heavy):
+    """+30 % in one drag coefficient after a minute: an instrument frame swung out."""
+    for name in ("X_uu", "N_rr"):
+        changed = heavy.model.with_values({name: 1.3 * heavy.model.theta[heavy.model.names.index(name)]})
+        before, wrench = driven(heavy, 60.0, 21)
+        first = textbook.rows_of(before, wrench, np.random.default_rng(1), wrench_std=0.01)
+        start = (before.nu[-1], before.orientation[-1])
+        after, wrench = driven(heavy, 180.0, 22, model=changed, start=start)
+        second = textbook.rows_of(after, wrench, np.random.default_rng(2), wrench_std=0.01)
+        i = heavy.model.names.index(name)
+        estimate, state, _ = result(heavy, first)
+        assert estimate.values[i] == pytest.approx(heavy.model.theta[i], rel=0.1)
+        estimate, _, info = result(heavy, textbook.joined(first, second))
+        assert estimate.values[i] == pytest.approx(changed.theta[i], rel=0.1), name
+        others = np.arange(len(heavy.model.theta)) != i
+        error = np.abs(estimate.values - changed.theta) / prior_of(heavy).std
+        assert (error[others] < 0.3).all()
+
+
+# ------------------------------------------------------------------ consistency
+
+
+def test_intervals_and_bias_over_seeds(heavy, dives):
+    """95 % intervals hold the truth about as often as they say, and nothing leans to one side."""
+    z, prior = [], None
+    for config, samples in dives:
+        prior = prior_of(config)
+        estimate, state, _ = result(config, samples)
+        assert np.linalg.eigvalsh(estimate.covariance / np.outer(prior.std, prior.std))[0] > 0
+        z.append((estimate.values - heavy.model.theta) / estimate.std)
+    z = np.array(z)
+    told = dict(zip(prior.names, zip(z.mean(0).round(2), z.std(0).round(2), strict=True)))
+    covered = np.mean(np.abs(z) < 1.96)
+    assert 0.80 <= covered, f"{covered:.2f} {told}"
+    assert np.abs(z.mean(axis=0)).max() < 3.0 / np.sqrt(len(z)) * max(1.0, z.std()), told
+
+
+def test_errors_are_small_after_ninety_seconds(heavy, dives):
+    errors = []
+    for config, samples in dives:
+        errors.append(np.abs(result(config, samples)[0].values / heavy.model.theta - 1.0))
+    median = np.median(errors, axis=0)
+    strong = [heavy.model.names.index(n) for n in ("X_udot", "Y_vdot", "Z_wdot", "X_uu", "Y_vv", "Z_ww")]
+    assert (median[strong] < 0.03).all(), median.round(3)
+    assert (median < 0.15).all(), median.round(3)
+
+
+@pytest.fixture(scope="module")
+def dives(heavy):
+    return textbook.prior_and_samples(heavy, range(12), 90.0)
+
+
+def test_simulated_sensors_suite_is_what_the_configuration_assumes(heavy):
+    """The consistency tests above mean something only while both agree on the noise."""
+    suite = sensors.Suite()
+    assert heavy.imu.gyro_std == suite.gyro_std
+    assert heavy.wrench.relative_std == suite.wrench_std

@@ -1,0 +1,601 @@
+"""From messages to samples: against the true motion, in any order, with any rubbish among them."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from textbook import with_section
+
+from rov_ident import sensors
+from rov_ident.frames import from_core, quaternion_to_matrix
+from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.samples import IMU, ODOMETRY, SAMPLE, WRENCH, Sampler, describe
+
+SECOND = 1_000_000_000
+NOISELESS = sensors.Suite().scaled(0.0)
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def taken(config, messages):
+    """All samples of (role, message) in this order, and the sampler."""
+    sampler = Sampler(config)
+    parts = [sampler.push(role, message) for role, message in messages]
+    return np.concatenate([*parts, sampler.flush()]), sampler
+
+
+def without_arrival(dive):
+    return [(role, message) for _, role, message in dive.messages]
+
+
+def clean(config, duration=6.0, seed=3, **suite):
+    return sensors.dive(config, "steps", duration, dataclasses.replace(NOISELESS, **suite), seed)
+
+
+def instants(dive, sampler, samples):
+    """Places (k,) of the samples' instants among those of the truth."""
+    t = samples["t"] + (sampler.origin - sensors.START) * 1e-9
+    places = np.searchsorted(dive.truth.t, t - 1e-7)
+    np.testing.assert_allclose(dive.truth.t[places], t, atol=2e-9)
+    return places
+
+
+def moments(t, demand, begin, end):
+    """Mean and slope (6,) of a demand held from each of t to the next, over [begin, end]."""
+    first = np.searchsorted(t, begin, side="right") - 1
+    last = np.searchsorted(t, end, side="left")
+    edges = np.concatenate([[begin], t[first + 1 : last], [end]])
+    piece, length = demand[first:last], end - begin
+    mean = np.diff(edges) @ piece / length
+    # regression line: slope = integral of (s - middle) w ds / (length^3 / 12)
+    away = edges - 0.5 * (begin + end)
+    slope = 0.5 * np.diff(away**2) @ piece / (length**3 / 12.0)
+    return mean, slope
+
+
+# ------------------------------------------------------------------ truth
+
+
+@pytest.mark.parametrize(
+    "odometry_rate, imu_rate, wrench_rate",
+    [
+        (5, 0, 50), (20, 0, 50), (50, 0, 5), (200, 0, 200), (500, 0, 50), (20, 50, 20), (5, 100, 50),
+        (20, 100, 5), (20, 100, 200), (50, 100, 50), (100, 100, 50), (200, 50, 50), (20, 200, 50),
+        (20, 500, 50), (500, 500, 200), (500, 50, 5),
+    ],
+)  # fmt: skip
+def test_samples_are_the_truth(heavy, odometry_rate, imu_rate, wrench_rate):
+    dive = clean(
+        heavy, odometry_rate=odometry_rate, imu_rate=imu_rate, wrench_rate=wrench_rate
+    )
+    samples, sampler = taken(heavy, without_arrival(dive))
+    expected = (imu_rate or odometry_rate) * 6.0
+    assert expected - 1.3 * (imu_rate or odometry_rate) * max(1 / 5, 1 / odometry_rate) <= len(
+        samples
+    ) <= expected + odometry_rate * 6.0 + 1
+    assert not describe(
+        {k: v for k, v in sampler.counts.items() if k != "sample: no odometry yet"}
+        if imu_rate
+        else sampler.counts
+    ) or imu_rate < odometry_rate
+    assert samples["restart"].sum() == 1 and samples["restart"][0]
+    at = instants(dive, sampler, samples)
+
+    # odometry alone passes as it came (single precision); with an IMU a step of the thrust between
+    # two samples is integrated as a ramp: the thrust steps by 3 m/s2, 6 rad/s2 at most
+    error = samples["nu"] - dive.truth.nu[at]
+    step = 0.0 if imu_rate == 0 else 3.0 / imu_rate
+    assert np.abs(error[:, :3]).max() < 1e-6 + 1.0 * step
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 1e-6 + 0.15 * step
+    # a gyro measures what it measures; only the bias found from odometry may be off
+    assert np.abs(error[:, 3:]).max() < (1e-6 if imu_rate == 0 else 6e-3)
+    assert np.sqrt(np.mean(error[:, 3:] ** 2)) < (1e-6 if imu_rate == 0 else 1e-3)
+
+    down = quaternion_to_matrix(dive.truth.orientation)[:, 2]
+    assert np.abs(samples["down"] - down[at]).max() < 1e-6 + 0.1 * step
+    np.testing.assert_allclose(np.linalg.norm(samples["down"], axis=1), 1.0, rtol=1e-9)
+    slope = np.diff(samples["down"], axis=0) / samples["dt"][1:, None]
+    np.testing.assert_allclose(samples["down_slope"][1:], slope, atol=1e-9)
+
+    scale = np.abs(dive.demand).max(axis=0)
+    for k in range(1, len(samples), 7):
+        end = dive.truth.t[at[k]]
+        mean, slope = moments(dive.truth.t, dive.demand, end - samples["dt"][k], end)
+        np.testing.assert_allclose(samples["wrench"][k] / scale, mean / scale, atol=1e-6)
+        allowed = 1e-5 / samples["dt"][k]
+        np.testing.assert_allclose(samples["wrench_slope"][k] / scale, slope / scale, atol=allowed)
+
+
+def test_the_same_measurements_one_by_one(heavy):
+    """``odometry`` and ``gyro`` hold each measurement once; NaN where there is none."""
+    dive = clean(heavy)
+    samples, sampler = taken(heavy, without_arrival(dive))
+    assert samples["measured"].sum() == pytest.approx(120, abs=2)
+    has = np.isfinite(samples["odometry"][:, :3]).all(axis=1)
+    assert np.array_equal(has, samples["measured"])
+    assert np.isnan(samples["odometry"][:, 3:]).all(), "with a gyro the odometry's rate is not used"
+    assert np.isfinite(samples["gyro"]).all()
+    at = instants(dive, sampler, samples)
+    assert np.abs(samples["odometry"][has, :3] - dive.truth.nu[at[has], :3]).max() < 0.03
+    assert (samples["odometry_variance"] > 0).all() and (samples["gyro_variance"] > 0).all()
+    alone, _ = taken(heavy, without_arrival(clean(heavy, imu_rate=0)))
+    assert np.isfinite(alone["odometry"]).all() and np.isnan(alone["gyro"]).all()
+
+
+def test_noise_is_not_enlarged_and_not_biased(heavy):
+    dive = sensors.dive(heavy, "steps", 20.0, seed=4)
+    samples, sampler = taken(heavy, without_arrival(dive))
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    error = error[100:]
+    assert (error[:, :3].std(axis=0) < 0.009).all(), "no noisier than the odometry itself (0.008)"
+    assert (error[:, 3:].std(axis=0) < 0.0035).all()
+    assert (np.abs(error.mean(axis=0)) < [2e-3] * 3 + [1.5e-3] * 3).all()
+
+
+def test_no_lag(heavy):
+    """What is taken from one source is left of the other: the error is not the acceleration's."""
+    dive = sensors.dive(heavy, "multisine", 20.0, seed=4)
+    samples, sampler = taken(heavy, without_arrival(dive))
+    at = instants(dive, sampler, samples)[100:]
+    error = samples["nu"][100:] - dive.truth.nu[at]
+    for axis in range(6):
+        a = dive.truth.nu_dot[at, axis]
+        lag = a @ error[:, axis] / (a @ a)
+        assert abs(lag) < 4e-3, f"axis {axis} is {lag:.4f} s ahead"
+
+
+# ------------------------------------------------------------------ mounting, bias
+
+
+def test_lever_arms_and_mounting(heavy):
+    mounted = with_section(heavy, "odometry", position=(0.3, -0.2, 0.1))
+    mounted = with_section(
+        mounted, "imu", position=(-0.15, 0.1, 0.2), rotation=(0.4, -0.3, 2.0)
+    )
+    dive = clean(mounted)
+    samples, sampler = taken(mounted, without_arrival(dive))
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 0.01
+    assert np.abs(error[:, 3:]).max() < 2e-3
+    assert sampler.counts["odom: outlier against the IMU"] == 0
+    # and it matters: unaware of them the velocities are off
+    ignorant, sampler = taken(heavy, without_arrival(dive))
+    error = ignorant["nu"] - dive.truth.nu[instants(dive, sampler, ignorant)]
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) > 0.05
+
+
+def test_lever_arm_without_an_imu(heavy):
+    mounted = with_section(heavy, "odometry", position=(0.3, -0.2, 0.1))
+    dive = clean(mounted, imu_rate=0)
+    samples, sampler = taken(mounted, without_arrival(dive))
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.abs(error).max() < 1e-6
+
+
+def test_biases_are_found(heavy):
+    dive = clean(heavy, 40.0, gyro_bias_std=0.01, accelerometer_bias_std=0.1)
+    samples, sampler = taken(heavy, without_arrival(dive))
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    raw = [m.angular_velocity for _, role, m in dive.messages if role == IMU]
+    late = samples["t"] > 20.0
+    assert np.abs(error[late, 3:]).max() < 2e-3
+    assert np.abs(error[late, :3].mean(axis=0)).max() < 5e-3
+    assert len(raw) == len(samples) + sampler.counts["sample: no odometry yet"]
+
+
+def test_imu_drops_out_and_returns(heavy):
+    dive = clean(heavy, 12.0)
+    start = sensors.START
+    messages = [
+        (role, m)
+        for role, m in without_arrival(dive)
+        if role != IMU or not 4 * SECOND < m.stamp - start < 8 * SECOND
+    ]
+    samples, sampler = taken(heavy, messages)
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.abs(error).max() < 0.03
+    assert samples["restart"].sum() == 1, "odometry bridges the gap"
+    out = (samples["t"] > 4.2) & (samples["t"] < 7.8)
+    assert np.diff(samples["t"][out]) == pytest.approx(0.05)
+    assert np.isnan(samples["gyro"][out]).all() and np.isfinite(samples["odometry"][out]).all()
+    assert np.isfinite(samples["gyro"][samples["t"] > 8.2]).all()
+    assert sampler.counts["imu: gap, odometry alone"] == 1
+
+
+def test_odometry_drops_out_and_returns(heavy):
+    """Between, the IMU is integrated; nothing is invented as measured."""
+    dive = clean(heavy, 12.0)
+    messages = [
+        (role, m)
+        for role, m in without_arrival(dive)
+        if role != ODOMETRY or not 4 * SECOND < m.stamp - sensors.START < 6 * SECOND
+    ]
+    samples, sampler = taken(heavy, messages)
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.abs(error).max() < 0.1
+    out = (samples["t"] > 4.1) & (samples["t"] < 5.9)
+    assert not samples["measured"][out].any()
+
+
+@pytest.mark.parametrize("silent", [0.8, 3.0])
+def test_silent_wrench(heavy, silent):
+    """Within the timeout the demand holds, beyond it there are no samples."""
+    dive = clean(heavy, 8.0)
+    begin, end = 3.0, 3.0 + silent
+    messages = [
+        (role, m)
+        for role, m in without_arrival(dive)
+        if role != WRENCH or not begin < (m.stamp - sensors.START) * 1e-9 < end
+    ]
+    samples, sampler = taken(heavy, messages)
+    t = samples["t"] + (sampler.origin - sensors.START) * 1e-9
+    gone = (t > begin + heavy.timeout) & (t < end)
+    if silent < heavy.timeout:
+        assert sampler.counts["sample: no wrench"] <= 2
+    else:
+        assert not gone.any()
+        assert sampler.counts["sample: no wrench"] > 20
+        after = np.flatnonzero(t > end)
+        assert samples["restart"][after[0]] and not samples["restart"][after[1:]].any()
+
+
+def test_no_wrench_at_all(heavy):
+    dive = clean(heavy)
+    samples, sampler = taken(heavy, [m for m in without_arrival(dive) if m[0] != WRENCH])
+    assert len(samples) == 0
+    assert "no wrench" in describe(sampler.counts)[0], describe(sampler.counts)
+
+
+def test_no_odometry_at_all(heavy):
+    dive = clean(heavy)
+    samples, sampler = taken(heavy, [m for m in without_arrival(dive) if m[0] != ODOMETRY])
+    assert len(samples) == 0
+    assert any("no odometry" in line for line in describe(sampler.counts))
+
+
+# ------------------------------------------------------------------ order
+
+
+def interleaved(dive, lag, rng):
+    """Another order of arrival: every topic in order, no message later than ``lag`` seconds."""
+    messages = sorted((m.stamp, role, m) for _, role, m in dive.messages)
+    newest: dict[str, float] = {}
+    arrived = []
+    for stamp, role, message in messages:
+        arrival = max(stamp + 1e9 * lag * rng.random(), newest.get(role, 0.0))
+        newest[role] = arrival
+        arrived.append((arrival, role, message))
+    arrived.sort(key=lambda m: m[0])
+    return [(role, message) for _, role, message in arrived]
+
+
+def same(a, b):
+    """Bit for bit, NaN included, but not the padding between the fields."""
+    return a.shape == b.shape and all(a[n].tobytes() == b[n].tobytes() for n in SAMPLE.names)
+
+
+@pytest.mark.parametrize("rates", [(20, 100, 50), (50, 0, 20), (100, 50, 10), (20, 100, 5)])
+def test_order_of_arrival_does_not_matter(heavy, rates):
+    odometry_rate, imu_rate, wrench_rate = rates
+    dive = clean(
+        heavy, 4.0, odometry_rate=odometry_rate, imu_rate=imu_rate, wrench_rate=wrench_rate
+    )
+    reference, _ = taken(heavy, [m[1:] for m in sorted((m.stamp, r, m) for _, r, m in dive.messages)])
+    first = min(m.stamp for _, _, m in dive.messages)
+    for seed in range(6):
+        order = interleaved(dive, 0.9 * heavy.grace, np.random.default_rng(seed))
+        # the clock's origin is the first message to arrive: here always the same one
+        order.sort(key=lambda m: m[1].stamp != first)
+        samples, sampler = taken(heavy, order)
+        assert same(samples, reference), f"seed {seed}: {sampler.counts}"
+
+
+def test_order_does_not_matter_with_drops(heavy):
+    """Lost messages make the topics uneven, the samples are still the stamps' alone."""
+    dive = sensors.dive(heavy, "steps", 6.0, sensors.Suite(drop=0.3, wrench_rate=5.0), 5)
+    messages = sorted((m.stamp, r, m) for _, r, m in dive.messages)
+    reference, _ = taken(heavy, [m[1:] for m in messages])
+    for seed in range(4):
+        order = interleaved(dive, 0.2 * heavy.grace, np.random.default_rng(seed))
+        order.sort(key=lambda m: m[1].stamp != messages[0][0])
+        samples, _ = taken(heavy, order)
+        assert same(samples, reference)
+
+
+def test_jitter_and_delay_of_the_simulated_sensors(heavy):
+    """The simulator's own: arrival is put off, the stamps stay."""
+    prompt = sensors.dive(heavy, "steps", 5.0, sensors.Suite(), 7)
+    late = sensors.dive(heavy, "steps", 5.0, sensors.Suite(delay=0.05, jitter=0.03), 7)
+    a, _ = taken(heavy, without_arrival(prompt))
+    b, sampler = taken(heavy, without_arrival(late))
+    # not the same first message, hence not the same origin
+    assert len(a) == len(b) and not sampler.counts["odom: too late"]
+    np.testing.assert_allclose(a["nu"], b["nu"], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(a["wrench"], b["wrench"], rtol=1e-9, atol=1e-9)
+
+
+def test_later_than_the_grace_is_counted(heavy):
+    dive = clean(heavy, 6.0, delay=0.0)
+    late = []
+    for arrival, role, message in dive.messages:
+        lag = 0.8 if role == ODOMETRY and message.stamp > sensors.START + 3 * SECOND else 0.0
+        late.append((arrival + lag * 1e9, role, message))
+    late.sort(key=lambda m: m[0])
+    samples, sampler = taken(heavy, [m[1:] for m in late])
+    assert sampler.counts["odom: too late"] > 30
+    assert np.isfinite(samples["nu"]).all()
+    assert (np.diff(samples["t"]) > 0).all()
+
+
+def test_messages_are_not_modified(heavy):
+    dive = clean(heavy, 2.0)
+    for _, _, message in dive.messages:
+        for value in message:
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+    taken(heavy, without_arrival(dive))
+
+
+def test_samples_stay_what_they_were(heavy):
+    """A sample already given away does not change with later ones."""
+    sampler = Sampler(heavy)
+    given_away, copies = [], []
+    for role, message in without_arrival(clean(heavy, 2.0)):
+        samples = sampler.push(role, message)
+        given_away.append(samples)
+        copies.append(samples.copy())
+    assert all(same(a, b) for a, b in zip(given_away, copies, strict=True))
+
+
+# ------------------------------------------------------------------ axes
+
+
+@pytest.mark.parametrize("body, world", [("flu", "enu"), ("frd", "enu"), ("flu", "ned")])
+def test_axes_of_the_input_do_not_matter(heavy, body, world):
+    """The same motion in ROS axes, by default or as the parameters say, gives the same samples."""
+    dive = sensors.dive(heavy, "steps", 4.0, seed=9)
+    reference, _ = taken(heavy, without_arrival(dive))
+    told = dataclasses.replace(
+        heavy, frames=dataclasses.replace(heavy.frames, body=body, world=world)
+    )
+    turned = []
+    for role, message in without_arrival(dive):
+        if isinstance(message, Odometry):
+            message = message._replace(frame_id="odom", child_frame_id="base_link")
+        else:
+            message = message._replace(frame_id="base_link" if role == WRENCH else "imu_link")
+        turned.append((role, from_core(message, body, world)))
+    samples, _ = taken(told, turned)
+    assert len(samples) == len(reference)
+    for name in SAMPLE.names:
+        np.testing.assert_allclose(samples[name], reference[name], rtol=0, atol=1e-9, err_msg=name)
+
+
+def test_uneven_axes_of_the_topics(heavy):
+    """FRD odometry beside a FLU wrench: each by its own frame id."""
+    dive = sensors.dive(heavy, "steps", 3.0, seed=9)
+    reference, _ = taken(heavy, without_arrival(dive))
+    mixed = [
+        (role, from_core(m._replace(frame_id="base_link")) if role == WRENCH else m)
+        for role, m in without_arrival(dive)
+    ]
+    samples, _ = taken(heavy, mixed)
+    np.testing.assert_allclose(samples["wrench"], reference["wrench"], atol=1e-12)
+
+
+# ------------------------------------------------------------------ refusals
+
+
+def odometry(t=1.0, **changed):
+    message = Odometry(
+        round(t * SECOND), "odom", "base_link", np.zeros(3), LEVEL, np.zeros(3), np.zeros(3),
+        np.zeros(6),
+    )  # fmt: skip
+    return message._replace(**changed)
+
+
+def imu(t=1.0, **changed):
+    message = Imu(
+        round(t * SECOND), "imu_link", LEVEL, np.zeros(3), np.array([0.0, 0.0, 9.81]), np.zeros(3),
+        np.zeros(3),
+    )  # fmt: skip
+    return message._replace(**changed)
+
+
+def wrench(t=1.0, **changed):
+    return Wrench(round(t * SECOND), "base_link", np.zeros(3), np.zeros(3))._replace(**changed)
+
+
+def steady(begin, end, rate=20.0):
+    """Still water, nothing moves: (role, message) of all topics."""
+    for t in np.arange(begin, end, 1.0 / rate):
+        yield WRENCH, wrench(t)
+        yield ODOMETRY, odometry(t)
+        yield IMU, imu(t)
+
+
+BAD = [math.nan, math.inf, -math.inf, 1e300]
+REFUSED = [
+    *((ODOMETRY, odometry, {"linear": np.array([0.0, v, 0.0])}) for v in BAD),
+    *((ODOMETRY, odometry, {"angular": np.array([v, 0.0, 0.0])}) for v in BAD),
+    *((IMU, imu, {"angular_velocity": np.array([0.0, 0.0, v])}) for v in BAD),
+    *((IMU, imu, {"linear_acceleration": np.array([0.0, 0.0, v])}) for v in BAD),
+    *((WRENCH, wrench, {"force": np.array([v, 0.0, 0.0])}) for v in BAD),
+    *((WRENCH, wrench, {"torque": np.array([0.0, v, 0.0])}) for v in BAD),
+    (ODOMETRY, odometry, {"orientation": np.zeros(4)}),
+    (ODOMETRY, odometry, {"orientation": np.full(4, math.nan)}),
+    (ODOMETRY, odometry, {"orientation": np.array([1e300, 0.0, 0.0, 0.0])}),
+    (ODOMETRY, odometry, {"orientation": np.array([0.1, 0.0, 0.0, 0.0])}),
+    *((role, make, {"stamp": s}) for role, make in
+      ((ODOMETRY, odometry), (IMU, imu), (WRENCH, wrench)) for s in (0, -1, 7 * 10**18)),
+    (WRENCH, wrench, {"frame_id": "odom"}),
+    (WRENCH, wrench, {"frame_id": "map_ned"}),
+    (ODOMETRY, odometry, {"child_frame_id": "world"}),
+    (IMU, imu, {"frame_id": "map"}),
+    (WRENCH, wrench, {"frame_id": "base_link_frd"}),
+    (ODOMETRY, odometry, {"frame_id": "map"}),
+]  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
+@pytest.mark.parametrize("role, make, changed", REFUSED)
+def test_a_bad_message_is_counted_and_changes_nothing(heavy, role, make, changed):
+    before, after = list(steady(1.0, 2.0)), list(steady(2.0, 3.0))
+    reference, _ = taken(heavy, before + after)
+    samples, sampler = taken(heavy, [*before, (role, make(1.985)._replace(**changed)), *after])
+    assert same(samples, reference)
+    refused = {k: n for k, n in sampler.counts.items() if k.startswith(f"{role}: ")}
+    assert list(refused.values()) == [1], sampler.counts
+    (line,) = (line for line in describe(sampler.counts) if line.startswith(f"{role}: "))
+    assert line.endswith("(1)")
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
+@pytest.mark.parametrize("bad", [math.inf, math.nan, -1.0, 1e300, 1e-320, 0.0])
+def test_a_useless_variance_is_as_good_as_none(heavy, bad):
+    """Drivers fill covariances with anything; the velocity beside it is still a velocity."""
+    config = with_section(heavy, "odometry", linear_std=0.008, angular_std=0.004)
+    dive = clean(heavy, 4.0)
+    messages = [
+        (role, m._replace(twist_variance=np.full(6, bad)) if role == ODOMETRY else m)
+        for role, m in without_arrival(dive)
+    ]
+    samples, sampler = taken(config, messages)
+    assert np.isfinite(samples["nu"]).all()
+    assert np.isfinite(samples["odometry_variance"]).all()
+    assert len(samples) > 350
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.abs(error).max() < 0.5
+
+
+@pytest.mark.parametrize("role, make", [(ODOMETRY, odometry), (IMU, imu), (WRENCH, wrench)])
+@pytest.mark.parametrize("back, reason", [(0.0, "duplicate"), (0.02, "backward"), (0.9, "backward")])
+def test_duplicate_and_backward_stamps(heavy, role, make, back, reason):
+    before, after = list(steady(1.0, 2.0)), list(steady(2.0, 3.0))
+    reference, _ = taken(heavy, before + after)
+    again = make(before[-1][1].stamp / SECOND - back)
+    samples, sampler = taken(heavy, [*before, (role, again), *after])
+    assert same(samples, reference)
+    assert sampler.counts[f"{role}: {reason} stamp"] == 1
+
+
+@pytest.mark.parametrize("wild", [1, 3600 * SECOND, 5 * 10**18])
+def test_single_wild_stamps_now_and_then(heavy, wild):
+    """A driver that now and then says 1970: every time one message is lost, never the motion."""
+    parts, messages = list(steady(100.0, 110.0)), []
+    for k, pair in enumerate(parts):
+        messages.append(pair)
+        if k % 90 == 80:
+            messages.append((ODOMETRY, odometry(stamp=wild)))
+    samples, sampler = taken(heavy, messages)
+    reference, _ = taken(heavy, parts)
+    assert sampler.counts["odom: stamp jumps"] == sum(k % 90 == 80 for k in range(len(parts)))
+    assert same(samples, reference)
+
+
+@pytest.mark.parametrize("jump", [-8.0, 1000.0, -0.0])
+def test_a_bag_that_starts_over(heavy, jump):
+    """Another clock: buffers begin anew, and samples go on after at most two lost messages."""
+    first = list(steady(100.0, 110.0))
+    begin = 100.0 if jump == 0.0 else 110.0 + jump
+    samples, sampler = taken(heavy, first + list(steady(begin, begin + 10.0)))
+    assert sampler.counts["clock: jumps, buffers restarted"] >= 1
+    assert samples["restart"].sum() == 2
+    assert len(samples) == pytest.approx(400, abs=6)
+    assert np.isfinite(samples["nu"]).all()
+    k = np.flatnonzero(samples["restart"])[1]
+    assert (np.diff(samples["t"][:k]) > 0).all() and (np.diff(samples["t"][k:]) > 0).all()
+
+
+def test_a_first_stamp_that_is_wild(heavy):
+    """The very first message carries another clock: nothing after it suffers."""
+    good = list(steady(100.0, 110.0))
+    for wild in (1, 3600 * SECOND):
+        samples, _ = taken(heavy, [(ODOMETRY, odometry(stamp=wild)), *good])
+        assert len(samples) > 190
+        assert samples["restart"].sum() <= 2
+        np.testing.assert_allclose(samples["dt"][-100:], 0.05, rtol=1e-6)
+
+
+def test_topics_on_different_clocks_are_told(heavy):
+    """Wrench on boot time beside odometry on Unix time can never meet: said, nothing invented."""
+    messages = []
+    for role, m in steady(100.0, 104.0):
+        messages.append((role, m if role == WRENCH else m._replace(stamp=m.stamp + 10**18)))
+    samples, sampler = taken(heavy, messages)
+    assert len(samples) == 0
+    assert describe(sampler.counts)
+
+
+def test_velocity_outliers_against_the_imu(heavy):
+    """A Doppler log's wild ping between good ones."""
+    dive = clean(heavy, 6.0)
+    messages, wild = [], 0
+    for k, (role, m) in enumerate(without_arrival(dive)):
+        if role == ODOMETRY and k % 29 == 0 and m.stamp > sensors.START + 2 * SECOND:
+            m = m._replace(linear=m.linear + 3.0)
+            wild += 1
+        messages.append((role, m))
+    samples, sampler = taken(heavy, messages)
+    assert wild > 2 and sampler.counts["odom: outlier against the IMU"] == wild
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.abs(error).max() < 0.05
+
+
+def test_a_gate_that_was_wrong_opens_again(heavy):
+    """The velocity has jumped for good (a lost lock): refused, then believed."""
+    messages = [
+        (role, m._replace(linear=np.array([0.5, 0.0, 0.0])))
+        if role == ODOMETRY and m.stamp > 5 * SECOND
+        else (role, m)
+        for role, m in steady(1.0, 30.0)
+    ]
+    samples, sampler = taken(heavy, messages)
+    assert samples["nu"][-1, 0] == pytest.approx(0.5, abs=0.05)
+
+
+FLOATS = st.floats(allow_nan=True, allow_infinity=True, width=64)
+MILD = st.floats(-3.0, 3.0)
+VECTOR = st.lists(st.one_of(MILD, MILD, FLOATS), min_size=3, max_size=3).map(np.array)
+SIX = st.lists(st.one_of(MILD, FLOATS), min_size=6, max_size=6).map(np.array)
+FOUR = st.one_of(
+    st.just(LEVEL), st.lists(st.one_of(MILD, FLOATS), min_size=4, max_size=4).map(np.array)
+)
+STAMPS = st.one_of(
+    st.integers(SECOND, 3 * SECOND),
+    st.integers(SECOND, 3 * SECOND),
+    st.integers(-(2**63), 2**63),
+)
+MESSAGES = st.lists(
+    st.one_of(
+        st.builds(
+            lambda *a: (ODOMETRY, Odometry(*a)),
+            STAMPS, st.just("odom"), st.just("base_link"), VECTOR, FOUR, VECTOR, VECTOR, SIX,
+        ),
+        st.builds(
+            lambda *a: (IMU, Imu(*a)), STAMPS, st.just("imu"), FOUR, VECTOR, VECTOR, VECTOR, VECTOR
+        ),
+        st.builds(lambda *a: (WRENCH, Wrench(*a)), STAMPS, st.just("base_link"), VECTOR, VECTOR),
+    ),
+    max_size=25,
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
+@settings(deadline=None, max_examples=200, derandomize=True)
+@given(messages=MESSAGES, sort=st.booleans())
+def test_nothing_raises_and_samples_are_finite(heavy, messages, sort):
+    if sort:
+        messages = sorted(messages, key=lambda m: m[1].stamp)
+    rounds = [(role, m) for role, m in steady(1.0, 1.3)]
+    samples, _ = taken(heavy, [*rounds, *messages])
+    for name in ("t", "dt", "nu", "down", "down_slope", "wrench", "wrench_slope"):
+        assert np.isfinite(samples[name]).all(), name
+    assert np.isfinite(samples["odometry_variance"]).all()
+    assert (samples["odometry_variance"] > 0).all()
+    assert (samples["dt"][~samples["restart"]] > 0).all()
+    # refused or not, a well-behaved stream goes on
+    sampler_samples, _ = taken(heavy, [*messages, *steady(1000.0, 1002.0)])
+    assert len(sampler_samples) > 20
