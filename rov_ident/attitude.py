@@ -8,7 +8,7 @@ from rov_ident.jit import kernel
 
 
 @kernel
-def rotation(q):  # type: ignore[no-untyped-def]
+def rotation(q):
     """R (3, 3), body -> world, of the unit quaternion q (w, x, y, z); its last row is "down"."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     r = np.empty((3, 3))
@@ -25,7 +25,7 @@ def rotation(q):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def turned(q, angle):  # type: ignore[no-untyped-def]
+def turned(q, angle):
     """q after turning by the rotation vector ``angle`` (3,) [rad] in body axes; unit length."""
     half = 0.5 * math.sqrt(angle[0] ** 2 + angle[1] ** 2 + angle[2] ** 2)
     s = 0.5 * (math.sin(half) / half if half > 1e-9 else 1.0 - half * half / 6.0)

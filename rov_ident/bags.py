@@ -40,7 +40,7 @@ from rov_ident.errors import UserError
 from rov_ident.messages import Message
 
 ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
-_ROLE_NAMES = {"odom": "odom", "imu": "imu/data", "wrench": "thruster_wrench"}
+ROLE_NAMES = {"odom": "odom", "imu": "imu/data", "wrench": "thruster_wrench"}
 _OPTIONAL_ROLES = ("imu",)
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -212,7 +212,7 @@ def read_messages(
 
 
 def _select_topic(bag: Bag, role: str, override: str) -> str | None:
-    type_name, name = ROLE_TYPES[role], _ROLE_NAMES[role]
+    type_name, name = ROLE_TYPES[role], ROLE_NAMES[role]
     filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
     holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
     if override:

@@ -209,9 +209,7 @@ def _fit(options: argparse.Namespace) -> None:
         with Progress(console=ERR, transient=True) as progress:
             bar = progress.add_task(f"reading {path.name}")
             records.append(
-                read_record(
-                    path, config, lambda k, n: progress.update(bar, completed=k, total=n)
-                )
+                read_record(path, config, lambda k, n: progress.update(bar, completed=k, total=n))
             )
         for note in records[-1].notes:
             ERR.print(f"{path.name}: {note}", markup=False)

@@ -29,9 +29,7 @@ LINEAR = slice(0, 3)
 ANGULAR = slice(3, 6)
 
 # Even under port-starboard or up-down mirror symmetry, hence a plain square.
-EVEN = frozenset(
-    "X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split()
-)
+EVEN = frozenset("X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split())
 
 # Places in the extended velocity [1, nu, |nu|] of model.extended_velocity.
 ONE = 0
@@ -106,7 +104,10 @@ def parse(name: str) -> Coefficient:
     if match["abs"]:
         second, c = VELOCITIES.index(match["abs"]), match["abs"]
         if first == second:
-            raise UserError(f"'{name}' is written {match['axis']}_{b}{b}")
+            square = f"{match['axis']}_{b}{b}"
+            if square in EVEN:
+                raise UserError(f"'{name}' is odd in {b}, but symmetry makes it {square} ({b}^2)")
+            raise UserError(f"'{name}' is written {square}")
         left, right, formula = ABSOLUTE + second, PLAIN + first, f"{b} |{c}|"
     elif match["second"]:
         second, c = VELOCITIES.index(match["second"]), match["second"]

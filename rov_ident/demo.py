@@ -122,11 +122,8 @@ def _page(
     stretch = samples["t"] < 60.0
     runs = {label: predicted(model, samples, math.inf) for label, model in models.items()}
     scores = {label: score(model, samples) for label, model in models.items()}
-    rows = [
-        [label, *(f"{value:.4f}" for value in scores[label].rmse)]
-        for label in models
-    ]
-    values = [
+    rows = [[label, *(f"{value:.4f}" for value in scores[label].rmse)] for label in models]
+    coefficients = [
         [name, f"{truth[name]:.5g}"]
         + [
             f"{history.values[-1, i]:.5g} ± {1.96 * history.std[-1, i]:.2g}"
@@ -146,7 +143,7 @@ def _page(
                 "Published values over the time of the bag with their 95 % intervals; dashed: the "
                 "coefficients the bag was simulated with.",
             ),
-            report.table(["", "truth", *histories, "unit"], values),
+            report.table(["", "truth", *histories, "unit"], coefficients),
             report.heading("What it means for a simulation"),
             report.figure(
                 plots.to_svg(

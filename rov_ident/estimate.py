@@ -1,11 +1,11 @@
 """What an estimator knows before and after: prior, estimate, and what physics allows of it."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.coefficients import ABSOLUTE, ONE
 from rov_ident.config import Config
 from rov_ident.excitation import WORKING_SPEED, authority
 from rov_ident.model import Array, Model
@@ -94,7 +94,9 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     values, p = estimate.values.copy(), estimate.covariance
     at_zero: list[int] = []
     while True:
-        wrong = np.where(prior.negative & (values > 0.0), values / np.maximum(estimate.std, 1e-300), 0)
+        wrong = np.where(
+            prior.negative & (values > 0.0), values / np.maximum(estimate.std, 1e-300), 0
+        )
         wrong[at_zero] = 0.0
         if not wrong.any():
             break
@@ -117,42 +119,29 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
 def is_passive(model: Model, prior: Prior, values: Array) -> bool:
     """Whether M is positive definite and the damping takes energy out in every direction.
 
-    Linear damping: its symmetric part is positive semidefinite. Quadratic damping: checked along
-    fixed directions of motion; products of two velocities (lift) may do work of either sign and
-    are left out.
+    Diagonal derivatives must not be positive. Couplings: the power of the linear and of the
+    quadratic damping is checked along fixed directions of motion; products of two velocities (lift)
+    may do work of either sign and are left out.
     """
     theta = model.theta.copy()
     theta[prior.estimated] = values
-    candidate = model.with_theta(theta)
-    if not np.isfinite(theta).all() or np.linalg.eigvalsh(candidate.mass_matrix)[0] <= 0.0:
+    if not np.isfinite(theta).all():
         return False
-    diagonal = [c.is_diagonal or c.is_added_mass for c in model.coefficients]
-    if all(diagonal):
-        return bool((theta <= 0.0).all())
-    return _takes_energy(candidate)
-
-
-_DIRECTIONS = np.random.default_rng(0).standard_normal((200, 6))
-
-
-def _takes_energy(model: Model) -> bool:
-    linear = model.damping_matrix(np.zeros(6))
-    if np.linalg.eigvalsh(linear + linear.T)[0] < -1e-9 * np.abs(linear).max():
+    if np.linalg.eigvalsh(model.with_theta(theta).mass_matrix)[0] <= 0.0:
         return False
-    dissipating = [
-        i
-        for i, c in enumerate(model.coefficients)
-        if not c.is_added_mass and (c.left == 0 or c.left >= 7)
-    ]
-    theta = np.zeros_like(model.theta)
-    theta[dissipating] = model.theta[dissipating]
-    damping = model.with_theta(theta)
-    for direction in _DIRECTIONS:
-        nu = direction * WORKING_SPEED
-        if nu @ (damping.damping_matrix(nu) - linear) @ nu < -1e-12:
+    linear, quadratic = np.zeros(len(_DIRECTIONS)), np.zeros(len(_DIRECTIONS))
+    coupled = False
+    for c, value in zip(model.coefficients, theta, strict=True):
+        if c.is_diagonal and value > 0.0:
             return False
-    return True
+        if c.is_added_mass or (c.left != ONE and c.left < ABSOLUTE):
+            continue
+        coupled = coupled or not c.is_diagonal
+        power = value * _DIRECTIONS[:, c.row] * _EXTENDED[:, c.left] * _EXTENDED[:, c.right]
+        (linear if c.left == ONE else quadratic)[:] += power
+    largest = max(np.abs(linear).max(), np.abs(quadratic).max())
+    return not coupled or bool(max(linear.max(), quadratic.max()) <= 1e-9 * largest)
 
 
-def named(names: tuple[str, ...], values: Array) -> Mapping[str, float]:
-    return dict(zip(names, values.tolist(), strict=True))
+_DIRECTIONS = np.random.default_rng(0).standard_normal((2000, 6)) * WORKING_SPEED
+_EXTENDED = np.hstack([np.ones((len(_DIRECTIONS), 1)), _DIRECTIONS, np.abs(_DIRECTIONS)])

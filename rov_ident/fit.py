@@ -97,9 +97,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     removed = 1.0 - (report.std / estimator.prior.std) ** 2
     model = config.model.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
     samples = sum(len(record.samples) for record in records)
-    squares = [
-        score(model, record.samples).rmse ** 2 * len(record.samples) for record in records
-    ]
+    squares = [score(model, record.samples).rmse ** 2 * len(record.samples) for record in records]
     return Fit(
         kind,
         report.names,

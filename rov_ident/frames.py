@@ -29,7 +29,7 @@ FLIP_BODY.setflags(write=False)
 FLIP_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLIP_WORLD.setflags(write=False)
 
-AnyMessage = TypeVar("AnyMessage", Odometry, Imu, Wrench)
+AnyMessage = TypeVar("AnyMessage", bound=Odometry | Imu | Wrench)
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,15 @@ def _cache_folder() -> Path:
     return Path(tempfile.gettempdir()) / f"rov_ident-{os.getuid()}-{digest.hexdigest()[:16]}"
 
 
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
 # One thread for BLAS: the matrices are 30 x 30, and a node shares its computer with a pilot's.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import numba  # noqa: E402  (reads NUMBA_CACHE_DIR when imported)
+import numba  # noqa: E402  (after the number of threads is set)
+
+# Not by NUMBA_CACHE_DIR, which a child process with other sources would inherit.
+if not os.environ.get("NUMBA_CACHE_DIR"):
+    numba.config.CACHE_DIR = str(_cache_folder())
 
 
 def kernel(function: F) -> F:

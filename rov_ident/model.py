@@ -46,7 +46,7 @@ class Structure(NamedTuple):
     right: Indices
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigidBody:
     """What the vehicle weighs and where, about the body origin, SI, forward-starboard-down.
 
@@ -79,7 +79,7 @@ class RigidBody:
         return np.vstack([(self.weight - self.buoyancy) * np.eye(3), skew(lever)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
     """A rigid body and its hydrodynamic coefficients: all that the equations of motion need.
 
@@ -107,12 +107,31 @@ class Model:
         )
 
     def with_theta(self, theta: Array) -> "Model":
-        return Model(self.body, self.coefficients, np.asarray(theta, dtype=float))
+        """The same structure with another parameter vector (m,).
+
+        Raises
+        ------
+        UserError
+            If it has another length.
+        """
+        if np.shape(theta) != self.theta.shape:
+            raise UserError(f"theta needs shape {self.theta.shape}, not {np.shape(theta)}")
+        return Model(self.body, self.coefficients, _vector(theta))
 
     def with_values(self, values: Mapping[str, float]) -> "Model":
-        """The same structure with some coefficients replaced by name."""
+        """The same structure with some coefficients replaced by name.
+
+        Raises
+        ------
+        UserError
+            If the model has no such coefficient.
+        """
         theta = self.theta.copy()
         for name, value in values.items():
+            if name not in self.names:
+                raise UserError(
+                    f"the model has no coefficient {name}, only {', '.join(self.names)}"
+                )
             theta[self.names.index(name)] = value
         return self.with_theta(theta)
 
@@ -125,7 +144,7 @@ class Model:
 
     def coriolis_force(self, nu: Array) -> Array:
         """C(nu) nu (6,)."""
-        return coriolis(self.mass_matrix @ nu, np.asarray(nu, dtype=float))
+        return coriolis(self.mass_matrix @ nu, _vector(nu))
 
     def damping_matrix(self, nu: Array) -> Array:
         """D(nu) (6, 6) with ``d(nu) = -D(nu) nu``: each term's second factor is its velocity."""
@@ -148,21 +167,21 @@ class Model:
 
     def wrench(self, nu: Array, nu_dot: Array, down: Array) -> Array:
         """The thruster wrench (6,) that this motion takes: the inverse dynamics."""
-        h = _force_of_one(self.structure, self.mass_matrix, self.theta, np.asarray(nu, dtype=float))
+        h = _force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
         return self.mass_matrix @ nu_dot + h + self.restoring_force(down)
 
     def acceleration(self, nu: Array, tau: Array, down: Array) -> Array:
         """nu_dot (6,) under the thruster wrench tau: the forward dynamics."""
-        h = _force_of_one(self.structure, self.mass_matrix, self.theta, np.asarray(nu, dtype=float))
+        h = _force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
         return np.linalg.solve(self.mass_matrix, tau - h - self.restoring_force(down))
 
     def regressor(self, nu: Array, nu_dot: Array) -> Array:
         """Y (6, n): ``wrench = M_RB nu_dot + C_RB nu + g + Y theta``."""
         structure, n = self.structure, len(self.theta)
         momentum, force = np.zeros((6, n)), np.zeros((6, n))
-        columns(structure, np.asarray(nu_dot, dtype=float), momentum, force)
+        columns(structure, _vector(nu_dot), momentum, force)
         of_acceleration = momentum.copy()
-        columns(structure, np.asarray(nu, dtype=float), momentum, force)
+        columns(structure, _vector(nu), momentum, force)
         return of_acceleration + force
 
 
@@ -180,9 +199,13 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
     by_place: dict[tuple[int, ...], Coefficient] = {}
     for name, value in values.items():
         coefficient = parse(name)
+        if not np.isfinite(value):
+            raise UserError(f"coefficients.{name} is {value}, but must be a finite number")
         known = by_place.setdefault(coefficient.place, coefficient)
         if known is not coefficient and not (known.is_added_mass and values[known.name] == value):
-            raise UserError(f"coefficients.{name} and coefficients.{known.name} are the same term: keep one")
+            raise UserError(
+                f"coefficients.{name} and coefficients.{known.name} are the same term: keep one"
+            )
         if coefficient.is_diagonal and value > 0:
             raise UserError(
                 f"coefficients.{name} is {value}, but it must not be positive: damping and added mass "
@@ -199,6 +222,11 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
     return model
 
 
+def _vector(a: Sequence[float] | Array) -> Array:
+    """As the kernels take it: float64, contiguous."""
+    return np.ascontiguousarray(a, dtype=np.float64)
+
+
 def skew(a: Sequence[float] | Array) -> Array:
     """S(a) (3, 3) with ``S(a) b = a x b``."""
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
@@ -211,7 +239,7 @@ def skew(a: Sequence[float] | Array) -> Array:
 
 
 @inlined
-def extend(lanes, nu, extended):  # type: ignore[no-untyped-def]
+def extend(lanes, nu, extended):
     """[1, nu, |nu|] (13, lanes) from nu (6, lanes)."""
     for k in range(lanes):
         extended[0, k] = 1.0
@@ -222,7 +250,7 @@ def extend(lanes, nu, extended):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def add_coriolis(lanes, p, nu, h):  # type: ignore[no-untyped-def]
+def add_coriolis(lanes, p, nu, h):
     """h += C(nu) nu, from the momentum p = M nu; all (6, lanes)."""
     for k in range(lanes):
         h[0, k] += nu[4, k] * p[2, k] - nu[5, k] * p[1, k]
@@ -234,7 +262,7 @@ def add_coriolis(lanes, p, nu, h):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def generalized_force(lanes, structure, mass, theta, nu, h, p, extended):  # type: ignore[no-untyped-def]
+def generalized_force(lanes, structure, mass, theta, nu, h, p, extended):
     """h = C(nu) nu - d(nu) (6, lanes).
 
     mass (6, 6, lanes), theta (n, lanes), nu (6, lanes); p (6, lanes) and extended (13, lanes) are
@@ -257,7 +285,7 @@ def generalized_force(lanes, structure, mass, theta, nu, h, p, extended):  # typ
 
 
 @kernel
-def add_added_mass(structure, theta, mass):  # type: ignore[no-untyped-def]
+def add_added_mass(structure, theta, mass):
     """mass (6, 6, lanes) += M_A: each coefficient enters its entry and the mirrored one."""
     lanes = mass.shape[2]
     for c in range(len(structure.mass_row)):
@@ -269,7 +297,7 @@ def add_added_mass(structure, theta, mass):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def columns(structure, nu, momentum, force):  # type: ignore[no-untyped-def]
+def columns(structure, nu, momentum, force):
     """The regressor's two parts: per unit of each coefficient, momentum and force (6, n).
 
     ``wrench = d/dt(momentum @ theta) + force @ theta + known``: the derivative is left to the
@@ -296,7 +324,7 @@ def columns(structure, nu, momentum, force):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def coriolis(p, nu):  # type: ignore[no-untyped-def]
+def coriolis(p, nu):
     """C(nu) nu (6,) from the momentum p = M nu (6,)."""
     h = np.zeros((6, 1))
     add_coriolis(1, p.reshape(6, 1), nu.reshape(6, 1), h)
@@ -304,16 +332,18 @@ def coriolis(p, nu):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _force_of_one(structure, mass, theta, nu):  # type: ignore[no-untyped-def]
+def _force_of_one(structure, mass, theta, nu):
     """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,) -> (6,)."""
     h, p = np.empty((6, 1)), np.empty((6, 1))
     extended = np.empty((EXTENDED_SIZE, 1))
     one_mass = np.ascontiguousarray(mass).reshape(6, 6, 1)
-    generalized_force(1, structure, one_mass, theta.reshape(-1, 1), nu.reshape(6, 1), h, p, extended)
+    generalized_force(
+        1, structure, one_mass, theta.reshape(-1, 1), nu.reshape(6, 1), h, p, extended
+    )
     return h[:, 0]
 
 
 def _extended(nu: Array) -> Array:
     extended = np.empty((EXTENDED_SIZE, 1))
-    extend(1, np.asarray(nu, dtype=float).reshape(6, 1), extended)
+    extend(1, _vector(nu).reshape(6, 1), extended)
     return extended[:, 0]

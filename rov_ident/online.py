@@ -21,7 +21,9 @@ ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
 
 EXCITATION_TIME = 30.0  # s; of motion over which the present excitation is judged
 _EXCITED = 0.05  # share of the prior variance that this motion alone would remove
-_CONVERGED = 0.1  # standard deviation relative to the value, or to the prior's, from which it counts
+_CONVERGED = (
+    0.1  # standard deviation relative to the value, or to the prior's, from which it counts
+)
 _QUANTILE = 1.959963984540054  # of the normal distribution, 97.5 %
 
 
@@ -69,7 +71,8 @@ class OnlineEstimator:
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
-        self.enabled = True
+        self._enabled = True
+        self._paused = False
         self.reset()
 
     def reset(self) -> None:
@@ -80,6 +83,22 @@ class OnlineEstimator:
         self._variance = self._estimate().std ** 2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
+
+    def configure(self, config: Config) -> None:
+        """Take other settings of the same model and coefficients; what is learnt stays."""
+        self.config = config
+        self._task = self._module.problem(config)
+        self.sampler.configure(config)
+
+    @property
+    def enabled(self) -> bool:
+        """Whether samples are used; the inputs are followed all the same."""
+        return self._enabled
+
+    @enabled.setter
+    def enabled(self, value: bool) -> None:
+        self._paused = self._paused or not value
+        self._enabled = value
 
     @property
     def counts(self) -> Counter[str]:
@@ -100,12 +119,17 @@ class OnlineEstimator:
 
     def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
         """Fold samples (k,) into the estimate unless disabled; INFO (k,)."""
-        if len(samples) == 0 or not self.enabled:
+        if len(samples) == 0 or not self._enabled:
             return np.zeros(0, dtype=self._module.INFO)
+        if self._paused:
+            samples = samples.copy()
+            samples["restart"][0] = True
+            self._paused = False
         self._state, info = self._module.fold(self._task, self._state, samples)
         self._last_t = float(samples["t"][-1])
-        for reason, count in zip(*np.unique(info["reason"], return_counts=True), strict=True):
-            self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += int(count)
+        for reason in self._module.REFUSALS:
+            if count := int(np.count_nonzero(info["reason"] == reason)):
+                self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
         self._watch(float(samples["dt"].sum()))
         return info
 

@@ -3,11 +3,9 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from rov_ident.bags import ROLE_TYPES, BagWriter
+from rov_ident.bags import ROLE_NAMES, ROLE_TYPES, BagWriter
 from rov_ident.cdr import encode
 from rov_ident.messages import Message
-
-TOPICS = {"odom": "/odom", "imu": "/imu/data", "wrench": "/thruster_wrench"}
 
 
 def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]]) -> None:
@@ -20,4 +18,4 @@ def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]
     """
     with BagWriter(path) as writer:
         for arrival, role, message in messages:
-            writer.write(TOPICS[role], ROLE_TYPES[role], arrival, encode(message))
+            writer.write(f"/{ROLE_NAMES[role]}", ROLE_TYPES[role], arrival, encode(message))

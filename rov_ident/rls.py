@@ -48,6 +48,8 @@ REASONS = (
     "not finite",
 )
 
+REFUSALS = (GATED, NOT_FINITE)
+
 INFO = np.dtype(
     [
         ("t", "f8"),
@@ -176,11 +178,13 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     inverse = np.linalg.solve(r, np.eye(n))
     information = inverse @ inverse.T
     covariance = information @ state.score @ information
-    scale = np.outer(task.scale, task.scale)
+    # From a short record the sandwich is itself uncertain, and mostly too thin: never thinner than
+    # the inverse information, whose rows count once for the filter's memory.
+    widen = np.sqrt(np.maximum(np.diag(information) / np.diag(covariance), 1.0)) * task.scale
     return Estimate(
         prior.names,
         task.theta[task.estimated] + task.scale * deviation,
-        covariance * scale,
+        covariance * np.outer(widen, widen),
         float(state.scalars["t"][0]),
     )
 
@@ -194,7 +198,7 @@ def variance(task: Problem, state: State) -> Array:
 
 
 @kernel
-def inverse_diagonal(root):  # type: ignore[no-untyped-def]
+def inverse_diagonal(root):
     """Diagonal (n,) of (R'R)^-1: squared rows of R^-1, column by column."""
     n = root.shape[0]
     out, x = np.zeros(n), np.empty(n)
@@ -209,7 +213,7 @@ def inverse_diagonal(root):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fold(task, state, samples, info):  # type: ignore[no-untyped-def]
+def _fold(task, state, samples, info):
     n = len(task.scale)
     m = len(task.theta)
     momentum, force = np.empty((6, m)), np.empty((6, m))
@@ -220,7 +224,7 @@ def _fold(task, state, samples, info):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _step(task, state, sample, info, momentum, force, now, rows):  # type: ignore[no-untyped-def]
+def _step(task, state, sample, info, momentum, force, now, rows):
     root, score, lagged, filters, scalars = state
     s, c = task.settings[0], scalars[0]
     n = len(task.scale)
@@ -310,17 +314,14 @@ def _step(task, state, sample, info, momentum, force, now, rows):  # type: ignor
 
 
 @kernel
-def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignore[no-untyped-def]
+def _update(s, c, root, score, lagged, y, deviation, rows, info):
     """Take the filtered rows y (6, n + 1) into the estimate."""
     n = root.shape[0]
     # Rows closer than the filter's memory repeat each other: they count as one.
     repeats = max(1.0, 2.0 / (s.corner * c.since_update))
     surprise, driven, gated = 0.0, 0, False
-    whitened = np.empty(n)
+    whitened, noise = np.empty(n), np.empty(6)
     for i in range(6):
-        if c.drive[i] <= c.variance[i]:
-            continue
-        driven += 1
         spread = 0.0
         for j in range(n):  # R^-T phi
             total = y[i, j]
@@ -328,7 +329,13 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
                 total -= root[b, j] * whitened[b]
             whitened[j] = total / root[j, j]
             spread += whitened[j] ** 2
-        info.ratio[i] = info.residual[i] ** 2 / (c.variance[i] + spread)
+        predicted = c.variance[i] + spread
+        # what of the squared residual is noise, and not a coefficient still to be learnt
+        noise[i] = info.residual[i] ** 2 * c.variance[i] / predicted
+        if c.drive[i] <= c.variance[i]:
+            continue
+        driven += 1
+        info.ratio[i] = info.residual[i] ** 2 / predicted
         surprise += info.ratio[i]
         gated = gated or info.ratio[i] > s.gate**2
     if gated and c.refused < _PATIENCE:
@@ -367,10 +374,7 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
             e -= gradient[i, j] * deviation[j]
         for j in range(n):
             g[j] += gradient[i, j] * e
-        if c.drive[i] > c.variance[i]:
-            e2 = e * e * c.variance[i] * repeats
-        else:
-            e2 = info.residual[i] ** 2
+        e2 = e * e * c.variance[i] * repeats if c.drive[i] > c.variance[i] else noise[i]
         c.variance[i] = max(c.variance[i] + blend * (e2 - c.variance[i]), s.floor[i] ** 2)
     for a in range(n):
         lagged[a] *= decay
@@ -382,7 +386,7 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):  # type: ignor
 
 
 @kernel
-def solution(root):  # type: ignore[no-untyped-def]
+def solution(root):
     """x (n,) of R x = z by back substitution, root (n, n + 1) = [R | z]."""
     n = root.shape[0]
     x = np.empty(n)
@@ -395,7 +399,7 @@ def solution(root):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _stack(root, rows):  # type: ignore[no-untyped-def]
+def _stack(root, rows):
     """Householder: make [root; rows] upper triangular again; rows (q, n + 1) are used up."""
     n, q = root.shape[0], rows.shape[0]
     for j in range(n):
@@ -420,7 +424,7 @@ def _stack(root, rows):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _forget(root, score, deviation, rows, factor):  # type: ignore[no-untyped-def]
+def _forget(root, score, deviation, rows, factor):
     """Multiply the information by ``factor`` in the subspace that the rows excite, and only there.
 
     With A = R'R, u = R phi' and Q an orthonormal basis of the u of all excited rows::

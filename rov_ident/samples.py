@@ -107,6 +107,16 @@ class Sampler:
 
     def __init__(self, config: Config) -> None:
         self._defaults: FrameDefaults = config.frames
+        self.configure(config)
+        self.counts: Counter[str] = Counter()
+        self.origin: int | None = None
+        self._frame_ids: dict[str, tuple[str, ...]] = {}
+        self._last_stamp: dict[str, int] = {}
+        self._suspect: int | None = None
+        self._clear()
+
+    def configure(self, config: Config) -> None:
+        """Take other settings; the buffered messages and the motion stay."""
         self._grace = config.grace
         self._hold = config.timeout
         self._effects = [
@@ -115,12 +125,6 @@ class Sampler:
             if EFFECTS[name].place == "input"
         ]
         self._settings = _settings(config)
-        self.counts: Counter[str] = Counter()
-        self.origin: int | None = None
-        self._frame_ids: dict[str, tuple[str, ...]] = {}
-        self._last_stamp: dict[str, int] = {}
-        self._suspect: int | None = None
-        self._clear()
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
@@ -199,15 +203,15 @@ class Sampler:
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)
             squared = float(message.orientation @ message.orientation)
-            values = (message.linear, message.angular, message.position)
+            values = [message.linear, message.angular, message.position]
             if not 0.5 < squared < 2.0:  # NaN too
                 return "orientation is not a unit quaternion"
         elif isinstance(message, Imu):
             frames = (message.frame_id,)
-            values = (message.angular_velocity, message.linear_acceleration)
+            values = [message.angular_velocity, message.linear_acceleration]
         else:
             frames = (message.frame_id,)
-            values = (message.force, message.torque)
+            values = [message.force, message.torque]
         for value in values:
             # one comparison refuses NaN, infinities and values no vehicle reaches
             if not float(value @ value) < 1e12:
@@ -371,7 +375,7 @@ _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU'
 
 
 @kernel
-def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, gyro, specific):  # type: ignore[no-untyped-def]
+def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, gyro, specific):
     """One instant of the kinematic filter; fills the sample; whether the odometry was taken.
 
     Velocity and accelerometer bias share one 2 x 2 covariance for the three axes, as their noise is

@@ -158,9 +158,8 @@ def measure(
             )
         )
     for at, wrench in zip(demand_t, demand, strict=True):
-        measured = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
-        message = Wrench(0, "base_link_frd", measured[:3], measured[3:])
-        messages.append(_stamped(at, WRENCH, message))
+        noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
+        messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
 
     keep = rng.random(len(messages)) >= suite.drop
     late = suite.delay + suite.jitter * np.abs(rng.standard_normal(len(messages)))

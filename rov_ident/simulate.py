@@ -11,7 +11,7 @@ from rov_ident.errors import UserError
 from rov_ident.jit import kernel
 from rov_ident.model import Array, Model, generalized_force
 
-MAX_STEP = 0.02  # s; within 2e-6 m/s of an adaptive integration for a BlueROV2 driven hard
+MAX_STEP = 0.02  # s; within 1e-5 m/s of an adaptive integration for a BlueROV2 driven hard
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,12 @@ def simulate(
     Raises
     ------
     UserError
-        If the motion does not stay finite: no vehicle moves as this model says.
+        If shapes do not fit, or if the motion does not stay finite: no vehicle moves as this model
+        says.
     """
     n = len(t)
+    if n == 0 or np.shape(wrench) != (n, 6):
+        raise UserError(f"{n} instants need a wrench ({n}, 6), not {np.shape(wrench)}")
     out = np.empty((n, 19))
     if guide is None:
         guide = Guide(np.ones(6, dtype=bool), np.zeros((n, 6)), np.zeros((n, 4)))
@@ -140,7 +143,7 @@ def open_loop(
 
 
 @kernel
-def _derivative(  # type: ignore[no-untyped-def]
+def _derivative(
     structure, mass, inverse, theta, restoring, wrench, slope, late, free, pace, state, rate, work
 ):
     """rate (13,) of state (13,) = position, quaternion, nu; work (31, 1) is scratch.
@@ -177,7 +180,7 @@ def _derivative(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _simulate(  # type: ignore[no-untyped-def]
+def _simulate(
     structure, mass, inverse, theta, restoring, t, wrench, wrench_slope, free, guide, attitude,
     start, max_step, out,
 ):  # fmt: skip
@@ -187,12 +190,16 @@ def _simulate(  # type: ignore[no-untyped-def]
     """
     state, stage, slope = start.copy(), np.empty(13), np.empty((4, 13))
     work, pace = np.empty((31, 1)), np.zeros(6)
+    span = 0.0
     for i in range(len(t)):
-        span = t[i + 1] - t[i] if i + 1 < len(t) else 1.0
+        last = i + 1 == len(t)
+        if not last:
+            span = t[i + 1] - t[i]
         for j in range(6):
             if not free[j]:
                 state[7 + j] = guide[i, j]
-                pace[j] = (guide[min(i + 1, len(t) - 1), j] - guide[i, j]) / span
+                if not last:  # at the last instant the pace of the last interval goes on
+                    pace[j] = (guide[i + 1, j] - guide[i, j]) / span
                 if j >= 3:
                     state[3:7] = attitude[i]
         steps = max(1, int(np.ceil(span / max_step - 1e-9)))
@@ -212,10 +219,12 @@ def _simulate(  # type: ignore[no-untyped-def]
                         out[i, j] = state[j]
                     for j in range(6):
                         out[i, 13 + j] = slope[0, 7 + j]
-                    if i + 1 == len(t):
+                    if last:
                         return
             for j in range(13):
-                state[j] += dt / 6.0 * (slope[0, j] + 2.0 * (slope[1, j] + slope[2, j]) + slope[3, j])
+                state[j] += (
+                    dt / 6.0 * (slope[0, j] + 2.0 * (slope[1, j] + slope[2, j]) + slope[3, j])
+                )
             length = np.sqrt(state[3] ** 2 + state[4] ** 2 + state[5] ** 2 + state[6] ** 2)
             for j in range(3, 7):
                 state[j] /= length

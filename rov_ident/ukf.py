@@ -50,6 +50,8 @@ REASONS = (
     "covariance repaired",
 )
 
+REFUSALS = (GATED, NOT_FINITE, REPAIRED)
+
 LANES = 16
 _MAX_STEP = 0.05  # s; of one Runge-Kutta step
 _LOWEST = -2.0  # of xi where theta stays negative: below, it has too little slope to come back
@@ -116,7 +118,9 @@ def problem(config: Config) -> Problem:
     # A coefficient configured as zero starts within reach of its scale: at exactly zero the
     # parametrisation has no slope.
     size = np.where(prior.negative, np.maximum(-prior.mean, scale), prior.mean)
-    start = np.where(prior.negative, size / scale - scale / np.where(size == 0, 1, size), size / scale)
+    start = np.where(
+        prior.negative, size / scale - scale / np.where(size == 0, 1, size), size / scale
+    )
     slope = np.where(prior.negative, 0.5 * (1.0 + start / np.sqrt(start**2 + 4.0)), 1.0)
     deviation = prior.std / (slope * scale)
     walk = (u.random_walk * np.abs(size) / (slope * scale)) ** 2 / 3600.0
@@ -137,7 +141,6 @@ def problem(config: Config) -> Problem:
 
 def init(task: Problem) -> State:
     """Nothing learnt: the prior; the velocity is taken from the first measurement."""
-    n = len(task.scale)
     p = np.diag(np.concatenate([np.full(6, 1.0), task.prior_variance]))
     return State(
         np.concatenate([np.zeros(6), task.start]),
@@ -197,7 +200,7 @@ def _slope(task: Problem, xi: Array) -> Array:
 
 
 @kernel
-def _coefficients(lanes, scale, negative, xi, theta):  # type: ignore[no-untyped-def]
+def _coefficients(lanes, scale, negative, xi, theta):
     """theta (n, lanes) from xi (n, lanes)."""
     for j in range(len(scale)):
         if negative[j]:
@@ -209,7 +212,7 @@ def _coefficients(lanes, scale, negative, xi, theta):  # type: ignore[no-untyped
 
 
 @inlined
-def _invert(lanes, mass, inverse, work):  # type: ignore[no-untyped-def]
+def _invert(lanes, mass, inverse, work):
     """Inverse of symmetric positive definite matrices (6, 6, lanes) by Gauss-Jordan, no pivoting."""
     for i in range(6):
         for j in range(6):
@@ -234,7 +237,7 @@ def _invert(lanes, mass, inverse, work):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _rates(structure, mass, inverse, theta, force, slope, late, nu, out, h, p, extended):  # type: ignore[no-untyped-def]
+def _rates(structure, mass, inverse, theta, force, slope, late, nu, out, h, p, extended):
     """nu_dot (6, LANES) of sixteen states side by side, ``late`` seconds after mid-interval.
 
     force (6,) is wrench minus restoring in the mean over the interval, slope (6,) its trend.
@@ -252,7 +255,7 @@ def _rates(structure, mass, inverse, theta, force, slope, late, nu, out, h, p, e
 
 
 @kernel
-def _propagate(structure, mass, inverse, theta, force, slope, late, dt, nu, work):  # type: ignore[no-untyped-def]
+def _propagate(structure, mass, inverse, theta, force, slope, late, dt, nu, work):
     """One classical Runge-Kutta step of nu (6, LANES), in place; work (43, LANES) is scratch."""
     h, p, extended = work[0:6], work[6:12], work[12 : 12 + EXTENDED_SIZE]
     stage, rate, total = work[25:31], work[31:37], work[37:43]
@@ -276,7 +279,7 @@ def _propagate(structure, mass, inverse, theta, force, slope, late, dt, nu, work
 
 
 @kernel
-def _cholesky(p, root):  # type: ignore[no-untyped-def]
+def _cholesky(p, root):
     """Lower root (n, n) of p; False where p is not positive definite."""
     n = p.shape[0]
     for j in range(n):
@@ -298,7 +301,7 @@ def _cholesky(p, root):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fold(task, state, samples, info):  # type: ignore[no-untyped-def]
+def _fold(task, state, samples, info):
     size = len(state.x)
     root = np.zeros((size, size))
     moved = np.empty((6, 2 * size))  # propagated velocities minus the centre's, + points then -
@@ -336,7 +339,7 @@ def _fold(task, state, samples, info):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _restart(state, sample):  # type: ignore[no-untyped-def]
+def _restart(state, sample):
     """The velocity is lost, the coefficients are not: begin from the measurement."""
     for i in range(6):
         for j in range(len(state.x)):
@@ -348,7 +351,7 @@ def _restart(state, sample):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _predict(  # type: ignore[no-untyped-def]
+def _predict(
     task, state, sample, out, root, moved, xi, part, theta, mass, inverse, scratch, nu, work
 ):
     s = task.settings[0]
@@ -392,9 +395,7 @@ def _predict(  # type: ignore[no-untyped-def]
         _invert(LANES, mass, inverse, scratch)
         for n_step in range(steps):
             late = n_step * dt - 0.5 * sample.dt
-            _propagate(
-                task.structure, mass, inverse, theta, force, slope, late, dt, nu, work
-            )
+            _propagate(task.structure, mass, inverse, theta, force, slope, late, dt, nu, work)
         for k in range(LANES):
             point = first + k
             if point == 0:
@@ -441,7 +442,7 @@ def _predict(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _model_of(task, xi, part, theta, mass):  # type: ignore[no-untyped-def]
+def _model_of(task, xi, part, theta, mass):
     """theta (m, LANES) and mass (6, 6, LANES) of the sigma points' xi (n, LANES)."""
     _coefficients(LANES, task.scale, task.negative, xi, part)
     for j in range(len(task.theta)):
@@ -458,7 +459,7 @@ def _model_of(task, xi, part, theta, mass):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _update(task, state, sample, out):  # type: ignore[no-untyped-def]
+def _update(task, state, sample, out):
     """Linear and angular velocity, each behind its own gate, one component after another."""
     s = task.settings[0]
     x, p, size = state.x, state.p, len(state.x)
@@ -501,7 +502,7 @@ def _update(task, state, sample, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _residual(task, state, sample, out, theta, mass, work, xi, part):  # type: ignore[no-untyped-def]
+def _residual(task, state, sample, out, theta, mass, work, xi, part):
     """Wrench, measured minus model at the present mean, low-passed twice like the RLS regression."""
     x, y, u, last = state.residual[0], state.residual[1], state.residual[2], state.residual[3]
     w, dt = task.settings[0].corner, sample.dt

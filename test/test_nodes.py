@@ -254,9 +254,10 @@ def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
     monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     process = start_node("rls", heavy_path)
-    time.sleep(3.0)
+    while "compiling" not in (line := process.stderr.readline()):
+        assert line, "the node ended by itself"
     began = time.monotonic()
     status, said = end_node(process)
     assert status == 0, said
     assert time.monotonic() - began < 5.0
-    assert "active" not in said and "Traceback" not in said
+    assert "] active" not in said and "Traceback" not in said

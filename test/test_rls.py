@@ -67,7 +67,7 @@ def test_fold_is_step_after_step(heavy, noisy, forgetting):
         infos.append(one)
     stepped = np.concatenate(infos)
     for a, b in zip(folded, state, strict=True):
-        assert a.tobytes() == b.tobytes()
+        assert all(x.tobytes() == y.tobytes() for x, y in zip(*map(textbook.arrays, ([a], [b]))))
     for name in rls.INFO.names:
         assert np.array_equal(info[name], stepped[name], equal_nan=name not in ("reason",))
     halves, _ = rls.fold(task, rls.init(task), rows[:333])
@@ -76,12 +76,12 @@ def test_fold_is_step_after_step(heavy, noisy, forgetting):
 
 
 def test_samples_and_problem_are_not_modified(heavy, noisy):
-    task = rls.problem(heavy)
-    textbook.read_only(task)
-    rows = noisy[:200].copy()
-    rows.setflags(write=False)
-    state, info = rls.fold(task, textbook.read_only(rls.init(task)), rows)
+    task, rows = rls.problem(heavy), noisy[:200].copy()
+    before = textbook.arrays((*task, rows))
+    _, info = rls.fold(task, textbook.read_only(rls.init(task)), rows)
     assert len(info) == 200
+    after = textbook.arrays((*task, rows))
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(before, after, strict=True))
 
 
 def test_nothing_learnt_is_the_prior(heavy):
@@ -138,7 +138,7 @@ def test_equals_batch_least_squares_on_independently_filtered_rows(heavy, exact,
         weight = np.linalg.lstsq(outer / norm, gained.ravel(), rcond=1e-13)[0] / norm
         misfit = np.abs(outer @ weight - gained.ravel()).max()
         assert misfit < 1e-8 * np.abs(before + gained).max(), f"sample {k}"
-        assert (weight > -1e-9 * np.abs(weight).max()).all()
+        assert (weight >= -1e-9 * np.abs(weight).max()).all()
         used.append(k)
         weights.append(np.maximum(weight, 0.0))
     assert len(used) > 100
@@ -167,7 +167,15 @@ def test_truth_without_noise(heavy, exact):
 def test_truth_without_noise_of_a_coupled_model(heavy):
     parameters = configuration.to_parameters(heavy)
     parameters["coefficients"].update(
-        {"Y_v": -5.0, "N_r": -0.8, "K_p": -0.3, "Y_rdot": 0.4, "Y_r": 0.6, "N_v": 0.3, "X_vv": -20.0}
+        {
+            "Y_v": -5.0,
+            "N_r": -0.8,
+            "K_p": -0.3,
+            "Y_rdot": 0.4,
+            "Y_r": 0.6,
+            "N_v": 0.3,
+            "X_vv": -20.0,
+        }
     )
     truth = configuration.from_parameters(parameters)
     rows = textbook.rows_of(*driven(truth, 90.0, 4))
@@ -295,6 +303,17 @@ def learnt(heavy, noisy):
     return config, rls.problem(config), state, estimate
 
 
+def test_rest_teaches_nothing_by_default(heavy, noisy):
+    """Twenty minutes on the bottom with noisy sensors, default settings: nothing is unlearnt."""
+    known, state, _ = result(heavy, noisy)
+    rng = np.random.default_rng(3)
+    rows = textbook.held_at_rest(heavy.model, textbook.resting(60_000, DT, rng))
+    then, _, _ = result(heavy, rows, state)
+    prior = prior_of(heavy)
+    assert (np.abs(then.values - known.values) < 0.05 * prior.std + 2.0 * known.std).all()
+    assert (then.std > 0.3 * known.std).all(), "noise has no information"
+
+
 @pytest.mark.parametrize("motion", ["rest", "one axis"])
 def test_no_windup(heavy, learnt, motion):
     """1e5 samples without information (or on one axis): what is not excited stays as it is."""
@@ -335,7 +354,9 @@ def test_no_windup(heavy, learnt, motion):
 def test_follows_a_change(heavy):
     """+30 % in one drag coefficient after a minute: an instrument frame swung out."""
     for name in ("X_uu", "N_rr"):
-        changed = heavy.model.with_values({name: 1.3 * heavy.model.theta[heavy.model.names.index(name)]})
+        changed = heavy.model.with_values(
+            {name: 1.3 * heavy.model.theta[heavy.model.names.index(name)]}
+        )
         before, wrench = driven(heavy, 60.0, 21)
         first = textbook.rows_of(before, wrench, np.random.default_rng(1), wrench_std=0.01)
         start = (before.nu[-1], before.orientation[-1])
@@ -374,7 +395,9 @@ def test_errors_are_small_after_ninety_seconds(heavy, dives):
     for config, samples in dives:
         errors.append(np.abs(result(config, samples)[0].values / heavy.model.theta - 1.0))
     median = np.median(errors, axis=0)
-    strong = [heavy.model.names.index(n) for n in ("X_udot", "Y_vdot", "Z_wdot", "X_uu", "Y_vv", "Z_ww")]
+    strong = [
+        heavy.model.names.index(n) for n in ("X_udot", "Y_vdot", "Z_wdot", "X_uu", "Y_vv", "Z_ww")
+    ]
     assert (median[strong] < 0.03).all(), median.round(3)
     assert (median < 0.15).all(), median.round(3)
 

@@ -67,19 +67,22 @@ def moments(t, demand, begin, end):
     ],
 )  # fmt: skip
 def test_samples_are_the_truth(heavy, odometry_rate, imu_rate, wrench_rate):
-    dive = clean(
-        heavy, odometry_rate=odometry_rate, imu_rate=imu_rate, wrench_rate=wrench_rate
-    )
+    dive = clean(heavy, odometry_rate=odometry_rate, imu_rate=imu_rate, wrench_rate=wrench_rate)
     samples, sampler = taken(heavy, without_arrival(dive))
     expected = (imu_rate or odometry_rate) * 6.0
-    assert expected - 1.3 * (imu_rate or odometry_rate) * max(1 / 5, 1 / odometry_rate) <= len(
-        samples
-    ) <= expected + odometry_rate * 6.0 + 1
-    assert not describe(
-        {k: v for k, v in sampler.counts.items() if k != "sample: no odometry yet"}
-        if imu_rate
-        else sampler.counts
-    ) or imu_rate < odometry_rate
+    assert (
+        expected - 1.3 * (imu_rate or odometry_rate) * max(1 / 5, 1 / odometry_rate)
+        <= len(samples)
+        <= expected + odometry_rate * 6.0 + 1
+    )
+    assert (
+        not describe(
+            {k: v for k, v in sampler.counts.items() if k != "sample: no odometry yet"}
+            if imu_rate
+            else sampler.counts
+        )
+        or imu_rate < odometry_rate
+    )
     assert samples["restart"].sum() == 1 and samples["restart"][0]
     at = instants(dive, sampler, samples)
 
@@ -151,9 +154,7 @@ def test_no_lag(heavy):
 
 def test_lever_arms_and_mounting(heavy):
     mounted = with_section(heavy, "odometry", position=(0.3, -0.2, 0.1))
-    mounted = with_section(
-        mounted, "imu", position=(-0.15, 0.1, 0.2), rotation=(0.4, -0.3, 2.0)
-    )
+    mounted = with_section(mounted, "imu", position=(-0.15, 0.1, 0.2), rotation=(0.4, -0.3, 2.0))
     dive = clean(mounted)
     samples, sampler = taken(mounted, without_arrival(dive))
     error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
@@ -282,7 +283,9 @@ def test_order_of_arrival_does_not_matter(heavy, rates):
     dive = clean(
         heavy, 4.0, odometry_rate=odometry_rate, imu_rate=imu_rate, wrench_rate=wrench_rate
     )
-    reference, _ = taken(heavy, [m[1:] for m in sorted((m.stamp, r, m) for _, r, m in dive.messages)])
+    reference, _ = taken(
+        heavy, [m[1:] for m in sorted((m.stamp, r, m) for _, r, m in dive.messages)]
+    )
     first = min(m.stamp for _, _, m in dive.messages)
     for seed in range(6):
         order = interleaved(dive, 0.9 * heavy.grace, np.random.default_rng(seed))
@@ -471,7 +474,9 @@ def test_a_useless_variance_is_as_good_as_none(heavy, bad):
 
 
 @pytest.mark.parametrize("role, make", [(ODOMETRY, odometry), (IMU, imu), (WRENCH, wrench)])
-@pytest.mark.parametrize("back, reason", [(0.0, "duplicate"), (0.02, "backward"), (0.9, "backward")])
+@pytest.mark.parametrize(
+    "back, reason", [(0.0, "duplicate"), (0.02, "backward"), (0.9, "backward")]
+)
 def test_duplicate_and_backward_stamps(heavy, role, make, back, reason):
     before, after = list(steady(1.0, 2.0)), list(steady(2.0, 3.0))
     reference, _ = taken(heavy, before + after)

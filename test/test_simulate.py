@@ -1,5 +1,6 @@
 """The simulator against another integrator of other equations, and against closed solutions."""
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from rov_ident import config, simulate
 from rov_ident.errors import UserError
 from rov_ident.excitation import MANOEUVRES, authority, manoeuvre
 from rov_ident.model import Model, RigidBody, build
-from rov_ident.simulate import open_loop
+from rov_ident.simulate import Guide, open_loop
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def matrix_of(q: Array) -> Array:
     return np.eye(3) + 2.0 * q[0] * S(q[1:]) + 2.0 * S(q[1:]) @ S(q[1:])
 
 
-def textbook_rate(model: Model) -> Callable[[float, Array, Array], Array]:
+def textbook_rate(model: Model) -> Callable[[float, Array, Array, Array], Array]:
     """d/dt of (position, roll, pitch, yaw, nu) (12,), in Euler angles and written out by name."""
     body, k = model.body, dict(zip(model.names, model.theta))
     r_g, r_b = body.cog, body.cob
@@ -91,7 +92,8 @@ def textbook_rate(model: Model) -> Callable[[float, Array, Array], Array]:
     def get(name: str) -> float:
         return k.get(name, 0.0)
 
-    def rate(t: float, state: Array, tau: Array) -> Array:
+    def rate(t: float, state: Array, constant: Array, slope: Array) -> Array:
+        tau = constant + t * slope
         angles, v, w = state[3:6], state[6:9], state[9:12]
         (phi, theta, _), (p, q, r) = angles, w
         turn = np.array(
@@ -120,13 +122,22 @@ def textbook_rate(model: Model) -> Callable[[float, Array, Array], Array]:
     return rate
 
 
-def reference(model: Model, t: Array, wrench: Array, start: Array) -> Array:
+def reference(
+    model: Model, t: Array, wrench: Array, start: Array, slope: Array | None = None
+) -> Array:
     """(N, 12) by an adaptive integrator of order 8, begun anew wherever the wrench may jump."""
     states = [start]
     rate = textbook_rate(model)
-    for now, then, tau in zip(t[:-1], t[1:], wrench[:-1]):
+    slopes = np.zeros_like(wrench) if slope is None else slope
+    for (now, then), tau, rise in zip(itertools.pairwise(t), wrench, slopes):
         solution = solve_ivp(
-            rate, (now, then), states[-1], "DOP853", args=(tau,), rtol=1e-11, atol=1e-12
+            rate,
+            (now, then),
+            states[-1],
+            "DOP853",
+            args=(tau - 0.5 * (now + then) * rise, rise),
+            rtol=1e-11,
+            atol=1e-12,
         )
         states.append(solution.y[:, -1])
     return np.array(states)
@@ -203,6 +214,34 @@ def test_error_falls_with_the_fourth_power_of_the_step(monkeypatch):
         errors.append(np.linalg.norm(run.nu - expected))
     order = np.log2(np.array(errors[:-1]) / errors[1:])
     np.testing.assert_allclose(order, 4.0, atol=0.1)
+
+
+def test_a_wrench_may_rise_within_an_interval(monkeypatch):
+    """Linearly about its mean, as the samples of a measured wrench do."""
+    monkeypatch.setattr(simulate, "MAX_STEP", 0.001)
+    t = np.arange(0.0, 2.01, 0.25)
+    wrench, slope = pushes(LOPSIDED, len(t), 7), 4.0 * pushes(LOPSIDED, len(t), 8)
+    start = np.concatenate([np.zeros(6), START[6:]])
+    run = simulate.simulate(LOPSIDED, t, wrench, START[6:], wrench_slope=slope)
+    expected = reference(LOPSIDED, t, wrench, start, slope)
+    np.testing.assert_allclose(run.nu, expected[:, 6:], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(run.position, expected[:, :3], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("free", [(0,), (0, 1, 5), (2, 3, 4), (5,)])
+def test_guided_by_its_own_motion_the_free_components_move_as_before(free):
+    """The couplings, inertia included, come from the components that follow the guide."""
+    t = np.arange(0.0, 3.0, 0.005)
+    wrench = manoeuvre("multisine", LOPSIDED, t, np.random.default_rng(3))
+    run = simulate.simulate(LOPSIDED, t, wrench)
+    mask = np.isin(np.arange(6), free)
+    guide = Guide(mask, run.nu, run.orientation)
+    guided = simulate.simulate(LOPSIDED, t, wrench, guide=guide)
+    np.testing.assert_array_equal(guided.nu[:, ~mask], run.nu[:, ~mask])
+    # Between instants the guide is a straight line: off by dt^2/8 of its second derivative.
+    np.testing.assert_allclose(guided.nu[:, mask], run.nu[:, mask], rtol=0, atol=1e-4)
+    alone = simulate.simulate(LOPSIDED, t, wrench, guide=Guide(mask, 0.0 * run.nu, run.orientation))
+    assert np.max(np.abs(alone.nu[:, mask] - run.nu[:, mask])) > 0.02  # it did matter
 
 
 def test_nu_dot_is_the_forward_dynamics_at_each_instant():

@@ -39,6 +39,19 @@ def read_only(parts):
     return parts
 
 
+def arrays(parts):
+    """Copies of all arrays in a tuple, inner tuples included, records field by field."""
+    out = []
+    for part in parts:
+        if isinstance(part, tuple):
+            out += arrays(part)
+        elif part.dtype.names:
+            out += [part[name].copy() for name in part.dtype.names]
+        else:
+            out.append(part.copy())
+    return out
+
+
 # ------------------------------------------------------------------ samples without the sampler
 
 
@@ -47,7 +60,9 @@ def drive(model, t, wrench, nu=None, orientation=None):
     return simulate(model, t, wrench, nu, None, orientation)
 
 
-def rows_of(motion, wrench, rng=None, linear_std=0.008, angular_std=0.003, wrench_std=0.0, gyro=True):
+def rows_of(
+    motion, wrench, rng=None, linear_std=0.008, angular_std=0.003, wrench_std=0.0, gyro=True
+):
     """Samples (N,) of a motion at its own instants; without ``rng`` free of noise."""
     rows = np.zeros(len(motion.t), dtype=SAMPLE)
     rows["t"], rows["dt"][1:] = motion.t - motion.t[0], np.diff(motion.t)

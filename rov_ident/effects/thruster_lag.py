@@ -17,11 +17,13 @@ def start(wrench: Array) -> Array:
 
 
 def step(state: Array, wrench: Array, dt: float, time_constant: float) -> tuple[Array, Array]:
-    if dt <= 0.0 or time_constant <= 0.0:
-        return (wrench if time_constant <= 0.0 else state), wrench
-    decay = math.exp(-dt / time_constant)
-    mean_decay = (1.0 - decay) * time_constant / dt
-    return wrench + (state - wrench) * decay, wrench + (state - wrench) * mean_decay
+    if time_constant <= 0.0:
+        return wrench, wrench
+    if dt <= 0.0:
+        return state, state
+    approach = -math.expm1(-dt / time_constant)
+    after = state + (wrench - state) * approach
+    return after, wrench + (state - wrench) * (approach * time_constant / dt)
 
 
 EFFECT = Effect(
@@ -29,9 +31,7 @@ EFFECT = Effect(
     place="input",
     summary="The thrusters follow their demand with a first-order lag, the same on every axis.",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
-    parameters=(
-        EffectParameter("time_constant", "s", "time constant of the lag", 0.0, 0.0, 3.0),
-    ),
+    parameters=(EffectParameter("time_constant", "s", "time constant of the lag", 0.0, 0.0, 3.0),),
     start=start,
     step=step,
 )

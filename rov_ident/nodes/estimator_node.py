@@ -39,7 +39,7 @@ from rov_ident.messages import Imu, Odometry, Wrench
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
-from rov_ident.online import ESTIMATORS, Kind, Level, OnlineEstimator, Report
+from rov_ident.online import Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
 
 _OWN_PARAMETERS = ("save_path", "lockstep")
@@ -48,11 +48,8 @@ _DIAGNOSTICS_PERIOD = 1.0  # s
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOG_PERIOD = 10.0  # s; between two equal complaints
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-# Not worth a warning: regular, or the consequence of something that is named itself.
+# Not worth a warning: the consequence of something that is named itself.
 _NO_COMPLAINT = {
-    "sample: used",
-    "sample: between updates",
-    "sample: restarted after a gap",
     "sample: no odometry yet",
     "sample: no wrench",
 }
@@ -79,6 +76,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         )
         self._lockstep = self._own_parameter("lockstep", False, "a player sets the pace")
         started = time.monotonic()
+        self.get_logger().info("compiling: half a minute when first started on a computer")
         warm_up(config, kind)
         self._online = OnlineEstimator(config, kind)
 
@@ -383,9 +381,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
     def _take_parameters(self, _: list[Parameter]) -> None:
         # Only settings can change while running: the state stays good.
-        config = parameters.changed(self, _OWN_PARAMETERS)
-        self._online.config = config
-        self._online._task = ESTIMATORS[self._online.kind].problem(config)
+        self._online.configure(parameters.changed(self, _OWN_PARAMETERS))
         self.destroy_timer(self._publish_timer)
         self._publish_timer = self.create_timer(
             1.0 / self._config.publish_rate, self._publish_in_time, clock=self._steady

@@ -1,0 +1,277 @@
+"""The estimator that nodes, replay and offline fits share: words, bounds, garbage, reset."""
+
+import numpy as np
+import pytest
+import textbook
+
+from rov_ident import sensors
+from rov_ident.estimate import is_passive
+from rov_ident.online import Level, OnlineEstimator
+from rov_ident.samples import IMU, ODOMETRY, WRENCH
+
+KINDS = ["rls", "ukf"]
+SECOND = 1_000_000_000
+
+
+def seconds(message):
+    return (message.stamp - sensors.START) / SECOND
+
+
+@pytest.fixture(scope="module")
+def messages(heavy):
+    return [(role, m) for _, role, m in sensors.dive(heavy, "steps", 60.0, seed=2).messages]
+
+
+@pytest.fixture(scope="module")
+def wrong(heavy):
+    factors = 1.0 + 0.2 * np.random.default_rng(3).uniform(-1, 1, len(heavy.model.theta))
+    return textbook.off(heavy, factors)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def trained(request, wrong, messages):
+    return fed(OnlineEstimator(wrong, request.param), messages)
+
+
+def fed(estimator, messages):
+    for role, message in messages:
+        estimator.push(role, message)
+    estimator.flush()
+    return estimator
+
+
+def publishable(estimator):
+    """A report that a controller may use blindly, and it is returned."""
+    report = estimator.report()
+    n = len(report.names)
+    for name in ("values", "std", "lower", "upper", "covariance", "excitation"):
+        assert np.isfinite(getattr(report, name)).all(), name
+    assert report.values.shape == report.std.shape == (n,)
+    assert report.covariance.shape == (n, n)
+    assert (report.std >= 0).all()
+    assert (report.lower <= report.values).all() and (report.values <= report.upper).all()
+    np.testing.assert_allclose(report.covariance, report.covariance.T, rtol=1e-6, atol=1e-12)
+    assert is_passive(estimator.config.model, estimator.prior, report.values)
+    assert len(report.levels) == len(report.messages) == n
+    assert all(isinstance(level, Level) for level in report.levels)
+    return report
+
+
+# ------------------------------------------------------------------ words
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_before_any_message(heavy, kind):
+    report = publishable(OnlineEstimator(heavy, kind))
+    assert report.stamp == 0
+    np.testing.assert_allclose(report.values, heavy.model.theta, rtol=1e-9)
+    assert not report.excitation.any()
+    assert set(report.levels) == {Level.WARN}
+    assert all("not excited" in text for text in report.messages)
+
+
+def test_converged(trained, heavy):
+    report = publishable(trained)
+    strong = [report.names.index(n) for n in ("X_udot", "Y_vdot", "Z_wdot", "X_uu", "Y_vv", "N_rr")]
+    for i in strong:
+        assert report.levels[i] == Level.OK, report.names[i]
+        assert report.messages[i] == "converged"
+        assert report.excitation[i] > 0.5
+        assert report.values[i] == pytest.approx(heavy.model.theta[i], rel=0.1)
+    assert (report.excitation <= 1.0).all() and (report.excitation >= 0.0).all()
+    assert report.units[report.names.index("X_u")] == "N s/m"
+
+
+def test_stamp_is_the_last_sample_s(trained, messages):
+    last = max(m.stamp for role, m in messages if role in (ODOMETRY, IMU))
+    assert abs(trained.report().stamp - last) <= 2
+    assert trained.report().stamp == trained.report().stamp
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_words_change_from_converging_to_converged(wrong, messages, kind):
+    estimator = OnlineEstimator(wrong, kind)
+    i = estimator.prior.names.index("X_u")
+    words = []
+    for k, (role, message) in enumerate(messages):
+        estimator.push(role, message)
+        if k % 100 == 99:
+            words.append(publishable(estimator).messages[i])
+    assert words[0].startswith(("not excited", "converging"))
+    assert "converging" in words
+    assert words[-1] == "converged"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_not_excited_is_held_and_said_to_be(wrong, kind):
+    """Surge alone for a minute; then rest."""
+    run = sensors.dive(wrong, "rest", 10.0, seed=1)
+    t = np.arange(0.0, 60.0, 0.02)
+    from rov_ident.excitation import manoeuvre
+
+    wrench = manoeuvre("steps", wrong.model, t, np.random.default_rng(2))
+    wrench[:, 1:] = 0.0
+    surge = sensors.measure(wrong, t, wrench, 60.0, sensors.Suite(), np.random.default_rng(0))
+    estimator = OnlineEstimator(wrong, kind)
+    fed(estimator, [(role, m) for _, role, m in surge.messages])
+    report = publishable(estimator)
+    by_name = dict(zip(report.names, zip(report.levels, report.messages, strict=True)))
+    assert by_name["X_uu"][0] == Level.OK
+    for name in ("Y_vv", "K_pp", "N_rr"):
+        assert by_name[name][0] == Level.WARN and "not excited" in by_name[name][1], name
+        i = report.names.index(name)
+        assert report.values[i] == pytest.approx(estimator.prior.mean[i], rel=0.3)
+    later = [(role, m._replace(stamp=m.stamp + 60 * SECOND)) for _, role, m in run.messages]
+    for k in range(20):
+        shift = 10 * k * SECOND
+        for role, m in later:
+            estimator.push(role, m._replace(stamp=m.stamp + shift))
+    report = publishable(estimator)
+    text = dict(zip(report.names, report.messages, strict=True))["X_uu"]
+    assert text == "converged, held: not excited now"
+
+
+# ------------------------------------------------------------------ switching
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reset_is_a_fresh_start(wrong, messages, kind):
+    """Amid the motion: back to the prior, then as good as an estimator that began there."""
+    estimator, fresh = OnlineEstimator(wrong, kind), OnlineEstimator(wrong, kind)
+    done = False
+    for role, message in messages:
+        if seconds(message) > 25.0 and not done:
+            estimator.reset()
+            report, done = publishable(estimator), True
+            np.testing.assert_allclose(report.values, estimator.prior.mean, rtol=1e-9)
+            np.testing.assert_allclose(report.std, estimator.prior.std, rtol=1e-9)
+            assert not report.excitation.any()
+        estimator.push(role, message)
+        if done:
+            fresh.push(role, message)
+    a, b = publishable(estimator), publishable(fresh)
+    assert (np.abs(a.values - b.values) < 0.5 * b.std + 0.01 * np.abs(b.values)).all()
+    np.testing.assert_allclose(a.std, b.std, rtol=0.3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_disabled_learns_nothing_and_goes_on_without_a_jolt(wrong, messages, kind):
+    """What happened meanwhile is not seen: neither as motion nor as an outlier."""
+    estimator, gap = OnlineEstimator(wrong, kind), OnlineEstimator(wrong, kind)
+    held = None
+    for role, message in messages:
+        estimator.enabled = not 20.0 < seconds(message) < 35.0
+        if not estimator.enabled and seconds(message) > 21.0:
+            held = held or estimator.report()
+            assert len(estimator.push(role, message)) == 0
+        else:
+            estimator.push(role, message)
+        if estimator.enabled:
+            gap.push(role, message)
+    assert held is not None
+    a, b = publishable(estimator), publishable(gap)
+    assert estimator.counts["sample: outlier"] <= gap.counts["sample: outlier"] + 3
+    assert (np.abs(a.values - b.values) < 0.5 * b.std + 0.005 * np.abs(b.values)).all()
+
+
+def test_report_does_not_change_the_state(trained):
+    before = textbook.arrays(tuple(trained.state))
+    first, second = trained.report(), trained.report()
+    assert np.array_equal(first.values, second.values)
+    after = textbook.arrays(tuple(trained.state))
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_reports_do_not_matter(wrong, messages, kind):
+    """How often anybody looks has no influence on the numbers."""
+    part = messages[:2500]
+    quiet, watched = OnlineEstimator(wrong, kind), OnlineEstimator(wrong, kind)
+    fed(quiet, part)
+    for k, (role, message) in enumerate(part):
+        watched.push(role, message)
+        if k % 50 == 0:
+            watched.report()
+    watched.flush()
+    a, b = quiet.report(), watched.report()
+    assert np.array_equal(a.values, b.values) and np.array_equal(a.covariance, b.covariance)
+
+
+# ------------------------------------------------------------------ garbage
+
+
+def spoiled(messages, spoil, begin=20.0, end=35.0):
+    rng = np.random.default_rng(9)
+    for role, m in messages:
+        yield role, (spoil(rng, role, m) if begin < seconds(m) < end else m)
+
+
+def no_covariance(variance):
+    def spoil(rng, role, m):
+        return m._replace(twist_variance=np.full(6, variance)) if role == ODOMETRY else m
+
+    return spoil
+
+
+def angular_unknown(rng, role, m):
+    if role != ODOMETRY:
+        return m
+    return m._replace(twist_variance=np.r_[m.twist_variance[:3], [1e6] * 3], angular=np.zeros(3))
+
+
+def noise_for_velocities(rng, role, m):
+    if role == ODOMETRY:
+        return m._replace(linear=rng.normal(0, 3, 3), angular=rng.normal(0, 3, 3))
+    return m._replace(angular_velocity=rng.normal(0, 3, 3)) if role == IMU else m
+
+
+def wrench_of(size):
+    def spoil(rng, role, m):
+        return m._replace(force=rng.normal(0, size, 3)) if role == WRENCH else m
+
+    return spoil
+
+
+def wrench_backward(rng, role, m):
+    return m._replace(force=-m.force, torque=-m.torque) if role == WRENCH else m
+
+
+def upside_down(rng, role, m):
+    return m._replace(orientation=np.array([0.0, 1.0, 0.0, 0.0])) if role == ODOMETRY else m
+
+
+def stuck(rng, role, m):
+    return m._replace(linear=np.full(3, 0.7), angular=np.zeros(3)) if role == ODOMETRY else m
+
+
+GARBAGE = {
+    "infinite variance": no_covariance(np.inf),
+    "NaN variance": no_covariance(np.nan),
+    "variance 1e6": no_covariance(1e6),
+    "variance 1e300": no_covariance(1e300),
+    "angular velocity not measured": angular_unknown,
+    "noise for velocities": noise_for_velocities,
+    "wrench 1e3": wrench_of(1e3),
+    "wrench 4e5": wrench_of(4e5),
+    "wrench with the wrong sign": wrench_backward,
+    "attitude upside down": upside_down,
+    "stuck odometry": stuck,
+}
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("what", GARBAGE)
+@pytest.mark.parametrize("begin", [-1.0, 10.0])
+def test_garbage(wrong, messages, kind, what, begin):
+    """Twelve seconds of it, from the start or amid: no exception, every report fit for use, and
+    the estimator is not lost for good."""
+    estimator = OnlineEstimator(wrong, kind)
+    part = [(role, m) for role, m in messages if seconds(m) < 40.0]
+    for k, (role, m) in enumerate(spoiled(part, GARBAGE[what], begin, begin + 12.0)):
+        estimator.push(role, m)
+        if k % 200 == 0:
+            publishable(estimator)
+    report = publishable(estimator)
+    assert not any("diverged" in text for text in report.messages), "needs a reset by hand"
+    assert estimator.counts["sample: used"] > 50
