@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -19,6 +20,9 @@ from rich.table import Table
 from rov_ident import config as configuration
 from rov_ident.coefficients import catalogue
 from rov_ident.errors import UserError
+
+if TYPE_CHECKING:
+    from rov_ident.records import Record
 
 ERR = Console(stderr=True, highlight=False)
 OUT = Console(highlight=False, soft_wrap=True)
@@ -201,18 +205,9 @@ def _replay(options: argparse.Namespace) -> None:
 
 def _fit(options: argparse.Namespace) -> None:
     from rov_ident.fit import fit_online, write_text
-    from rov_ident.records import read_record
 
     config = configuration.load(options.config, f"{options.estimator}_node")
-    records = []
-    for path in options.bags:
-        with Progress(console=ERR, transient=True) as progress:
-            bar = progress.add_task(f"reading {path.name}")
-            records.append(
-                read_record(path, config, lambda k, n: progress.update(bar, completed=k, total=n))
-            )
-        for note in records[-1].notes:
-            ERR.print(f"{path.name}: {note}", markup=False)
+    records = [_read(path, config) for path in options.bags]
     fit = fit_online(records, config, options.estimator)
     table = _table(
         f"{options.estimator}: {fit.samples} samples, {fit.duration:.1f} s",
@@ -232,6 +227,18 @@ def _fit(options: argparse.Namespace) -> None:
             options.save,
             comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags}.",
         )
+
+
+def _read(path: Path, config: configuration.Config) -> "Record":
+    """A bag's samples behind a progress bar, and what had to be refused on standard error."""
+    from rov_ident.records import read_record
+
+    with Progress(console=ERR, transient=True) as progress:
+        bar = progress.add_task(f"reading {path.name}")
+        record = read_record(path, config, lambda k, n: progress.update(bar, completed=k, total=n))
+    for note in record.notes:
+        ERR.print(f"{path.name}: {note}", markup=False)
+    return record
 
 
 def _simulate(options: argparse.Namespace) -> None:
@@ -259,12 +266,10 @@ def _simulate(options: argparse.Namespace) -> None:
 def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
     """Open-loop simulation of a whole bag beside what it measured."""
     from rov_ident.recording import write_messages
-    from rov_ident.records import HORIZON, VELOCITIES, predicted, read_record, score
+    from rov_ident.records import HORIZON, VELOCITIES, predicted, score
     from rov_ident.sensors import odometry_of
 
-    record = read_record(options.bag, config)
-    for note in record.notes:
-        ERR.print(f"{options.bag.name}: {note}", markup=False)
+    record = _read(options.bag, config)
     free = options.channels
     run = predicted(config.model, record.samples, math.inf, free)
     if not np.isfinite(run).all():

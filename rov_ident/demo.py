@@ -41,7 +41,7 @@ def demo(out: Path, rate: float, err: Console, console: Console) -> None:
     """Replay the shipped bag over DDS into both nodes and report against the simulator's truth."""
     from rov_ident.nodes.replay import replay
 
-    bag, start = shipped("bags/demo.mcap"), shipped("config/demo.yaml")
+    bag, start = shipped("bags/demo.mcap"), shipped("config/bluerov2_heavy_demo.yaml")
     config = configuration.load(start)
     model = configuration.load(shipped("config/bluerov2_heavy.yaml")).model
     truth = dict(zip(model.names, model.theta.tolist(), strict=True))
@@ -73,9 +73,9 @@ def demo(out: Path, rate: float, err: Console, console: Console) -> None:
         error = np.abs(history.values[-1] / true - 1.0)
         z = np.abs(history.values[-1] - true) / history.std[-1]
         console.print(
-            f"{name}: error median {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} % "
-            f"({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true values "
-            "inside their 95 % interval"
+            f"{name}: error median {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} "
+            f"% ({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
+            "values inside their 95 % interval"
         )
     console.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")
 
@@ -134,8 +134,8 @@ def _page(
     ]
     return report.page(
         f"{config.name}: coefficients identified live",
-        f"Both nodes started from coefficients off by up to 50 % and saw {record.duration:.0f} s of "
-        "simulated odometry, IMU and thruster wrench, replayed over DDS.",
+        f"Both nodes started from coefficients off by up to 50 % and saw {record.duration:.0f} s "
+        "of simulated odometry, IMU and thruster wrench, replayed over DDS.",
         [
             report.heading("Coefficients converging to the simulator's truth"),
             report.figure(

@@ -3,18 +3,20 @@
 In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 8.1; Kirchhoff)::
 
     p   = M nu                                      momentum of body and added water
-    tau = M nu_dot + C(nu) nu - d(nu) + g           with  C(nu) nu = [omega x p1; omega x p2 + v x p1]
+    tau = M nu_dot + C(nu) nu - d(nu) + g
+    C(nu) nu = [omega x p1; omega x p2 + v x p1]
     M   = M_RB - sym(added-mass coefficients)
     d   = sum of  coefficient * extended[left] * extended[right],  extended = [1, nu, |nu|]
     g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
 
-``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, centre
-of gravity anywhere, off-diagonal terms included, and does no work by construction.
+``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, with
+the centre of gravity anywhere, off-diagonal terms included, and does no work by construction.
 
-The same few functions serve every use: :func:`generalized_force` evaluates ``C nu - d`` for a bundle
-of states side by side ("lanes": one for simulation and one row of the regressor, sixteen for sigma
-points, so that the compiler can use vector instructions), :func:`columns` gives the same forces per
-unit of each coefficient (the regressor), and the forward dynamics solve the inverse ones.
+The same few functions serve every use: :func:`generalized_force` evaluates ``C nu - d`` for a
+bundle of states side by side ("lanes": one for simulation and for a row of the regressor, sixteen
+for sigma points, so that the compiler can use vector instructions), :func:`columns` gives the same
+forces per unit of each coefficient (the regressor), and the forward dynamics solve the inverse
+ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -208,7 +210,7 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
             )
         if coefficient.is_diagonal and value > 0:
             raise UserError(
-                f"coefficients.{name} is {value}, but it must not be positive: damping and added mass "
+                f"coefficients.{name} is {value}, but must not be positive: damping and added mass "
                 "are negative derivatives (SNAME signs)"
             )
     coefficients = sorted(by_place.values(), key=lambda c: not c.is_added_mass)

@@ -1,4 +1,4 @@
-"""An online estimator as a node, a replay and an offline fit all use it: messages in, reports out."""
+"""An online estimator as node, replay and offline fit use it: messages in, reports out."""
 
 import enum
 import math

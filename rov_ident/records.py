@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +105,7 @@ def predicted(
     if edges[0] != 0:
         edges = np.insert(edges, 0, 0)
     attitude = attitude_of(samples)
-    for first, end in zip(edges[:-1], edges[1:]):
+    for first, end in pairwise(edges):
         part = samples[first:end]
         # a sample's wrench belongs to the interval that ends there
         wrench, slope = (

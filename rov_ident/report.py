@@ -12,11 +12,13 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper);
   max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-p.lead { font-size: 1.05rem; } p, figcaption { max-width: 48rem; } figcaption, footer { color: var(--soft); }
+p.lead { font-size: 1.05rem; } p, figcaption { max-width: 48rem; }
+figcaption, footer { color: var(--soft); }
 figure { margin: 1rem 0; padding: .5rem; } figure svg { width: 100%; height: auto; display: block; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
+th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right;
+  white-space: nowrap; }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
 @media print { body { margin: 0; max-width: none; } figure, tr { break-inside: avoid; } }
 """
@@ -51,4 +53,5 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
     )
-    return f"<div class='scroll'><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
+    inside = f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody>"
+    return f"<div class='scroll'><table>{inside}</table></div>"

@@ -1,10 +1,10 @@
 """Recursive least squares over the filtered 6-DOF regressor, as ``init``, ``step`` and ``fold``.
 
 The wrench is linear in the coefficients, ``tau = d/dt(P theta) + H theta + known``
-(:func:`rov_ident.model.columns`). Every channel, the measured wrench included, goes through the same
+(:func:`rov_ident.model.columns`). Every channel, the measured wrench included, goes through one
 low-pass filter F, so that no acceleration is measured and no phase difference biases the fit::
 
-    F(s) = (w / (s + w))^2,     y = F[tau - known],     Phi = s F[P] + F[H],     y = Phi theta + noise
+    F(s) = (w / (s + w))^2,   y = F[tau - known],   Phi = s F[P] + F[H],   y = Phi theta + noise
 
 The derivative is exact: ``s w/(s + w) P = w (P - x)`` where x is the filtered P. Started with
 ``x(0) = P(0)`` there is no transient, so that a gap in the data costs nothing but itself.

@@ -1,9 +1,9 @@
 """From messages to samples: one clock, one set of axes, one filter for every channel.
 
 Topics come at their own rates and phases. A :class:`Sampler` waits until every topic has reached an
-instant (or is ``grace`` seconds behind), then emits one sample for it. The instants are those of the
-IMU messages while there is an IMU, else those of the odometry. Everything is decided by the stamps,
-never by arrival, so that a bag gives the same samples live, replayed and offline.
+instant (or is ``grace`` seconds behind), then emits one sample for it. The instants are those of
+the IMU messages while there is an IMU, else those of the odometry. Everything is decided by the
+stamps, never by arrival, so that a bag gives the same samples live, replayed and offline.
 
 What a sample holds, and why (docs/samples.md has the measurements):
 
@@ -247,7 +247,7 @@ class Sampler:
         return np.concatenate(samples) if samples else _NONE
 
     def _reached(self, t: float) -> bool:
-        """Whether no topic can still bring a message at or before t (or it is not worth waiting)."""
+        """Whether no topic can still bring a message up to t, or it is not worth waiting."""
         horizon = max(self._newest.values())
         if horizon - t > self._grace:
             return True
@@ -305,7 +305,7 @@ class Sampler:
         return sample
 
     def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array] | None:
-        """Mean and slope (6,) of the acting wrench in the interval; None where no demand is known."""
+        """Mean and slope (6,) of the acting wrench; None where no demand is known."""
         queue = self._queues[WRENCH]
         pieces: list[tuple[float, float, Array]] = []
         now = start

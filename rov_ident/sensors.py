@@ -1,4 +1,4 @@
-"""What the sensors of a simulated vehicle publish: rates, noise, delays, all drawn from one seed."""
+"""What the sensors of a simulated vehicle publish: rates, noise, delays, from one seed."""
 
 import dataclasses
 from collections.abc import Iterator

@@ -1,6 +1,7 @@
 """Open-loop simulation of the equations of motion."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -94,8 +95,8 @@ def simulate(
     finite = np.isfinite(out).all(axis=1)
     if not finite.all():
         raise UserError(
-            f"the simulation diverges {t[int(np.argmin(finite))] - t[0]:.1f} s after its start: check "
-            "the signs and sizes of the coefficients and of the wrench"
+            f"the simulation diverges {t[np.argmin(finite)] - t[0]:.1f} s after its start: "
+            "check the signs and sizes of the coefficients and of the wrench"
         )
     return Trajectory(np.asarray(t), out[:, :3], out[:, 3:7], out[:, 7:13], out[:, 13:])
 
@@ -120,7 +121,7 @@ def open_loop(
     slope = np.zeros_like(wrench) if wrench_slope is None else wrench_slope
     predicted = np.empty((len(t), 6))
     edges = np.append(np.flatnonzero(np.diff(np.floor((t - t[0]) / horizon), prepend=-1.0)), len(t))
-    for first, end in zip(edges[:-1], edges[1:], strict=True):
+    for first, end in pairwise(edges):
         window = slice(first, end)
         try:
             run = simulate(

@@ -1,9 +1,9 @@
-"""Unscented Kalman filter over body velocities and coefficients, as ``init``, ``step`` and ``fold``.
+"""Unscented Kalman filter over body velocities and coefficients: ``init``, ``step``, ``fold``.
 
-State ``x = [nu (6), xi (n)]``. The coefficients are a random walk; those that physics keeps negative
-are ``theta = -s (xi + sqrt(xi^2 + 4)) / 2``: negative for every xi, smooth, and linear where the
-coefficient is well above its scale s, so that intervals stay those of a normal distribution. The
-others are ``theta = s xi``.
+State ``x = [nu (6), xi (n)]``. The coefficients are a random walk; those that physics keeps
+negative are ``theta = -s (xi + sqrt(xi^2 + 4)) / 2``: negative for every xi, smooth, and linear
+where the coefficient is well above its scale s, so that intervals stay those of a normal
+distribution. The others are ``theta = s xi``.
 
 Prediction: scaled sigma points (Merwe; the weights are filterpy's) through one or more Runge-Kutta
 steps of the equations of motion, sixteen points side by side. The coefficients do not move and the
@@ -19,10 +19,10 @@ same as all at once.
 
 The random walk fades out as a variance nears its prior: without excitation nothing grows beyond it.
 
-What the model leaves unexplained is found from the innovations: per axis, the density of the process
-noise follows the difference between their square and its prediction (Mehra 1972; Myers and Tapley
-1976), down to the configured floor. A wrong structure then widens the intervals instead of being
-learnt as a coefficient.
+What the model leaves unexplained is found from the innovations: per axis, the density of the
+process noise follows the difference between their square and its prediction (Mehra 1972; Myers and
+Tapley 1976), down to the configured floor. A wrong structure then widens the intervals instead of
+being learnt as a coefficient.
 """
 
 from typing import NamedTuple
@@ -213,7 +213,7 @@ def _coefficients(lanes, scale, negative, xi, theta):
 
 @inlined
 def _invert(lanes, mass, inverse, work):
-    """Inverse of symmetric positive definite matrices (6, 6, lanes) by Gauss-Jordan, no pivoting."""
+    """Inverses of positive definite matrices (6, 6, lanes) by Gauss-Jordan, no pivoting."""
     for i in range(6):
         for j in range(6):
             for k in range(lanes):
@@ -503,7 +503,7 @@ def _update(task, state, sample, out):
 
 @kernel
 def _residual(task, state, sample, out, theta, mass, work, xi, part):
-    """Wrench, measured minus model at the present mean, low-passed twice like the RLS regression."""
+    """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     x, y, u, last = state.residual[0], state.residual[1], state.residual[2], state.residual[3]
     w, dt = task.settings[0].corner, sample.dt
     nu, h, p = work[0:6], work[6:12], work[12:18]

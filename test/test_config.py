@@ -550,8 +550,9 @@ def test_unflatten_leaves_nested_parameters_as_they_are():
 def test_a_shipped_vehicle_is_trimmed_light_and_states_its_units(path):
     config = load(path)
     body = config.model.body
-    assert config.name == path.stem
-    assert 1.0 <= body.buoyancy - body.weight <= 2.0
+    assert path.stem.startswith(config.name)
+    if path.stem == config.name:  # the others say themselves how they differ
+        assert 1.0 <= body.buoyancy - body.weight <= 2.0
     assert body.cog[2] > body.cob[2]
     text = path.read_text()
     for coefficient in config.model.coefficients:

@@ -386,7 +386,7 @@ def test_intervals_and_bias_over_seeds(heavy, dives):
     z = np.array(z)
     told = dict(zip(prior.names, zip(z.mean(0).round(2), z.std(0).round(2), strict=True)))
     covered = np.mean(np.abs(z) < 1.96)
-    assert 0.80 <= covered, f"{covered:.2f} {told}"
+    assert covered >= 0.80, f"{covered:.2f} {told}"
     assert np.abs(z.mean(axis=0)).max() < 3.0 / np.sqrt(len(z)) * max(1.0, z.std()), told
 
 

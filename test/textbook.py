@@ -16,7 +16,6 @@ from rov_ident.model import skew
 from rov_ident.samples import SAMPLE
 from rov_ident.simulate import simulate
 
-
 # ------------------------------------------------------------------ configurations
 
 
@@ -257,9 +256,18 @@ def random_covariance(n, rng):
 # ------------------------------------------------------------------ many dives
 
 
+_dives = {}
+
+
 def prior_and_samples(config, seeds, duration):
-    """[(configuration with the prior off by some 20 %, samples of a noisy dive)], one a seed."""
-    out = []
+    """[(configuration with the prior off by some 20 %, samples of a noisy dive)], one a seed.
+
+    Made once for all tests: the simulation of the messages takes most of the time.
+    """
+    key = (config.name, tuple(seeds), duration)
+    out = _dives.setdefault(key, [])
+    if out:
+        return out
     for seed in seeds:
         run = sensors.dive(config, "steps", duration, seed=seed)
         parts = list(sensors.samples_of(config, run))
