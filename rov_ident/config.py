@@ -232,7 +232,7 @@ class Rls:
 class Ukf:
     """`ukf`: the unscented Kalman filter."""
 
-    alpha: float = option(0.1, "spread of the sigma points", lower=1e-4, upper=1.0)
+    alpha: float = option(0.5, "spread of the sigma points", lower=1e-4, upper=1.0)
     beta: float = option(2.0, "weight of the centre point: 2 suits a Gaussian", lower=0.0)
     kappa: float = option(0.0, "secondary spread of the sigma points", lower=0.0)
     gate: float = option(

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from rov_ident.coefficients import ABSOLUTE, ONE
 from rov_ident.config import Config
@@ -86,24 +87,23 @@ def typical(model: Model) -> Array:
 def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     """The values (n,) nearest the estimate, in its own metric, that a passive hull can have.
 
-    Signs first: while a diagonal derivative is positive, the worst is held at zero and the others
-    move as their correlation with it says. Then, should couplings still make the mass matrix
+    Signs first: the nearest set without positive diagonal derivatives (a non-negative least-squares
+    problem in the multipliers); what is held at zero moves the others as their correlation says.
+    Then, should couplings still make the mass matrix
     indefinite or the damping feed energy, the set is drawn back towards the prior just as far as
     needed.
     """
-    values, p = estimate.values.copy(), estimate.covariance
-    at_zero: list[int] = []
-    while True:
-        wrong = np.where(
-            prior.negative & (values > 0.0), values / np.maximum(estimate.std, 1e-300), 0
-        )
-        wrong[at_zero] = 0.0
-        if not wrong.any():
-            break
-        at_zero.append(int(np.argmax(wrong)))
-        gain = np.linalg.lstsq(p[np.ix_(at_zero, at_zero)], p[at_zero], rcond=None)[0]
-        values = estimate.values - estimate.values[at_zero] @ gain
-        values[at_zero] = 0.0
+    if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
+        return estimate.values
+    values, signed = estimate.values.copy(), np.flatnonzero(prior.negative)
+    if (values[signed] > 0.0).any():
+        # minimise |theta - estimate| in the metric of P: theta = estimate - P[:, signed] lambda
+        size = estimate.std[signed] + 1e-300
+        p = estimate.covariance[np.ix_(signed, signed)] / np.outer(size, size)
+        root = np.linalg.cholesky(p + 1e-12 * np.eye(len(signed)))
+        multipliers = nnls(root.T, np.linalg.solve(root, values[signed] / size))[0]
+        values -= estimate.covariance[:, signed] @ (multipliers / size)
+        values[signed] = np.minimum(values[signed], 0.0)
     if is_passive(model, prior, values):
         return values
     low, high = 0.0, 1.0  # share of the way from the prior to the estimate
@@ -119,9 +119,10 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
 def is_passive(model: Model, prior: Prior, values: Array) -> bool:
     """Whether M is positive definite and the damping takes energy out in every direction.
 
-    Diagonal derivatives must not be positive. Couplings: the power of the linear and of the
-    quadratic damping is checked along fixed directions of motion; products of two velocities (lift)
-    may do work of either sign and are left out.
+    Diagonal derivatives must not be positive. With couplings, the symmetric part of the linear
+    damping matrix is positive semidefinite, and the power of the quadratic damping is checked along
+    fixed directions of motion; products of two velocities (lift) may do work of either sign and are
+    left out.
     """
     theta = model.theta.copy()
     theta[prior.estimated] = values
@@ -129,18 +130,21 @@ def is_passive(model: Model, prior: Prior, values: Array) -> bool:
         return False
     if np.linalg.eigvalsh(model.with_theta(theta).mass_matrix)[0] <= 0.0:
         return False
-    linear, quadratic = np.zeros(len(_DIRECTIONS)), np.zeros(len(_DIRECTIONS))
-    coupled = False
+    linear, power, coupled = np.zeros((6, 6)), np.zeros(len(_DIRECTIONS)), False
     for c, value in zip(model.coefficients, theta, strict=True):
         if c.is_diagonal and value > 0.0:
             return False
         if c.is_added_mass or (c.left != ONE and c.left < ABSOLUTE):
             continue
         coupled = coupled or not c.is_diagonal
-        power = value * _DIRECTIONS[:, c.row] * _EXTENDED[:, c.left] * _EXTENDED[:, c.right]
-        (linear if c.left == ONE else quadratic)[:] += power
-    largest = max(np.abs(linear).max(), np.abs(quadratic).max())
-    return not coupled or bool(max(linear.max(), quadratic.max()) <= 1e-9 * largest)
+        if c.left == ONE:
+            linear[c.row, c.right - 1] = value
+        else:
+            power += value * _DIRECTIONS[:, c.row] * _EXTENDED[:, c.left] * _EXTENDED[:, c.right]
+    if not coupled:
+        return True
+    largest = np.linalg.eigvalsh(linear + linear.T)[-1]
+    return bool(largest <= 1e-9 * np.abs(linear).max() and power.max() <= 1e-9 * -power.min())
 
 
 _DIRECTIONS = np.random.default_rng(0).standard_normal((2000, 6)) * WORKING_SPEED

@@ -326,6 +326,20 @@ def columns(structure, nu, momentum, force):
 
 
 @kernel
+def in_motion(structure, moving, out):
+    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,)."""
+    first = len(structure.mass_row)
+    for c in range(first):
+        out[c] = moving[structure.mass_row[c]] != 0 and moving[structure.mass_column[c]] != 0
+    for term in range(len(structure.row)):
+        moves = True
+        for index in (structure.left[term], structure.right[term]):
+            if index > 0:  # not the constant
+                moves = moves and moving[(index - 1) % 6] != 0
+        out[first + term] = moves
+
+
+@kernel
 def coriolis(p, nu):
     """C(nu) nu (6,) from the momentum p = M nu (6,)."""
     h = np.zeros((6, 1))

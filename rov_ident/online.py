@@ -19,7 +19,7 @@ from rov_ident.samples import Sampler
 Kind = Literal["rls", "ukf"]
 ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
 
-EXCITATION_TIME = 30.0  # s; of motion over which the present excitation is judged
+EXCITATION_TIME = 20.0  # s; the present excitation is that of this window and of the one before
 _EXCITED = 0.05  # share of the prior variance that this motion alone would remove
 _CONVERGED = (
     0.1  # standard deviation relative to the value, or to the prior's, from which it counts
@@ -42,7 +42,7 @@ class Report:
 
     Arrays are (n,) in the order of ``names``; covariance (n, n). ``stamp`` [ns] is the time of the
     last sample used, 0 before the first. ``excitation`` is the share of the prior variance that the
-    motion of the last half minute would remove by itself.
+    motion of the last 20 to 40 seconds would remove by itself.
     """
 
     stamp: int
@@ -79,7 +79,9 @@ class OnlineEstimator:
         """Back to the prior; the input buffers and counts go on."""
         self._state = self._module.init(self._task)
         self._last_t = math.nan
-        self._gained = np.zeros(len(self.prior.names))  # recent information over the prior's
+        # information over the prior's: in the window that is filling, and in the one before
+        self._gained = np.zeros((2, len(self.prior.names)))
+        self._window = 0.0  # s of the window that is filling
         self._variance = self._estimate().std ** 2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
@@ -134,12 +136,15 @@ class OnlineEstimator:
         return info
 
     def _watch(self, elapsed: float) -> None:
-        """Information gained per coefficient, fading over EXCITATION_TIME."""
+        """Information gained per coefficient, in windows of EXCITATION_TIME."""
         variance = self._module.variance(self._task, self._state)
         gained = self.prior.std**2 * (1.0 / variance - 1.0 / self._variance)
-        self._gained *= math.exp(-elapsed / EXCITATION_TIME)
-        self._gained += np.maximum(gained, 0.0)
+        self._gained[0] += np.maximum(gained, 0.0)
         self._variance = variance
+        self._window += elapsed
+        if self._window >= EXCITATION_TIME:
+            self._gained[1], self._gained[0] = self._gained[0], 0.0
+            self._window = 0.0
 
     def _estimate(self) -> Estimate:
         estimate: Estimate = self._module.estimate(self._task, self._state, self.prior)
@@ -155,7 +160,8 @@ class OnlineEstimator:
             covariance = np.diag(std**2)
         else:
             self._safe, std, covariance = values, raw.std, raw.covariance
-        excitation = self._gained / (1.0 + self._gained)
+        gained = self._gained.sum(axis=0)
+        excitation = gained / (1.0 + gained)
         words = [
             self._judge(i, values, std, raw.values, excitation, diverged)
             for i in range(len(values))

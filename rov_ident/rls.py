@@ -13,7 +13,8 @@ The information is kept as a triangular root R of ``R'R = sum of Phi' Phi / sigm
 it keeps half the digits that the covariance form loses), in coefficients scaled by their prior
 standard deviation about their prior value: the prior is the unit matrix.
 
-*Rows* count where the thrusters drive their axis. Where the residual is larger than the wrench, the
+*Columns* count where the motion they multiply is well above its noise, *rows* where the thrusters
+drive their axis. Where the residual is larger than the wrench, the
 motion has other causes (a tether, waves, the wash of another axis) which are correlated with it,
 and least squares would turn that into coefficients.
 
@@ -34,7 +35,7 @@ from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, prior_of
 from rov_ident.excitation import authority
 from rov_ident.jit import kernel
-from rov_ident.model import Structure, columns, coriolis
+from rov_ident.model import Structure, columns, coriolis, in_motion
 from rov_ident.samples import SAMPLE
 
 Array = NDArray[np.float64]
@@ -61,7 +62,11 @@ INFO = np.dtype(
     align=True,
 )
 
-_PATIENCE = 1.0  # s; outliers that go on for longer are the vehicle having changed
+_PATIENCE = 3.0  # s; outliers that go on for longer are the vehicle having changed
+_RINGING = 5.0  # times 1/corner: how long an outlier stays in the filters
+_STEADY = 4.0  # a squared residual counts for at most this often its variance: a change of the
+# vehicle is noticed by the surprise long before it passes for noise
+_SETTLED = 100  # updates after which the residual's variance is known roughly
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 2.0  # its value from which old data are forgotten; 1 is expected
 _FORGETTING_TIME = 5.0  # s; memory while surprised
@@ -91,7 +96,9 @@ _SCALARS = np.dtype(
         ("drive", "f8", (6,)),  # its mean square of late
         ("surprise", "f8"),  # normalised innovation squared, averaged: 1 when all is well
         ("refused", "f8"),  # s of uninterrupted outliers
+        ("ringing", "f8"),  # s until the last outlier has left the filters
         ("updates", "i8"),
+        ("started", "?"),
     ],
     align=True,
 )
@@ -177,7 +184,7 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     deviation = np.linalg.solve(r, state.root[:, n])
     inverse = np.linalg.solve(r, np.eye(n))
     information = inverse @ inverse.T
-    covariance = information @ state.score @ information
+    covariance = information @ (0.5 * (state.score + state.score.T)) @ information
     # From a short record the sandwich is itself uncertain, and mostly too thin: never thinner than
     # the inverse information, whose rows count once for the filter's memory.
     widen = np.sqrt(np.maximum(np.diag(information) / np.diag(covariance), 1.0)) * task.scale
@@ -218,13 +225,13 @@ def _fold(task, state, samples, info):
     m = len(task.theta)
     momentum, force = np.empty((6, m)), np.empty((6, m))
     now = np.empty((2, 6, n + 1))  # force - corner * momentum, and momentum
-    rows = np.empty((6, n + 1))
+    rows, moves = np.empty((6, n + 1)), np.empty(m, dtype=np.bool_)
     for k in range(len(samples)):
-        _step(task, state, samples[k], info[k], momentum, force, now, rows)
+        _step(task, state, samples[k], info[k], momentum, force, now, rows, moves)
 
 
 @kernel
-def _step(task, state, sample, info, momentum, force, now, rows):
+def _step(task, state, sample, info, momentum, force, now, rows, moves):
     root, score, lagged, filters, scalars = state
     s, c = task.settings[0], scalars[0]
     n = len(task.scale)
@@ -235,10 +242,7 @@ def _step(task, state, sample, info, momentum, force, now, rows):
         info.residual[i] = np.nan
         info.ratio[i] = np.nan
 
-    finite = np.isfinite(sample.dt)
-    for i in range(6):
-        finite = finite and np.isfinite(sample.nu[i]) and np.isfinite(sample.wrench[i])
-    if not finite:
+    if not is_finite(sample):
         info.reason = NOT_FINITE
         return
 
@@ -268,7 +272,8 @@ def _step(task, state, sample, info, momentum, force, now, rows):
     x, y, u, last = filters[0], filters[1], filters[2], filters[3]
     dt = sample.dt
     c.t = sample.t
-    if sample.restart or not dt > 0.0:
+    if sample.restart or not c.started or not dt > 0.0:
+        c.started = True
         for i in range(6):
             for j in range(n + 1):
                 x[i, j] = -w * now[1, i, j]
@@ -309,13 +314,15 @@ def _step(task, state, sample, info, momentum, force, now, rows):
     if c.since_update < s.period - 1e-6:
         info.reason = WAITING
         return
-    _update(s, c, root, score, lagged, y, deviation, rows, info)
+    in_motion(task.structure, sample.moving, moves)
+    _update(task, moves, c, root, score, lagged, y, deviation, rows, info)
     c.since_update = 0.0
 
 
 @kernel
-def _update(s, c, root, score, lagged, y, deviation, rows, info):
+def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
     """Take the filtered rows y (6, n + 1) into the estimate."""
+    s = task.settings[0]
     n = root.shape[0]
     # Rows closer than the filter's memory repeat each other: they count as one.
     repeats = max(1.0, 2.0 / (s.corner * c.since_update))
@@ -338,11 +345,15 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):
         info.ratio[i] = info.residual[i] ** 2 / predicted
         surprise += info.ratio[i]
         gated = gated or info.ratio[i] > s.gate**2
-    if gated and c.refused < _PATIENCE:
+    c.ringing -= c.since_update
+    if gated:
+        c.ringing = _RINGING / s.corner
+    if c.ringing > 0.0 and c.refused < _PATIENCE:
         c.refused += c.since_update
         info.reason = GATED
         return
-    c.refused = 0.0
+    if not gated:
+        c.refused = 0.0
     info.reason = USED
     c.updates += 1
     if driven > 0:
@@ -357,8 +368,14 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):
     for i in range(6):
         weight = 1.0 / np.sqrt(c.variance[i] * repeats)
         used = weight if c.drive[i] > c.variance[i] else 0.0
-        for j in range(n + 1):
-            rows[i, j] = y[i, j] * used
+        rows[i, n] = y[i, n] * used
+        for j in range(n):
+            # A coefficient whose motion is not above its noise stays out: least squares would
+            # learn from the noise.
+            free = moves[task.estimated[j]]
+            rows[i, j] = y[i, j] * used if free else 0.0
+            if not free:
+                rows[i, n] -= y[i, j] * used * deviation[j]
     if info.forgetting < 1.0:
         _forget(root, score, deviation, rows, info.forgetting)
     gradient = rows.copy()
@@ -375,6 +392,8 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):
         for j in range(n):
             g[j] += gradient[i, j] * e
         e2 = e * e * c.variance[i] * repeats if c.drive[i] > c.variance[i] else noise[i]
+        if c.updates > _SETTLED:
+            e2 = min(e2, _STEADY * c.variance[i])
         c.variance[i] = max(c.variance[i] + blend * (e2 - c.variance[i]), s.floor[i] ** 2)
     for a in range(n):
         lagged[a] *= decay
@@ -383,6 +402,17 @@ def _update(s, c, root, score, lagged, y, deviation, rows, info):
             score[a, b] += g[a] * g[b] + g[a] * lagged[b] + lagged[a] * g[b]
     for a in range(n):
         lagged[a] += g[a]
+
+
+@kernel
+def is_finite(sample):
+    """Whether nothing in a sample would spoil a state; NaN where not measured is no harm."""
+    total = sample.t + sample.dt
+    for i in range(6):
+        total += sample.nu[i] + sample.wrench[i] + sample.wrench_slope[i]
+    for i in range(3):
+        total += sample.down[i] + sample.down_slope[i]
+    return np.isfinite(total)
 
 
 @kernel

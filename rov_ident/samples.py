@@ -40,6 +40,7 @@ SAMPLE = np.dtype(
         ("dt", "f8"),  # s since the previous sample
         ("restart", "?"),  # the interval before this sample is not known: filters begin anew
         ("measured", "?"),  # an odometry message belongs to this sample
+        ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
         ("nu", "f8", (6,)),
         ("down", "f8", (3,)),  # unit, body axes
         ("down_slope", "f8", (3,)),  # per s, over the interval
@@ -67,6 +68,7 @@ _KINEMATICS = np.dtype(
         ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2
         ("v", "f8", (3,)),
+        ("power", "f8", (6,)),  # of nu, of late
         ("rate", "f8", (3,)),  # rad/s, bias removed
         ("slow_rate", "f8", (3,)),  # for the angular acceleration of the lever arm
         ("acceleration", "f8", (3,)),  # m/s2 at the origin, body axes
@@ -172,6 +174,7 @@ class Sampler:
                 self.counts[f"{role}: {'duplicate' if step == 0.0 else 'backward'} stamp"] += 1
                 return _NONE
         self._last_stamp[role] = message.stamp
+        self._suspect = None
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
             if role != WRENCH:
@@ -203,7 +206,7 @@ class Sampler:
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)
             squared = float(message.orientation @ message.orientation)
-            values = [message.linear, message.angular, message.position]
+            values = [message.linear, message.angular, 1e-3 * message.position]
             if not 0.5 < squared < 2.0:  # NaN too
                 return "orientation is not a unit quaternion"
         elif isinstance(message, Imu):
@@ -216,7 +219,7 @@ class Sampler:
             # one comparison refuses NaN, infinities and values no vehicle reaches
             if not float(value @ value) < 1e12:
                 return "not finite or absurdly large"
-        if frames[-1] in _WORLD_FRAMES:
+        if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
             return f"frame '{frames[-1]}' is a world frame, body axes are needed"
         if self._frame_ids.setdefault(role, frames) != frames:
             return f"frame changed from {self._frame_ids[role]} to {frames}"
@@ -277,9 +280,10 @@ class Sampler:
             odometry = np.concatenate(
                 [pose[1].orientation, pose[1].linear, pose[1].angular, pose[1].twist_variance]
             )
-        inertial, gyro, specific = imu is not None, _ZERO, _ZERO
+        inertial, gyro, specific, gyro_variance = imu is not None, _ZERO, _ZERO, 0.0
         if isinstance(imu, Imu):
             gyro, specific = imu.angular_velocity, imu.linear_acceleration
+            gyro_variance = float(imu.angular_variance.mean())
             self._seen_imu = t
         if restart:
             self._kinematics["known"] = False
@@ -289,16 +293,12 @@ class Sampler:
             self.counts["imu: gap, odometry alone"] += 1
         taken = fuse(
             self._kinematics, self._settings, sample, pose is not None, shift, odometry, inertial,
-            gyro, specific,
+            gyro, gyro_variance, specific,
         )  # fmt: skip
         if pose is not None and not taken:
-            self.counts["odom: outlier against the IMU"] += 1
-        if not self._kinematics["known"][0]:
-            self.counts["sample: no odometry yet"] += 1
-            self._previous = math.nan
-            return None
-        if wrench is None:
-            self.counts["sample: no wrench"] += 1
+            self.counts["odom: outlier, or marked as not measured"] += 1
+        if wrench is None or not self._kinematics["known"][0]:
+            self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
             self._previous = math.nan
             return None
         row["wrench"], row["wrench_slope"] = wrench
@@ -371,11 +371,16 @@ _ZERO = np.zeros(3)
 _ZERO_WRENCH = np.zeros(6)
 
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
+_UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
+_POWER_TIME = 5.0  # s; over which it is judged whether a component of nu moves
+_MOVING = 16.0  # mean square over noise variance from which it does: noise biases by 1/16 at most
 _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU's lever arm
 
 
 @kernel
-def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, gyro, specific):
+def fuse(
+    kinematics, settings, sample, has_odometry, shift, odometry, has_imu, gyro, gyro_given, specific
+):
     """One instant of the kinematic filter; fills the sample; whether the odometry was taken.
 
     Velocity and accelerometer bias share one 2 x 2 covariance for the three axes, as their noise is
@@ -384,11 +389,13 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
         v_dot = f - b + g k - omega x v,   z = v + lever arm,   b a slow random walk
 
     ``odometry`` is [orientation 4, linear 3, angular 3, variance 6], measured ``shift`` seconds
-    before the sample; ``gyro`` and ``specific`` (force) are in sensor axes.
+    before the sample; ``gyro`` and ``specific`` (force) are in sensor axes. ``gyro_given`` is the
+    variance in the message, zero or negative where there is none.
     """
     k, s, out = kinematics[0], settings[0], sample[0]
     dt = out.dt
     nan = np.nan
+    gyro_variance = gyro_given if 0.0 < gyro_given < 1.0 else s.gyro_variance
     started = k.inertial
     for i in range(3):
         out.gyro[i] = nan
@@ -396,11 +403,18 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
         out.odometry[3 + i] = nan
     variance = np.empty(6)
     for i in range(6):
-        given = has_odometry and odometry[10 + i] > 0.0
+        given = has_odometry and 0.0 < odometry[10 + i] < _UNKNOWN
         variance[i] = odometry[10 + i] if given else s.odometry_variance[i]
         out.odometry_variance[i] = variance[i]
     r_linear = (variance[0] + variance[1] + variance[2]) / 3.0
     r_angular = (variance[3] + variance[4] + variance[5]) / 3.0
+
+    # What is marked as unknown is not used, unless the gyro knows it.
+    for i in range(3):
+        if not odometry[10 + i] < _UNKNOWN:
+            has_odometry = False
+        if not odometry[13 + i] < _UNKNOWN and not has_imu:
+            has_odometry = False
 
     # attitude, by the rate known so far; the odometry's own rate if there is no IMU
     rate = np.empty(3)
@@ -421,7 +435,7 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
             mean_rate[i] = 0.5 * (rate[i] + k.rate[i])
     if k.known:
         k.q[:] = turned(k.q, mean_rate * dt)
-        k.attitude_variance += s.gyro_variance * dt * dt + 1e-8 * dt
+        k.attitude_variance += gyro_variance * dt * dt + 1e-8 * dt
     if has_odometry:
         q = turned(odometry[:4] / np.sqrt(np.sum(odometry[:4] ** 2)), rate * shift)
         if not k.known or not k.inertial:
@@ -520,16 +534,17 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
                 if not has_imu:
                     out.odometry[3 + i] = angular[i]
         if has_imu:
-            gain = k.gyro_bias_variance / (k.gyro_bias_variance + r_angular + s.gyro_variance)
-            k.gyro_bias_variance *= 1.0 - gain
-            back = min(shift / dt, 1.0) if k.inertial and dt > 0.0 else 0.0
-            for i in range(3):
-                then = rate[i] + back * (k.rate[i] - rate[i])
-                k.gyro_bias[i] += gain * (then - angular[i])
+            gain = k.gyro_bias_variance / (k.gyro_bias_variance + r_angular + gyro_variance)
+            # the gyro at the instant of the odometry; without a past it cannot be known
+            if k.inertial and dt > 0.0 and r_angular < _UNKNOWN:
+                k.gyro_bias_variance *= 1.0 - gain
+                for i in range(3):
+                    then = rate[i] + min(shift / dt, 1.0) * (k.rate[i] - rate[i])
+                    k.gyro_bias[i] += gain * (then - angular[i])
         k.known = True
     if has_imu:
         k.inertial = True
-        out.gyro_variance = s.gyro_variance
+        out.gyro_variance = gyro_variance
         for i in range(3):
             out.gyro[i] = rate[i]
             k.acceleration[i] = acceleration[i]
@@ -538,6 +553,12 @@ def fuse(kinematics, settings, sample, has_odometry, shift, odometry, has_imu, g
         k.rate[i] = rate[i]
         out.nu[i] = k.v[i]
         out.nu[3 + i] = rate[i]
+        r = gyro_variance if has_imu else r_angular
+        blend = min(dt / _POWER_TIME, 1.0) if dt > 0.0 else 1.0
+        k.power[i] += blend * (out.nu[i] ** 2 - k.power[i])
+        k.power[3 + i] += blend * (out.nu[3 + i] ** 2 - k.power[3 + i])
+        out.moving[i] = k.power[i] > _MOVING * r_linear
+        out.moving[3 + i] = k.power[3 + i] > _MOVING * r
         out.down[i] = down[i]
         out.down_slope[i] = (down[i] - k.down[i]) / dt if dt > 0.0 else 0.0
         k.down[i] = down[i]

@@ -17,6 +17,10 @@ in which the huge central weight has cancelled exactly.
 Update: odometry and gyro measure nu with independent noise, so one component after another is the
 same as all at once.
 
+Coefficients whose motion is not well above its noise are *considered*, not estimated (Schmidt
+1966): they stay what they are, their uncertainty is carried along. At rest a filter would else
+learn from the difference between its assumed and the true noise.
+
 The random walk fades out as a variance nears its prior: without excitation nothing grows beyond it.
 
 What the model leaves unexplained is found from the innovations: per axis, the density of the
@@ -35,27 +39,33 @@ from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, prior_of
 from rov_ident.jit import inlined, kernel
-from rov_ident.model import Structure, add_added_mass, generalized_force
-from rov_ident.rls import INFO
+from rov_ident.model import Structure, add_added_mass, generalized_force, in_motion
+from rov_ident.rls import INFO, is_finite
 from rov_ident.samples import SAMPLE
 
 Array = NDArray[np.float64]
 
-USED, RESTARTED, GATED, NOT_FINITE, REPAIRED = range(5)
+USED, RESTARTED, GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE = range(6)
 REASONS = (
     "used",
     "restarted after a gap",
     "outlier",
     "not finite",
     "covariance repaired",
+    "no model moves so",
 )
 
-REFUSALS = (GATED, NOT_FINITE, REPAIRED)
+REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 
 LANES = 16
 _MAX_STEP = 0.05  # s; of one Runge-Kutta step
 _LOWEST = -2.0  # of xi where theta stays negative: below, it has too little slope to come back
 _ADAPTATION_TIME = 20.0  # s; over which the process noise follows the innovations
+_STEADY = 4.0  # a squared innovation counts for at most this often its variance in that
+_SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
+_SURPRISING = 2.0  # its value from which the vehicle is taken to have changed; 1 is expected
+_RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
+_FASTEST = 50.0  # m/s, rad/s; no sigma point of a sane model gets there
 
 _SETTINGS = np.dtype(
     [
@@ -96,7 +106,7 @@ class State(NamedTuple):
     residual: Array  # (4, 6): stage 1, stage 2, last input, last momentum of the published residual
     process: Array  # (6,): variance density of the acceleration, adapted
     since: Array  # (6,): s since each velocity was measured
-    scalars: Array  # (2,): t, 1 once nu is known
+    scalars: Array  # (3,): t, 1 once nu is known, surprise
 
 
 def problem(config: Config) -> Problem:
@@ -148,7 +158,7 @@ def init(task: Problem) -> State:
         np.zeros((4, 6)),
         task.settings["process"][0].copy(),
         np.zeros(6),
-        np.zeros(2),
+        np.array([0.0, 0.0, 1.0]),
     )
 
 
@@ -311,6 +321,7 @@ def _fold(task, state, samples, info):
     mass, inverse = np.empty((6, 6, LANES)), np.empty((6, 6, LANES))
     scratch = np.empty((7, 6, LANES))
     nu, work = np.empty((6, LANES)), np.empty((43, LANES))
+    moves = np.empty(len(task.theta), dtype=np.bool_)
     for k in range(len(samples)):
         sample, out = samples[k], info[k]
         out.t = sample.t
@@ -318,10 +329,7 @@ def _fold(task, state, samples, info):
         for i in range(6):
             out.residual[i] = np.nan
             out.ratio[i] = np.nan
-        finite = np.isfinite(sample.dt) and np.isfinite(sample.t)
-        for i in range(6):
-            finite = finite and np.isfinite(sample.wrench[i]) and np.isfinite(sample.nu[i])
-        if not finite:
+        if not is_finite(sample):
             out.reason = NOT_FINITE
             continue
         state.scalars[0] = sample.t
@@ -330,11 +338,17 @@ def _fold(task, state, samples, info):
             _restart(state, sample)
             out.reason = RESTARTED
         else:
-            _predict(
+            in_motion(task.structure, sample.moving, moves)
+            predicted = _predict(
                 task, state, sample, out, root, moved, xi, part, theta, mass, inverse, scratch, nu,
                 work,
             )  # fmt: skip
-            _update(task, state, sample, out)
+            if predicted:
+                _update(task, state, sample, out, moves)
+            else:
+                out.reason = UNPREDICTABLE
+                state.scalars[1] = 0.0
+                continue
         _residual(task, state, sample, out, theta, mass, work, xi, part)
 
 
@@ -346,7 +360,8 @@ def _restart(state, sample):
             state.p[i, j] = 0.0
             state.p[j, i] = 0.0
         state.x[i] = sample.nu[i]
-        state.p[i, i] = sample.odometry_variance[i]
+        variance = sample.odometry_variance[i]
+        state.p[i, i] = variance if variance < 1.0 else 1.0
     state.scalars[1] = 1.0
 
 
@@ -407,6 +422,14 @@ def _predict(
                 for i in range(6):
                     moved[i, point - 1] = nu[i, k] - centre[i]
 
+    worst = 0.0
+    for i in range(6):
+        worst = max(worst, abs(centre[i]))
+        for c in range(2 * size):
+            worst = max(worst, abs(moved[i, c]))
+    if not worst < _FASTEST:  # NaN too
+        return False
+
     # covariance of the velocities and with the coefficients
     e = np.empty(6)
     for i in range(6):
@@ -438,7 +461,11 @@ def _predict(
     for j in range(n):
         room = 1.0 - p[6 + j, 6 + j] / task.prior_variance[j]
         if room > 0.0:
-            p[6 + j, 6 + j] += task.walk[j] * sample.dt * room
+            walk = task.walk[j]
+            if state.scalars[2] > _SURPRISING:
+                walk = max(walk, task.prior_variance[j] / _RELEARNING_TIME)
+            p[6 + j, 6 + j] += walk * sample.dt * room
+    return True
 
 
 @kernel
@@ -459,7 +486,7 @@ def _model_of(task, xi, part, theta, mass):
 
 
 @kernel
-def _update(task, state, sample, out):
+def _update(task, state, sample, out, moves):
     """Linear and angular velocity, each behind its own gate, one component after another."""
     s = task.settings[0]
     x, p, size = state.x, state.p, len(state.x)
@@ -468,6 +495,10 @@ def _update(task, state, sample, out):
         z[i], r[i] = sample.odometry[i], sample.odometry_variance[i]
         if i >= 3 and np.isfinite(sample.gyro[i - 3]):
             z[i], r[i] = sample.gyro[i - 3], sample.gyro_variance
+        if not np.isfinite(r[i]):
+            z[i] = np.nan
+    part = np.zeros(size)
+    surprise, count = 0.0, 0
     for i in range(6):
         state.since[i] += sample.dt
     for group in range(2):
@@ -479,8 +510,9 @@ def _update(task, state, sample, out):
             total = p[i, i] + r[i]
             out.ratio[i] = (z[i] - x[i]) ** 2 / total
             worst = max(worst, out.ratio[i])
-            # an outlier counts as one at the gate: if it is none, the gate opens within a second
-            excess = (min(out.ratio[i], s.gate**2) - 1.0) * total
+            surprise += min(out.ratio[i], s.gate**2)
+            count += 1
+            excess = (min(out.ratio[i], _STEADY) - 1.0) * total
             blend = min(state.since[i] / _ADAPTATION_TIME, 0.1)
             density = state.process[i] + blend * excess / state.since[i]
             state.process[i] = max(density, s.process[i])
@@ -491,11 +523,18 @@ def _update(task, state, sample, out):
         for i in range(first, first + 3):
             total = p[i, i] + r[i]
             innovation = z[i] - x[i]
-            gain = p[:, i] / total
+            cross = p[:, i].copy()
             for a in range(size):
-                x[a] += gain[a] * innovation
-                for b in range(size):
-                    p[a, b] -= gain[a] * total * gain[b]
+                considered = a >= 6 and not moves[task.estimated[a - 6]]
+                part[a] = 0.0 if considered else cross[a] / total
+                x[a] += part[a] * innovation
+            for a in range(size):
+                for b in range(a + 1):
+                    p[a, b] -= part[a] * cross[b] + cross[a] * part[b] - total * part[a] * part[b]
+                    p[b, a] = p[a, b]
+    if count > 0:
+        blend = min(sample.dt / _SURPRISE_TIME, 1.0)
+        state.scalars[2] += blend * (surprise / count - state.scalars[2])
     for j in range(len(task.scale)):
         if task.negative[j] and x[6 + j] < _LOWEST:
             x[6 + j] = _LOWEST

@@ -331,7 +331,7 @@ def test_no_windup(heavy, learnt, motion):
         rows = np.tile(one, count // len(one))
         rows["restart"][:: len(one)] = True
         unexcited = np.array([n[0] in "YKN" for n in prior.names])
-    after, info = rls.fold(task, state, rows)
+    after, _ = rls.fold(task, state, rows)
     then = rls.estimate(task, after, prior)
     assert np.isfinite(then.values).all() and np.isfinite(then.covariance).all()
     assert np.linalg.eigvalsh(then.covariance / np.outer(prior.std, prior.std))[0] > -1e-9
@@ -363,9 +363,9 @@ def test_follows_a_change(heavy):
         after, wrench = driven(heavy, 180.0, 22, model=changed, start=start)
         second = textbook.rows_of(after, wrench, np.random.default_rng(2), wrench_std=0.01)
         i = heavy.model.names.index(name)
-        estimate, state, _ = result(heavy, first)
+        estimate, _, _ = result(heavy, first)
         assert estimate.values[i] == pytest.approx(heavy.model.theta[i], rel=0.1)
-        estimate, _, info = result(heavy, textbook.joined(first, second))
+        estimate, _, _ = result(heavy, textbook.joined(first, second))
         assert estimate.values[i] == pytest.approx(changed.theta[i], rel=0.1), name
         others = np.arange(len(heavy.model.theta)) != i
         error = np.abs(estimate.values - changed.theta) / prior_of(heavy).std
@@ -380,7 +380,7 @@ def test_intervals_and_bias_over_seeds(heavy, dives):
     z, prior = [], None
     for config, samples in dives:
         prior = prior_of(config)
-        estimate, state, _ = result(config, samples)
+        estimate, _, _ = result(config, samples)
         assert np.linalg.eigvalsh(estimate.covariance / np.outer(prior.std, prior.std))[0] > 0
         z.append((estimate.values - heavy.model.theta) / estimate.std)
     z = np.array(z)

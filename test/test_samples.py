@@ -61,7 +61,8 @@ def moments(t, demand, begin, end):
 @pytest.mark.parametrize(
     "odometry_rate, imu_rate, wrench_rate",
     [
-        (5, 0, 50), (20, 0, 50), (50, 0, 5), (200, 0, 200), (500, 0, 50), (20, 50, 20), (5, 100, 50),
+        (5, 0, 50), (20, 0, 50), (50, 0, 5), (200, 0, 200), (500, 0, 50), (20, 50, 20),
+        (5, 100, 50),
         (20, 100, 5), (20, 100, 200), (50, 100, 50), (100, 100, 50), (200, 50, 50), (20, 200, 50),
         (20, 500, 50), (500, 500, 200), (500, 50, 5),
     ],
@@ -557,7 +558,7 @@ def test_a_gate_that_was_wrong_opens_again(heavy):
         else (role, m)
         for role, m in steady(1.0, 30.0)
     ]
-    samples, sampler = taken(heavy, messages)
+    samples, _ = taken(heavy, messages)
     assert samples["nu"][-1, 0] == pytest.approx(0.5, abs=0.05)
 
 

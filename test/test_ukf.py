@@ -223,7 +223,7 @@ def test_truth_without_noise(heavy):
     rows["odometry_variance"] = 1e-8
     config = with_section(wrong_prior(heavy, spread=0.3), "ukf", process_std=(1e-5,) * 6)
     config = with_section(config, "wrench", relative_std=1e-5)
-    estimate, state, _ = result(with_section(config, "ukf", gate=1e6), rows)
+    estimate, _, _ = result(with_section(config, "ukf", gate=1e6), rows)
     error = np.abs(estimate.values / heavy.model.theta - 1.0)
     assert error.max() < 0.003, dict(zip(estimate.names, error.round(5), strict=True))
 
@@ -341,7 +341,7 @@ def test_a_start_from_a_velocity_that_is_not_known(heavy, noisy, variance):
     """Drivers without angular rates give them a huge variance: start wide, not in pieces."""
     rows = noisy.copy()
     rows["odometry_variance"][:, 3:] = variance
-    estimate, state, info = result(heavy, rows)
+    estimate, _, info = result(heavy, rows)
     assert np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()
     assert (info["reason"] == ukf.REPAIRED).sum() == 0
     error = np.abs(estimate.values / heavy.model.theta - 1.0)
@@ -353,7 +353,7 @@ def test_one_wild_wrench(heavy, noisy, force):
     """A finite but absurd thrust in one sample: refused, or forgotten soon; never fatal."""
     rows = noisy.copy()
     rows["wrench"][700, 0] += force
-    estimate, state, info = result(heavy, rows)
+    estimate, state, _ = result(heavy, rows)
     assert np.isfinite(state.x).all() and np.isfinite(state.p).all()
     clean, _, _ = result(heavy, noisy)
     assert (np.abs(estimate.values - clean.values) < 0.1 * prior_of(heavy).std).all()
