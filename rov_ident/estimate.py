@@ -98,12 +98,14 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     values, signed = estimate.values.copy(), np.flatnonzero(prior.negative)
     if (values[signed] > 0.0).any():
         # minimise |theta - estimate| in the metric of P: theta = estimate - P[:, signed] lambda
-        size = estimate.std[signed] + 1e-300
+        size = np.where(estimate.std[signed] > 0.0, estimate.std[signed], 1.0)
         p = estimate.covariance[np.ix_(signed, signed)] / np.outer(size, size)
-        root = np.linalg.cholesky(p + 1e-12 * np.eye(len(signed)))
-        multipliers = nnls(root.T, np.linalg.solve(root, values[signed] / size))[0]
+        eigenvalues, vectors = np.linalg.eigh(p)
+        root = vectors * np.sqrt(np.maximum(eigenvalues, 1e-12))
+        goal = (vectors.T @ (values[signed] / size)) / np.sqrt(np.maximum(eigenvalues, 1e-12))
+        multipliers = nnls(root.T, goal)[0]
         values -= estimate.covariance[:, signed] @ (multipliers / size)
-        values[signed] = np.minimum(values[signed], 0.0)
+        values[signed] = np.where(multipliers > 0.0, 0.0, np.minimum(values[signed], 0.0))
     if is_passive(model, prior, values):
         return values
     low, high = 0.0, 1.0  # share of the way from the prior to the estimate

@@ -62,8 +62,8 @@ INFO = np.dtype(
     align=True,
 )
 
-_PATIENCE = 3.0  # s; outliers that go on for longer are the vehicle having changed
-_RINGING = 5.0  # times 1/corner: how long an outlier stays in the filters
+_PATIENCE = 3.0  # outliers in short order from which they are the vehicle having changed
+_PATIENCE_TIME = 5.0  # s; over which that is counted
 _STEADY = 4.0  # a squared residual counts for at most this often its variance: a change of the
 # vehicle is noticed by the surprise long before it passes for noise
 _SETTLED = 100  # updates after which the residual's variance is known roughly
@@ -95,8 +95,7 @@ _SCALARS = np.dtype(
         ("wrench", "f8", (6,)),  # filtered once
         ("drive", "f8", (6,)),  # its mean square of late
         ("surprise", "f8"),  # normalised innovation squared, averaged: 1 when all is well
-        ("refused", "f8"),  # s of uninterrupted outliers
-        ("ringing", "f8"),  # s until the last outlier has left the filters
+        ("refused", "f8"),  # outliers of late
         ("updates", "i8"),
         ("started", "?"),
     ],
@@ -184,7 +183,8 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     deviation = np.linalg.solve(r, state.root[:, n])
     inverse = np.linalg.solve(r, np.eye(n))
     information = inverse @ inverse.T
-    covariance = information @ (0.5 * (state.score + state.score.T)) @ information
+    covariance = information @ state.score @ information
+    covariance = 0.5 * (covariance + covariance.T)
     # From a short record the sandwich is itself uncertain, and mostly too thin: never thinner than
     # the inverse information, whose rows count once for the filter's memory.
     widen = np.sqrt(np.maximum(np.diag(information) / np.diag(covariance), 1.0)) * task.scale
@@ -345,15 +345,13 @@ def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
         info.ratio[i] = info.residual[i] ** 2 / predicted
         surprise += info.ratio[i]
         gated = gated or info.ratio[i] > s.gate**2
-    c.ringing -= c.since_update
-    if gated:
-        c.ringing = _RINGING / s.corner
-    if c.ringing > 0.0 and c.refused < _PATIENCE:
-        c.refused += c.since_update
+    c.refused *= np.exp(-c.since_update / _PATIENCE_TIME)
+    if gated and c.refused < _PATIENCE:
+        c.refused += 1.0
+        # The outlier would ring on in the filters; beginning anew costs nothing but their memory.
+        c.started = False
         info.reason = GATED
         return
-    if not gated:
-        c.refused = 0.0
     info.reason = USED
     c.updates += 1
     if driven > 0:
@@ -385,6 +383,8 @@ def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
     decay = np.exp(-c.since_update / s.lag)
     g = np.zeros(n)
     blend = max(c.since_update / _NOISE_TIME, 1.0 / (20.0 + c.updates))
+    if c.surprise > _SURPRISING:
+        blend *= 0.2
     for i in range(6):
         e = gradient[i, n]
         for j in range(n):

@@ -114,7 +114,7 @@ class Sampler:
         self.origin: int | None = None
         self._frame_ids: dict[str, tuple[str, ...]] = {}
         self._last_stamp: dict[str, int] = {}
-        self._suspect: int | None = None
+        self._suspect: dict[str, int] = {}  # a stamp out of line, by topic
         self._clear()
 
     def configure(self, config: Config) -> None:
@@ -160,7 +160,7 @@ class Sampler:
         if last is not None:
             step = (message.stamp - last) * 1e-9
             if step < -1.0 or step > _MAX_JUMP:
-                if not self._is_new_clock(message.stamp):
+                if not self._is_new_clock(role, message.stamp):
                     self.counts[f"{role}: stamp jumps"] += 1
                     return _NONE
                 done = self.flush()
@@ -174,7 +174,7 @@ class Sampler:
                 self.counts[f"{role}: {'duplicate' if step == 0.0 else 'backward'} stamp"] += 1
                 return _NONE
         self._last_stamp[role] = message.stamp
-        self._suspect = None
+        self._suspect.pop(role, None)
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
             if role != WRENCH:
@@ -193,9 +193,10 @@ class Sampler:
         self._newest[role] = t
         self._queues[role].append((t, to_core(message, self._defaults)))
 
-    def _is_new_clock(self, stamp: int) -> bool:
+    def _is_new_clock(self, role: str, stamp: int) -> bool:
         """A single wild stamp is an error; two in a row that agree are another clock."""
-        suspect, self._suspect = self._suspect, stamp
+        suspect = self._suspect.get(role)
+        self._suspect[role] = stamp
         return suspect is not None and abs(stamp - suspect) * 1e-9 < 1.0
 
     def _refusal(self, role: str, message: Message) -> str:
@@ -411,9 +412,9 @@ def fuse(
 
     # What is marked as unknown is not used, unless the gyro knows it.
     for i in range(3):
-        if not odometry[10 + i] < _UNKNOWN:
+        if _UNKNOWN <= odometry[10 + i] < np.inf:
             has_odometry = False
-        if not odometry[13 + i] < _UNKNOWN and not has_imu:
+        if _UNKNOWN <= odometry[13 + i] < np.inf and not has_imu:
             has_odometry = False
 
     # attitude, by the rate known so far; the odometry's own rate if there is no IMU

@@ -62,6 +62,7 @@ _MAX_STEP = 0.05  # s; of one Runge-Kutta step
 _LOWEST = -2.0  # of xi where theta stays negative: below, it has too little slope to come back
 _ADAPTATION_TIME = 20.0  # s; over which the process noise follows the innovations
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in that
+_LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
 _SURPRISING = 2.0  # its value from which the vehicle is taken to have changed; 1 is expected
 _RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
@@ -106,7 +107,7 @@ class State(NamedTuple):
     residual: Array  # (4, 6): stage 1, stage 2, last input, last momentum of the published residual
     process: Array  # (6,): variance density of the acceleration, adapted
     since: Array  # (6,): s since each velocity was measured
-    scalars: Array  # (3,): t, 1 once nu is known, surprise
+    scalars: Array  # (4,): t, 1 once nu is known, surprise, s of nothing but outliers
 
 
 def problem(config: Config) -> Problem:
@@ -158,7 +159,7 @@ def init(task: Problem) -> State:
         np.zeros((4, 6)),
         task.settings["process"][0].copy(),
         np.zeros(6),
-        np.array([0.0, 0.0, 1.0]),
+        np.array([0.0, 0.0, 1.0, 0.0]),
     )
 
 
@@ -363,6 +364,8 @@ def _restart(state, sample):
         variance = sample.odometry_variance[i]
         state.p[i, i] = variance if variance < 1.0 else 1.0
     state.scalars[1] = 1.0
+    state.scalars[2] = 1.0
+    state.scalars[3] = 0.0
 
 
 @kernel
@@ -520,6 +523,7 @@ def _update(task, state, sample, out, moves):
         if worst > s.gate**2:
             out.reason = GATED
             continue
+        state.scalars[3] = 0.0
         for i in range(first, first + 3):
             total = p[i, i] + r[i]
             innovation = z[i] - x[i]
@@ -532,6 +536,11 @@ def _update(task, state, sample, out, moves):
                 for b in range(a + 1):
                     p[a, b] -= part[a] * cross[b] + cross[a] * part[b] - total * part[a] * part[b]
                     p[b, a] = p[a, b]
+    if out.reason == GATED:
+        state.scalars[3] += sample.dt
+        if state.scalars[3] > _LOST:
+            _restart(state, sample)
+            return
     if count > 0:
         blend = min(sample.dt / _SURPRISE_TIME, 1.0)
         state.scalars[2] += blend * (surprise / count - state.scalars[2])

@@ -161,7 +161,7 @@ def test_lever_arms_and_mounting(heavy):
     error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
     assert np.sqrt(np.mean(error[:, :3] ** 2)) < 0.01
     assert np.abs(error[:, 3:]).max() < 2e-3
-    assert sampler.counts["odom: outlier against the IMU"] == 0
+    assert sampler.counts["odom: outlier, or marked as not measured"] == 0
     # and it matters: unaware of them the velocities are off
     ignorant, sampler = taken(heavy, without_arrival(dive))
     error = ignorant["nu"] - dive.truth.nu[instants(dive, sampler, ignorant)]
@@ -457,7 +457,7 @@ def test_a_bad_message_is_counted_and_changes_nothing(heavy, role, make, changed
 
 
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
-@pytest.mark.parametrize("bad", [math.inf, math.nan, -1.0, 1e300, 1e-320, 0.0])
+@pytest.mark.parametrize("bad", [math.inf, math.nan, -1.0, 1e-320, 0.0])
 def test_a_useless_variance_is_as_good_as_none(heavy, bad):
     """Drivers fill covariances with anything; the velocity beside it is still a velocity."""
     config = with_section(heavy, "odometry", linear_std=0.008, angular_std=0.004)
@@ -545,7 +545,7 @@ def test_velocity_outliers_against_the_imu(heavy):
             wild += 1
         messages.append((role, m))
     samples, sampler = taken(heavy, messages)
-    assert wild > 2 and sampler.counts["odom: outlier against the IMU"] == wild
+    assert wild > 2 and sampler.counts["odom: outlier, or marked as not measured"] == wild
     error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
     assert np.abs(error).max() < 0.05
 

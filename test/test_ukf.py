@@ -101,12 +101,15 @@ class Peer:
         q = np.zeros((6 + n, 6 + n))
         q[:6, :6] = (forces + np.diag(self.process)) * row["dt"]
         room = np.maximum(1.0 - np.diag(self.filter.P)[6:] / self.task.prior_variance, 0.0)
-        q[6:, 6:] = np.diag(self.task.walk * row["dt"] * room)
+        walk = self.task.walk
+        if self.surprise > ukf._SURPRISING:
+            walk = np.maximum(walk, self.task.prior_variance / ukf._RELEARNING_TIME)
+        q[6:, 6:] = np.diag(walk * row["dt"] * room)
         return q
 
-    def step(self, row, process):
-        """``process`` (6,): the density that the library has found so far, its own matter."""
-        self.row, self.process = row, process
+    def step(self, row, process, surprise):
+        """``process`` (6,), ``surprise``: what the library has found so far, its own matter."""
+        self.row, self.process, self.surprise = row, process, surprise
         if row["restart"]:
             x, p = self.filter.x, self.filter.P
             x[:6], p[:6], p[:, :6] = row["nu"], 0.0, 0.0
@@ -163,7 +166,7 @@ def test_equals_filterpy(heavy, names, alpha, dt, kind):
     peer = Peer(config, task, state)
     assert len(state.x) == 6 + names
     for i in range(len(rows)):
-        peer.step(rows[i], state.process)
+        peer.step(rows[i], state.process, state.scalars[2])
         state, info = ukf.step(task, state, rows[i : i + 1])
         assert info["reason"][0] in (ukf.USED, ukf.RESTARTED)
         error = np.abs(state.x - peer.filter.x) / np.sqrt(np.diag(peer.filter.P))

@@ -72,6 +72,7 @@ def rows_of(
     rows["nu"] = motion.nu + std * noise[0]
     rows["odometry"] = rows["nu"]
     rows["odometry_variance"] = std**2
+    rows["moving"] = np.sqrt(np.mean(motion.nu**2, axis=0)) > 4.0 * std
     rows["gyro"] = np.nan
     if gyro:
         rows["odometry"][:, 3:] = np.nan
