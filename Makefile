@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check bag clean
+.PHONY: demo test check accuracy bag clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -23,9 +23,13 @@ check: .venv/test.stamp
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+## accuracy over seeds, the tables of docs/accuracy.md (a quarter of an hour)
+accuracy: .venv/demo.stamp
+	$(BIN)/python bench/accuracy.py
+
 ## the shipped bag, anew
 bag: .venv/demo.stamp
-	$(BIN)/rov-ident simulate --config config/bluerov2_heavy.yaml --manoeuvre demo --out bags/demo.mcap
+	$(BIN)/rov-ident simulate --config config/bluerov2_heavy.yaml --manoeuvre steps --seed 1 --duration 120 --out bags/demo.mcap
 
 clean:
 	rm -rf .venv build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

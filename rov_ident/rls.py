@@ -62,14 +62,15 @@ INFO = np.dtype(
     align=True,
 )
 
-_PATIENCE = 3.0  # outliers in short order from which they are the vehicle having changed
-_PATIENCE_TIME = 5.0  # s; over which that is counted
+_WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
+_PATIENCE = 1.5  # lesser outliers in short order from which the vehicle has changed
+_PATIENCE_TIME = 3.0  # s; over which that is counted
 _STEADY = 4.0  # a squared residual counts for at most this often its variance: a change of the
 # vehicle is noticed by the surprise long before it passes for noise
 _SETTLED = 100  # updates after which the residual's variance is known roughly
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 2.0  # its value from which old data are forgotten; 1 is expected
-_FORGETTING_TIME = 5.0  # s; memory while surprised
+_FORGETTING_TIME = 2.0  # s; memory while surprised
 _DRIVE_TIME = 20.0  # s; memory of how strongly an axis is driven
 _NOISE_TIME = 60.0  # s; memory of the residual's variance
 _EXCITED = 0.01  # a row with less information than this, relative to the prior, excites nothing
@@ -326,7 +327,7 @@ def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
     n = root.shape[0]
     # Rows closer than the filter's memory repeat each other: they count as one.
     repeats = max(1.0, 2.0 / (s.corner * c.since_update))
-    surprise, driven, gated = 0.0, 0, False
+    surprise, driven, gated, wild = 0.0, 0, False, False
     whitened, noise = np.empty(n), np.empty(6)
     for i in range(6):
         spread = 0.0
@@ -343,10 +344,14 @@ def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
             continue
         driven += 1
         info.ratio[i] = info.residual[i] ** 2 / predicted
-        surprise += info.ratio[i]
+        surprise += min(info.ratio[i], s.gate**2)
         gated = gated or info.ratio[i] > s.gate**2
+        wild = wild or info.ratio[i] > _WILD**2
+    if driven > 0:
+        blend = min(c.since_update / _SURPRISE_TIME, 1.0)
+        c.surprise += blend * (surprise / driven - c.surprise)
     c.refused *= np.exp(-c.since_update / _PATIENCE_TIME)
-    if gated and c.refused < _PATIENCE:
+    if wild or (gated and c.refused < _PATIENCE):
         c.refused += 1.0
         # The outlier would ring on in the filters; beginning anew costs nothing but their memory.
         c.started = False
@@ -354,9 +359,6 @@ def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
         return
     info.reason = USED
     c.updates += 1
-    if driven > 0:
-        blend = min(c.since_update / _SURPRISE_TIME, 1.0)
-        c.surprise += blend * (surprise / driven - c.surprise)
 
     if s.variable:
         if c.surprise > _SURPRISING:

@@ -64,7 +64,7 @@ _ADAPTATION_TIME = 20.0  # s; over which the process noise follows the innovatio
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in that
 _LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
-_SURPRISING = 2.0  # its value from which the vehicle is taken to have changed; 1 is expected
+_SURPRISING = 3.0  # its value from which the vehicle is taken to have changed; 1 is expected
 _RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
 _FASTEST = 50.0  # m/s, rad/s; no sigma point of a sane model gets there
 

@@ -258,7 +258,7 @@ REFUSED = [
         "vehicle.inertia [0.26, 0.23, 0.37, 0.5, 0.0, 0.0] is not positive definite: check",
     ),
     ({"coefficients__Y_rdot": 20.0}, "the mass matrix (rigid body plus added mass) is not positi"),
-    ({"coefficients__X_uu": 141.0}, "coefficients.X_uu is 141.0, but it must not be positive"),
+    ({"coefficients__X_uu": 141.0}, "coefficients.X_uu is 141.0, but must not be positive"),
     ({"gravity": 32.2}, "gravity is 32.2 m/s2, but must be between 9.7 and 9.9"),
     ({"rls": {"forgetting_factor": 1.01}}, "rls.forgetting_factor is 1.01, but must be between 0 "),
     ({"qos": {"depth": 0}}, "qos.depth is 0, but must be at least 1"),

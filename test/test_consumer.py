@@ -126,7 +126,7 @@ def test_empty_and_repeated(hydrodynamics):
 @pytest.mark.parametrize(
     "name, value, reason",
     [
-        ("X_u", "0.1", "coefficients.X_u is 0.1, but it must not be positive"),
+        ("X_u", "0.1", "coefficients.X_u is 0.1, but must not be positive"),
         ("X_udot", "30.0", "coefficients.X_udot"),
         ("Y_rdot", "5.0", "not positive definite"),
         ("N_v", "60.0", "feed energy"),

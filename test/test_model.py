@@ -648,9 +648,7 @@ def test_the_same_term_twice_is_refused(values):
 
 @pytest.mark.parametrize("name", "X_udot N_rdot X_u M_q X_uu K_pp".split())
 def test_a_positive_value_of_the_own_axis_is_refused(name):
-    with pytest.raises(
-        UserError, match=rf"coefficients\.{name} is 0\.1, but it must not be positive"
-    ):
+    with pytest.raises(UserError, match=rf"coefficients\.{name} is 0\.1, but must not be positive"):
         build(BODY, {name: 0.1})
     assert build(BODY, {name: 0.0}).theta.tolist() == [0.0]
 

@@ -1,0 +1,221 @@
+"""Offline fits and what they are judged by: records, open-loop scores, the written result."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from rov_ident import sensors
+from rov_ident.bags import Bag, BagWriter
+from rov_ident.cdr import ODOMETRY_TYPE
+from rov_ident.errors import UserError
+from rov_ident.fit import fit_online, write_text
+from rov_ident.frames import gravity_direction
+from rov_ident.recording import write_messages
+from rov_ident.records import VELOCITIES, attitude_of, predicted, read_record, score
+
+DURATION = 20.0  # s
+GAP = (9_000_000_000, 12_000_000_000)  # ns, of the record with a gap
+
+
+@pytest.fixture(scope="module")
+def quiet(heavy):
+    """A dive without noise: (arrival, role, message)."""
+    suite = sensors.Suite().scaled(0.0)
+    return sensors.dive(heavy, duration=DURATION, suite=suite, seed=1).messages
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("records")
+
+
+@pytest.fixture(scope="module")
+def record(folder, heavy, quiet):
+    write_messages(folder / "quiet.mcap", quiet)
+    return read_record(folder / "quiet.mcap", heavy)
+
+
+@pytest.fixture(scope="module")
+def broken(folder, heavy, quiet):
+    """The same with a pause of three seconds."""
+    write_messages(folder / "gap.mcap", [m for m in quiet if not GAP[0] < m[2].stamp < GAP[1]])
+    return read_record(folder / "gap.mcap", heavy)
+
+
+@pytest.fixture(scope="module")
+def resting(folder, heavy):
+    messages = sensors.dive(heavy, "rest", duration=10.0, seed=1).messages
+    write_messages(folder / "rest.mcap", messages)
+    return read_record(folder / "rest.mcap", heavy)
+
+
+@pytest.fixture(scope="module")
+def fits(heavy, record):
+    return {kind: fit_online([record], heavy, kind) for kind in ("rls", "ukf")}
+
+
+# ------------------------------------------------------------------ records
+
+
+def test_a_gap_counts_for_nothing(record, broken):
+    assert record.duration == pytest.approx(DURATION, abs=0.2)
+    pause = (GAP[1] - GAP[0]) * 1e-9
+    assert record.duration - broken.duration == pytest.approx(pause, abs=0.2)
+    assert np.count_nonzero(broken.samples["restart"]) == 2
+
+
+def test_progress_ends_at_the_whole(folder, heavy, record, quiet):
+    seen = []
+    again = read_record(folder / "quiet.mcap", heavy, lambda *at: seen.append(at))
+    assert seen == sorted(seen)
+    assert seen[-1] == (len(quiet), len(quiet))
+    assert again.sha256 == record.sha256
+    for name in record.samples.dtype.names:  # NaN where nothing was measured
+        np.testing.assert_array_equal(again.samples[name], record.samples[name])
+
+
+def test_messages_that_cannot_be_decoded_are_counted(folder, heavy, quiet):
+    path = folder / "spoilt.mcap"
+    write_messages(path, quiet)
+    rows = list(Bag(path).iter_raw())
+    spoilt = folder / "spoilt_again.mcap"
+    with BagWriter(spoilt) as writer:
+        for k, raw in enumerate(rows):
+            cut = raw.type_name == ODOMETRY_TYPE and k % 3 == 0
+            data = raw.data[:40] if cut else raw.data
+            writer.write(raw.topic, raw.type_name, raw.log_time, data)
+    count = sum(raw.type_name == ODOMETRY_TYPE and k % 3 == 0 for k, raw in enumerate(rows))
+    record = read_record(spoilt, heavy)
+    assert record.counts["odom: cannot be decoded"] == count > 0
+    assert f"odom: cannot be decoded ({count})" in record.notes
+
+
+def test_what_makes_no_sample_is_refused(folder, heavy, quiet):
+    path = folder / "unstamped.mcap"
+    write_messages(path, [(at, role, m._replace(stamp=0)) for at, role, m in quiet])
+    with pytest.raises(UserError, match=r"unstamped\.mcap: .* no samples: .*zero stamp"):
+        read_record(path, heavy)
+
+
+def test_attitude_is_that_of_the_samples_without_heading(record):
+    np.testing.assert_allclose(
+        gravity_direction(attitude_of(record.samples)), record.samples["down"], atol=1e-12
+    )
+
+
+# ------------------------------------------------------------------ open loop
+
+
+def test_the_truth_simulates_its_own_record(heavy, record):
+    for horizon in (10.0, math.inf):
+        result = score(heavy.model, record.samples, horizon)
+        assert np.all(result.r2 > 0.995)
+        assert np.all(result.rmse < 0.02)
+
+
+def test_a_wrong_model_scores_worse(heavy, record):
+    wrong = heavy.model.with_theta(1.5 * heavy.model.theta)
+    true = score(heavy.model, record.samples)
+    assert np.all(score(wrong, record.samples).rmse > 2.0 * true.rmse)
+
+
+def test_components_not_simulated_follow_the_measurement(heavy, record):
+    free = np.array([True, False, False, False, False, True])
+    run = predicted(heavy.model, record.samples, math.inf, free)
+    np.testing.assert_array_equal(run[:, ~free], record.samples["nu"][:, ~free])
+    assert np.all(np.any(run[:, free] != record.samples["nu"][:, free], axis=0))
+
+
+def test_one_run_begins_anew_after_a_gap(heavy, broken):
+    run = predicted(heavy.model, broken.samples, math.inf)
+    starts = np.flatnonzero(broken.samples["restart"])
+    np.testing.assert_allclose(run[starts], broken.samples["nu"][starts], atol=1e-12)
+    assert np.isfinite(run).all()
+
+
+# ------------------------------------------------------------------ fits
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_result_is_the_agreed_json(heavy, record, fits, kind):
+    fit = fits[kind]
+    result = json.loads(fit.to_json(), parse_constant=lambda name: pytest.fail(name))
+    assert {*result} >= {"estimator", "coefficients", "samples", "duration_s", "open_loop"}
+    assert result["estimator"] == kind
+    assert result["samples"] == len(record.samples)
+    assert result["duration_s"] == record.duration
+    assert result["open_loop"]["horizon_s"] == 10.0
+    assert tuple(result["open_loop"]["rmse"]) == VELOCITIES
+    assert tuple(result["coefficients"]) == heavy.model.names
+    for i, found in enumerate(result["coefficients"].values()):
+        assert found == {
+            "value": fit.values[i],
+            "std": math.sqrt(fit.covariance[i, i]),
+            "unit": heavy.model.coefficients[i].unit,
+            "identifiable": fit.identifiable[i],
+        }
+    assert result["provenance"]["bags"] == [{"file": "quiet.mcap", "sha256": record.sha256}]
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_fit_finds_the_truth(heavy, fits, kind):
+    fit = fits[kind]
+    assert np.median(np.abs(fit.values / heavy.model.theta - 1.0)) < 0.03
+    assert all(fit.identifiable)
+    np.testing.assert_array_equal(fit.model.theta, fit.values)
+    assert np.all(fit.rmse < 0.03)
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_rest_identifies_nothing(heavy, resting, kind):
+    """What the motion does not show is said to be not identifiable, and stays at the prior."""
+    fit = fit_online([resting], heavy, kind)
+    damping = [i for i, name in enumerate(fit.names) if name in ("X_uu", "Y_vv", "N_rr")]
+    for i in damping:
+        assert not fit.identifiable[i]
+        assert abs(fit.values[i] - heavy.model.theta[i]) < fit.std[i]
+
+
+def test_two_records_are_one_fit(heavy, record, broken, fits):
+    both = fit_online([record, broken], heavy, "rls")
+    assert both.samples == len(record.samples) + len(broken.samples)
+    assert both.duration == pytest.approx(record.duration + broken.duration, abs=1e-9)
+    assert np.all(both.std <= 1.001 * fits["rls"].std)
+    files = [bag["file"] for bag in both.provenance["bags"]]
+    assert files == ["quiet.mcap", "gap.mcap"]
+
+
+def test_no_such_estimator(heavy, record):
+    with pytest.raises(UserError, match="no estimator 'ols': use rls or ukf"):
+        fit_online([record], heavy, "ols")
+
+
+def test_numbers_that_do_not_exist_are_null(fits):
+    rmse = np.array([0.1, np.nan, np.inf, 0.0, 0.0, 0.0])
+    result = json.loads(dataclasses.replace(fits["rls"], rmse=rmse).to_json())
+    assert [result["open_loop"]["rmse"][name] for name in "uvw"] == [0.1, None, None]
+
+
+# ------------------------------------------------------------------ writing
+
+
+def test_text_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "result.json"
+    write_text(path, "first")
+    write_text(path, "second, ψ")
+    assert path.read_text("utf-8") == "second, ψ"
+    taken = tmp_path / "folder"
+    taken.mkdir()
+    with pytest.raises(UserError, match=f"{taken} cannot be written"):
+        write_text(taken, "third")
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["folder", "new", "result.json"]
+
+
+@pytest.mark.xfail(raises=NotADirectoryError, strict=True, reason="the clean-up itself fails")
+def test_a_file_in_the_way_is_named(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match=r"result\.json cannot be written"):
+        write_text(tmp_path / "file" / "result.json", "text")
