@@ -28,7 +28,7 @@ setup(
         "zstandard>=0.21",
         "PyYAML>=6.0",
         "rich>=13",
-        "matplotlib>=3.8",
+        "matplotlib>=3.6",
     ],
     extras_require={
         # On a ROS 2 machine rclpy and the messages come from apt; these wheels stand in elsewhere.

@@ -28,12 +28,13 @@ def _cache_folder() -> Path:
     )
     folder = root / digest.hexdigest()[:16]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():
             return folder
     except OSError:
         pass
-    return Path(tempfile.gettempdir()) / f"rov_ident-{os.getuid()}-{digest.hexdigest()[:16]}"
+    # Compiled code is run as it is found: never from a folder that others could have made.
+    return Path(tempfile.mkdtemp(prefix="rov_ident-"))
 
 
 # One thread for BLAS: the matrices are 30 x 30, and a node shares its computer with a pilot's.

@@ -286,10 +286,7 @@ def _step(task, state, sample, info, momentum, force, now, rows, moves):
         info.reason = RESTARTED
         return
 
-    # exact response of a first-order section to an input that is linear between samples
-    a = np.exp(-w * dt)
-    b1 = 1.0 - (1.0 - a) / (w * dt)
-    b0 = (1.0 - a) - b1
+    a, b0, b1 = first_order(w, dt)
     for i in range(6):
         for j in range(n + 1):
             before = w * last[i, j] + x[i, j]
@@ -404,6 +401,17 @@ def _update(task, moves, c, root, score, lagged, y, deviation, rows, info):
             score[a, b] += g[a] * g[b] + g[a] * lagged[b] + lagged[a] * g[b]
     for a in range(n):
         lagged[a] += g[a]
+
+
+@kernel
+def first_order(corner, dt):
+    """a, b0, b1 of ``x = a x + b0 u_before + b1 u_now``.
+
+    The exact response of corner / (s + corner) to an input that is linear between samples.
+    """
+    a = np.exp(-corner * dt)
+    b1 = 1.0 - (1.0 - a) / (corner * dt)
+    return a, (1.0 - a) - b1, b1
 
 
 @kernel

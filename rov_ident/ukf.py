@@ -40,7 +40,7 @@ from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, prior_of
 from rov_ident.jit import inlined, kernel
 from rov_ident.model import Structure, add_added_mass, generalized_force, in_motion
-from rov_ident.rls import INFO, is_finite
+from rov_ident.rls import INFO, first_order, is_finite
 from rov_ident.samples import SAMPLE
 
 Array = NDArray[np.float64]
@@ -564,9 +564,7 @@ def _residual(task, state, sample, out, theta, mass, work, xi, part):
             nu[i, k] = sample.nu[i]
     _model_of(task, xi, part, theta, mass)
     generalized_force(LANES, task.structure, mass, theta, nu, h, p, extended)
-    a = np.exp(-w * dt)
-    b1 = 1.0 - (1.0 - a) / (w * dt) if dt > 0.0 else 0.0
-    b0 = (1.0 - a) - b1
+    a, b0, b1 = first_order(w, dt)
     for i in range(6):
         force = h[i, 0]
         for j in range(3):
