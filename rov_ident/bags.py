@@ -492,7 +492,7 @@ class BagWriter:
         self._crash_safe = crash_safe
         self._is_directory = self.path.suffix != ".mcap"
         self._part = self.path if crash_safe else self.path.with_name(f".{self.path.name}.part")
-        if self.path.is_dir():
+        if self.path.is_dir() or (self._is_directory and self.path.exists()):
             raise UserError(f"{self.path} exists already: remove it or choose another name.")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
 import argparse
 import dataclasses
 import math
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -28,6 +29,7 @@ ERR = Console(stderr=True, highlight=False)
 OUT = Console(highlight=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
+LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 CHANNELS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
@@ -102,14 +104,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     simulate.add_argument("--out", required=True, type=Path, metavar="BAG")
     simulate.add_argument("--duration", type=_positive, default=180.0, help="s (180)")
-    simulate.add_argument("--seed", type=int, default=0, help="of manoeuvre and noise (0)")
+    simulate.add_argument("--seed", type=_seed, default=0, help="of manoeuvre and noise (0)")
     simulate.add_argument("--odometry-rate", type=_positive, default=20.0, help="Hz (20)")
     simulate.add_argument("--imu-rate", type=_rate, default=100.0, help="Hz; 0: no IMU (100)")
     simulate.add_argument("--wrench-rate", type=_positive, default=50.0, help="Hz (50)")
     simulate.add_argument("--noise", type=_rate, default=1.0, help="factor on all noise (1)")
     simulate.add_argument("--delay", type=_rate, default=0.0, help="s until a message arrives (0)")
     simulate.add_argument("--jitter", type=_rate, default=0.0, help="s, of the delay (0)")
-    simulate.add_argument("--drop", type=_rate, default=0.0, help="share of messages lost (0)")
+    simulate.add_argument("--drop", type=_share, default=0.0, help="share of messages lost (0)")
     simulate.set_defaults(run=_simulate)
 
     import_ = commands.add_parser("import", help="turn plain CSV logs into a bag")
@@ -146,11 +148,31 @@ def _bag_and_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", required=True, type=Path)
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
 def _rate(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError("must not be negative")
+    value = _number(text)
+    if not 0.0 <= value <= LARGEST:
+        raise argparse.ArgumentTypeError(f"{text} must be from 0 to {LARGEST:g}")
     return value
+
+
+def _share(text: str) -> float:
+    value = _number(text)
+    if not 0.0 <= value < 1.0:
+        raise argparse.ArgumentTypeError(f"{text} must be from 0 to below 1")
+    return value
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
+    return int(text)
 
 
 def _channels(text: str) -> "np.ndarray":
@@ -161,9 +183,9 @@ def _channels(text: str) -> "np.ndarray":
 
 
 def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError("must be positive")
+    value = _number(text)
+    if not 0.0 < value <= LARGEST:
+        raise argparse.ArgumentTypeError(f"{text} must be above 0, up to {LARGEST:g}")
     return value
 
 
@@ -194,6 +216,8 @@ def _replay(options: argparse.Namespace) -> None:
             ),
         )
     for name, report in result.reports.items():
+        if not report.stamp:
+            raise UserError(f"{options.bag}: {name} could not use any of its messages")
         table = _table(f"{name}, at the end of {options.bag}", "value", "std", "unit", "state")
         for row in zip(report.names, report.values, report.std, report.units, report.messages):
             table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], row[4])
@@ -206,18 +230,10 @@ def _replay(options: argparse.Namespace) -> None:
 def _fit(options: argparse.Namespace) -> None:
     from rov_ident.fit import fit_online, write_text
 
+    _check_outputs([options.json, options.save], [*options.bags, options.config])
     config = configuration.load(options.config, f"{options.estimator}_node")
     records = [_read(path, config) for path in options.bags]
     fit = fit_online(records, config, options.estimator)
-    table = _table(
-        f"{options.estimator}: {fit.samples} samples, {fit.duration:.1f} s",
-        "value", "std", "unit", "configured", "identifiable",
-    )  # fmt: skip
-    for row in zip(fit.names, fit.values, fit.std, fit.units, fit.identifiable):
-        before = config.model.theta[config.model.names.index(row[0])]
-        yes = "yes" if row[4] else "no: the prior decides"
-        table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
-    OUT.print(table)
     if options.json:
         write_text(options.json, fit.to_json())
     if options.save:
@@ -228,20 +244,45 @@ def _fit(options: argparse.Namespace) -> None:
             comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags}.",
         )
 
+    table = _table(
+        f"{options.estimator}: {fit.samples} samples, {fit.duration:.1f} s",
+        "value", "std", "unit", "configured", "identifiable",
+    )  # fmt: skip
+    for row in zip(fit.names, fit.values, fit.std, fit.units, fit.identifiable):
+        before = config.model.theta[config.model.names.index(row[0])]
+        yes = "yes" if row[4] else "no: the prior decides"
+        table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
+    OUT.print(table)
+
+
+def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]) -> None:
+    """Refuse, before any work, what could not be written or would replace what is read."""
+    for out in filter(None, outputs):
+        for source in filter(None, inputs):
+            if out.exists() and source.exists() and out.samefile(source):
+                raise UserError(f"{out} would be replaced by the result: choose another name")
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{out} cannot be written: {error.strerror}") from error
+        if not os.access(out.parent, os.W_OK):
+            raise UserError(f"{out} cannot be written: its folder is not yours to write in")
+
 
 def _read(path: Path, config: configuration.Config) -> "Record":
     """A bag's samples behind a progress bar, and what had to be refused on standard error."""
     from rov_ident.records import read_record
 
-    with Progress(console=ERR, transient=True) as progress:
+    with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
         bar = progress.add_task(f"reading {path.name}")
         record = read_record(path, config, lambda k, n: progress.update(bar, completed=k, total=n))
     for note in record.notes:
-        ERR.print(f"{path.name}: {note}", markup=False)
+        ERR.print(note, markup=False, soft_wrap=True)
     return record
 
 
 def _simulate(options: argparse.Namespace) -> None:
+    _check_outputs([options.out], [options.bag, options.config])
     config = configuration.load(options.config)
     if options.bag:
         _compare(config, options)
@@ -306,7 +347,7 @@ def _import(options: argparse.Namespace) -> None:
         wrench_timing=options.wrench_timing,
     )
     for note in report.notes:
-        ERR.print(note, markup=False)
+        ERR.print(note, markup=False, soft_wrap=True)
     ERR.print(
         f"{options.out}: {report.odometry} odometry messages from {report.rows} rows, "
         f"{report.duration:.1f} s"

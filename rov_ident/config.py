@@ -238,6 +238,12 @@ class Ukf:
     gate: float = option(
         5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
     )
+    change_threshold: float = option(
+        3.0,
+        "normalised innovation squared, over 2 s, from which the vehicle is taken to have changed "
+        "and its coefficients are learnt anew; 1 is expected, higher where the model is rough",
+        lower=1.0,
+    )
     process_std: Vector = option(
         (0.003, 0.003, 0.003, 0.003, 0.003, 0.003),
         "density of the acceleration that the model does not explain, besides the noise of the "

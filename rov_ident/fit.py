@@ -1,5 +1,6 @@
 """Offline fits, all with one type of result."""
 
+import contextlib
 import json
 import math
 import os
@@ -132,5 +133,6 @@ def write_text(path: str | Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
         part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
         raise UserError(f"{path} cannot be written: {error.strerror}") from error

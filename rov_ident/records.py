@@ -72,7 +72,8 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
         progress(total, total)
     samples = np.concatenate(parts)
     counts = sampler.counts + undecodable
-    notes = describe(counts) + ([bag.damage] if bag.damage else [])
+    notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
+    notes += [bag.damage] if bag.damage else []
     if len(samples) < 2:
         raise UserError(
             f"{path}: its messages make no samples"

@@ -374,7 +374,8 @@ _ZERO_WRENCH = np.zeros(6)
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
 _UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
 _POWER_TIME = 5.0  # s; over which it is judged whether a component of nu moves
-_MOVING = 16.0  # mean square over noise variance from which it does: noise biases by 1/16 at most
+_MOVING = 4.0  # mean square over noise variance from which it does; at rest it is 1. Higher values
+# hold coefficients that still act, and their error goes into the others.
 _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU's lever arm
 
 

@@ -64,7 +64,6 @@ _ADAPTATION_TIME = 20.0  # s; over which the process noise follows the innovatio
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in that
 _LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
-_SURPRISING = 3.0  # its value from which the vehicle is taken to have changed; 1 is expected
 _RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
 _FASTEST = 50.0  # m/s, rad/s; no sigma point of a sane model gets there
 
@@ -74,6 +73,7 @@ _SETTINGS = np.dtype(
         ("weight", "f8"),  # of an outer sigma point
         ("centre", "f8"),  # beta - alpha^2
         ("gate", "f8"),
+        ("changed", "f8"),  # surprise from which the vehicle is taken to have changed
         ("process", "f8", (6,)),  # variance density of the acceleration
         ("wrench", "f8"),  # relative variance of the wrench times its correlation time
         ("wrench_floor", "f8", (6,)),
@@ -120,6 +120,7 @@ def problem(config: Config) -> Problem:
     settings["spread"] = np.sqrt(0.5 / points.Wc[1])
     settings["centre"] = u.beta - u.alpha**2
     settings["gate"] = u.gate
+    settings["changed"] = u.change_threshold
     settings["process"] = np.square(u.process_std)
     settings["wrench"] = config.wrench.relative_std**2 * config.wrench.correlation_time
     settings["wrench_floor"] = np.square(config.wrench.floor_std) * config.wrench.correlation_time
@@ -465,7 +466,7 @@ def _predict(
         room = 1.0 - p[6 + j, 6 + j] / task.prior_variance[j]
         if room > 0.0:
             walk = task.walk[j]
-            if state.scalars[2] > _SURPRISING:
+            if state.scalars[2] > s.changed:
                 walk = max(walk, task.prior_variance[j] / _RELEARNING_TIME)
             p[6 + j, 6 + j] += walk * sample.dt * room
     return True

@@ -102,7 +102,7 @@ class Peer:
         q[:6, :6] = (forces + np.diag(self.process)) * row["dt"]
         room = np.maximum(1.0 - np.diag(self.filter.P)[6:] / self.task.prior_variance, 0.0)
         walk = self.task.walk
-        if self.surprise > ukf._SURPRISING:
+        if self.surprise > self.task.settings["changed"][0]:
             walk = np.maximum(walk, self.task.prior_variance / ukf._RELEARNING_TIME)
         q[6:, 6:] = np.diag(walk * row["dt"] * room)
         return q

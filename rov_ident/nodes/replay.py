@@ -68,6 +68,9 @@ def replay(
     started = time.monotonic()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with ExitStack() as stack:
+        writer = None
+        if out is not None:
+            writer = stack.enter_context(BagWriter(Path(out), crash_safe=True))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rov_ident-")))
         nodes = []
         for estimator in estimators:
@@ -87,9 +90,6 @@ def replay(
         context = Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stack.callback(rclpy.try_shutdown, context=context)
-        writer = None
-        if out is not None:
-            writer = stack.enter_context(BagWriter(Path(out), crash_safe=True))
         player = Player(context, estimators, writer, on_report, check)
         stack.callback(player.destroy_node)
         player.wait_for_nodes(next(recorded.iter_raw(roles)).log_time)

@@ -1,0 +1,243 @@
+"""The command line, further: streams, seeds, damage and wrong use."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import HEAVY
+
+from rov_ident import sensors
+from rov_ident.bags import Bag, BagWriter, read_messages, select_topics
+from rov_ident.demo import shipped
+from rov_ident.errors import UserError
+from rov_ident.recording import write_messages
+
+COMMANDS = ("demo", "replay", "fit", "simulate", "import", "coefficients")
+DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
+
+
+def run(*arguments):
+    command = [sys.executable, "-m", "rov_ident.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240)
+
+
+def simulate(out, *options, source=("--manoeuvre", "steps", "--duration", 5)):
+    return run("simulate", "--config", HEAVY, *source, *options, "--out", out)
+
+
+def fit(bag, *options, path=HEAVY):
+    return run("fit", bag, "--config", path, "--estimator", "rls", *options)
+
+
+def refused(done, *parts):
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    (line,) = [line for line in done.stderr.splitlines() if line]
+    for part in parts:
+        assert part in line
+
+
+def misused(done, *parts):
+    """As argparse says it: the usage, then one sentence."""
+    assert done.returncode == 2 and done.stdout == ""
+    assert "Traceback" not in done.stderr
+    for part in parts:
+        assert part in done.stderr.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def dive(heavy):
+    return sensors.dive(heavy, duration=12.0, seed=1).messages
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory, dive):
+    path = tmp_path_factory.mktemp("cli") / "dive.mcap"
+    write_messages(path, dive)
+    return path
+
+
+# ------------------------------------------------------------------ results
+
+
+def test_same_seed_same_bytes(tmp_path):
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        assert simulate(tmp_path / f"{name}.mcap", "--seed", seed).returncode == 0
+    a, b, c = ((tmp_path / f"{name}.mcap").read_bytes() for name in "abc")
+    assert a == b != c
+
+
+def test_without_noise_the_wrench_is_the_demand(tmp_path):
+    path = tmp_path / "rest.mcap"
+    done = simulate(path, "--noise", 0, source=("--manoeuvre", "rest", "--duration", 5))
+    assert done.returncode == 0
+    found = Bag(path)
+    for role, message in read_messages(found, select_topics(found)):
+        if role == "wrench":
+            assert not message.force.any() and not message.torque.any()
+        elif role == "odom":
+            assert not message.twist_variance.any()
+
+
+def test_results_on_one_stream_messages_on_the_other(tmp_path, bag):
+    done = fit(bag, "--json", tmp_path / "a.json")
+    assert done.returncode == 0
+    assert "X_udot" in done.stdout and "no odometry yet" not in done.stdout
+    assert "no odometry yet" in done.stderr and "X_udot" not in done.stderr
+
+
+def test_fitted_configuration_is_taken_by_the_commands(tmp_path, bag):
+    fitted = tmp_path / "fitted.yaml"
+    assert fit(bag, "--save", fitted).returncode == 0
+    assert fit(bag, path=fitted).returncode == 0
+    for source in (("--bag", bag), ("--manoeuvre", "rest", "--duration", 2)):
+        out = tmp_path / f"{source[0][2:]}.mcap"
+        done = run("simulate", "--config", fitted, *source, "--out", out)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(command):
+    done = run(command, "--help")
+    assert done.returncode == 0 and done.stderr == ""
+    assert done.stdout.startswith(f"usage: rov-ident {command}")
+
+
+def test_what_is_shipped():
+    assert shipped("bags/demo.mcap") == DEMO
+    with pytest.raises(UserError, match="bags/other.mcap is not here"):
+        shipped("bags/other.mcap")
+
+
+# ------------------------------------------------------------------ bad input
+
+
+def test_truncated_bag_says_how_much_is_lost(tmp_path):
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(DEMO.read_bytes()[:900_000])
+    lost = Bag(path).lost_bytes
+    done = fit(path)
+    assert done.returncode == 0 and lost > 0
+    assert f"the last {lost} bytes cannot be read" in done.stderr
+
+
+def test_bag_of_other_types(tmp_path):
+    path = tmp_path / "other.mcap"
+    with BagWriter(path) as writer:
+        writer.write("/chatter", "std_msgs/msg/String", 10**9, b"\0\1\0\0\2\0\0\0a\0")
+    refused(fit(path), "other.mcap", "/chatter (std_msgs/msg/String)")
+
+
+@pytest.mark.parametrize(
+    "change, part",
+    [
+        (lambda role, m: m._replace(stamp=0), "zero stamp"),
+        (
+            lambda role, m: m._replace(frame_id="world_ned") if role == "wrench" else m,
+            "frame 'world_ned' is a world frame",
+        ),
+        (
+            lambda role, m: m._replace(force=m.force * np.nan) if role == "wrench" else m,
+            "wrench: not finite",
+        ),
+    ],
+)
+def test_too_little_that_can_be_used(tmp_path, dive, change, part):
+    path = tmp_path / "bad.mcap"
+    write_messages(path, [(at, role, change(role, m)) for at, role, m in dive])
+    refused(fit(path, "--json", tmp_path / "a.json", "--save", tmp_path / "a.yaml"), "bad", part)
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.mcap"]
+
+
+@pytest.mark.parametrize(
+    "change, part",
+    [
+        (("mass: 13.5", "mass: heavy"), "vehicle.mass is 'heavy'"),
+        (("mass: 13.5", "mas: 13.5"), "did you mean mass?"),
+        (("0.26, 0.23", "-0.26, 0.23"), "vehicle.inertia"),
+        (("X_u: -13.7", "X_u: .nan"), "coefficients.X_u"),
+        (("coefficients:", "koefficients:"), "coefficients is missing"),
+    ],
+)
+def test_bad_configuration_writes_nothing(tmp_path, change, part):
+    path, out = tmp_path / "bad.yaml", tmp_path / "out.mcap"
+    path.write_text(HEAVY.read_text().replace(*change))
+    refused(
+        run("simulate", "--config", path, "--manoeuvre", "rest", "--out", out), "bad.yaml", part
+    )
+    assert not out.exists()
+
+
+def test_missing_files_are_named(tmp_path, bag):
+    none = tmp_path / "none.yaml"
+    refused(fit(bag, path=none), "none.yaml", "No such file")
+    refused(run("replay", tmp_path / "none.mcap", "--config", HEAVY), "none.mcap")
+    refused(run("import", tmp_path / "none.csv", "--out", tmp_path / "o.mcap"), "none.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_wrong_use(tmp_path, bag):
+    out = tmp_path / "out.mcap"
+    misused(simulate(out, "--imu-rate", -1), "--imu-rate", "from 0")
+    misused(simulate(out, "--odometry-rate", 0), "--odometry-rate", "above 0")
+    misused(simulate(out, "--duration", "nan"), "--duration", "above 0")
+    misused(run("replay", bag, "--config", HEAVY, "--rate", -1), "--rate", "from 0")
+    misused(
+        run("simulate", "--config", HEAVY, "--bag", bag, "--channels", "surge,foo", "--out", out),
+        "no channel 'foo'",
+    )
+    assert not out.exists()
+
+
+def test_a_bag_is_not_replayed_onto_itself(bag):
+    before = bag.read_bytes()
+    refused(run("replay", bag, "--config", HEAVY, "--rate", 0, "--out", bag), "is the bag to play")
+    assert bag.read_bytes() == before
+
+
+# ------------------------------------------------------------------ known defects
+
+
+def test_a_bag_is_not_simulated_onto_itself(tmp_path, bag):
+    path = tmp_path / "dive.mcap"
+    path.write_bytes(bag.read_bytes())
+    done = simulate(path, source=("--bag", path))
+    assert path.read_bytes() == bag.read_bytes()
+    refused(done, "dive.mcap")
+
+
+def test_a_result_does_not_replace_its_bag(tmp_path, bag):
+    path = tmp_path / "dive.mcap"
+    path.write_bytes(bag.read_bytes())
+    fit(path, "--json", path)
+    assert path.read_bytes() == bag.read_bytes()
+
+
+def test_fit_writes_all_or_nothing(tmp_path, bag):
+    (tmp_path / "file").write_text("in the way")
+    done = fit(bag, "--json", tmp_path / "a.json", "--save", tmp_path / "file" / "a.yaml")
+    assert done.returncode == 2
+    assert not (tmp_path / "a.json").exists() and done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "option", [("--seed", -1), ("--drop", 3), ("--delay", 1e300), ("--noise", 1e300)]
+)
+def test_senseless_numbers(tmp_path, option):
+    done = simulate(tmp_path / "out.mcap", *option)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+
+
+def test_out_is_a_file_that_is_no_bag(tmp_path):
+    path = tmp_path / "notes"
+    path.write_text("keep me")
+    done = simulate(path)
+    assert path.read_text() == "keep me"
+    refused(done, "notes")
+
+
+def test_no_empty_line_where_there_is_no_terminal(tmp_path):
+    done = fit(Path("none.mcap"))
+    assert done.stderr.count("\n") == 1
