@@ -85,7 +85,7 @@ class Vehicle:
         ):
             self.node.create_subscription(type_, topic, heard.append, qos)
 
-    def until(self, ready, seconds=10.0):
+    def until(self, ready, seconds=30.0):
         """Listen until ``ready()``; fails after some seconds."""
         end = time.monotonic() + seconds
         while not ready():
