@@ -11,7 +11,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
-	$(BIN)/rov-ident demo
+	@$(BIN)/rov-ident demo
 
 ## style, types, then all tests
 test: check
@@ -37,11 +37,11 @@ clean:
 # The stamps are written last: an interrupted installation is taken up again.
 .venv/demo.stamp: setup.py
 	@echo "Installing rov_ident into .venv (about a minute, 1 GB) ..." >&2
-	$(PYTHON) -m venv .venv
-	$(PIP) --editable '.[wheels]'
+	@$(PYTHON) -m venv .venv
+	@$(PIP) --editable '.[wheels]'
 	@touch $@
 
 .venv/test.stamp: .venv/demo.stamp
 	@echo "Installing the test tools into .venv ..." >&2
-	$(PIP) --editable '.[wheels,test]'
+	@$(PIP) --editable '.[wheels,test]'
 	@touch $@

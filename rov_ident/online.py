@@ -21,9 +21,7 @@ ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
 
 EXCITATION_TIME = 20.0  # s; the present excitation is that of this window and of the one before
 _EXCITED = 0.05  # share of the prior variance that this motion alone would remove
-_CONVERGED = (
-    0.1  # standard deviation relative to the value, or to the prior's, from which it counts
-)
+_CONVERGED = 0.1  # standard deviation over the value (or the prior's) at which it counts as known
 _QUANTILE = 1.959963984540054  # of the normal distribution, 97.5 %
 
 

@@ -14,9 +14,9 @@ it keeps half the digits that the covariance form loses), in coefficients scaled
 standard deviation about their prior value: the prior is the unit matrix.
 
 *Columns* count where the motion they multiply is well above its noise, *rows* where the thrusters
-drive their axis. Where the residual is larger than the wrench, the
-motion has other causes (a tether, waves, the wash of another axis) which are correlated with it,
-and least squares would turn that into coefficients.
+drive their axis. Where the residual is larger than the wrench, the motion has other causes (a
+tether, waves, the wash of another axis) which are correlated with it, and least squares would turn
+that into coefficients.
 
 *Forgetting* touches only directions that the present motion excites (subspace-of-information
 forgetting, Lai and Bernstein 2024): unexcited ones keep their information, so nothing winds up.

@@ -125,7 +125,7 @@ def problem(config: Config) -> Problem:
     settings["wrench"] = config.wrench.relative_std**2 * config.wrench.correlation_time
     settings["wrench_floor"] = np.square(config.wrench.floor_std) * config.wrench.correlation_time
     settings["corner"] = config.rls.filter_corner
-    # A fifth of the prior's width: straight where the coefficient is likely, bent close to zero.
+    # Two fifths of the prior's width: straight where the coefficient is likely, bent close to zero.
     scale = np.where(prior.negative, 0.4 * prior.std, prior.std)
     # A coefficient configured as zero starts within reach of its scale: at exactly zero the
     # parametrisation has no slope.
