@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check accuracy bag clean
+.PHONY: demo test check accuracy bench explain-bench bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -27,9 +27,22 @@ check: .venv/test.stamp
 accuracy: .venv/demo.stamp
 	$(BIN)/python bench/accuracy.py
 
+## speed against peers, the table of docs/speed.md (ten minutes; let nothing else run)
+bench: .venv/bench.stamp
+	@$(BIN)/python bench/speed.py
+
+## how often explain finds what is hidden, the tables of docs/explain-bench.md (many hours; it may be
+## stopped and goes on where it was)
+explain-bench: .venv/demo.stamp
+	$(BIN)/python bench/explain.py
+
 ## the shipped bag, anew
 bag: .venv/demo.stamp
 	$(BIN)/rov-ident simulate --config config/bluerov2_heavy.yaml --manoeuvre steps --seed 1 --duration 120 --out bags/demo.mcap
+
+## the picture of `explain` in the README, anew
+picture: .venv/demo.stamp
+	$(BIN)/python bench/picture.py
 
 clean:
 	rm -rf .venv build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
@@ -39,6 +52,11 @@ clean:
 	@echo "Installing rov_ident into .venv (about a minute, 1 GB) ..." >&2
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --editable '.[wheels]'
+	@touch $@
+
+.venv/bench.stamp: .venv/demo.stamp
+	@echo "Installing the peers into .venv ..." >&2
+	@$(PIP) --editable '.[wheels,bench]'
 	@touch $@
 
 .venv/test.stamp: .venv/demo.stamp

@@ -43,6 +43,7 @@ setup(
             "mypy",
             "types-PyYAML",
         ],
+        "bench": ["padasip>=1.2"],
     },
     zip_safe=True,
     maintainer="rov_ident maintainers",

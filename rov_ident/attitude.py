@@ -4,23 +4,26 @@ import math
 
 import numpy as np
 
-from rov_ident.jit import kernel
+from rov_ident.jit import inlined, kernel
+
+
+@inlined
+def rotation_of(w, x, y, z):
+    """The rows of R, body -> world, of a unit quaternion, as tuples; the last is "down"."""
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
 
 
 @kernel
 def rotation(q):
-    """R (3, 3), body -> world, of the unit quaternion q (w, x, y, z); its last row is "down"."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
+    """R (3, 3), body -> world, of the unit quaternion q (4,)."""
+    a, b, c = rotation_of(q[0], q[1], q[2], q[3])
     r = np.empty((3, 3))
-    r[0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    r[0, 1] = 2.0 * (x * y - w * z)
-    r[0, 2] = 2.0 * (x * z + w * y)
-    r[1, 0] = 2.0 * (x * y + w * z)
-    r[1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    r[1, 2] = 2.0 * (y * z - w * x)
-    r[2, 0] = 2.0 * (x * z - w * y)
-    r[2, 1] = 2.0 * (y * z + w * x)
-    r[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    for j in range(3):
+        r[0, j], r[1, j], r[2, j] = a[j], b[j], c[j]
     return r
 
 
@@ -35,4 +38,7 @@ def turned(q, angle):
     p[1] = q[0] * x + q[1] * c + q[2] * z - q[3] * y
     p[2] = q[0] * y - q[1] * z + q[2] * c + q[3] * x
     p[3] = q[0] * z + q[1] * y - q[2] * x + q[3] * c
-    return p / math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 + p[3] ** 2)
+    length = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 + p[3] ** 2)
+    for i in range(4):
+        p[i] /= length
+    return p

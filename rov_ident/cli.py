@@ -23,7 +23,9 @@ from rov_ident.coefficients import catalogue
 from rov_ident.errors import UserError
 
 if TYPE_CHECKING:
+    from rov_ident.explain_report import Source
     from rov_ident.records import Record
+    from rov_ident.streams import Streams
 
 ERR = Console(stderr=True, highlight=False)
 OUT = Console(highlight=False, soft_wrap=True)
@@ -87,6 +89,20 @@ def _parser() -> argparse.ArgumentParser:
         "--save", type=Path, metavar="FILE", help="write a configuration with the fitted values"
     )
     fit.set_defaults(run=_fit)
+
+    explain = commands.add_parser(
+        "explain", help="what the simulation gets wrong, why, and what mending it gains"
+    )
+    explain.add_argument("bags", nargs="+", type=Path, metavar="BAG")
+    explain.add_argument("--config", required=True, type=Path)
+    explain.add_argument(
+        "--out", required=True, type=Path, metavar="DIR",
+        help="folder for findings.json, report.html and extended.yaml",
+    )  # fmt: skip
+    explain.add_argument(
+        "--validate", type=Path, metavar="BAG", help="judge on this bag, not on held-out parts"
+    )
+    explain.set_defaults(run=_explain)
 
     simulate = commands.add_parser(
         "simulate",
@@ -255,6 +271,70 @@ def _fit(options: argparse.Namespace) -> None:
     OUT.print(table)
 
 
+def _explain(options: argparse.Namespace) -> None:
+    from rov_ident import explain_report
+    from rov_ident.explain import BLOCK, explain
+
+    config = configuration.load(options.config)
+    outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
+    _check_outputs(outputs, [*options.bags, options.config, options.validate])
+    read = [_gather(path, config) for path in options.bags]
+    judge = _gather(options.validate, config) if options.validate else None
+    with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
+        bar = progress.add_task("", total=1.0)
+        explanation = explain(
+            [streams for streams, _ in read],
+            config,
+            judge[0] if judge else None,
+            lambda what, share: progress.update(bar, description=what, completed=share),
+        )
+    made = explain_report.origin(
+        [source for _, source in read], options.config, judge[1] if judge else None
+    )
+    findings = dataclasses.replace(explanation.findings, provenance=made)
+    explanation = dataclasses.replace(explanation, findings=findings)
+    explain_report.write(explanation, config, options.out)
+
+    OUT.print(explain_report.verdict(findings), markup=False)
+    table = _table(
+        f"RMSE of the {BLOCK:g} s open-loop prediction",
+        "as configured", "retuned", "extended", "unit",
+    )  # fmt: skip
+    for name, unit in explain_report.UNITS.items():
+        models = (findings.baseline, findings.retuned, findings.extended)
+        table.add_row(name, *(explain_report.number(by[name]) for by in models), unit)
+    OUT.print(table)
+    for f in findings.effects:
+        OUT.print(f"{f.effect}: {f.sentence}", markup=False)
+        for name, value in f.parameters.items():
+            OUT.print(f"  {explain_report.valued(name, value)}", markup=False)
+        OUT.print(f"  gain {explain_report.interval(f.gain)}", markup=False)
+        if f.alternatives:
+            OUT.print("  tried instead:")
+        for a in f.alternatives:
+            OUT.print(f"    {a.effect}: {a.why_not}", markup=False)
+    ERR.print(f"report: {options.out / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _gather(path: Path, config: configuration.Config) -> "tuple[Streams, Source]":
+    """A bag's messages in arrays, behind a progress bar; damage is told on standard error."""
+    from rov_ident.bags import Bag, read_messages, select_topics
+    from rov_ident.explain_report import Source
+    from rov_ident.streams import gather
+
+    bag = Bag(path)
+    topics = select_topics(bag, vars(config.topics))
+    total = sum(bag.topics[name].message_count for name in topics.values() if name)
+    with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
+        bar = progress.track(
+            read_messages(bag, topics), total=total, description=f"reading {path.name}"
+        )
+        streams = gather(((role, m) for role, m in bar if m is not None), config)
+    if bag.damage:
+        ERR.print(bag.damage, markup=False, soft_wrap=True)
+    return streams, Source(bag.path.name, bag.sha256)
+
+
 def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]) -> None:
     """Refuse, before any work, what could not be written or would replace what is read."""
     for out in filter(None, outputs):
@@ -306,21 +386,23 @@ def _simulate(options: argparse.Namespace) -> None:
 
 def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
     """Open-loop simulation of a whole bag beside what it measured."""
+    from rov_ident.effects import compiled
     from rov_ident.recording import write_messages
     from rov_ident.records import HORIZON, VELOCITIES, predicted, score
     from rov_ident.sensors import odometry_of
 
     record = _read(options.bag, config)
     free = options.channels
-    run = predicted(config.model, record.samples, math.inf, free)
+    model, effects = config.dynamics, compiled(config.effects)
+    run = predicted(model, record.samples, math.inf, free, effects)
     if not np.isfinite(run).all():
         raise UserError(
             f"the simulation diverges on {options.bag}: check the signs and sizes of the "
             "coefficients and of the wrench"
         )
     write_messages(options.out, odometry_of(record.samples["t"], run))
-    whole = score(config.model, record.samples, math.inf, free)
-    windows = score(config.model, record.samples, HORIZON, free)
+    whole = score(model, record.samples, math.inf, free, effects)
+    windows = score(model, record.samples, HORIZON, free, effects)
     table = _table(
         f"open-loop simulation against {options.bag.name}",
         "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit",

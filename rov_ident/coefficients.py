@@ -11,11 +11,14 @@ name           term on the hydrodynamic side of the axis    example
                makes the term even
 ``A_bc``       plain product ``b c``                        ``Y_uv``
 ``A_b_abs_c``  ``b |c|``                                    ``Y_v_abs_r``
+``A_b_neg``    ``min(b, 0)``, added to ``A_b b``; only      ``Z_w_neg``
+               where b is the axis's own velocity
+``A_bb_neg``   ``|b| min(b, 0)``, added to ``A_bb |b| b``   ``Z_ww_neg``
 =============  ==========================================  ============================
 
-A *term* is the product of two entries of the extended velocity ``[1, nu, |nu|]``, so that every
-velocity coefficient is a row and two indices: simulator, regressor and Kalman filter loop over
-one table, and a new name in the grammar needs no new equation.
+A *term* is the product of two entries of the extended velocity ``[1, nu, |nu|, min(nu, 0)]``, so
+that every velocity coefficient is a row and two indices: simulator, regressor and Kalman filter
+loop over one table, and a new name in the grammar needs no new equation.
 """
 
 import re
@@ -31,14 +34,16 @@ ANGULAR = slice(3, 6)
 # Even under port-starboard or up-down mirror symmetry, hence a plain square.
 EVEN = frozenset("X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split())
 
-# Places in the extended velocity [1, nu, |nu|] of model.extended_velocity.
+# Places in the extended velocity [1, nu, |nu|, min(nu, 0)] of model.extend.
 ONE = 0
 PLAIN = 1
 ABSOLUTE = 7
-EXTENDED_SIZE = 13
+NEGATIVE = 13
+EXTENDED_SIZE = 19
 
 _GRAMMAR = re.compile(
-    r"(?P<axis>[XYZKMN])_(?P<first>[uvwpqr])(?:(?P<dot>dot)|_abs_(?P<abs>[uvwpqr])|(?P<second>[uvwpqr]))?"
+    r"(?P<axis>[XYZKMN])_(?P<first>[uvwpqr])"
+    r"(?:(?P<dot>dot)|_abs_(?P<abs>[uvwpqr])|(?P<second>[uvwpqr])?(?P<neg>_neg)?)"
 )
 
 
@@ -69,6 +74,21 @@ class Coefficient:
             return self.row == self.column
         own = PLAIN + self.row
         return (self.left, self.right) in ((ONE, own), (ABSOLUTE + self.row, own))
+
+    @property
+    def velocity(self) -> int:
+        """The component of nu (0..5) in the second factor; every term has one."""
+        return (self.right - PLAIN) % 6
+
+    @property
+    def is_one_sided(self) -> bool:
+        """Acts only where the axis's own velocity is negative (``Z_ww_neg``)."""
+        return self.right >= NEGATIVE
+
+    @property
+    def symmetric(self) -> str:
+        """The name of the same term for both directions: ``Z_ww`` of ``Z_ww_neg``."""
+        return self.name.removesuffix("_neg")
 
     @property
     def place(self) -> tuple[int, ...]:
@@ -119,6 +139,15 @@ def parse(name: str) -> Coefficient:
             left, right, formula = ABSOLUTE + first, PLAIN + first, f"|{b}| {b}"
     else:
         second, left, right, formula = first, ONE, PLAIN + first, b
+    if match["neg"]:
+        if not first == second == row:
+            own = VELOCITIES[row]
+            raise UserError(
+                f"'{name}': only an axis's own damping may differ for negative velocity, "
+                f"{match['axis']}_{own}_neg or {match['axis']}_{own}{own}_neg"
+            )
+        right = NEGATIVE + first
+        formula = formula.removesuffix(b) + f"min({b}, 0)"
     meaning = f"{'linear damping' if left == ONE else 'quadratic term'}: {axis} = {name} {formula}"
     order = [first] if left == ONE else [first, second]
     return Coefficient(name, row, first, left, right, _unit(force, order), meaning)
@@ -145,6 +174,8 @@ def catalogue() -> list[Coefficient]:
     pairs = [(b, c) for i, b in enumerate(VELOCITIES) for c in VELOCITIES[i + 1 :]]
     names += [f"{a}_{b}{c}" for a in AXES for b, c in pairs]
     names += [f"{a}_{b}_abs_{c}" for a in AXES for b in VELOCITIES for c in VELOCITIES if b != c]
+    own = list(zip(AXES, VELOCITIES, strict=True))
+    names += [f"{a}_{b}_neg" for a, b in own] + [f"{a}_{b}{b}_neg" for a, b in own]
     unique: dict[tuple[int, ...], Coefficient] = {}
     for name in names:
         coefficient = parse(name)

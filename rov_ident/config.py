@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 from rov_ident.coefficients import catalogue, parse
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, rigid_body
 from rov_ident.errors import UserError
 from rov_ident.frames import FrameDefaults, to_core
 from rov_ident.messages import Wrench
@@ -274,6 +274,7 @@ class Config:
 
     ``estimate`` names the coefficients to estimate, in the order of ``model.names``; the others
     are held. ``effects`` are part of the simulation: {effect: {parameter: value}}, complete.
+    ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what really moves.
     """
 
     name: str
@@ -297,6 +298,11 @@ class Config:
     )
     grace: float = option(0.3, "how long a late topic is waited for, in stamp time", "s", lower=0.0)
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @property
+    def dynamics(self) -> Model:
+        """The model with the effects on the rigid body: that of simulation and estimation."""
+        return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
 
     def with_model(self, model: Model) -> "Config":
         """The same with another model: what was held stays held, new coefficients are estimated."""
@@ -377,7 +383,10 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
         prior = settings["prior"]
         std = {_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}
         settings["prior"] = dataclasses.replace(prior, std=std)
-    return Config(name=vehicle.name, model=model, **settings)
+    config = Config(name=vehicle.name, model=model, **settings)
+    if np.linalg.eigvalsh(config.dynamics.mass_matrix)[0] <= 0:
+        raise UserError("effects.cog_offset makes the mass matrix indefinite: give a smaller one")
+    return config
 
 
 def unflatten(parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -517,6 +526,11 @@ def _effects(values: Any) -> dict[str, dict[str, float]]:
     for name, given in values.items():
         if name not in EFFECTS:
             raise UserError(f"effects.{name} is an unknown effect: {_suggestion(name, EFFECTS)}")
+        if names := EFFECTS[name].coefficients:
+            raise UserError(
+                f"effects.{name} is a family of coefficients: put {', '.join(names)}, or some of "
+                "them, under coefficients"
+            )
         declared = {p.name: p for p in EFFECTS[name].parameters}
         numbers = _numbers(given, f"effects.{name}")
         for parameter, number in numbers.items():

@@ -38,7 +38,8 @@ class HydrodynamicModel:
     :meth:`take` is given every message; of a message only the converged coefficients are taken up,
     and only if the whole set is physical with them. Sets are exchanged in one assignment: ``model``
     is the present one, and a controller thread that needs several matrices of the same set keeps
-    it in a variable. Effects in the configuration belong to the simulation and are left out.
+    it in a variable. Of the effects in the configuration, those on the rigid body are in the
+    matrices; the others are left out.
 
     ``now`` is always a time in seconds on a steady clock of the caller's, such as
     ``time.monotonic()``. Vectors are SI, body forward-starboard-down; an attitude is either the
@@ -54,7 +55,7 @@ class HydrodynamicModel:
         if not hold_after > 0.0:
             raise UserError(f"hold_after is {hold_after} s, but must be positive")
         self.hold_after = hold_after
-        self._model = config.model
+        self._model = config.dynamics
         self._prior = prior_of(config)
         self._units = {c.name: c.unit for c in config.model.coefficients}
         self._stamp: int | None = None  # ns, of the last message in order

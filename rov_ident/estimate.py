@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from rov_ident.coefficients import ABSOLUTE, ONE
 from rov_ident.config import Config
@@ -49,7 +48,7 @@ def prior_of(config: Config) -> Prior:
     what such a term would weigh at working speed: a published zero means "not known", not "exactly
     zero".
     """
-    model = config.model
+    model = config.dynamics
     index = [model.names.index(name) for name in config.estimate]
     scale = typical(model)
     std = np.array(
@@ -74,7 +73,7 @@ def prior_of(config: Config) -> Prior:
 def typical(model: Model) -> Array:
     """(m,) the size at which each term alone would take its axis's whole working wrench."""
     wrench, inertia = authority(model), np.diag(model.body.mass_matrix)
-    speed = np.concatenate([[1.0], WORKING_SPEED, WORKING_SPEED])
+    speed = np.concatenate([[1.0], WORKING_SPEED, WORKING_SPEED, WORKING_SPEED])
     sizes = [
         np.sqrt(inertia[c.row] * inertia[c.column])
         if c.is_added_mass
@@ -87,25 +86,34 @@ def typical(model: Model) -> Array:
 def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     """The values (n,) nearest the estimate, in its own metric, that a passive hull can have.
 
-    Signs first: the nearest set without positive diagonal derivatives (a non-negative least-squares
-    problem in the multipliers); what is held at zero moves the others as their correlation says.
-    Then, should couplings still make the mass matrix
+    Signs first: the nearest set without positive diagonal derivatives, in either direction of the
+    motion (a non-negative least-squares problem in the multipliers); what is held at its limit
+    moves the others as their correlation says. Then, should couplings still make the mass matrix
     indefinite or the damping feed energy, the set is drawn back towards the prior just as far as
     needed.
     """
     if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
         return estimate.values
-    values, signed = estimate.values.copy(), np.flatnonzero(prior.negative)
-    if (values[signed] > 0.0).any():
-        # minimise |theta - estimate| in the metric of P: theta = estimate - P[:, signed] lambda
-        size = np.where(estimate.std[signed] > 0.0, estimate.std[signed], 1.0)
-        p = estimate.covariance[np.ix_(signed, signed)] / np.outer(size, size)
-        eigenvalues, vectors = np.linalg.eigh(p)
+    values = estimate.values.copy()
+    rows, limit = _signs(model, prior)
+    if (rows @ values > limit).any():
+        # Here, for it takes a node 35 MB and a third of a second, and most never need it.
+        from scipy.optimize import nnls
+
+        # minimise |theta - estimate| in the metric of P: theta = estimate - P rows' lambda
+        p = rows @ estimate.covariance @ rows.T
+        size = np.sqrt(np.where(np.diag(p) > 0.0, np.diag(p), 1.0))
+        eigenvalues, vectors = np.linalg.eigh(p / np.outer(size, size))
         root = vectors * np.sqrt(np.maximum(eigenvalues, 1e-12))
-        goal = (vectors.T @ (values[signed] / size)) / np.sqrt(np.maximum(eigenvalues, 1e-12))
+        excess = (rows @ values - limit) / size
+        goal = (vectors.T @ excess) / np.sqrt(np.maximum(eigenvalues, 1e-12))
         multipliers = nnls(root.T, goal)[0]
-        values -= estimate.covariance[:, signed] @ (multipliers / size)
-        values[signed] = np.where(multipliers > 0.0, 0.0, np.minimum(values[signed], 0.0))
+        values -= estimate.covariance @ rows.T @ (multipliers / size)
+        signed = np.flatnonzero(prior.negative)  # the first rows: what they hold is exactly zero
+        held = multipliers[: len(signed)] > 0.0
+        values[signed] = np.where(held, 0.0, np.minimum(values[signed], 0.0))
+        for row, bound in zip(rows[len(signed) :], limit[len(signed) :], strict=True):
+            values[np.flatnonzero(row)[-1]] -= max(row @ values - bound, 0.0)  # rounding
     if is_passive(model, prior, values):
         return values
     low, high = 0.0, 1.0  # share of the way from the prior to the estimate
@@ -118,13 +126,34 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     return prior.mean + low * (values - prior.mean)
 
 
+def _signs(model: Model, prior: Prior) -> tuple[Array, Array]:
+    """Rows (k, n) and limits (k,) with ``rows @ values <= limit`` for a passive hull.
+
+    First each derivative that is never positive, then the sum of each one-sided derivative with
+    that of both directions.
+    """
+    n = len(prior.names)
+    rows, limits = list(np.eye(n)[prior.negative]), [0.0] * int(prior.negative.sum())
+    index = {model.names[i]: k for k, i in enumerate(prior.estimated)}
+    known = dict(zip(model.names, model.theta.tolist(), strict=True))
+    for c in model.coefficients:
+        pair = [name for name in (c.symmetric, c.name) if name in index]
+        if c.is_one_sided and pair:
+            row = np.zeros(n)
+            row[[index[name] for name in pair]] = 1.0
+            rows.append(row)
+            held = {c.symmetric, c.name} - set(pair)
+            limits.append(-sum(known.get(name, 0.0) for name in held))
+    return np.array(rows).reshape(-1, n), np.array(limits)
+
+
 def is_passive(model: Model, prior: Prior, values: Array) -> bool:
     """Whether M is positive definite and the damping takes energy out in every direction.
 
-    Diagonal derivatives must not be positive. With couplings, the symmetric part of the linear
-    damping matrix is positive semidefinite, and the power of the quadratic damping is checked along
-    fixed directions of motion; products of two velocities (lift) may do work of either sign and are
-    left out.
+    Diagonal derivatives must not be positive, nor their sums with the one-sided ones. With
+    couplings, the symmetric part of the linear damping matrix is positive semidefinite, and the
+    power of the quadratic damping is checked along fixed directions of motion; products of two
+    velocities (lift) may do work of either sign and are left out.
     """
     theta = model.theta.copy()
     theta[prior.estimated] = values
@@ -133,14 +162,16 @@ def is_passive(model: Model, prior: Prior, values: Array) -> bool:
     if np.linalg.eigvalsh(model.with_theta(theta).mass_matrix)[0] <= 0.0:
         return False
     linear, power, coupled = np.zeros((6, 6)), np.zeros(len(_DIRECTIONS)), False
+    known = dict(zip(model.names, theta.tolist(), strict=True))
     for c, value in zip(model.coefficients, theta, strict=True):
-        if c.is_diagonal and value > 0.0:
+        both = value + known.get(c.symmetric, 0.0) if c.is_one_sided else value
+        if (c.is_diagonal or c.is_one_sided) and both > 0.0:
             return False
         if c.is_added_mass or (c.left != ONE and c.left < ABSOLUTE):
             continue
-        coupled = coupled or not c.is_diagonal
-        if c.left == ONE:
-            linear[c.row, c.right - 1] = value
+        coupled = coupled or not (c.is_diagonal or c.is_one_sided)
+        if c.left == ONE:  # of the two directions of an axis the one that is damped less
+            linear[c.row, c.velocity] += max(value, 0.0) if c.is_one_sided else value
         else:
             power += value * _DIRECTIONS[:, c.row] * _EXTENDED[:, c.left] * _EXTENDED[:, c.right]
     if not coupled:
@@ -150,4 +181,11 @@ def is_passive(model: Model, prior: Prior, values: Array) -> bool:
 
 
 _DIRECTIONS = np.random.default_rng(0).standard_normal((2000, 6)) * WORKING_SPEED
-_EXTENDED = np.hstack([np.ones((len(_DIRECTIONS), 1)), _DIRECTIONS, np.abs(_DIRECTIONS)])
+_EXTENDED = np.hstack(
+    [
+        np.ones((len(_DIRECTIONS), 1)),
+        _DIRECTIONS,
+        np.abs(_DIRECTIONS),
+        np.minimum(_DIRECTIONS, 0.0),
+    ]
+)

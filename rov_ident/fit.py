@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.effects import compiled
 from rov_ident.errors import UserError
 from rov_ident.messages import Array
 from rov_ident.model import Model
@@ -98,7 +99,9 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     removed = 1.0 - (report.std / estimator.prior.std) ** 2
     model = config.model.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
     samples = sum(len(record.samples) for record in records)
-    squares = [score(model, record.samples).rmse ** 2 * len(record.samples) for record in records]
+    moves, effects = config.with_model(model).dynamics, compiled(config.effects)
+    scores = [score(moves, record.samples, effects=effects) for record in records]
+    squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
     return Fit(
         kind,
         report.names,

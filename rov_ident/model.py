@@ -6,14 +6,15 @@ In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 
     tau = M nu_dot + C(nu) nu - d(nu) + g
     C(nu) nu = [omega x p1; omega x p2 + v x p1]
     M   = M_RB - sym(added-mass coefficients)
-    d   = sum of  coefficient * extended[left] * extended[right],  extended = [1, nu, |nu|]
+    d   = sum of  coefficient * extended[left] * extended[right]
+    extended = [1, nu, |nu|, min(nu, 0)]
     g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
 
 ``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, with
 the centre of gravity anywhere, off-diagonal terms included, and does no work by construction.
 
 The same few functions serve every use: :func:`generalized_force` evaluates ``C nu - d`` for a
-bundle of states side by side ("lanes": one for simulation and for a row of the regressor, sixteen
+bundle of states side by side ("lanes": one for simulation and for a row of the regressor, many
 for sigma points, so that the compiler can use vector instructions), :func:`columns` gives the same
 forces per unit of each coefficient (the regressor), and the forward dynamics solve the inverse
 ones.
@@ -26,7 +27,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.coefficients import EXTENDED_SIZE, Coefficient, parse
+from rov_ident.coefficients import (
+    ABSOLUTE,
+    EXTENDED_SIZE,
+    NEGATIVE,
+    ONE,
+    PLAIN,
+    Coefficient,
+    parse,
+)
 from rov_ident.errors import UserError
 from rov_ident.jit import inlined, kernel
 
@@ -140,7 +149,12 @@ class Model:
     @property
     def mass_matrix(self) -> Array:
         """M (6, 6): rigid body and added mass."""
-        m = np.ascontiguousarray(self.body.mass_matrix[:, :, None])
+        return self.body.mass_matrix + self.added_mass
+
+    @property
+    def added_mass(self) -> Array:
+        """M_A (6, 6)."""
+        m = np.zeros((6, 6, 1))
         add_added_mass(self.structure, self.theta[:, None], m)
         return m[:, :, 0]
 
@@ -150,11 +164,11 @@ class Model:
 
     def damping_matrix(self, nu: Array) -> Array:
         """D(nu) (6, 6) with ``d(nu) = -D(nu) nu``: each term's second factor is its velocity."""
-        extended = _extended(nu)
+        extended = _extended(_vector(nu))
         matrix = np.zeros((6, 6))
         for c, value in zip(self.coefficients, self.theta, strict=True):
-            if not c.is_added_mass:
-                matrix[c.row, c.right - 1] -= value * extended[c.left]
+            if not c.is_added_mass and not (c.is_one_sided and nu[c.velocity] >= 0.0):
+                matrix[c.row, c.velocity] -= value * extended[c.left]
         return matrix
 
     def coriolis_matrix(self, nu: Array) -> Array:
@@ -213,6 +227,11 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
                 f"coefficients.{name} is {value}, but must not be positive: damping and added mass "
                 "are negative derivatives (SNAME signs)"
             )
+        if coefficient.is_one_sided and values.get(coefficient.symmetric, 0.0) + value > 0:
+            raise UserError(
+                f"coefficients.{name} is {value}, but its sum with {coefficient.symmetric} must "
+                "not be positive: the hull would be driven where the velocity is negative"
+            )
     coefficients = sorted(by_place.values(), key=lambda c: not c.is_added_mass)
     theta = np.array([float(values[c.name]) for c in coefficients])
     model = Model(body, tuple(coefficients), theta)
@@ -237,47 +256,73 @@ def skew(a: Sequence[float] | Array) -> Array:
 # ------------------------------------------------------------------ kernels
 #
 # ``lanes`` is passed as a literal by a caller that inlines these, so that the inner loops either
-# vanish (one lane) or become vector instructions (sixteen).
+# vanish (one lane) or become vector instructions. These want one long expression a lane and rows of
+# known length, hence the tuples.
 
 
 @inlined
 def extend(lanes, nu, extended):
-    """[1, nu, |nu|] (13, lanes) from nu (6, lanes)."""
+    """[1, nu, |nu|, min(nu, 0)] (EXTENDED_SIZE, lanes) from nu (6, lanes)."""
     for k in range(lanes):
-        extended[0, k] = 1.0
+        extended[ONE, k] = 1.0
     for i in range(6):
         for k in range(lanes):
-            extended[1 + i, k] = nu[i, k]
-            extended[7 + i, k] = abs(nu[i, k])
+            extended[PLAIN + i, k] = nu[i, k]
+            extended[ABSOLUTE + i, k] = abs(nu[i, k])
+            extended[NEGATIVE + i, k] = min(nu[i, k], 0.0)
 
 
 @inlined
-def add_coriolis(lanes, p, nu, h):
-    """h += C(nu) nu, from the momentum p = M nu; all (6, lanes)."""
-    for k in range(lanes):
-        h[0, k] += nu[4, k] * p[2, k] - nu[5, k] * p[1, k]
-        h[1, k] += nu[5, k] * p[0, k] - nu[3, k] * p[2, k]
-        h[2, k] += nu[3, k] * p[1, k] - nu[4, k] * p[0, k]
-        h[3, k] += nu[4, k] * p[5, k] - nu[5, k] * p[4, k] + nu[1, k] * p[2, k] - nu[2, k] * p[1, k]
-        h[4, k] += nu[5, k] * p[3, k] - nu[3, k] * p[5, k] + nu[2, k] * p[0, k] - nu[0, k] * p[2, k]
-        h[5, k] += nu[3, k] * p[4, k] - nu[4, k] * p[3, k] + nu[0, k] * p[1, k] - nu[1, k] * p[0, k]
+def six(a, k):
+    """Lane k of a (6, lanes), as a tuple."""
+    return a[0, k], a[1, k], a[2, k], a[3, k], a[4, k], a[5, k]
 
 
 @inlined
-def generalized_force(lanes, structure, mass, theta, nu, h, p, extended):
+def symmetric_product(m, x, k):
+    """Lane k of the symmetric m (6, 6, lanes), its lower half read, times a tuple of six."""
+    a, b, c, d, e, f = x
+    return (
+        m[0, 0, k] * a + m[1, 0, k] * b + m[2, 0, k] * c
+        + m[3, 0, k] * d + m[4, 0, k] * e + m[5, 0, k] * f,
+        m[1, 0, k] * a + m[1, 1, k] * b + m[2, 1, k] * c
+        + m[3, 1, k] * d + m[4, 1, k] * e + m[5, 1, k] * f,
+        m[2, 0, k] * a + m[2, 1, k] * b + m[2, 2, k] * c
+        + m[3, 2, k] * d + m[4, 2, k] * e + m[5, 2, k] * f,
+        m[3, 0, k] * a + m[3, 1, k] * b + m[3, 2, k] * c
+        + m[3, 3, k] * d + m[4, 3, k] * e + m[5, 3, k] * f,
+        m[4, 0, k] * a + m[4, 1, k] * b + m[4, 2, k] * c
+        + m[4, 3, k] * d + m[4, 4, k] * e + m[5, 4, k] * f,
+        m[5, 0, k] * a + m[5, 1, k] * b + m[5, 2, k] * c
+        + m[5, 3, k] * d + m[5, 4, k] * e + m[5, 5, k] * f,
+    )  # fmt: skip
+
+
+@inlined
+def coriolis_of(momentum, nu):
+    """C(nu) nu from the momentum M nu; all tuples of six."""
+    (a, b, c, d, e, f), (u, v, w, p, q, r) = momentum, nu
+    return (
+        q * c - r * b,
+        r * a - p * c,
+        p * b - q * a,
+        q * f - r * e + v * c - w * b,
+        r * d - p * f + w * a - u * c,
+        p * e - q * d + u * b - v * a,
+    )
+
+
+@inlined
+def generalized_force(lanes, structure, mass, theta, nu, h, extended):
     """h = C(nu) nu - d(nu) (6, lanes).
 
-    mass (6, 6, lanes), theta (n, lanes), nu (6, lanes); p (6, lanes) and extended (13, lanes) are
-    work space.
+    mass (6, 6, lanes), theta (n, lanes), nu (6, lanes); extended (EXTENDED_SIZE, lanes) is work
+    space. Of the mass matrices the lower half is read.
     """
-    for i in range(6):
-        for k in range(lanes):
-            h[i, k] = 0.0
-            p[i, k] = mass[i, 0, k] * nu[0, k]
-        for j in range(1, 6):
-            for k in range(lanes):
-                p[i, k] += mass[i, j, k] * nu[j, k]
-    add_coriolis(lanes, p, nu, h)
+    for k in range(lanes):
+        x = six(nu, k)
+        p = symmetric_product(mass, x, k)
+        h[0, k], h[1, k], h[2, k], h[3, k], h[4, k], h[5, k] = coriolis_of(p, x)
     extend(lanes, nu, extended)
     first = len(structure.mass_row)
     for term in range(len(structure.row)):
@@ -307,19 +352,16 @@ def columns(structure, nu, momentum, force):
     """
     momentum[:] = 0.0
     force[:] = 0.0
-    one, h, p = nu.reshape(6, 1), np.zeros((6, 1)), np.zeros((6, 1))
     first = len(structure.mass_row)
     for c in range(first):
         i, j = structure.mass_row[c], structure.mass_column[c]
-        p[:] = 0.0
-        p[i, 0] = -nu[j]
-        p[j, 0] = -nu[i]
-        h[:] = 0.0
-        add_coriolis(1, p, one, h)
-        momentum[:, c] = p[:, 0]
-        force[:, c] = h[:, 0]
+        momentum[i, c] = -nu[j]
+        momentum[j, c] = -nu[i]
+        h = coriolis_of(six(momentum, c), (nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]))
+        for k in range(6):
+            force[k, c] = h[k]
     extended = np.empty((EXTENDED_SIZE, 1))
-    extend(1, one, extended)
+    extend(1, nu.reshape(6, 1), extended)
     for term in range(len(structure.row)):
         left, right = structure.left[term], structure.right[term]
         force[structure.row[term], first + term] = -extended[left, 0] * extended[right, 0]
@@ -334,32 +376,58 @@ def in_motion(structure, moving, out):
     for term in range(len(structure.row)):
         moves = True
         for index in (structure.left[term], structure.right[term]):
-            if index > 0:  # not the constant
-                moves = moves and moving[(index - 1) % 6] != 0
+            if index != ONE:
+                moves = moves and moving[(index - PLAIN) % 6] != 0
         out[first + term] = moves
 
 
 @kernel
 def coriolis(p, nu):
     """C(nu) nu (6,) from the momentum p = M nu (6,)."""
-    h = np.zeros((6, 1))
-    add_coriolis(1, p.reshape(6, 1), nu.reshape(6, 1), h)
-    return h[:, 0]
+    return np.array(coriolis_of(six(p.reshape(6, 1), 0), six(nu.reshape(6, 1), 0)))
+
+
+@kernel
+def current_wrench(structure, added_mass, theta, nu, water):
+    """What steadily moving water adds to the thruster wrench (6,) of a vehicle in still water.
+
+    ``added_mass`` (6, 6), ``theta`` (n,), ``nu`` (6,) over ground, ``water`` (3,) the velocity of
+    the water in body axes [m/s], irrotational and constant in the world. The hydrodynamic forces
+    are those of the velocity through the water ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
+
+        M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r - d(nu_r) + g = tau
+        nu_c = [water; 0],   nu_c_dot = [-omega x water; 0]
+
+    Moving what differs from the equation for still water to the right leaves
+    ``M_A nu_c_dot + (C_A(nu) nu - d(nu)) - (C_A(nu_r) nu_r - d(nu_r))``.
+    """
+    relative, turning = nu.copy(), np.zeros(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        relative[i] -= water[i]
+        turning[i] = nu[3 + k] * water[j] - nu[3 + j] * water[k]
+    out = _force_of_one(structure, added_mass, theta, nu)
+    through_water = _force_of_one(structure, added_mass, theta, relative)
+    for i in range(6):
+        out[i] -= through_water[i]
+        for j in range(3):
+            out[i] += added_mass[i, j] * turning[j]
+    return out
 
 
 @kernel
 def _force_of_one(structure, mass, theta, nu):
     """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,) -> (6,)."""
-    h, p = np.empty((6, 1)), np.empty((6, 1))
+    h = np.empty((6, 1))
     extended = np.empty((EXTENDED_SIZE, 1))
     one_mass = np.ascontiguousarray(mass).reshape(6, 6, 1)
-    generalized_force(
-        1, structure, one_mass, theta.reshape(-1, 1), nu.reshape(6, 1), h, p, extended
-    )
+    generalized_force(1, structure, one_mass, theta.reshape(-1, 1), nu.reshape(6, 1), h, extended)
     return h[:, 0]
 
 
-def _extended(nu: Array) -> Array:
+@kernel
+def _extended(nu):
+    """:func:`extend` for a single state (6,)."""
     extended = np.empty((EXTENDED_SIZE, 1))
-    extend(1, _vector(nu).reshape(6, 1), extended)
+    extend(1, nu.reshape(6, 1), extended)
     return extended[:, 0]

@@ -40,7 +40,9 @@ class Report:
 
     Arrays are (n,) in the order of ``names``; covariance (n, n). ``stamp`` [ns] is the time of the
     last sample used, 0 before the first. ``excitation`` is the share of the prior variance that the
-    motion of the last 20 to 40 seconds would remove by itself.
+    motion of the last 20 to 40 seconds would remove by itself. ``condition`` is that of the
+    information's root in prior units: 1 before any data, and an estimate has some
+    ``16 - log10(condition)`` digits; NaN where it is not known.
     """
 
     stamp: int
@@ -54,6 +56,7 @@ class Report:
     excitation: Array
     levels: tuple[Level, ...]
     messages: tuple[str, ...]
+    condition: float = math.nan
 
 
 class OnlineEstimator:
@@ -151,7 +154,7 @@ class OnlineEstimator:
     def report(self) -> Report:
         """The present coefficients, made physical, with their state in words."""
         raw = self._estimate()
-        values = physical(self.config.model, self.prior, raw)
+        values = physical(self.config.dynamics, self.prior, raw)
         diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
         if diverged:
             values, std = self._safe, self.prior.std
@@ -179,6 +182,7 @@ class OnlineEstimator:
             excitation,
             tuple(level for level, _ in words),
             tuple(text for _, text in words),
+            self._module.condition(self._task, self._state),
         )
 
     def _stamp(self) -> int:

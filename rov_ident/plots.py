@@ -1,11 +1,13 @@
 """Pictures, each a function of results; the only module that knows matplotlib."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from rov_ident.messages import Array
 matplotlib.rcParams.update(
     {
         "svg.hashsalt": "rov_ident",
+        "svg.fonttype": "none",  # text stays text: sharp, and found by a search
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.grid": True,
@@ -24,6 +27,17 @@ matplotlib.rcParams.update(
 )
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")  # Okabe and Ito: told apart by everyone
+INK = "#000000"
+PANEL = (4.6, 1.9)  # inches; read at the width of a telephone, and side by side on a screen
+LIMIT = 1.0  # a simulated curve may leave the measured range by so many ranges, then it is cut
+
+MEASURED = "measured"
+MODELS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    "as configured": (COLOURS[1], (3.0, 1.2)),
+    "retuned": (COLOURS[0], (1.0, 1.0)),
+    "extended": (COLOURS[2], ()),
+}
+"""The three models of `explain`: the same colour and dashes in every picture."""
 
 
 @dataclass(frozen=True)
@@ -87,15 +101,131 @@ def open_loop(
     return figure
 
 
+def curves(
+    x: Array,
+    models: Mapping[str, Array],
+    title: str,
+    x_label: str,
+    y_label: str,
+    *,
+    measured: Array | None = None,
+    shaded: Sequence[tuple[float, float]] = (),
+    marker: str = "",
+) -> Figure:
+    """One panel: a curve (k,) over x (k,) for each of MODELS, held-out spans shaded."""
+    figure, ax = panel(title, x_label, y_label)
+    draw_curves(ax, x, models, measured=measured, shaded=shaded, marker=marker)
+    return figure
+
+
+def panel(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
+    """A small figure of one pair of axes."""
+    figure = Figure(figsize=PANEL, layout="constrained")
+    ax = figure.subplots()
+    ax.set(xlabel=x_label, ylabel=y_label)
+    ax.set_title(title, loc="left", fontsize=9)
+    return figure, ax
+
+
+def draw_curves(
+    ax: Axes,
+    x: Array,
+    models: Mapping[str, Array],
+    *,
+    measured: Array | None = None,
+    shaded: Sequence[tuple[float, float]] = (),
+    marker: str = "",
+) -> None:
+    """As :func:`curves`, on given axes. Without ``measured`` the curves are errors, from zero."""
+    for begin, end in shaded:
+        if end > x[0] and begin < x[-1]:
+            ax.axvspan(max(begin, x[0]), min(end, x[-1]), color=INK, alpha=0.08, lw=0)
+    if measured is not None:
+        ax.plot(x, measured, color=INK, lw=3.2, alpha=0.35, label=MEASURED)
+        low, high = np.nanmin(measured), np.nanmax(measured)
+        reach = LIMIT * (high - low)
+        drawn = np.concatenate([[low, high], *models.values()])
+        drawn = np.clip(drawn[np.isfinite(drawn)], low - reach, high + reach)
+        edge = 0.05 * np.ptp(drawn) + 1e-9
+        ax.set_ylim(drawn.min() - edge, drawn.max() + edge)
+    for label, y in models.items():
+        colour, dashes = MODELS[label]
+        ax.plot(
+            x,
+            y,
+            color=colour,
+            dashes=dashes or (None, None),
+            lw=1.3,
+            marker=marker,
+            ms=2.5,
+            label=label,
+        )
+    if measured is None:
+        ax.set_ylim(bottom=0.0)
+    if not marker and len(x) and x[0] < x[-1]:
+        ax.set_xlim(x[0], x[-1])
+
+
+def bars(groups: Sequence[str], models: Mapping[str, Array], title: str, y_label: str) -> Figure:
+    """One panel: a bar for each of MODELS in every group; values (groups,)."""
+    figure, ax = panel(title, "", y_label)
+    draw_bars(ax, groups, models)
+    return figure
+
+
+def draw_bars(ax: Axes, groups: Sequence[str], models: Mapping[str, Array]) -> None:
+    """As :func:`bars`, on given axes."""
+    width = 0.8 / len(models)
+    for i, (label, values) in enumerate(models.items()):
+        at = np.arange(len(groups)) + (i - 0.5 * (len(models) - 1)) * width
+        drawn = ax.bar(at, values, 0.92 * width, color=MODELS[label][0], label=label)
+        ax.bar_label(drawn, fmt="%.2g", fontsize=6.5, padding=1)
+    ax.set_xticks(np.arange(len(groups)), groups)
+    ax.grid(False, axis="x")
+    ax.margins(y=0.12)
+
+
+def overview(title: str) -> tuple[Figure, tuple[Axes, Axes, Axes, Axes]]:
+    """A figure of one wide pair of axes above three."""
+    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    grid = figure.add_gridspec(2, 3)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, wrap=True)
+    left, middle, right = (figure.add_subplot(grid[1, i]) for i in range(3))
+    return figure, (figure.add_subplot(grid[0, :]), left, middle, right)
+
+
+def outside_legend(figure: Figure, ax: Axes) -> None:
+    """A legend of what is on the axes, outside of them."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=len(labels))
+
+
+def css(colour: str) -> str:
+    """A colour of COLOURS as the style of a page may change it."""
+    return f"var(--colour-{COLOURS.index(colour)}, {colour})"
+
+
 def to_png(figure: Figure, dpi: int = 110) -> bytes:
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()
 
 
-def to_svg(figure: Figure) -> str:
-    """An svg element without XML head, to stand inside a page."""
+def to_svg(figure: Figure, name: str = "") -> str:
+    """An svg element without XML head, to stand inside a page.
+
+    Ink and COLOURS follow the style of the page (``color``, ``--colour-0`` ...). ``name`` keeps
+    the ids of several pictures on one page apart.
+    """
     buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(buffer, format="svg", metadata=metadata, transparent=True)
     text = buffer.getvalue().decode()
-    return text[text.index("<svg") :]
+    text = text[text.index("<svg") :]
+    text = text.replace(INK, "currentColor")
+    for colour in COLOURS:
+        text = text.replace(colour, css(colour))
+    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
+    used = set(re.findall(r"[(\"]#([\w-]+)[)\"]", text))
+    text = re.sub(r' id="([\w.-]+)"', lambda m: f' id="{name}{m[1]}"' if m[1] in used else "", text)
+    return re.sub(r"([(\"]#)([\w-]+[)\"])", rf"\g<1>{name}\g<2>", text)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from rov_ident.bags import Bag, read_messages, select_topics
 from rov_ident.config import Config
+from rov_ident.effects import Acting
 from rov_ident.errors import UserError
-from rov_ident.frames import quaternion_from_euler
 from rov_ident.messages import Array
 from rov_ident.model import Model
-from rov_ident.samples import Sampler, describe
+from rov_ident.samples import Sampler, describe, joined
 from rov_ident.simulate import open_loop
 
 HORIZON = 10.0  # s; of the open-loop windows by which models are judged
@@ -70,7 +70,7 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
     parts.append(sampler.flush())
     if progress is not None:
         progress(total, total)
-    samples = np.concatenate(parts)
+    samples = joined(parts)
     counts = sampler.counts + undecodable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
@@ -82,40 +82,43 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
     return Record(Path(path), samples, counts, tuple(notes), bag.sha256)
 
 
-def attitude_of(samples: NDArray[np.void]) -> Array:
-    """Attitudes (k, 4) of the samples with heading zero: the model does not depend on heading."""
-    down = samples["down"]
-    roll, pitch = np.arctan2(down[:, 1], down[:, 2]), -np.arcsin(np.clip(down[:, 0], -1.0, 1.0))
-    return quaternion_from_euler(roll, pitch, 0.0)
-
-
 def predicted(
     model: Model,
     samples: NDArray[np.void],
     horizon: float,
     free: NDArray[np.bool_] | None = None,
+    effects: Acting | None = None,
 ) -> Array:
-    """Velocities (k, 6) simulated open loop in windows of ``horizon`` seconds (inf: one run).
+    """Velocities (k, 6) over ground, simulated open loop in windows of ``horizon`` seconds.
 
-    Every window starts from the measured state at its first sample; so does every stretch after a
-    gap. Components not marked in ``free`` (6,) follow the measurement. Infinite where the
-    simulation diverges.
+    An infinite horizon is one run. Every window starts from the measured state at its first sample;
+    so does every stretch after a gap. Components not marked in ``free`` (6,) follow the
+    measurement. Infinite where the simulation diverges. ``effects`` on the wrench and the current
+    act along the simulated motion, in place of what the samples say they did along the measured
+    one.
     """
     out = np.empty((len(samples), 6))
     edges = np.append(np.flatnonzero(samples["restart"]), len(samples))
     if edges[0] != 0:
         edges = np.insert(edges, 0, 0)
-    attitude = attitude_of(samples)
     for first, end in pairwise(edges):
         part = samples[first:end]
+        thrust = part["wrench"] - part["surroundings"]
+        slope = part["wrench_slope"] - part["surroundings_slope"]
         # a sample's wrench belongs to the interval that ends there
-        wrench, slope = (
-            np.vstack([part[name][1:], part[name][-1:]]) for name in ("wrench", "wrench_slope")
-        )
+        thrust, slope = (np.vstack([values[1:], values[-1:]]) for values in (thrust, slope))
         out[first:end] = open_loop(
-            model, part["t"], wrench, part["nu"], attitude[first:end], horizon, slope, free
-        )
+            model, part["t"], thrust, over_ground(part), part["orientation"], horizon, slope, free,
+            effects,
+        )  # fmt: skip
     return out
+
+
+def over_ground(samples: NDArray[np.void]) -> Array:
+    """The measured velocities (k, 6) over ground, as the odometry has them."""
+    nu = samples["nu"].copy()
+    nu[:, :3] += samples["water"]
+    return nu
 
 
 @dataclass(frozen=True)
@@ -131,11 +134,12 @@ def score(
     samples: NDArray[np.void],
     horizon: float = HORIZON,
     free: NDArray[np.bool_] | None = None,
+    effects: Acting | None = None,
 ) -> Score:
     """Score the simulation of :func:`predicted` where the velocity was measured."""
     measured = samples["measured"]
-    nu = samples["nu"][measured]
-    error = predicted(model, samples, horizon, free)[measured] - nu
+    nu = over_ground(samples)[measured]
+    error = predicted(model, samples, horizon, free, effects)[measured] - nu
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(np.mean(error**2, axis=0))
         r2 = 1.0 - np.sum(error**2, axis=0) / np.sum((nu - nu.mean(axis=0)) ** 2, axis=0)

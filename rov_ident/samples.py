@@ -10,11 +10,14 @@ What a sample holds, and why (docs/samples.md has the measurements):
 * ``wrench`` is the *mean* over the interval that ends at the sample, ``wrench_slope`` its trend in
   there. A demand holds from its stamp to the next one; a value picked at the sample's instant would
   look like a delay of half a period, and without the trend a step early in the interval would be
-  taken for one in its middle.
-* ``nu`` is the best estimate of the body velocity: odometry and the integrated IMU are weighed
-  by a Kalman filter on the kinematics alone (no model of the vehicle). Such a filter is
-  complementary, what it takes from one source it leaves of the other, so it adds noise but no
-  lag. Without an IMU ``nu`` is the odometry as it came.
+  taken for one in its middle. It is all that acts besides the model: what the thrusters make of the
+  demand, and ``surroundings``, that of the configured wrench effects.
+* ``nu`` is the best estimate of the body velocity *through the water*. A steady current is a moving
+  frame, in which the equations of motion are those for still water, whatever the coefficients; so
+  it is taken off all velocities here (``water``), and no estimator needs to know of it. Odometry
+  and the integrated IMU are weighed by a Kalman filter on the kinematics alone (no model of the
+  vehicle). Such a filter is complementary, what it takes from one source it leaves of the other, so
+  it adds noise but no lag. Without an IMU ``nu`` is the odometry as it came.
 * ``odometry`` and ``gyro`` are the same measurements one by one, their noise independent, for a
   filter that does its own weighing. With a gyro the odometry's own angular rate only serves to find
   the gyro's bias.
@@ -22,16 +25,24 @@ What a sample holds, and why (docs/samples.md has the measurements):
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.attitude import rotation, turned
 from rov_ident.config import Config
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import (
+    act,
+    add_wrenches,
+    affects_sensors,
+    compiled,
+    correct,
+    memory,
+)
+from rov_ident.effects.base import Reading
 from rov_ident.frames import FrameDefaults, quaternion_from_euler, to_core
-from rov_ident.jit import kernel
+from rov_ident.jit import inlined, kernel
 from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
 
 SAMPLE = np.dtype(
@@ -41,12 +52,20 @@ SAMPLE = np.dtype(
         ("restart", "?"),  # the interval before this sample is not known: filters begin anew
         ("measured", "?"),  # an odometry message belongs to this sample
         ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
-        ("nu", "f8", (6,)),
+        ("nu", "f8", (6,)),  # m/s, rad/s: through the water
+        ("water", "f8", (3,)),  # m/s: velocity of the water in body axes; nu + water: over ground
+        ("orientation", "f8", (4,)),  # w x y z, body -> world
         ("down", "f8", (3,)),  # unit, body axes
         ("down_slope", "f8", (3,)),  # per s, over the interval
-        ("wrench", "f8", (6,)),  # N, N m: mean over dt, after the input effects
+        ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
-        ("odometry", "f8", (6,)),  # m/s, rad/s; NaN: not measured
+        (
+            "surroundings",
+            "f8",
+            (6,),
+        ),  # part of the wrench: of the wrench effects at the measured motion
+        ("surroundings_slope", "f8", (6,)),
+        ("odometry", "f8", (6,)),  # as nu; NaN: not measured
         ("odometry_variance", "f8", (6,)),
         ("gyro", "f8", (3,)),  # rad/s, bias removed; NaN: not measured
         ("gyro_variance", "f8"),
@@ -85,6 +104,7 @@ _KINEMATICS = np.dtype(
 _SETTINGS = np.dtype(
     [
         ("gravity", "f8"),
+        ("water", "f8", (3,)),  # m/s, in the world
         ("odometry_lever", "f8", (3,)),
         ("imu_lever", "f8", (3,)),
         ("imu_rotation", "f8", (3, 3)),  # sensor axes -> body axes
@@ -121,11 +141,11 @@ class Sampler:
         """Take other settings; the buffered messages and the motion stay."""
         self._grace = config.grace
         self._hold = config.timeout
-        self._effects = [
-            (EFFECTS[name].step, EFFECTS[name].start, dict(parameters))
-            for name, parameters in config.effects.items()
-            if EFFECTS[name].place == "input"
-        ]
+        self._effects = config.effects
+        self._acting = compiled(config.effects)
+        self._corrects = affects_sensors(config.effects)
+        self._acts = bool(self._acting.inputs.any())
+        self._surrounded = bool(self._acting.wrenches.any())
         self._settings = _settings(config)
 
     def _clear(self) -> None:
@@ -143,7 +163,8 @@ class Sampler:
         self._kinematics["gyro_bias_variance"] = self._settings["gyro_bias_variance"]
         self._demand: Array | None = None
         self._demand_time = -math.inf
-        self._input_states: list[Array] = []
+        self._memory = memory()
+        self._around = np.zeros(6)  # the surroundings' wrench at the last sample
 
     # -------------------------------------------------------------- messages in
 
@@ -193,6 +214,26 @@ class Sampler:
         self._newest[role] = t
         self._queues[role].append((t, to_core(message, self._defaults)))
 
+    def _corrected(self, message: Message) -> Message:
+        """The message (FRD) without what the effects on the sensors have added."""
+        if not self._corrects:
+            return message
+        if isinstance(message, Odometry):
+            reading = Reading(message.linear, message.angular, _ZERO, _ZERO)
+            reading = correct(reading, self._effects)
+            return message._replace(linear=reading.linear, angular=reading.angular)
+        if isinstance(message, Imu):
+            to_body = self._settings["imu_rotation"][0]
+            gyro, force = message.angular_velocity, message.linear_acceleration
+            given = Reading(_ZERO, _ZERO, to_body @ gyro, to_body @ force)
+            reading = correct(given, self._effects)
+            return message._replace(
+                angular_velocity=gyro + to_body.T @ (reading.gyro - given.gyro),
+                linear_acceleration=force
+                + to_body.T @ (reading.specific_force - given.specific_force),
+            )
+        return message
+
     def _is_new_clock(self, role: str, stamp: int) -> bool:
         """A single wild stamp is an error; two in a row that agree are another clock."""
         suspect = self._suspect.get(role)
@@ -206,20 +247,23 @@ class Sampler:
         frames: tuple[str, ...]
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)
-            squared = float(message.orientation @ message.orientation)
-            values = [message.linear, message.angular, 1e-3 * message.position]
-            if not 0.5 < squared < 2.0:  # NaN too
+            p, q, v, w = message.position, message.orientation, message.linear, message.angular
+            if not 0.5 < q.dot(q) < 2.0:  # NaN too
                 return "orientation is not a unit quaternion"
+            size = v.dot(v) + w.dot(w) + 1e-6 * p.dot(p)
         elif isinstance(message, Imu):
             frames = (message.frame_id,)
-            values = [message.angular_velocity, message.linear_acceleration]
+            w, f = message.angular_velocity, message.linear_acceleration
+            size = w.dot(w) + f.dot(f)
         else:
             frames = (message.frame_id,)
-            values = [message.force, message.torque]
-        for value in values:
-            # one comparison refuses NaN, infinities and values no vehicle reaches
-            if not float(value @ value) < 1e12:
-                return "not finite or absurdly large"
+            f, w = message.force, message.torque
+            size = f.dot(f) + w.dot(w)
+        # one comparison refuses NaN, infinities and values no vehicle reaches
+        if not size < 1e12:
+            return "not finite or absurdly large"
+        if self._frame_ids.get(role) == frames:
+            return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
             return f"frame '{frames[-1]}' is a world frame, body axes are needed"
         if self._frame_ids.setdefault(role, frames) != frames:
@@ -232,15 +276,13 @@ class Sampler:
         samples = []
         odometry, imu = self._queues[ODOMETRY], self._queues[IMU]
         while odometry or imu:
-            merged = bool(
-                odometry
-                and imu
-                and imu[0][0] >= odometry[0][0]
-                and imu[0][0] - odometry[0][0] <= _MERGE
-                and not (len(odometry) > 1 and odometry[1][0] <= imu[0][0])
+            pose_t = odometry[0][0] if odometry else math.inf
+            imu_t = imu[0][0] if imu else math.inf
+            merged = 0.0 <= imu_t - pose_t <= _MERGE and not (
+                len(odometry) > 1 and odometry[1][0] <= imu_t
             )
-            take_imu = merged or not odometry or bool(imu and imu[0][0] < odometry[0][0])
-            t = imu[0][0] if take_imu else odometry[0][0]
+            take_imu = merged or imu_t < pose_t
+            t = imu_t if take_imu else pose_t
             if not (final or self._reached(t)):
                 break
             message = imu.popleft()[1] if take_imu else None
@@ -248,7 +290,9 @@ class Sampler:
             sample = self._sample(t, pose, message)
             if sample is not None:
                 samples.append(sample)
-        return np.concatenate(samples) if samples else _NONE
+        if not samples:
+            return _NONE
+        return samples[0] if len(samples) == 1 else joined(samples)
 
     def _reached(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t, or it is not worth waiting."""
@@ -256,11 +300,11 @@ class Sampler:
         if horizon - t > self._grace:
             return True
         for role in (ODOMETRY, IMU, WRENCH):
-            newest = self._newest.get(role, self._first)
-            silent = t - newest > self._grace
-            if newest < t and not silent:
-                return False
-            if role not in self._newest and t - self._first <= self._grace:
+            newest = self._newest.get(role)
+            if newest is None:
+                if t - self._first <= self._grace:
+                    return False
+            elif newest < t and t - newest <= self._grace:
                 return False
         return True
 
@@ -271,20 +315,22 @@ class Sampler:
         restart = not 0.0 < dt <= _MAX_GAP
         wrench = self._mean_wrench(self._previous if not restart else t, t)
         self._previous = t
+        mean, slope = (_ZERO_WRENCH, _ZERO_WRENCH) if wrench is None else wrench
         sample = np.zeros(1, dtype=SAMPLE)
-        row = sample[0]
-        row["t"], row["dt"], row["restart"] = t, 0.0 if restart else dt, restart
         odometry, shift = _ABSENT, 0.0
         if pose is not None:
-            assert isinstance(pose[1], Odometry)
+            given = self._corrected(pose[1])
+            assert isinstance(given, Odometry)
             shift = t - pose[0]
             odometry = np.concatenate(
-                [pose[1].orientation, pose[1].linear, pose[1].angular, pose[1].twist_variance]
+                [given.orientation, given.linear, given.angular, given.twist_variance]
             )
         inertial, gyro, specific, gyro_variance = imu is not None, _ZERO, _ZERO, 0.0
-        if isinstance(imu, Imu):
+        if imu is not None:
+            imu = self._corrected(imu)
+            assert isinstance(imu, Imu)
             gyro, specific = imu.angular_velocity, imu.linear_acceleration
-            gyro_variance = float(imu.angular_variance.mean())
+            gyro_variance = sum(imu.angular_variance.tolist()) / 3.0
             self._seen_imu = t
         if restart:
             self._kinematics["known"] = False
@@ -292,17 +338,18 @@ class Sampler:
         if t - self._seen_imu > _MERGE and self._kinematics["inertial"][0]:
             self._kinematics["inertial"] = False
             self.counts["imu: gap, odometry alone"] += 1
-        taken = fuse(
-            self._kinematics, self._settings, sample, pose is not None, shift, odometry, inertial,
-            gyro, gyro_variance, specific,
+        taken, known = fuse(
+            self._kinematics, self._settings, sample, t, 0.0 if restart else dt, restart,
+            mean, slope, pose is not None, shift, odometry, inertial, gyro, gyro_variance, specific,
         )  # fmt: skip
         if pose is not None and not taken:
             self.counts["odom: outlier, or marked as not measured"] += 1
-        if wrench is None or not self._kinematics["known"][0]:
+        if wrench is None or not known:
             self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
             self._previous = math.nan
             return None
-        row["wrench"], row["wrench_slope"] = wrench
+        if self._surrounded:
+            _surround(self._acting, sample, self._around)
         return sample
 
     def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array] | None:
@@ -314,42 +361,51 @@ class Sampler:
             at, message = queue.popleft()
             assert isinstance(message, Wrench)
             if self._demand is not None and at > now:
-                pieces.append((now, at, self._act(at - now)))
+                pieces.append((now, at, self._act(now, at - now)))
                 now = at
             elif self._demand is None:
                 start = now = max(at, start)
             self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
         if self._demand is None or end - self._demand_time > self._hold:
             self._demand = None
-            self._input_states = []
+            self._memory = memory()
             return None
-        acting = self._act(end - now)
+        acting = self._act(now, end - now)
         if not pieces:
             return acting, _ZERO_WRENCH
         pieces.append((now, end, acting))
         length, middle = end - start, 0.5 * (start + end)
-        mean, moment = np.zeros(6), np.zeros(6)
+        mean, slope = np.zeros(6), np.zeros(6)
         for begin, stop, wrench in pieces:
-            share = (stop - begin) / length * wrench
-            mean += share
-            moment += (0.5 * (begin + stop) - middle) * share
-        return mean, 12.0 / length**2 * moment
+            share = (stop - begin) / length
+            _add_piece(
+                share,
+                12.0 * share * (0.5 * (begin + stop) - middle) / length**2,
+                wrench,
+                mean,
+                slope,
+            )
+        return mean, slope
 
-    def _act(self, dt: float) -> Array:
-        """The wrench (6,) that acts, in the mean over dt, when the present demand is held."""
-        wrench = self._demand
-        assert wrench is not None
-        if self._effects and not self._input_states:
-            self._input_states = [start(wrench) for _, start, _ in self._effects]
-        for i, (step, _, parameters) in enumerate(self._effects):
-            self._input_states[i], wrench = step(self._input_states[i], wrench, dt, **parameters)
+    def _act(self, t: float, dt: float) -> Array:
+        """The wrench (6,) that acts, in the mean from t to t + dt, when the demand is held."""
+        assert self._demand is not None
+        wrench = self._demand.copy()
+        if self._acts:
+            act(self._acting, self._memory, t, dt, wrench)
         return wrench
+
+
+def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
+    """One array of the samples in all parts, as np.concatenate, which is slow with records."""
+    return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=SAMPLE)
 
 
 def _settings(config: Config) -> NDArray[np.void]:
     settings = np.zeros(1, dtype=_SETTINGS)
     row = settings[0]
     row["gravity"] = config.gravity
+    row["water"] = compiled(config.effects).water
     row["odometry_lever"] = config.odometry.position
     row["imu_lever"] = config.imu.position
     roll, pitch, yaw = config.imu.rotation
@@ -379,11 +435,21 @@ _MOVING = 4.0  # mean square over noise variance from which it does; at rest it 
 _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU's lever arm
 
 
+@inlined
+def _set(a, b):
+    """``a[:] = b``, which takes three seconds to compile."""
+    for i in range(len(a)):
+        a[i] = b[i]
+
+
 @kernel
 def fuse(
-    kinematics, settings, sample, has_odometry, shift, odometry, has_imu, gyro, gyro_given, specific
-):
-    """One instant of the kinematic filter; fills the sample; whether the odometry was taken.
+    kinematics, settings, sample, t, dt, restart, wrench, wrench_slope, has_odometry, shift,
+    odometry, has_imu, gyro, gyro_given, specific,
+):  # fmt: skip
+    """One instant of the kinematic filter; fills the sample.
+
+    Returns whether the odometry was taken, and whether the motion is known.
 
     Velocity and accelerometer bias share one 2 x 2 covariance for the three axes, as their noise is
     isotropic::
@@ -395,8 +461,10 @@ def fuse(
     variance in the message, zero or negative where there is none.
     """
     k, s, out = kinematics[0], settings[0], sample[0]
-    dt = out.dt
     nan = np.nan
+    out.t, out.dt, out.restart = t, dt, restart
+    _set(out.wrench, wrench)
+    _set(out.wrench_slope, wrench_slope)
     gyro_variance = gyro_given if 0.0 < gyro_given < 1.0 else s.gyro_variance
     started = k.inertial
     for i in range(3):
@@ -436,12 +504,12 @@ def fuse(
         for i in range(3):
             mean_rate[i] = 0.5 * (rate[i] + k.rate[i])
     if k.known:
-        k.q[:] = turned(k.q, mean_rate * dt)
+        _set(k.q, turned(k.q, mean_rate * dt))
         k.attitude_variance += gyro_variance * dt * dt + 1e-8 * dt
     if has_odometry:
         q = turned(odometry[:4] / np.sqrt(np.sum(odometry[:4] ** 2)), rate * shift)
         if not k.known or not k.inertial:
-            k.q[:] = q
+            _set(k.q, q)
             k.attitude_variance = s.attitude_variance
         else:
             gain = k.attitude_variance / (k.attitude_variance + s.attitude_variance)
@@ -453,8 +521,14 @@ def fuse(
             e[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
             e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
             sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
-            k.q[:] = turned(k.q, 2.0 * sign * gain * e)
-    down = rotation(k.q)[2]
+            _set(k.q, turned(k.q, 2.0 * sign * gain * e))
+    _set(out.orientation, k.q)
+    to_world = rotation(k.q)
+    down = to_world[2]
+    for i in range(3):
+        out.water[i] = 0.0
+        for j in range(3):
+            out.water[i] += to_world[j, i] * s.water[j]
 
     # acceleration of the origin from the IMU, and the velocity it predicts
     acceleration = np.zeros(3)
@@ -467,7 +541,7 @@ def fuse(
                 turn[i] = (rate[i] - k.slow_rate[i]) / (_LEVER_TIME + dt)
                 k.slow_rate[i] += blend * (rate[i] - k.slow_rate[i])
         else:
-            k.slow_rate[:] = rate
+            _set(k.slow_rate, rate)
         cross = np.empty(3)
         cross[0] = w[1] * lever[2] - w[2] * lever[1]
         cross[1] = w[2] * lever[0] - w[0] * lever[2]
@@ -508,7 +582,7 @@ def fuse(
                 + shift * acceleration[i]
             )
         if not k.known or not (has_imu and started):
-            k.v[:] = v
+            _set(k.v, v)
             k.p_vv = r_linear
             k.p_vb = 0.0
             k.p_bb = s.accelerometer_bias_variance
@@ -532,7 +606,7 @@ def fuse(
                 k.p_vv += r_linear
         if taken:
             for i in range(3):
-                out.odometry[i] = v[i]
+                out.odometry[i] = v[i] - out.water[i]
                 if not has_imu:
                     out.odometry[3 + i] = angular[i]
         if has_imu:
@@ -553,7 +627,7 @@ def fuse(
     out.measured = taken
     for i in range(3):
         k.rate[i] = rate[i]
-        out.nu[i] = k.v[i]
+        out.nu[i] = k.v[i] - out.water[i]
         out.nu[3 + i] = rate[i]
         r = gyro_variance if has_imu else r_angular
         blend = min(dt / _POWER_TIME, 1.0) if dt > 0.0 else 1.0
@@ -564,7 +638,31 @@ def fuse(
         out.down[i] = down[i]
         out.down_slope[i] = (down[i] - k.down[i]) / dt if dt > 0.0 else 0.0
         k.down[i] = down[i]
-    return taken
+    return taken, k.known
+
+
+@kernel
+def _add_piece(share, turn, wrench, mean, slope):
+    for i in range(6):
+        mean[i] += share * wrench[i]
+        slope[i] += turn * wrench[i]
+
+
+@kernel
+def _surround(acting, sample, around):
+    """Add the wrench effects to the sample; around (6,): theirs at the last sample, then at this.
+
+    Straight in between, as the motion is.
+    """
+    out, now = sample[0], np.zeros(6)
+    add_wrenches(acting, out.t, out.nu, rotation(out.orientation), now)
+    for i in range(6):
+        before = now[i] if out.restart else around[i]
+        out.surroundings[i] = 0.5 * (before + now[i])
+        out.surroundings_slope[i] = (now[i] - before) / out.dt if out.dt > 0.0 else 0.0
+        out.wrench[i] += out.surroundings[i]
+        out.wrench_slope[i] += out.surroundings_slope[i]
+        around[i] = now[i]
 
 
 def describe(counts: Mapping[str, int]) -> list[str]:

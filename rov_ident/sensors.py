@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rov_ident.config import Config
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import acted, compiled, sense
+from rov_ident.effects.base import Reading
 from rov_ident.excitation import manoeuvre
 from rov_ident.frames import (
     quaternion_from_euler,
@@ -16,7 +17,6 @@ from rov_ident.frames import (
     quaternion_to_matrix,
 )
 from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
-from rov_ident.model import skew
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
 from rov_ident.simulate import Trajectory, simulate
 
@@ -84,7 +84,7 @@ def dive(
     suite = suite or Suite()
     rng = np.random.default_rng(seed)
     demand_t = np.arange(0.0, duration, 1.0 / suite.wrench_rate)
-    demand = manoeuvre(name, config.model, demand_t, rng)
+    demand = manoeuvre(name, config.dynamics, demand_t, rng)
     return measure(config, demand_t, demand, duration, suite, rng)
 
 
@@ -102,14 +102,13 @@ def measure(
     imu_t = _clock(suite.imu_rate, duration, rng)
     t = np.unique(np.concatenate([demand_t, odometry_t, imu_t, np.arange(0.0, duration, 0.005)]))
     held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
-    truth = simulate(config.model, t, _acting(config, t, held))
-    down = quaternion_to_matrix(truth.orientation)[:, 2, :]
+    effects = compiled(config.effects)
+    truth = simulate(config.dynamics, t, acted(effects, t, held), effects=effects)
+    sensed = sense(_reading(truth, config), config.effects)
 
     messages: list[tuple[int, str, Message]] = []
     variance = np.repeat([suite.linear_std**2, suite.angular_std**2], 3)
-    lever = np.array(config.odometry.position)
     for i in np.searchsorted(t, odometry_t):
-        nu = truth.nu[i]
         noise = rng.standard_normal(12)
         tilt = quaternion_from_rotation_vector(suite.attitude_std * noise[:3])
         messages.append(
@@ -122,21 +121,16 @@ def measure(
                     "base_link_frd",
                     _coarse(truth.position[i] + suite.position_std * noise[3:6]),
                     _coarse(quaternion_multiply(truth.orientation[i], tilt)),
-                    _coarse(nu[:3] + np.cross(nu[3:], lever) + suite.linear_std * noise[6:9]),
-                    _coarse(nu[3:] + suite.angular_std * noise[9:]),
+                    _coarse(sensed.linear[i] + suite.linear_std * noise[6:9]),
+                    _coarse(sensed.angular[i] + suite.angular_std * noise[9:]),
                     variance,
                 ),
             )
         )
-    imu_lever = np.array(config.imu.position)
     mounting = _mounting(config)
     accelerometer_bias = suite.accelerometer_bias_std * rng.standard_normal(3)
     gyro_bias = suite.gyro_bias_std * rng.standard_normal(3)
     for i in np.searchsorted(t, imu_t):
-        nu, nu_dot = truth.nu[i], truth.nu_dot[i]
-        spin = skew(nu[3:])
-        acceleration = nu_dot[:3] + spin @ nu[:3] - config.gravity * down[i]
-        acceleration = acceleration + (skew(nu_dot[3:]) + spin @ spin) @ imu_lever
         noise = rng.standard_normal(6)
         messages.append(
             _stamped(
@@ -146,9 +140,9 @@ def measure(
                     0,
                     "imu_link_frd",
                     np.array([1.0, 0.0, 0.0, 0.0]),
-                    _coarse(mounting.T @ nu[3:] + gyro_bias + suite.gyro_std * noise[:3]),
+                    _coarse(mounting.T @ sensed.gyro[i] + gyro_bias + suite.gyro_std * noise[:3]),
                     _coarse(
-                        mounting.T @ acceleration
+                        mounting.T @ sensed.specific_force[i]
                         + accelerometer_bias
                         + suite.accelerometer_std * noise[3:]
                     ),
@@ -178,18 +172,16 @@ def measure(
     return Dive(truth, held, ordered)
 
 
-def _acting(config: Config, t: Array, demand: Array) -> Array:
-    """The wrench (N, 6) that acts from each instant to the next, after the input effects."""
-    for name, parameters in config.effects.items():
-        effect = EFFECTS[name]
-        if effect.place != "input":
-            continue
-        acting = demand.copy()
-        state = effect.start(demand[0])
-        for i, dt in enumerate(np.diff(t)):
-            state, acting[i] = effect.step(state, demand[i], dt, **parameters)
-        demand = acting
-    return demand
+def _reading(truth: Trajectory, config: Config) -> Reading:
+    """What perfect sensors measure where the configuration says that they are, in body axes."""
+    v, omega = truth.nu[:, :3], truth.nu[:, 3:]
+    v_dot, omega_dot = truth.nu_dot[:, :3], truth.nu_dot[:, 3:]
+    arm = np.array(config.imu.position)
+    down = quaternion_to_matrix(truth.orientation)[:, 2, :]
+    acceleration = v_dot + np.cross(omega, v) - config.gravity * down
+    acceleration += np.cross(omega_dot, arm) + np.cross(omega, np.cross(omega, arm))
+    linear = v + np.cross(omega, config.odometry.position)
+    return Reading(linear, omega, omega, acceleration)
 
 
 def _mounting(config: Config) -> Array:

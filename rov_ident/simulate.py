@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.attitude import rotation
+from rov_ident.attitude import rotation, rotation_of
+from rov_ident.coefficients import EXTENDED_SIZE
+from rov_ident.effects import Acting, add_surroundings, has_surroundings
 from rov_ident.errors import UserError
-from rov_ident.jit import kernel
-from rov_ident.model import Array, Model, generalized_force
+from rov_ident.jit import inner, kernel
+from rov_ident.model import Array, Model, generalized_force, six, symmetric_product
 
 MAX_STEP = 0.02  # s; within 1e-5 m/s of an adaptive integration for a BlueROV2 driven hard
 
@@ -48,12 +50,16 @@ def simulate(
     orientation: Array | None = None,
     wrench_slope: Array | None = None,
     guide: Guide | None = None,
+    effects: Acting | None = None,
 ) -> Trajectory:
     """Integrate from the first instant of ``t`` (N,), the wrench (N, 6) held from each to the next.
 
     nu (6,), position (3,) and orientation (4,) are the state at ``t[0]``: at rest, at the origin
     and level by default. ``wrench_slope`` (N, 6) lets the wrench change linearly in each interval
     about its mean. With a ``guide`` only some components are simulated, the others follow it.
+
+    Of ``effects`` wrenches and current act along the simulated motion, at the instants ``t`` since
+    the first message; effects on the input are the caller's (:func:`rov_ident.effects.acted`).
 
     Raises
     ------
@@ -66,19 +72,21 @@ def simulate(
         raise UserError(f"{n} instants need a wrench ({n}, 6), not {np.shape(wrench)}")
     out = np.empty((n, 19))
     if guide is None:
-        guide = Guide(np.ones(6, dtype=bool), np.zeros((n, 6)), np.zeros((n, 4)))
+        guide = Guide(np.ones(6, dtype=bool), np.empty((0, 6)), np.empty((0, 4)))
     free = np.flatnonzero(guide.free)
     inverse = np.zeros((6, 6))
     inverse[np.ix_(free, free)] = np.linalg.inv(model.mass_matrix[np.ix_(free, free)])
-    _simulate(
+    done = _simulate(
+        effects if effects is not None and has_surroundings(effects) else None,
         model.structure,
-        model.mass_matrix.reshape(6, 6, 1),
+        model.added_mass,
+        model.mass_matrix,
         inverse,
         model.theta.reshape(-1, 1),
         model.body.restoring,
         np.ascontiguousarray(t, dtype=float),
         np.ascontiguousarray(wrench, dtype=float),
-        np.zeros((n, 6)) if wrench_slope is None else np.ascontiguousarray(wrench_slope),
+        np.empty((0, 6)) if wrench_slope is None else np.ascontiguousarray(wrench_slope),
         guide.free,
         np.ascontiguousarray(guide.nu),
         np.ascontiguousarray(guide.orientation),
@@ -92,10 +100,9 @@ def simulate(
         MAX_STEP,
         out,
     )
-    finite = np.isfinite(out).all(axis=1)
-    if not finite.all():
+    if done < n:
         raise UserError(
-            f"the simulation diverges {t[np.argmin(finite)] - t[0]:.1f} s after its start: "
+            f"the simulation diverges {t[done] - t[0]:.1f} s after its start: "
             "check the signs and sizes of the coefficients and of the wrench"
         )
     return Trajectory(np.asarray(t), out[:, :3], out[:, 3:7], out[:, 7:13], out[:, 13:])
@@ -110,12 +117,13 @@ def open_loop(
     horizon: float,
     wrench_slope: Array | None = None,
     free: NDArray[np.bool_] | None = None,
+    effects: Acting | None = None,
 ) -> Array:
     """Velocities (N, 6) predicted open loop over windows of ``horizon`` seconds.
 
     Each window starts from the measured ``nu`` (N, 6) and ``orientation`` (N, 4) at its first
     sample; rows whose prediction has left all reason (a diverging model) hold infinity. Components
-    not marked in ``free`` (6,) follow the measurement.
+    not marked in ``free`` (6,) follow the measurement. ``effects`` as for :func:`simulate`.
     """
     free = np.ones(6, dtype=bool) if free is None else free
     slope = np.zeros_like(wrench) if wrench_slope is None else wrench_slope
@@ -133,6 +141,7 @@ def open_loop(
                 orientation[first],
                 slope[window],
                 Guide(free, nu[window], orientation[window]),
+                effects,
             )
             predicted[window] = run.nu
         except UserError:
@@ -142,55 +151,73 @@ def open_loop(
 
 # ------------------------------------------------------------------ kernels
 
+_SCRATCH = np.dtype(
+    [
+        ("state", "f8", (13,)),  # position, quaternion, nu
+        ("stage", "f8", (13,)),
+        ("slope", "f8", (4, 13)),
+        ("push", "f8", (6,)),  # wrench of thrusters and effects
+        ("pace", "f8", (6,)),  # of the components that are not free, whatever it takes
+        ("nu", "f8", (6, 1)),
+        ("h", "f8", (6, 1)),
+        ("extended", "f8", (EXTENDED_SIZE, 1)),
+        ("mass", "f8", (6, 6, 1)),
+        ("inverse", "f8", (6, 6, 1)),  # among the free components
+    ],
+    align=True,
+)
 
-@kernel
-def _derivative(
-    structure, mass, inverse, theta, restoring, wrench, slope, late, free, pace, state, rate, work
-):
-    """rate (13,) of state (13,) = position, quaternion, nu; work (31, 1) is scratch.
+_NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta step
 
-    The wrench is its mean plus ``late`` seconds of its slope; components that are not free change
-    at ``pace`` (6,), whatever it takes.
-    """
-    h, p, extended = work[:6], work[6:12], work[12:25]
-    nu = work[25:31]
+
+@inner
+def _derivative(structure, theta, restoring, guided, s, rate):
+    """rate (13,) of s.stage under s.push."""
+    x, h = s.stage, s.h
     for i in range(6):
-        nu[i, 0] = state[7 + i]
-    generalized_force(1, structure, mass, theta, nu, h, p, extended)
-    r = rotation(state[3:7])
+        s.nu[i, 0] = x[7 + i]
+    generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
+    q0, q1, q2, q3 = x[3], x[4], x[5], x[6]
+    u, v, w, p, q, r = six(s.nu, 0)
+    a, b, c = rotation_of(q0, q1, q2, q3)
     for i in range(6):
-        h[i, 0] = wrench[i] + late * slope[i] - h[i, 0]
-        for j in range(3):
-            h[i, 0] += restoring[i, j] * r[2, j]
-        for j in range(6):
-            if not free[j]:
-                h[i, 0] -= mass[i, j, 0] * pace[j]
-    for i in range(6):
-        rate[7 + i] = 0.0 if free[i] else pace[i]
-        for j in range(6):
-            rate[7 + i] += inverse[i, j] * h[j, 0]
-    for i in range(3):
-        rate[i] = r[i, 0] * state[7] + r[i, 1] * state[8] + r[i, 2] * state[9]
+        force = restoring[i, 0] * c[0] + restoring[i, 1] * c[1] + restoring[i, 2] * c[2]
+        h[i, 0] = s.push[i] + force - h[i, 0]
+    if guided:
+        for i in range(6):
+            for j in range(6):
+                h[i, 0] -= s.mass[i, j, 0] * s.pace[j]
+    rate[0] = a[0] * u + a[1] * v + a[2] * w
+    rate[1] = b[0] * u + b[1] * v + b[2] * w
+    rate[2] = c[0] * u + c[1] * v + c[2] * w
     # q_dot = q (0, omega) / 2
-    w, x, y, z = state[3], state[4], state[5], state[6]
-    a, b, c = 0.5 * state[10], 0.5 * state[11], 0.5 * state[12]
-    rate[3] = -x * a - y * b - z * c
-    rate[4] = w * a + y * c - z * b
-    rate[5] = w * b + z * a - x * c
-    rate[6] = w * c + x * b - y * a
+    rate[3] = 0.5 * (-q1 * p - q2 * q - q3 * r)
+    rate[4] = 0.5 * (q0 * p + q2 * r - q3 * q)
+    rate[5] = 0.5 * (q0 * q + q3 * p - q1 * r)
+    rate[6] = 0.5 * (q0 * r + q1 * q - q2 * p)
+    nu_dot = symmetric_product(s.inverse, six(h, 0), 0)
+    for i in range(6):
+        rate[7 + i] = nu_dot[i] + s.pace[i]
 
 
 @kernel
 def _simulate(
-    structure, mass, inverse, theta, restoring, t, wrench, wrench_slope, free, guide, attitude,
-    start, max_step, out,
+    acting, structure, added_mass, mass, inverse, theta, restoring, t, wrench, wrench_slope, free,
+    guide, attitude, start, max_step, out,
 ):  # fmt: skip
     """Classical Runge-Kutta; out (N, 19): position, quaternion, nu, nu_dot.
 
-    nu_dot is that under the wrench which begins to act at the instant.
+    nu_dot is that under the wrench which begins to act at the instant. Returns the number of rows
+    that are finite. ``wrench_slope`` may be empty, and ``guide`` where all is free.
     """
-    state, stage, slope = start.copy(), np.empty(13), np.empty((4, 13))
-    work, pace = np.empty((31, 1)), np.zeros(6)
+    s = np.zeros(1, dtype=_SCRATCH)[0]
+    state, stage, slope = s.state, s.stage, s.slope
+    for i in range(6):
+        for j in range(6):
+            s.mass[i, j, 0], s.inverse[i, j, 0] = mass[i, j], inverse[i, j]
+    for j in range(13):
+        state[j] = start[j]
+    guided = not free.all()
     span = 0.0
     for i in range(len(t)):
         last = i + 1 == len(t)
@@ -200,32 +227,45 @@ def _simulate(
             if not free[j]:
                 state[7 + j] = guide[i, j]
                 if not last:  # at the last instant the pace of the last interval goes on
-                    pace[j] = (guide[i + 1, j] - guide[i, j]) / span
+                    s.pace[j] = (guide[i + 1, j] - guide[i, j]) / span
                 if j >= 3:
-                    state[3:7] = attitude[i]
+                    for k in range(4):
+                        state[3 + k] = attitude[i, k]
         steps = max(1, int(np.ceil(span / max_step - 1e-9)))
         dt = span / steps
         for n in range(steps):
-            for s in range(4):
-                share = 0.0 if s == 0 else (1.0 if s == 3 else 0.5)
+            for k in range(4):
+                ahead = _NODES[k] * dt
                 for j in range(13):
-                    stage[j] = state[j] + share * dt * slope[s - 1, j] if s > 0 else state[j]
-                late = (n + share) * dt - 0.5 * span
-                _derivative(
-                    structure, mass, inverse, theta, restoring, wrench[i], wrench_slope[i], late,
-                    free, pace, stage, slope[s], work,
-                )  # fmt: skip
-                if n == 0 and s == 0:
+                    stage[j] = state[j] + ahead * slope[k - 1, j] if k > 0 else state[j]
+                now = n * dt + ahead
+                for j in range(6):
+                    s.push[j] = wrench[i, j]
+                if len(wrench_slope) > 0:
+                    for j in range(6):
+                        s.push[j] += (now - 0.5 * span) * wrench_slope[i, j]
+                if acting is not None:  # numba leaves this out where it is None
+                    add_surroundings(
+                        acting, structure, added_mass, theta.reshape(-1), t[i] + now,
+                        stage[7:13], rotation(stage[3:7]), s.push,
+                    )  # fmt: skip
+                _derivative(structure, theta, restoring, guided, s, slope[k])
+                if n == 0 and k == 0:
+                    total = 0.0
                     for j in range(13):
                         out[i, j] = state[j]
+                        total += state[j]
                     for j in range(6):
                         out[i, 13 + j] = slope[0, 7 + j]
+                        total += slope[0, 7 + j]
+                    if not np.isfinite(total):
+                        return i
                     if last:
-                        return
+                        return len(t)
             for j in range(13):
-                state[j] += (
-                    dt / 6.0 * (slope[0, j] + 2.0 * (slope[1, j] + slope[2, j]) + slope[3, j])
-                )
+                middle = slope[1, j] + slope[2, j]
+                state[j] += dt / 6.0 * (slope[0, j] + 2.0 * middle + slope[3, j])
             length = np.sqrt(state[3] ** 2 + state[4] ** 2 + state[5] ** 2 + state[6] ** 2)
             for j in range(3, 7):
                 state[j] /= length
+    return len(t)

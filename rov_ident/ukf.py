@@ -5,8 +5,8 @@ negative are ``theta = -s (xi + sqrt(xi^2 + 4)) / 2``: negative for every xi, sm
 where the coefficient is well above its scale s, so that intervals stay those of a normal
 distribution. The others are ``theta = s xi``.
 
-Prediction: scaled sigma points (Merwe; the weights are filterpy's) through one or more Runge-Kutta
-steps of the equations of motion, sixteen points side by side. The coefficients do not move and the
+Prediction: scaled sigma points (van der Merwe; as in filterpy) through one or more Runge-Kutta
+steps of the equations of motion, LANES points side by side. The coefficients do not move and the
 measurement is linear, so of the 2 (6 + n) + 1 points only the velocities are summed, as differences
 from the centre point: with e = mean - centre and W the weight of an outer point
 
@@ -15,7 +15,7 @@ from the centre point: with e = mean - centre and W the weight of an outer point
 in which the huge central weight has cancelled exactly.
 
 Update: odometry and gyro measure nu with independent noise, so one component after another is the
-same as all at once.
+same as all at once; the covariance takes three of them together.
 
 Coefficients whose motion is not well above its noise are *considered*, not estimated (Schmidt
 1966): they stay what they are, their uncertainty is carried along. At rest a filter would else
@@ -32,14 +32,19 @@ being learnt as a coefficient.
 from typing import NamedTuple
 
 import numpy as np
-from filterpy.kalman import MerweScaledSigmaPoints
 from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, prior_of
-from rov_ident.jit import inlined, kernel
-from rov_ident.model import Structure, add_added_mass, generalized_force, in_motion
+from rov_ident.jit import inlined, inner, kernel, reordered
+from rov_ident.model import (
+    Structure,
+    add_added_mass,
+    generalized_force,
+    in_motion,
+    symmetric_product,
+)
 from rov_ident.rls import INFO, first_order, is_finite
 from rov_ident.samples import SAMPLE
 
@@ -57,7 +62,7 @@ REASONS = (
 
 REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 
-LANES = 16
+LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
 _MAX_STEP = 0.05  # s; of one Runge-Kutta step
 _LOWEST = -2.0  # of xi where theta stays negative: below, it has too little slope to come back
 _ADAPTATION_TIME = 20.0  # s; over which the process noise follows the innovations
@@ -112,12 +117,12 @@ class State(NamedTuple):
 
 def problem(config: Config) -> Problem:
     """The constants of the estimation that a configuration asks for."""
-    model, prior, u = config.model, prior_of(config), config.ukf
+    model, prior, u = config.dynamics, prior_of(config), config.ukf
     n = len(prior.names)
-    points = MerweScaledSigmaPoints(6 + n, u.alpha, u.beta, u.kappa)
+    reach = u.alpha**2 * (6 + n + u.kappa)  # size of the state + lambda, van der Merwe (2004)
     settings = np.zeros(1, dtype=_SETTINGS)
-    settings["weight"] = points.Wc[1]
-    settings["spread"] = np.sqrt(0.5 / points.Wc[1])
+    settings["weight"] = 0.5 / reach
+    settings["spread"] = np.sqrt(reach)
     settings["centre"] = u.beta - u.alpha**2
     settings["gate"] = u.gate
     settings["changed"] = u.change_threshold
@@ -196,11 +201,17 @@ def variance(task: Problem, state: State) -> Array:
     return variances
 
 
+def condition(task: Problem, state: State) -> float:
+    """Condition number of the information's root as :func:`rov_ident.rls.condition` has it."""
+    std = np.sqrt(task.prior_variance)
+    return float(np.sqrt(np.linalg.cond(state.p[6:, 6:] / np.outer(std, std), 1)))
+
+
 def coefficients(task: Problem, xi: Array) -> Array:
     """theta (n,) of the estimated coefficients from xi (n,)."""
-    out = np.empty((len(xi), 1))
-    _coefficients(1, task.scale, task.negative, np.asarray(xi, dtype=float).reshape(-1, 1), out)
-    return out[:, 0]
+    theta = task.theta.copy().reshape(-1, 1)
+    _coefficients(task, np.asarray(xi, dtype=float), theta)
+    return theta[task.estimated, 0]
 
 
 def _slope(task: Problem, xi: Array) -> Array:
@@ -210,303 +221,441 @@ def _slope(task: Problem, xi: Array) -> Array:
 
 # ------------------------------------------------------------------ kernels
 
+_SCRATCH = np.dtype(
+    [
+        # sigma points, and the forces on them
+        ("nu", "f8", (6, LANES)),
+        ("mass", "f8", (6, 6, LANES)),
+        ("inverse", "f8", (6, 6, LANES)),  # its lower half
+        ("h", "f8", (6, LANES)),
+        ("extended", "f8", (EXTENDED_SIZE, LANES)),
+        ("stage", "f8", (6, LANES)),
+        ("total", "f8", (6, LANES)),
+        # the centre point
+        ("centre", "f8", (6,)),  # nu
+        ("centre_inverse", "f8", (6, 6)),
+        ("shift", "f8", (6,)),  # mean minus centre
+        # of the sample
+        ("force", "f8", (6,)),  # wrench minus restoring in mid-interval
+        ("slope", "f8", (6,)),
+        ("strength", "f8", (6,)),  # variance density of the wrench
+        ("z", "f8", (6,)),  # nu as measured
+        ("r", "f8", (6,)),  # its variance
+        # the estimate, for the residual
+        ("mean_nu", "f8", (6, 1)),
+        ("mean_mass", "f8", (6, 6, 1)),
+        ("mean_h", "f8", (6, 1)),
+        ("mean_extended", "f8", (EXTENDED_SIZE, 1)),
+    ],
+    align=True,
+)
 
-@kernel
-def _coefficients(lanes, scale, negative, xi, theta):
-    """theta (n, lanes) from xi (n, lanes)."""
-    for j in range(len(scale)):
-        if negative[j]:
-            for k in range(lanes):
-                theta[j, k] = -0.5 * scale[j] * (xi[j, k] + np.sqrt(xi[j, k] * xi[j, k] + 4.0))
-        else:
-            for k in range(lanes):
-                theta[j, k] = scale[j] * xi[j, k]
+
+class Work(NamedTuple):
+    """Scratch for all samples of a fold. Zeros fill the rows of matrices to a multiple of LANES."""
+
+    p: Array  # (6 + n, columns): the covariance
+    upper: Array  # (6 + n, columns)
+    root: Array  # (6 + n, columns): lower root of p; a column of zeros is the centre point
+    moved: Array  # (2, 6, columns): nu of the points on the + and - side of each column
+    cross: Array  # (3, columns)
+    gain: Array  # (3, columns)
+    free: Array  # (columns,): 1 where a state is estimated, 0 where it is only considered
+    moves: NDArray[np.bool_]  # (m,)
+    theta: Array  # (m, LANES)
+    mean: Array  # (m, 1)
+    scratch: NDArray[np.void]  # (1,): in one record, whose parts the compiler knows apart
 
 
-@inlined
-def _invert(lanes, mass, inverse, work):
-    """Inverses of positive definite matrices (6, 6, lanes) by Gauss-Jordan, no pivoting."""
+@inner
+def _work(task, state):
+    size, m = len(state.x), len(task.theta)
+    columns = LANES * (size // LANES + 1)
+    work = Work(
+        np.zeros((size, columns)),
+        np.zeros((size, columns)),
+        np.zeros((size, columns)),
+        np.empty((2, 6, columns)),
+        np.zeros((3, columns)),
+        np.zeros((3, columns)),
+        np.zeros(columns),
+        np.empty(m, dtype=np.bool_),
+        np.empty((m, LANES)),
+        np.empty((m, 1)),
+        np.empty(1, dtype=_SCRATCH),
+    )
+    _copy(state.p, work.p)
+    for j in range(m):
+        work.mean[j, 0] = task.theta[j]
+        for k in range(LANES):
+            work.theta[j, k] = task.theta[j]
+    mass = work.scratch[0].mass
     for i in range(6):
         for j in range(6):
-            for k in range(lanes):
-                work[i, j, k] = mass[i, j, k]
-                inverse[i, j, k] = 1.0 if i == j else 0.0
-    for c in range(6):
-        for k in range(lanes):
-            work[6, 0, k] = 1.0 / work[c, c, k]
-        for j in range(6):
-            for k in range(lanes):
-                work[c, j, k] *= work[6, 0, k]
-                inverse[c, j, k] *= work[6, 0, k]
-        for i in range(6):
-            if i != c:
-                for k in range(lanes):
-                    work[6, 0, k] = work[i, c, k]
-                for j in range(6):
-                    for k in range(lanes):
-                        work[i, j, k] -= work[6, 0, k] * work[c, j, k]
-                        inverse[i, j, k] -= work[6, 0, k] * inverse[c, j, k]
-
-
-@kernel
-def _rates(structure, mass, inverse, theta, force, slope, late, nu, out, h, p, extended):
-    """nu_dot (6, LANES) of sixteen states side by side, ``late`` seconds after mid-interval.
-
-    force (6,) is wrench minus restoring in the mean over the interval, slope (6,) its trend.
-    """
-    generalized_force(LANES, structure, mass, theta, nu, h, p, extended)
-    for i in range(6):
-        for k in range(LANES):
-            h[i, k] = force[i] + late * slope[i] - h[i, k]
-    for i in range(6):
-        for k in range(LANES):
-            out[i, k] = inverse[i, 0, k] * h[0, k]
-        for j in range(1, 6):
             for k in range(LANES):
-                out[i, k] += inverse[i, j, k] * h[j, k]
+                mass[i, j, k] = task.rigid_body[i, j]
+    return work
 
 
-@kernel
-def _propagate(structure, mass, inverse, theta, force, slope, late, dt, nu, work):
-    """One classical Runge-Kutta step of nu (6, LANES), in place; work (43, LANES) is scratch."""
-    h, p, extended = work[0:6], work[6:12], work[12 : 12 + EXTENDED_SIZE]
-    stage, rate, total = work[25:31], work[31:37], work[37:43]
-    _rates(structure, mass, inverse, theta, force, slope, late, nu, rate, h, p, extended)
-    for i in range(6):
-        for k in range(LANES):
-            total[i, k] = rate[i, k]
-            stage[i, k] = nu[i, k] + 0.5 * dt * rate[i, k]
-    for s in range(2):
-        middle = late + 0.5 * dt
-        _rates(structure, mass, inverse, theta, force, slope, middle, stage, rate, h, p, extended)
-        f = 0.5 * dt if s == 0 else dt
-        for i in range(6):
-            for k in range(LANES):
-                total[i, k] += 2.0 * rate[i, k]
-                stage[i, k] = nu[i, k] + f * rate[i, k]
-    _rates(structure, mass, inverse, theta, force, slope, late + dt, stage, rate, h, p, extended)
-    for i in range(6):
-        for k in range(LANES):
-            nu[i, k] += dt / 6.0 * (total[i, k] + rate[i, k])
-
-
-@kernel
-def _cholesky(p, root):
-    """Lower root (n, n) of p; False where p is not positive definite."""
-    n = p.shape[0]
-    for j in range(n):
-        for i in range(j):
-            root[i, j] = 0.0
-        pivot = p[j, j]
-        for k in range(j):
-            pivot -= root[j, k] * root[j, k]
-        if not pivot > 0.0:
-            return False
-        pivot = np.sqrt(pivot)
-        root[j, j] = pivot
-        for i in range(j + 1, n):
-            total = p[i, j]
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            root[i, j] = total / pivot
-    return True
+@inner
+def _copy(a, b):
+    """Into matrix b from a, as far as both go. (``b[:] = a`` takes a second to compile.)"""
+    for i in range(len(b)):
+        for j in range(min(a.shape[1], b.shape[1])):
+            b[i, j] = a[i, j]
 
 
 @kernel
 def _fold(task, state, samples, info):
-    size = len(state.x)
-    root = np.zeros((size, size))
-    moved = np.empty((6, 2 * size))  # propagated velocities minus the centre's, + points then -
-    xi = np.empty((size - 6, LANES))
-    part = np.empty((size - 6, LANES))
-    theta = np.empty((len(task.theta), LANES))
-    mass, inverse = np.empty((6, 6, LANES)), np.empty((6, 6, LANES))
-    scratch = np.empty((7, 6, LANES))
-    nu, work = np.empty((6, LANES)), np.empty((43, LANES))
-    moves = np.empty(len(task.theta), dtype=np.bool_)
+    work = _work(task, state)
     for k in range(len(samples)):
-        sample, out = samples[k], info[k]
-        out.t = sample.t
-        out.forgetting = 1.0
-        for i in range(6):
-            out.residual[i] = np.nan
-            out.ratio[i] = np.nan
-        if not is_finite(sample):
-            out.reason = NOT_FINITE
-            continue
-        state.scalars[0] = sample.t
-        out.reason = USED
-        if sample.restart or state.scalars[1] == 0.0 or not sample.dt > 0.0:
-            _restart(state, sample)
-            out.reason = RESTARTED
-        else:
-            in_motion(task.structure, sample.moving, moves)
-            predicted = _predict(
-                task, state, sample, out, root, moved, xi, part, theta, mass, inverse, scratch, nu,
-                work,
-            )  # fmt: skip
-            if predicted:
-                _update(task, state, sample, out, moves)
-            else:
-                out.reason = UNPREDICTABLE
-                state.scalars[1] = 0.0
-                continue
-        _residual(task, state, sample, out, theta, mass, work, xi, part)
+        _step(task, state, work, samples[k], info[k])
+    _copy(work.p, state.p)
 
 
-@kernel
-def _restart(state, sample):
+@inlined
+def _step(task, state, work, sample, out):
+    out.t = sample.t
+    out.forgetting = 1.0
+    out.condition = np.nan
+    for i in range(6):
+        out.residual[i] = np.nan
+        out.ratio[i] = np.nan
+    if not is_finite(sample):
+        out.reason = NOT_FINITE
+        return
+    state.scalars[0] = sample.t
+    out.reason = USED
+    if sample.restart or state.scalars[1] == 0.0 or not sample.dt > 0.0:
+        _restart(state, work.p, sample)
+        out.reason = RESTARTED
+    else:
+        _take_root(task, work, out)
+        _move(task, state.x, work, sample)
+        if not _collect(task, state, work, sample):
+            out.reason = UNPREDICTABLE
+            state.scalars[1] = 0.0
+            return
+        in_motion(task.structure, sample.moving, work.moves)
+        for i in range(len(state.x)):
+            work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
+        _update(task, state, work, sample, out)
+    _residual(task, state, work, sample, out)
+
+
+@inner
+def _restart(state, p, sample):
     """The velocity is lost, the coefficients are not: begin from the measurement."""
     for i in range(6):
         for j in range(len(state.x)):
-            state.p[i, j] = 0.0
-            state.p[j, i] = 0.0
+            p[i, j] = 0.0
+            p[j, i] = 0.0
         state.x[i] = sample.nu[i]
         variance = sample.odometry_variance[i]
-        state.p[i, i] = variance if variance < 1.0 else 1.0
+        p[i, i] = variance if variance < 1.0 else 1.0
     state.scalars[1] = 1.0
     state.scalars[2] = 1.0
     state.scalars[3] = 0.0
 
 
-@kernel
-def _predict(
-    task, state, sample, out, root, moved, xi, part, theta, mass, inverse, scratch, nu, work
-):
-    s = task.settings[0]
-    x, p = state.x, state.p
-    size, n = len(x), len(x) - 6
-    if not _cholesky(p, root):
-        # Rounding has made a direction negative: a little of the prior restores it.
+# ---------------------------------------------------------------- prediction
+
+
+@inlined
+def _take_root(task, work, out):
+    """work.root of work.p, which is repaired where rounding has made a direction negative."""
+    p, size = work.p, len(work.p)
+    for attempt in range(3):
+        if _cholesky(p, work.upper, work.root):
+            break
         out.reason = REPAIRED
         for i in range(size):
-            p[i, i] += 1e-9 * (task.prior_variance[i - 6] if i >= 6 else 1.0)
-        if not _cholesky(p, root):
-            for i in range(size):
-                for j in range(size):
-                    if i != j:
-                        p[i, j] = 0.0
+            if attempt == 0:  # a little of the prior
+                p[i, i] += 1e-9 * (task.prior_variance[i - 6] if i >= 6 else 1.0)
+            else:
+                for j in range(i):
+                    p[i, j] = 0.0
+                    p[j, i] = 0.0
                 p[i, i] = max(p[i, i], 1e-9)
-            _cholesky(p, root)
-    force, slope = np.empty(6), np.empty(6)
-    for i in range(6):
-        force[i], slope[i] = sample.wrench[i], sample.wrench_slope[i]
-        for j in range(3):
-            middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
-            force[i] += task.restoring[i, j] * middle
-            slope[i] += task.restoring[i, j] * sample.down_slope[j]
-    steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
-    dt = sample.dt / steps
-    centre = np.empty(6)
-    centre_inverse = np.empty((6, 6))
-    # point 0 is the centre, 1 .. size the plus points, size + 1 .. 2 size the minus points
-    points = 2 * size + 1
-    for first in range(0, points, LANES):
-        for k in range(LANES):
-            point = min(first + k, points - 1)
-            column = (point - 1) % size
-            offset = 0.0 if point == 0 else (s.spread if point <= size else -s.spread)
-            for i in range(6):
-                nu[i, k] = x[i] + offset * root[i, column]
-            for j in range(n):
-                xi[j, k] = x[6 + j] + offset * root[6 + j, column]
-        _model_of(task, xi, part, theta, mass)
-        _invert(LANES, mass, inverse, scratch)
-        for n_step in range(steps):
-            late = n_step * dt - 0.5 * sample.dt
-            _propagate(task.structure, mass, inverse, theta, force, slope, late, dt, nu, work)
-        for k in range(LANES):
-            point = first + k
-            if point == 0:
-                for i in range(6):
-                    centre[i] = nu[i, 0]
-                    for j in range(6):
-                        centre_inverse[i, j] = inverse[i, j, 0]
-            elif point < points:
-                for i in range(6):
-                    moved[i, point - 1] = nu[i, k] - centre[i]
 
-    worst = 0.0
-    for i in range(6):
-        worst = max(worst, abs(centre[i]))
-        for c in range(2 * size):
-            worst = max(worst, abs(moved[i, c]))
-    if not worst < _FASTEST:  # NaN too
-        return False
 
-    # covariance of the velocities and with the coefficients
-    e = np.empty(6)
-    for i in range(6):
-        total = 0.0
-        for c in range(2 * size):
-            total += moved[i, c]
-        e[i] = s.weight * total
-    for i in range(6):
+@reordered
+def _cholesky(p, upper, root):
+    """Lower root (size, columns) of p (size, columns); False where p is not positive definite.
+
+    Three rows of the upper root at a time, so that a row below is loaded a third as often.
+    """
+    size, columns = p.shape
+    _copy(p, upper)
+    for first in range(0, size, 3):
+        end = min(first + 3, size)
+        for j in range(first, end):
+            if not upper[j, j] > 0.0:
+                return False
+            f = 1.0 / np.sqrt(upper[j, j])
+            for k in range(columns):
+                upper[j, k] *= f
+            for i in range(j + 1, end):
+                f = upper[j, i]
+                for k in range(columns):
+                    upper[i, k] -= f * upper[j, k]
+        for i in range(end, size):
+            f, g, h = upper[first, i], upper[first + 1, i], upper[first + 2, i]
+            for k in range(columns):
+                upper[i, k] -= (
+                    f * upper[first, k] + g * upper[first + 1, k] + h * upper[first + 2, k]
+                )
+    for i in range(size):
         for j in range(i + 1):
-            total = 0.0
-            for c in range(2 * size):
-                total += moved[i, c] * moved[j, c]
-            noise = 0.0
-            for a in range(6):
-                strength = s.wrench * sample.wrench[a] ** 2 + s.wrench_floor[a]
-                noise += centre_inverse[i, a] * centre_inverse[j, a] * strength
-            if i == j:
-                noise += state.process[i]
-            p[i, j] = s.weight * total + s.centre * e[i] * e[j] + noise * sample.dt
-            p[j, i] = p[i, j]
-    for i in range(6):
-        for j in range(n):
-            total = 0.0
-            for c in range(7 + j):  # the root is lower triangular
-                total += (moved[i, c] - moved[i, size + c]) * root[6 + j, c]
-            p[i, 6 + j] = s.weight * s.spread * total
-            p[6 + j, i] = p[i, 6 + j]
-        x[i] = centre[i] + e[i]
-    for j in range(n):
-        room = 1.0 - p[6 + j, 6 + j] / task.prior_variance[j]
-        if room > 0.0:
-            walk = task.walk[j]
-            if state.scalars[2] > s.changed:
-                walk = max(walk, task.prior_variance[j] / _RELEARNING_TIME)
-            p[6 + j, 6 + j] += walk * sample.dt * room
+            root[i, j] = upper[j, i]
     return True
 
 
-@kernel
-def _model_of(task, xi, part, theta, mass):
-    """theta (m, LANES) and mass (6, 6, LANES) of the sigma points' xi (n, LANES)."""
-    _coefficients(LANES, task.scale, task.negative, xi, part)
-    for j in range(len(task.theta)):
-        for k in range(LANES):
-            theta[j, k] = task.theta[j]
-    for j in range(len(task.scale)):
-        for k in range(LANES):
-            theta[task.estimated[j], k] = part[j, k]
+@inlined
+def _move(task, x, work, sample):
+    """Move the sigma points to the sample's time: work.moved, and the centre's inverse mass."""
+    s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
     for i in range(6):
-        for j in range(6):
-            for k in range(LANES):
-                mass[i, j, k] = task.rigid_body[i, j]
-    add_added_mass(task.structure, theta, mass)
+        s.force[i], s.slope[i] = sample.wrench[i], sample.wrench_slope[i]
+        for j in range(3):
+            middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
+            s.force[i] += task.restoring[i, j] * middle
+            s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
+    steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
+    dt = sample.dt / steps
+    for side in range(2):
+        for first in range(0, columns, LANES):
+            _spread(task, x, work, first, spread if side == 0 else -spread)
+            for k in range(steps):
+                _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt)
+            for i in range(6):
+                row = work.moved[side, i, first : first + LANES]
+                for k in range(LANES):
+                    row[k] = s.nu[i, k]
+    for i in range(6):  # the last column is one of zeros
+        s.centre[i] = s.nu[i, LANES - 1]
+        for j in range(i + 1):
+            s.centre_inverse[i, j] = s.inverse[i, j, LANES - 1]
+            s.centre_inverse[j, i] = s.inverse[i, j, LANES - 1]
+
+
+@inlined
+def _negative(scale, xi):
+    """The coefficient that is negative for every xi."""
+    return -0.5 * scale * (xi + np.sqrt(xi * xi + 4.0))
 
 
 @kernel
-def _update(task, state, sample, out, moves):
-    """Linear and angular velocity, each behind its own gate, one component after another."""
-    s = task.settings[0]
-    x, p, size = state.x, state.p, len(state.x)
-    z, r = np.empty(6), np.empty(6)
+def _coefficients(task, xi, theta):
+    """Set the estimated ones of theta (m, 1) from xi (n,)."""
+    for j in range(len(xi)):
+        e, scale = task.estimated[j], task.scale[j]
+        theta[e, 0] = _negative(scale, xi[j]) if task.negative[j] else scale * xi[j]
+
+
+@reordered
+def _spread(task, x, work, first, spread):
+    """Sigma points x + spread * column: their velocities, coefficients, mass matrices."""
+    s, theta, structure = work.scratch[0], work.theta, task.structure
+    for i in range(6):
+        root = work.root[i, first : first + LANES]
+        for k in range(LANES):
+            s.nu[i, k] = x[i] + spread * root[k]
+    for j in range(len(task.scale)):
+        root = work.root[6 + j, first : first + LANES]
+        e, scale, mean = task.estimated[j], task.scale[j], x[6 + j]
+        if task.negative[j]:
+            for k in range(LANES):
+                theta[e, k] = _negative(scale, mean + spread * root[k])
+        else:
+            for k in range(LANES):
+                theta[e, k] = scale * (mean + spread * root[k])
+    for c in range(len(structure.mass_row)):
+        i, j = structure.mass_row[c], structure.mass_column[c]
+        for k in range(LANES):
+            s.mass[i, j, k] = task.rigid_body[i, j]
+            s.mass[j, i, k] = task.rigid_body[i, j]
+    add_added_mass(structure, theta, s.mass)
+    _invert(s.mass, s.inverse)
+
+
+_NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta step
+_WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+_AHEAD = (0.5, 0.5, 1.0, 0.0)  # from a stage's slope to the next stage
+
+
+@reordered
+def _propagate(structure, work, late, dt):
+    """One Runge-Kutta step of the sigma points, beginning ``late`` seconds after mid-interval."""
+    s = work.scratch[0]
+    nu, stage, total, h, force, slope = s.nu, s.stage, s.total, s.h, s.force, s.slope
+    for i in range(6):
+        for k in range(LANES):
+            stage[i, k] = nu[i, k]
+            total[i, k] = nu[i, k]
+    for n in range(4):
+        generalized_force(LANES, structure, s.mass, work.theta, stage, h, s.extended)
+        at = late + _NODES[n] * dt
+        a, b, c = force[0] + at * slope[0], force[1] + at * slope[1], force[2] + at * slope[2]
+        d, e, f = force[3] + at * slope[3], force[4] + at * slope[4], force[5] + at * slope[5]
+        weight, ahead = _WEIGHTS[n] * dt, _AHEAD[n] * dt
+        for k in range(LANES):
+            rest = (a - h[0, k], b - h[1, k], c - h[2, k], d - h[3, k], e - h[4, k], f - h[5, k])
+            nu_dot = symmetric_product(s.inverse, rest, k)
+            for i in range(6):
+                total[i, k] += weight * nu_dot[i]
+                stage[i, k] = nu[i, k] + ahead * nu_dot[i]
+    for i in range(6):
+        for k in range(LANES):
+            nu[i, k] = total[i, k]
+
+
+@reordered
+def _collect(task, state, work, sample):
+    """Mean and covariance of the moved points: of nu, and of nu with the coefficients.
+
+    False where the model takes a point out of all reason.
+    """
+    s, c = work.scratch[0], task.settings[0]
+    x, p, root, plus, minus = state.x, work.p, work.root, work.moved[0], work.moved[1]
+    size, columns = p.shape
+    speed = 0.0
+    for i in range(6):
+        total = 0.0
+        for k in range(columns):
+            speed += plus[i, k] ** 2 + minus[i, k] ** 2
+            plus[i, k] -= s.centre[i]
+            minus[i, k] -= s.centre[i]
+            total += plus[i, k] + minus[i, k]
+        s.shift[i] = c.weight * total
+        s.strength[i] = c.wrench * sample.wrench[i] ** 2 + c.wrench_floor[i]
+    if not speed < 2 * columns * _FASTEST**2:  # NaN too
+        return False
+    for i in range(6):
+        x[i] = s.centre[i] + s.shift[i]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(columns):
+                total += plus[i, k] * plus[j, k] + minus[i, k] * minus[j, k]
+            noise = state.process[i] if i == j else 0.0
+            for a in range(6):
+                noise += s.centre_inverse[i, a] * s.centre_inverse[j, a] * s.strength[a]
+            total = c.weight * total + c.centre * s.shift[i] * s.shift[j] + noise * sample.dt
+            p[i, j] = total
+            p[j, i] = total
+    for i in range(6):
+        for k in range(columns):
+            plus[i, k] = c.weight * c.spread * (plus[i, k] - minus[i, k])
+    for j in range(6, size):
+        for i in range(0, 6, 3):
+            u, v, w = 0.0, 0.0, 0.0
+            for k in range(columns):
+                u += plus[i, k] * root[j, k]
+                v += plus[i + 1, k] * root[j, k]
+                w += plus[i + 2, k] * root[j, k]
+            p[i, j], p[i + 1, j], p[i + 2, j] = u, v, w
+            p[j, i], p[j, i + 1], p[j, i + 2] = u, v, w
+    for j in range(6, size):
+        room = 1.0 - p[j, j] / task.prior_variance[j - 6]
+        if room > 0.0:
+            walk = task.walk[j - 6]
+            if state.scalars[2] > c.changed:
+                walk = max(walk, task.prior_variance[j - 6] / _RELEARNING_TIME)
+            p[j, j] += walk * sample.dt * room
+    return True
+
+
+# ---------------------------------------------------------------- inverse mass
+
+
+@inlined
+def _block(m, i, j, k):
+    """The 3 x 3 block at i, j of m (6, 6, LANES) in lane k, as a tuple of rows."""
+    return (
+        (m[i, j, k], m[i, j + 1, k], m[i, j + 2, k]),
+        (m[i + 1, j, k], m[i + 1, j + 1, k], m[i + 1, j + 2, k]),
+        (m[i + 2, j, k], m[i + 2, j + 1, k], m[i + 2, j + 2, k]),
+    )
+
+
+@inlined
+def _put(m, i, j, k, f, a):
+    """Write f a to where :func:`_block` would find it."""
+    m[i, j, k], m[i, j + 1, k], m[i, j + 2, k] = f * a[0][0], f * a[0][1], f * a[0][2]
+    m[i + 1, j, k], m[i + 1, j + 1, k], m[i + 1, j + 2, k] = f * a[1][0], f * a[1][1], f * a[1][2]
+    m[i + 2, j, k], m[i + 2, j + 1, k], m[i + 2, j + 2, k] = f * a[2][0], f * a[2][1], f * a[2][2]
+
+
+@inlined
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def _plus(a, f, b, c):
+    """A + f B C' (3 x 3)."""
+    x, y, z = c
+    return (
+        (a[0][0] + f * _dot(b[0], x), a[0][1] + f * _dot(b[0], y), a[0][2] + f * _dot(b[0], z)),
+        (a[1][0] + f * _dot(b[1], x), a[1][1] + f * _dot(b[1], y), a[1][2] + f * _dot(b[1], z)),
+        (a[2][0] + f * _dot(b[2], x), a[2][1] + f * _dot(b[2], y), a[2][2] + f * _dot(b[2], z)),
+    )
+
+
+@inlined
+def _transposed(a):
+    x, y, z = a
+    return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+
+
+@inlined
+def _inverse(a):
+    """Of a symmetric 3 x 3 matrix, by its cofactors."""
+    xx, xy, xz = a[0]
+    yy, yz, zz = a[1][1], a[1][2], a[2][2]
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    g = 1.0 / (xx * a + xy * b + xz * c)
+    return (g * a, g * b, g * c), (g * b, g * d, g * e), (g * c, g * e, g * f)
+
+
+@inlined
+def _invert(m, inverse):
+    """Lower half of the inverses (6, 6, LANES) of symmetric m (6, 6, LANES) = [[A, B'], [B, D]].
+
+    In 3 x 3 blocks, with V = A^-1 B', the Schur complement S = D - B V and U = V S^-1::
+
+        m^-1 = [[A^-1 + U V', -U], [-U', S^-1]]
+    """
+    none = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for k in range(LANES):
+        a, b = _inverse(_block(m, 0, 0, k)), _block(m, 3, 0, k)
+        v = _plus(none, 1.0, a, b)
+        s = _inverse(_plus(_block(m, 3, 3, k), -1.0, b, _transposed(v)))
+        u = _plus(none, 1.0, v, s)
+        _put(inverse, 0, 0, k, 1.0, _plus(a, 1.0, u, v))
+        _put(inverse, 3, 0, k, -1.0, _transposed(u))
+        _put(inverse, 3, 3, k, 1.0, s)
+
+
+# ---------------------------------------------------------------- update
+
+
+@inlined
+def _update(task, state, work, sample, out):
+    """Linear and angular velocity, each behind its own gate."""
+    s, scratch = task.settings[0], work.scratch[0]
+    x, p, z, r = state.x, work.p, scratch.z, scratch.r
     for i in range(6):
         z[i], r[i] = sample.odometry[i], sample.odometry_variance[i]
         if i >= 3 and np.isfinite(sample.gyro[i - 3]):
             z[i], r[i] = sample.gyro[i - 3], sample.gyro_variance
         if not np.isfinite(r[i]):
             z[i] = np.nan
-    part = np.zeros(size)
     surprise, count = 0.0, 0
     for i in range(6):
         state.since[i] += sample.dt
-    for group in range(2):
-        first = 3 * group
+    for first in (0, 3):
         if not np.isfinite(z[first] + z[first + 1] + z[first + 2]):
             continue
         worst = 0.0
@@ -525,22 +674,11 @@ def _update(task, state, sample, out, moves):
             out.reason = GATED
             continue
         state.scalars[3] = 0.0
-        for i in range(first, first + 3):
-            total = p[i, i] + r[i]
-            innovation = z[i] - x[i]
-            cross = p[:, i].copy()
-            for a in range(size):
-                considered = a >= 6 and not moves[task.estimated[a - 6]]
-                part[a] = 0.0 if considered else cross[a] / total
-                x[a] += part[a] * innovation
-            for a in range(size):
-                for b in range(a + 1):
-                    p[a, b] -= part[a] * cross[b] + cross[a] * part[b] - total * part[a] * part[b]
-                    p[b, a] = p[a, b]
+        _absorb(x, work, first)
     if out.reason == GATED:
         state.scalars[3] += sample.dt
         if state.scalars[3] > _LOST:
-            _restart(state, sample)
+            _restart(state, p, sample)
             return
     if count > 0:
         blend = min(sample.dt / _SURPRISE_TIME, 1.0)
@@ -550,33 +688,68 @@ def _update(task, state, sample, out, moves):
             x[6 + j] = _LOWEST
 
 
-@kernel
-def _residual(task, state, sample, out, theta, mass, work, xi, part):
+@reordered
+def _absorb(x, work, first):
+    """Take in three measured velocities, from ``first`` on, one after the other.
+
+    With w the covariance with the innovation over its standard deviation, p loses w w', but for the
+    block of the states that are only considered: they tell nothing of one another.
+    """
+    p, cross, gain, free = work.p, work.cross, work.gain, work.free
+    s, size, columns = work.scratch[0], p.shape[0], p.shape[1]
+    for c in range(3):
+        i = first + c
+        for k in range(columns):
+            cross[c, k] = p[i, k]
+        for b in range(c):
+            f = cross[b, i]
+            for k in range(columns):
+                cross[c, k] -= f * cross[b, k]
+        f = 1.0 / np.sqrt(cross[c, i] + s.r[i])
+        innovation = f * (s.z[i] - x[i])
+        for k in range(columns):
+            cross[c, k] *= f
+            gain[c, k] = cross[c, k] * free[k]
+        for j in range(size):
+            x[j] += gain[c, j] * innovation
+    for i in range(size):
+        w = cross if free[i] != 0.0 else gain
+        f, g, h = cross[0, i], cross[1, i], cross[2, i]
+        for k in range(columns):
+            p[i, k] -= f * w[0, k] + g * w[1, k] + h * w[2, k]
+
+
+# ---------------------------------------------------------------- residual
+
+
+@inlined
+def _residual(task, state, work, sample, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     x, y, u, last = state.residual[0], state.residual[1], state.residual[2], state.residual[3]
     w, dt = task.settings[0].corner, sample.dt
-    nu, h, p = work[0:6], work[6:12], work[12:18]
-    extended = work[18 : 18 + EXTENDED_SIZE]
-    for j in range(len(task.scale)):
-        for k in range(LANES):
-            xi[j, k] = state.x[6 + j]
+    s, theta = work.scratch[0], work.mean
+    nu, mass, h = s.mean_nu, s.mean_mass, s.mean_h
+    _coefficients(task, state.x[6:], theta)
     for i in range(6):
-        for k in range(LANES):
-            nu[i, k] = sample.nu[i]
-    _model_of(task, xi, part, theta, mass)
-    generalized_force(LANES, task.structure, mass, theta, nu, h, p, extended)
+        nu[i, 0] = sample.nu[i]
+        for j in range(6):
+            mass[i, j, 0] = task.rigid_body[i, j]
+    add_added_mass(task.structure, theta, mass)
+    generalized_force(1, task.structure, mass, theta, nu, h, s.mean_extended)
     a, b0, b1 = first_order(w, dt)
     for i in range(6):
-        force = h[i, 0]
+        p, force = 0.0, h[i, 0]
+        for j in range(6):
+            p += mass[i, j, 0] * sample.nu[j]
         for j in range(3):
             force -= task.restoring[i, j] * sample.down[j]
-        now = w * p[i, 0] - force
+        now = w * p - force
         if out.reason == RESTARTED:
-            x[i], y[i] = w * p[i, 0], 0.0
+            x[i], y[i] = w * p, 0.0
         else:
             before = x[i] - w * last[i]
             x[i] = a * x[i] + b0 * u[i] + b1 * now + (1.0 - a) * sample.wrench[i]
             x[i] += 0.5 * dt * (b1 - b0) * sample.wrench_slope[i]
-            y[i] = a * y[i] + b0 * before + b1 * (x[i] - w * p[i, 0])
+            y[i] = a * y[i] + b0 * before + b1 * (x[i] - w * p)
             out.residual[i] = y[i]
-        u[i], last[i] = now, p[i, 0]
+        u[i], last[i] = now, p

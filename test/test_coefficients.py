@@ -11,6 +11,7 @@ from rov_ident.coefficients import (
     ABSOLUTE,
     AXES,
     EXTENDED_SIZE,
+    NEGATIVE,
     ONE,
     PLAIN,
     VELOCITIES,
@@ -23,7 +24,7 @@ from rov_ident.errors import UserError
 CONTRACT = """
     X_udot Y_vdot Z_wdot K_pdot M_qdot N_rdot Y_rdot X_u Y_v Z_w K_p M_q N_r N_v
     X_uu Y_vv Z_ww K_pp M_qq N_rr X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr
-    Y_uv Z_uw M_uw N_uv Y_v_abs_r
+    Y_uv Z_uw M_uw N_uv Y_v_abs_r Z_ww_neg Z_w_neg
 """.split()
 PLAIN_SQUARES = "X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split()
 
@@ -51,9 +52,11 @@ def test_every_name_of_the_contract_is_in_the_catalogue():
 
 
 def test_the_catalogue_has_every_term_once():
-    """21 of a symmetric matrix; on each axis 6 linear, 6 squares, 15 products and 30 b |c|."""
+    """21 of a symmetric matrix; on each axis 6 linear, 6 squares, 15 products, 30 b |c|, 2 neg."""
     coefficients = catalogue()
-    assert len({c.place for c in coefficients}) == len(coefficients) == 21 + 6 * (6 + 6 + 15 + 30)
+    assert (
+        len({c.place for c in coefficients}) == len(coefficients) == 21 + 6 * (6 + 6 + 15 + 30 + 2)
+    )
     assert sum(c.is_added_mass for c in coefficients) == 21
 
 
@@ -66,7 +69,8 @@ def test_every_name_says_its_place_itself():
         if not c.is_added_mass:
             assert 0 <= c.left < EXTENDED_SIZE
             # The second factor is always a velocity: what lets D(nu) be a matrix.
-            assert PLAIN <= c.right < ABSOLUTE
+            assert PLAIN <= c.right < ABSOLUTE or (c.is_one_sided and c.right < EXTENDED_SIZE)
+            assert VELOCITIES[c.velocity] in c.name[2:]
 
 
 @pytest.mark.parametrize(
@@ -82,6 +86,8 @@ def test_every_name_says_its_place_itself():
         ("Y_uv", 1, PLAIN + u, PLAIN + v),
         ("K_pr", 3, PLAIN + p, PLAIN + r),
         ("Y_v_abs_r", 1, ABSOLUTE + r, PLAIN + v),
+        ("Z_w_neg", 2, ONE, NEGATIVE + w),
+        ("N_rr_neg", 5, ABSOLUTE + r, NEGATIVE + r),
     ],
 )
 def test_the_factors_of_a_term(name, row, left, right):
@@ -110,6 +116,9 @@ def test_two_names_of_one_term_have_one_place(name, other):
         ("Y_v", "N_v"),
         ("Y_r", "N_v"),  # damping is not symmetric
         ("X_u", "X_uu"),
+        ("X_u", "X_u_neg"),
+        ("X_uu", "X_uu_neg"),
+        ("X_u_neg", "X_uu_neg"),
     ],
 )
 def test_different_terms_have_different_places(name, other):
@@ -119,6 +128,19 @@ def test_different_terms_have_different_places(name, other):
 def test_own_motion_is_diagonal_and_nothing_else():
     own = {f"{a}_{b}{kind}" for a, b in zip(AXES, VELOCITIES) for kind in ("dot", "", b)}
     assert {c.name for c in catalogue() if c.is_diagonal} == own
+
+
+def test_one_sided_is_an_axis_own_damping_and_nothing_else():
+    own = {f"{a}_{b}{kind}_neg" for a, b in zip(AXES, VELOCITIES) for kind in ("", b)}
+    one_sided = [c for c in catalogue() if c.is_one_sided]
+    assert {c.name for c in one_sided} == own
+    assert all(f"{c.symmetric}_neg" == c.name and parse(c.symmetric).is_diagonal for c in one_sided)
+
+
+@pytest.mark.parametrize("name", ["Y_r_neg", "X_vv_neg", "Y_uv_neg", "M_w_neg"])
+def test_couplings_have_no_side(name):
+    with pytest.raises(UserError, match="only an axis's own damping may differ.*_neg or "):
+        parse(name)
 
 
 def test_units_make_forces_and_moments():
@@ -148,6 +170,8 @@ def test_units_make_forces_and_moments():
         ("X_uu", "N s2/m2"),
         ("N_rr", "N m s2/rad2"),
         ("N_v_abs_r", "N m s2/(m rad)"),
+        ("Z_w_neg", "N s/m"),
+        ("N_rr_neg", "N m s2/rad2"),
     ],
 )
 def test_units_as_they_are_printed(name, unit):
@@ -159,12 +183,29 @@ def test_meanings_show_the_term():
     assert parse("N_r").meaning.endswith("moment N = N_r r")
     assert parse("X_uu").meaning.endswith("force X = X_uu |u| u")
     assert parse("X_vv").meaning.endswith("force X = X_vv v^2")
+    assert parse("Z_w_neg").meaning.endswith("force Z = Z_w_neg min(w, 0)")
+    assert parse("Z_ww_neg").meaning.endswith("force Z = Z_ww_neg |w| min(w, 0)")
     assert parse("Y_v_abs_r").meaning.endswith("force Y = Y_v_abs_r v |r|")
 
 
 @pytest.mark.parametrize(
     "name",
-    ["", "X", "X_", "X_x", "x_u", "X_udott", "X_uuu", "X_u_abs_", "X_u ", " X_u", "X_u\n", "Xu"],
+    [
+        "",
+        "X",
+        "X_",
+        "X_x",
+        "x_u",
+        "X_udott",
+        "X_uuu",
+        "X_u_abs_",
+        "X_udot_neg",
+        "X_u_neg_",
+        "X_u ",
+        " X_u",
+        "X_u\n",
+        "Xu",
+    ],
 )
 def test_an_unknown_name_is_named_with_examples(name):
     with pytest.raises(UserError, match="not a hydrodynamic coefficient: use names such") as error:
@@ -180,7 +221,7 @@ def test_one_velocity_with_its_own_absolute_value_is_a_doubled_letter():
 PLACES = {c.place for c in catalogue()}
 
 
-@given(st.text(alphabet="XYZKMN_uvwpqrdotabs \n", max_size=12))
+@given(st.text(alphabet="XYZKMN_uvwpqrdotabsneg \n", max_size=12))
 def test_any_text_is_a_coefficient_of_that_name_or_refused(name):
     try:
         c = parse(name)

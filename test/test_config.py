@@ -162,6 +162,8 @@ def test_effects_are_complete():
     config = from_parameters(minimal(effects={"thruster_lag": {"time_constant": 0.2}}))
     assert config.effects == {"thruster_lag": {"time_constant": 0.2}}
     for effect in EFFECTS.values():
+        if effect.coefficients:
+            continue
         at_rest = from_parameters(minimal(effects={effect.name: {}})).effects[effect.name]
         assert at_rest == {p.name: p.null for p in effect.parameters}
 
@@ -231,6 +233,22 @@ REFUSED = [
     ({"estimate": ["Y_v"]}, "estimate: Y_v is not in coefficients: use one of X_udot, X_u, X_uu"),
     ({"estimate": ["X_uv"]}, "estimate: X_uv is not in coefficients: did you mean X_u?"),
     ({"prior": {"std": {"N_r": 1.0}}}, "prior.std.N_r is not in coefficients: use one of X_udot"),
+    (
+        {"effects": {"quadratic_damping": {}}},
+        "effects.quadratic_damping is a family of coefficients: put X_uu, Y_vv, ",
+    ),
+    (
+        {"effects": {"cog_offset": {"dx": 1.0}}, "coefficients": {"Y_rdot": -2.0, "X_u": -1.0}},
+        "effects.cog_offset makes the mass matrix indefinite: ",
+    ),
+    (
+        {"effects": {"battery_sag": {"end_loss": 0.1, "duration": 0.0}}},
+        "effects.battery_sag.duration is 0 s, but must be between 1 and ",
+    ),
+    (
+        {"coefficients": {"X_u": -1.0, "X_u_neg": 1.5}},
+        "coefficients.X_u_neg is 1.5, but its sum with X_u must not be positive",
+    ),
     (
         {"effects": {"thruster_lags": {}}},
         "effects.thruster_lags is an unknown effect: did you mean thruster_lag?",

@@ -1,8 +1,11 @@
 """What physics allows of an estimate: against a quadratic program, and case by case."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import textbook
+from scipy.optimize import minimize
 
 from rov_ident import config as configuration
 from rov_ident.estimate import Estimate, is_passive, physical, prior_of, typical
@@ -168,3 +171,75 @@ def test_shipped_configurations_are_passive():
         config = configuration.load(path)
         prior = prior_of(config)
         assert is_passive(config.model, prior, prior.mean), path.name
+
+
+# ------------------------------------------------------------------ one-sided damping
+
+
+@pytest.fixture
+def one_sided(heavy):
+    return variant(heavy, {"Z_ww_neg": -20.0, "Z_w_neg": 5.0})
+
+
+def test_one_sided_damping_may_have_either_sign_but_its_sum_not(one_sided):
+    prior = prior_of(one_sided)
+    assert not prior.negative[prior.names.index("Z_ww_neg")]
+    for values, passive in (
+        ({}, True),
+        ({"Z_ww_neg": 190.0}, True),
+        ({"Z_ww_neg": 190.1}, False),
+        ({"Z_w_neg": 33.1}, False),
+        ({"Z_ww": 0.1, "Z_ww_neg": -20.0}, False),
+    ):
+        assert is_passive(one_sided.model, prior, set_to(one_sided, values)) == passive
+
+
+def test_one_sided_damping_counts_where_couplings_are_judged(heavy):
+    """Y_v and N_r carry the coupling in one direction of sway only."""
+    couplings = {"Y_r": 4.0, "N_v": 4.0, "Y_v": -20.0, "N_r": -1.0}
+    for name, value, passive in (("Y_v_neg", 0.0, True), ("Y_v_neg", 15.0, False)):
+        config = variant(heavy, couplings | {name: value})
+        prior = prior_of(config)
+        assert is_passive(config.model, prior, prior.mean) == passive
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_physical_is_the_nearest_set_of_both_directions(one_sided, seed):
+    """Against scipy's constrained minimum of the same distance."""
+    rng = np.random.default_rng(seed)
+    names = ("Z_w", "Z_ww", "Z_w_neg", "Z_ww_neg")
+    config = dataclasses.replace(one_sided, estimate=names)
+    prior = prior_of(config)
+    assert set(prior.names) == set(names)
+    at = {name: prior.names.index(name) for name in names}
+    rows = np.zeros((4, 4))
+    rows[0, at["Z_w"]] = rows[1, at["Z_ww"]] = 1.0
+    rows[2, [at["Z_w"], at["Z_w_neg"]]] = rows[3, [at["Z_ww"], at["Z_ww_neg"]]] = 1.0
+    covariance = textbook.random_covariance(4, rng)
+    scale = np.sqrt(np.diag(covariance))
+    values = rng.standard_normal(4) * scale
+    found = physical(config.model, prior, Estimate(prior.names, values, covariance, 0.0))
+    assert is_passive(config.model, prior, found)
+    inverse = np.linalg.inv(covariance)
+
+    def distance(x):
+        return (x - values) @ inverse @ (x - values)
+
+    best = minimize(
+        distance,
+        -2.0 * scale,
+        constraints={"type": "ineq", "fun": lambda x: -rows @ x},
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 1000},
+    )
+    np.testing.assert_allclose(found, best.x, atol=1e-4 * scale.max())
+
+
+def test_one_sided_damping_beside_one_that_is_held(one_sided):
+    """Z_ww is not estimated: its sum with the estimate stays where a hull can be."""
+    config = dataclasses.replace(one_sided, estimate=("Z_w", "Z_ww_neg"))
+    prior = prior_of(config)
+    values = np.array([-30.0, 250.0])
+    found = physical(config.model, prior, Estimate(prior.names, values, np.diag([1.0, 400.0]), 0.0))
+    np.testing.assert_allclose(found, [-30.0, 190.0], rtol=1e-12)
+    assert is_passive(config.model, prior, found)

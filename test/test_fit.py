@@ -14,7 +14,7 @@ from rov_ident.errors import UserError
 from rov_ident.fit import fit_online, write_text
 from rov_ident.frames import gravity_direction
 from rov_ident.recording import write_messages
-from rov_ident.records import VELOCITIES, attitude_of, predicted, read_record, score
+from rov_ident.records import VELOCITIES, predicted, read_record, score
 
 DURATION = 20.0  # s
 GAP = (9_000_000_000, 12_000_000_000)  # ns, of the record with a gap
@@ -100,10 +100,9 @@ def test_what_makes_no_sample_is_refused(folder, heavy, quiet):
         read_record(path, heavy)
 
 
-def test_attitude_is_that_of_the_samples_without_heading(record):
-    np.testing.assert_allclose(
-        gravity_direction(attitude_of(record.samples)), record.samples["down"], atol=1e-12
-    )
+def test_attitude_of_the_samples_has_their_down(record):
+    orientation = record.samples["orientation"]
+    np.testing.assert_allclose(gravity_direction(orientation), record.samples["down"], atol=1e-12)
 
 
 # ------------------------------------------------------------------ open loop

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rov_ident import config
 from rov_ident.coefficients import catalogue
 from rov_ident.errors import UserError
-from rov_ident.model import Model, RigidBody, build, columns, coriolis
+from rov_ident.model import Model, RigidBody, build, columns, coriolis, current_wrench
 from rov_ident.simulate import simulate
 
 Array = NDArray[np.float64]
@@ -95,6 +95,9 @@ def damping_formulas() -> dict[str, Callable[[dict[str, float]], float]]:
         for c in VELOCITIES.replace(b, ""):
             formulas[f"{axis}_{b}{c}"] = lambda n, b=b, c=c: n[b] * n[c]
             formulas[f"{axis}_{b}_abs_{c}"] = lambda n, b=b, c=c: n[b] * abs(n[c])
+    for axis, b in zip(AXES, VELOCITIES):
+        formulas[f"{axis}_{b}_neg"] = lambda n, b=b: n[b] if n[b] < 0 else 0.0
+        formulas[f"{axis}_{b}{b}_neg"] = lambda n, b=b: -(n[b] ** 2) if n[b] < 0 else 0.0
     for name in even:
         formulas[name] = lambda n, b=name[2]: n[b] ** 2
     return formulas
@@ -164,7 +167,8 @@ def random_values(rng: np.random.Generator) -> dict[str, float]:
         if c.is_added_mass:
             values[c.name] = -A[c.row, c.column]
         else:
-            values[c.name] = -abs(rng.normal()) if c.is_diagonal else rng.normal()
+            own = c.is_diagonal or c.is_one_sided
+            values[c.name] = -abs(rng.normal()) if own else rng.normal()
     return values
 
 
@@ -250,6 +254,12 @@ def test_each_coefficient_alone_is_its_formula():
     tested = 0
     for c in catalogue():
         values = {c.name: -0.01}
+        if c.is_one_sided:
+            np.testing.assert_array_equal(
+                build(BODY, values).wrench(abs(nu), nu_dot, DOWN),
+                empty.wrench(abs(nu), nu_dot, DOWN),
+            )
+            nu = -abs(nu)
         ours = build(BODY, values).wrench(nu, nu_dot, DOWN) - empty.wrench(nu, nu_dot, DOWN)
         A = added_mass(values)
         theirs = A @ nu_dot + coriolis_of(A, nu) @ nu - damping_force(values, nu)[0]
@@ -317,6 +327,30 @@ def test_restoring_force_has_the_signs_one_can_feel():
     assert heeled[3] < 0.0
     nose_up = model.acceleration(np.zeros(6), np.zeros(6), down_of(0.0, 0.1))
     assert nose_up[4] < 0.0
+
+
+# ------------------------------------------------------------------ moving water
+
+
+@given_states
+@given(nu=vectors, water=arrays(float, 3, elements=number))
+def test_current_is_the_difference_of_fossens_two_equations(nu, water):
+    """Sec. 10.3: M_A, C_A and d have the velocity through the water, M_RB and C_RB over ground."""
+    A, still = added_mass(VALUES), np.concatenate([water, np.zeros(3)])
+    nu_c_dot = np.concatenate([-np.cross(nu[3:], water), np.zeros(3)])
+    over_ground = coriolis_of(A, nu) @ nu - damping_force(VALUES, nu)[0]
+    relative = nu - still
+    through = coriolis_of(A, relative) @ relative - damping_force(VALUES, relative)[0]
+    through = through - A @ nu_c_dot
+    size = 400.0 * (1.0 + np.abs(nu).max() + np.abs(water).max()) ** 2
+    found = current_wrench(FULL.structure, FULL.added_mass, FULL.theta, nu, water)
+    same(found, over_ground - through, np.full(6, size))
+
+
+def test_still_water_does_nothing():
+    nu = np.random.default_rng(6).normal(size=6)
+    found = current_wrench(FULL.structure, FULL.added_mass, FULL.theta, nu, np.zeros(3))
+    np.testing.assert_array_equal(found, 0.0)
 
 
 # ------------------------------------------------------------------ inverse and forward

@@ -157,6 +157,64 @@ def test_equals_batch_least_squares_on_independently_filtered_rows(heavy, exact,
     )
 
 
+def test_forgetting_is_the_textbook_formula(heavy, noisy):
+    """The same sample with and without forgetting, from states met on the way; to 1e-9.
+
+    The rows that came in show in the information gained without forgetting.
+    """
+    factor, checked = 0.9, 0
+    tasks = []
+    for f in (1.0, factor):
+        config = with_section(heavy, "rls", forgetting="constant", forgetting_factor=f)
+        tasks.append(rls.problem(config))
+    n = len(tasks[0].scale)
+    state = rls.init(tasks[1])
+    for k in range(1500):
+        (kept, _), (forgot, told) = (rls.step(t, state, noisy[k : k + 1]) for t in tasks)
+        if told["reason"][0] == rls.USED and k > 200:
+            r = state.root[:, :n]
+            before, gained = r.T @ r, kept.root[:, :n].T @ kept.root[:, :n] - r.T @ r
+            size, vectors = np.linalg.eigh(gained)
+            if size[-6] > 0.1:  # each of the six rows excites something
+                q = np.linalg.qr(r @ vectors[:, -6:])[0]
+                less = r.T @ (np.eye(n) - (1.0 - factor) * q @ q.T) @ r
+                scale = np.sqrt(np.outer(np.diag(before), np.diag(before)))
+                found = forgot.root[:, :n].T @ forgot.root[:, :n]
+                np.testing.assert_allclose(found / scale, (less + gained) / scale, atol=1e-9)
+                # the score's covariance goes with it, and takes in what is new
+                t = less @ np.linalg.inv(before)
+                decay = np.exp(-0.1 / tasks[1].settings["lag"][0])
+                old, new = decay * state.lagged, forgot.lagged - decay * state.lagged
+                score = t @ state.score @ t.T + np.outer(new, new)
+                score += np.outer(old, new) + np.outer(new, old)
+                np.testing.assert_allclose(forgot.score / scale, score / scale, atol=1e-9)
+                # and what is forgotten does not move the estimate
+                x, b = (
+                    np.linalg.solve(r, state.root[:, n]),
+                    forgot.root[:, :n].T @ forgot.root[:, n],
+                )
+                taken = kept.root[:, :n].T @ kept.root[:, n] - r.T @ state.root[:, n]
+                np.testing.assert_allclose(b - taken, less @ x, rtol=1e-7, atol=1e-7)
+                checked += 1
+        state = forgot
+    assert checked > 20
+
+
+def test_condition_number(heavy, noisy):
+    """That of numpy; 1 at first; told with each update."""
+    task = rls.problem(heavy)
+    assert rls.condition(task, rls.init(task)) == pytest.approx(1.0)
+    state, info = rls.fold(task, rls.init(task), noisy[:1500])
+    n = len(task.scale)
+    assert rls.condition(task, state) == pytest.approx(np.linalg.cond(state.root[:, :n], 1))
+    used = info["reason"] == rls.USED
+    assert np.isfinite(info["condition"][used]).all() and info["condition"][used][0] == 1.0
+    assert np.isnan(info["condition"][info["reason"] == rls.WAITING]).all()
+    last = np.flatnonzero(used)[-1]
+    before, _ = rls.fold(task, rls.init(task), noisy[:last])
+    assert info["condition"][last] == pytest.approx(rls.condition(task, before), rel=1e-9)
+
+
 def test_truth_without_noise(heavy, exact):
     config = wrong_prior(heavy, spread=0.3)
     estimate, _, info = result(config, exact)

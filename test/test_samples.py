@@ -353,6 +353,71 @@ def test_samples_stay_what_they_were(heavy):
     assert all(same(a, b) for a, b in zip(given_away, copies, strict=True))
 
 
+# ------------------------------------------------------------------ effects
+
+
+def test_attitude_with_its_heading(heavy):
+    dive = clean(heavy)
+    samples, sampler = taken(heavy, without_arrival(dive))
+    true = dive.truth.orientation[instants(dive, sampler, samples)]
+    same_turn = np.abs(np.sum(samples["orientation"] * true, axis=1))
+    np.testing.assert_allclose(same_turn, 1.0, atol=1e-7)
+    down = quaternion_to_matrix(samples["orientation"])[:, 2]
+    np.testing.assert_allclose(samples["down"], down, atol=1e-12)
+
+
+def test_surroundings_are_part_of_the_wrench_and_known_apart(heavy):
+    """A force fixed in the world, in body axes at both ends of the interval."""
+    force = np.array([3.0, -2.0, 1.0])
+    effects = {"constant_force": dict(zip(("fx", "fy", "fz"), force.tolist()))}
+    messages = without_arrival(clean(heavy))
+    plain, _ = taken(heavy, messages)
+    samples, _ = taken(dataclasses.replace(heavy, effects=effects), messages)
+    pull = np.einsum("kij,i->kj", quaternion_to_matrix(samples["orientation"]), force)
+    before = np.vstack([pull[:1], pull[:-1]])
+    np.testing.assert_allclose(samples["surroundings"][:, :3], 0.5 * (pull + before), atol=1e-12)
+    slope = (pull - before)[1:] / samples["dt"][1:, None]
+    np.testing.assert_allclose(samples["surroundings_slope"][1:, :3], slope, atol=1e-9)
+    for name in ("wrench", "wrench_slope"):
+        part = samples[name.replace("wrench", "surroundings")]
+        np.testing.assert_allclose(samples[name], plain[name] + part, atol=1e-12)
+        assert np.abs(part).max() > 0.1
+    assert not plain["surroundings"].any()
+
+
+@pytest.mark.parametrize("imu_rate", [0.0, 100.0])
+def test_velocities_are_through_the_water(heavy, imu_rate):
+    water = np.array([0.3, -0.2, 0.1])
+    effects = {"ocean_current": dict(zip(("north", "east", "down"), water.tolist()))}
+    dive = clean(heavy, imu_rate=imu_rate, odometry_rate=50.0)
+    messages = without_arrival(dive)
+    plain, _ = taken(heavy, messages)
+    samples, _ = taken(dataclasses.replace(heavy, effects=effects), messages)
+    in_body = np.einsum("kij,i->kj", quaternion_to_matrix(samples["orientation"]), water)
+    np.testing.assert_allclose(samples["water"], in_body, atol=1e-12)
+    np.testing.assert_allclose(samples["nu"][:, :3] + in_body, plain["nu"][:, :3], atol=1e-12)
+    measured = samples["measured"]
+    for rows in (samples, plain):
+        found = rows["odometry"][measured, :3] - rows["nu"][measured, :3]
+        assert np.abs(found).max() < 0.02
+    for name in ("wrench", "gyro", "down"):
+        np.testing.assert_array_equal(samples[name], plain[name])
+    assert samples["moving"][-1, :3].all()
+
+
+def test_after_a_gap_surroundings_begin_anew(heavy):
+    effects = {"payload": {"mass_wet": 1.0, "x": 0.0, "y": 0.0, "z": 0.0, "onset": 2.5}}
+    config = dataclasses.replace(heavy, effects=effects)
+    dive = clean(heavy)
+    gap = [m for m in without_arrival(dive) if not 2.0 < m[1].stamp / SECOND - 1.0 < 3.5]
+    samples, _ = taken(config, gap)
+    after = samples["t"] > 3.0
+    assert samples["restart"][after][0]
+    weight = np.linalg.norm(samples["surroundings"][after, :3], axis=1)
+    np.testing.assert_allclose(weight, 9.81, rtol=1e-2)
+    assert not samples["surroundings"][~after].any()
+
+
 # ------------------------------------------------------------------ axes
 
 

@@ -78,6 +78,7 @@ def rows_of(
         rows["odometry"][:, 3:] = np.nan
         rows["gyro"] = rows["nu"][:, 3:]
         rows["gyro_variance"] = angular_std**2
+    rows["orientation"] = motion.orientation
     rows["down"] = quaternion_to_matrix(motion.orientation)[:, 2]
     rows["down_slope"][1:] = np.diff(rows["down"], axis=0) / rows["dt"][1:, None]
     rows["wrench"][1:] = wrench[:-1] * (1.0 + wrench_std * noise[1, 1:])
@@ -106,7 +107,7 @@ def resting(count, dt, rng=None, linear_std=0.008, angular_std=0.003):
     rows["odometry"][:, 3:] = np.nan
     rows["odometry_variance"] = std**2
     rows["gyro"], rows["gyro_variance"] = rows["nu"][:, 3:], angular_std**2
-    rows["down"] = [0.0, 0.0, 1.0]
+    rows["orientation"], rows["down"] = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0]
     return rows
 
 

@@ -1,9 +1,21 @@
-"""What a simulation may lack: one file an effect, found by being in this folder."""
+"""What a simulation may lack: one file an effect, found by being in this folder.
 
+The kernels below run through all effects of a place; :func:`compiled` makes their arguments from
+the section ``effects`` of a configuration.
+"""
+
+from collections.abc import Mapping
 from importlib import import_module
 from pkgutil import iter_modules
+from typing import NamedTuple
 
-from rov_ident.effects.base import Effect
+import numpy as np
+from numba import literal_unroll
+from numpy.typing import NDArray
+
+from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, Reading
+from rov_ident.jit import kernel
+from rov_ident.model import RigidBody, current_wrench
 
 EFFECTS: dict[str, Effect] = {
     module.name: import_module(f"{__name__}.{module.name}").EFFECT
@@ -11,3 +23,129 @@ EFFECTS: dict[str, Effect] = {
     if module.name != "base"
 }
 """Every effect by the name users give it."""
+
+_INPUT = sorted((e for e in EFFECTS.values() if e.act), key=lambda e: (e.order, e.name))
+_WRENCH = [e for e in EFFECTS.values() if e.wrench]
+_SENSE = sorted((e for e in EFFECTS.values() if e.sense), key=lambda e: (e.order, e.name))
+_ACTS = tuple(e.act for e in _INPUT)
+_WRENCHES = tuple(e.wrench for e in _WRENCH)
+
+
+Values = Mapping[str, Mapping[str, float]]
+"""The section ``effects`` of a configuration: {effect: {parameter: value}}, complete."""
+
+
+class Acting(NamedTuple):
+    """The effects of a configuration that have kernels, as these take them."""
+
+    inputs: NDArray[np.bool_]  # which of the input effects are there
+    input_parameters: Array  # (inputs, SIZE)
+    wrenches: NDArray[np.bool_]
+    wrench_parameters: Array  # (wrenches, SIZE)
+    water: Array  # (3,) velocity of the water in the world [m/s]
+
+
+def compiled(effects: Values) -> Acting:
+    """The effects of a configuration for the kernels."""
+    water = np.zeros(3)
+    for name, values in effects.items():
+        effect = EFFECTS[name]
+        if effect.water is not None:
+            water = water + effect.water(**values)
+    return Acting(*_table(_INPUT, effects), *_table(_WRENCH, effects), water)
+
+
+def _table(library: list[Effect], effects: Values) -> tuple[NDArray[np.bool_], Array]:
+    parameters = np.zeros((len(library), SIZE))
+    for row, effect in enumerate(library):
+        if effect.name in effects:
+            values = [effects[effect.name][p.name] for p in effect.parameters]
+            parameters[row, : len(values)] = values
+    return np.array([effect.name in effects for effect in library], dtype=bool), parameters
+
+
+def rigid_body(body: RigidBody, effects: Values) -> RigidBody:
+    """The body with its effects."""
+    for name, values in effects.items():
+        change = EFFECTS[name].body
+        if change is not None:
+            body = change(body, **values)
+    return body
+
+
+def sense(reading: Reading, effects: Values) -> Reading:
+    """What the sensors give for true velocities."""
+    for effect in _SENSE:
+        if effect.sense is not None and effect.name in effects:
+            reading = effect.sense(reading, **effects[effect.name])
+    return reading
+
+
+def correct(reading: Reading, effects: Values) -> Reading:
+    """The true velocities from what the sensors give: the inverse of :func:`sense`."""
+    for effect in reversed(_SENSE):
+        if effect.correct is not None and effect.name in effects:
+            reading = effect.correct(reading, **effects[effect.name])
+    return reading
+
+
+def affects_sensors(effects: Values) -> bool:
+    """Whether :func:`correct` changes anything."""
+    return any(effect.name in effects for effect in _SENSE)
+
+
+def memory() -> Array:
+    """The state of all input effects before the first demand."""
+    return np.zeros((len(_INPUT), MEMORY))
+
+
+@kernel
+def act(acting, state, t, dt, wrench):
+    """wrench (6,), demanded from t to t + dt, becomes the mean of what acts in that time."""
+    i = 0
+    for effect in literal_unroll(_ACTS):
+        if acting.inputs[i]:
+            effect(acting.input_parameters[i], state[i], t, dt, wrench)
+        i += 1  # noqa: SIM113 (unrolled: no enumerate)
+
+
+@kernel
+def acted(acting, t, demand):
+    """The wrench (N, 6) that acts on average from each t (N,) to the next, of the one demanded."""
+    out, state = demand.copy(), np.zeros((len(acting.inputs), MEMORY))
+    for k in range(len(t)):
+        dt = t[k + 1] - t[k] if k + 1 < len(t) else 0.0
+        act(acting, state, t[k], dt, out[k])
+    return out
+
+
+@kernel
+def add_wrenches(acting, t, nu, rotation, out):
+    """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water."""
+    i = 0
+    for effect in literal_unroll(_WRENCHES):
+        if acting.wrenches[i]:
+            effect(acting.wrench_parameters[i], t, nu, rotation, out)
+        i += 1  # noqa: SIM113 (unrolled: no enumerate)
+
+
+@kernel
+def add_surroundings(acting, structure, added_mass, theta, t, nu, rotation, out):
+    """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground.
+
+    ``structure``, ``added_mass`` (6, 6) and ``theta`` (n,) are those of the model; ``rotation``
+    (3, 3) turns body axes into the world.
+    """
+    water, relative = np.zeros(3), nu.copy()
+    for i in range(3):
+        for j in range(3):
+            water[i] += rotation[j, i] * acting.water[j]
+        relative[i] -= water[i]
+    if acting.water.any():
+        out += current_wrench(structure, added_mass, theta, nu, water)
+    add_wrenches(acting, t, relative, rotation, out)
+
+
+def has_surroundings(acting: Acting) -> bool:
+    """Whether :func:`add_surroundings` adds anything."""
+    return bool(acting.wrenches.any() or acting.water.any())

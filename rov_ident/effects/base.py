@@ -1,18 +1,63 @@
-"""What every effect states about itself, and the three places where one can enter."""
+"""What every effect states about itself, and the places where one can enter.
+
+An effect says what it does by exactly one of these, each in the file of the effect:
+
+``coefficients``
+    Names that it adds to ``coefficients`` (damping and added-mass terms). The equations of motion
+    know them already.
+``body``
+    ``body(rigid_body, **parameters) -> rigid_body``: another rigid body (centre of gravity,
+    buoyancy).
+``wrench``
+    A kernel ``wrench(p, t, nu, rotation, out)`` that adds to the wrench ``out`` (6,) on the body:
+    ``p`` the parameters in their order (padded to :data:`SIZE`), ``t`` [s] since the first message,
+    ``nu`` (6,) body velocities relative to the water, ``rotation`` (3, 3) body -> world (NED).
+``water``
+    ``water(**parameters) -> (3,)``: the velocity of the water in the world [m/s].
+``act``
+    A kernel ``act(p, state, t, dt, wrench)``: on entry ``wrench`` (6,) is demanded from ``t`` to
+    ``t + dt``, on return it holds the mean of what acts meanwhile. ``state`` (:data:`MEMORY`,) is
+    the effect's own, all zeros before the first call. Effects act in the order of ``order``.
+``sense``
+    ``sense(reading, **parameters) -> reading`` and its inverse ``correct``: what the sensors give
+    for true velocities, and back. A reading is a :class:`Reading` of one instant or of rows. The
+    sensors apply them in the order of ``order``, the way back is the opposite one.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+SIZE = 8
+"""The most parameters that a kernel takes."""
+
+MEMORY = 1024
+"""Numbers that an input effect may keep from one call to the next."""
+
+
+class Reading(NamedTuple):
+    """What velocity sensor and IMU measure at the body origin, body axes, each (..., 3)."""
+
+    linear: Array  # m/s, of the odometry
+    angular: Array  # rad/s, of the odometry
+    gyro: Array  # rad/s
+    specific_force: Array  # m/s2
+
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One parameter: the effect vanishes where all of them are at ``null``."""
+    """One parameter: the effect vanishes where all of them are at ``null``.
+
+    ``typical`` is a size at which the effect matters on a small ROV: the step from which a search
+    starts and the width of the prior of an estimator. An ``amplitude`` makes the effect vanish at
+    its null; the other roles (where it attaches, when it begins, its frequency and phase) do
+    nothing while the amplitudes are at their nulls; ``fixed`` is never estimated.
+    """
 
     name: str
     unit: str
@@ -20,24 +65,60 @@ class EffectParameter:
     null: float
     lower: float
     upper: float
+    typical: float
+    axis: str = ""  # of a parameter that belongs to one axis of X Y Z K M N
+    role: Literal["amplitude", "place", "onset", "frequency", "phase", "fixed"] = "amplitude"
+
+
+def per_axis(
+    prefix: str,
+    meaning: str,
+    null: float,
+    lower: float,
+    upper: float,
+    typical: float,
+    units: tuple[str, str] = ("1", "1"),
+    moment: float = 1.0,
+) -> tuple[EffectParameter, ...]:
+    """One parameter for each axis (``gain_X`` ... ``gain_N``), ``units`` of forces and moments.
+
+    ``moment`` is what a typical size is multiplied by on K, M and N.
+    """
+    return tuple(
+        EffectParameter(
+            f"{prefix}_{axis}",
+            units[axis in "KMN"],
+            f"{meaning} of {axis}",
+            null,
+            lower,
+            upper,
+            typical * (moment if axis in "KMN" else 1.0),
+            axis,
+        )
+        for axis in "XYZKMN"
+    )
 
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect of the library.
+    """An effect of the library; see the module for the hooks, of which each has exactly one.
 
     ``place`` is where it enters: the *input* (between the demanded and the acting wrench), the
     *motion* (between the motion through the water and what is measured) or the *wrench*.
-
-    ``start(wrench) -> state`` and ``step(state, wrench, dt, **parameters) -> state, acting`` define
-    an input effect: ``wrench`` (6,) is demanded throughout the ``dt`` seconds of the step, and
-    ``acting`` (6,) is the mean of what acts during it.
+    ``manoeuvre`` is the run that shows it and tells it from its neighbours.
     """
 
     name: str
     place: Literal["input", "motion", "wrench"]
     summary: str
     source: str
-    parameters: tuple[EffectParameter, ...]
-    start: Callable[[Array], Array]
-    step: Callable[..., tuple[Array, Array]]
+    manoeuvre: str
+    parameters: tuple[EffectParameter, ...] = ()
+    coefficients: tuple[str, ...] = ()
+    body: Callable[..., Any] | None = None
+    wrench: Callable[..., None] | None = None
+    water: Callable[..., Array] | None = None
+    act: Callable[..., None] | None = None
+    order: int = 0
+    sense: Callable[..., Reading] | None = None
+    correct: Callable[..., Reading] | None = None

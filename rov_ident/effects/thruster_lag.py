@@ -1,37 +1,42 @@
 """First-order lag between the demanded and the acting wrench.
 
 ``T d(acting)/dt = demand - acting``, solved exactly for a demand held during the step. The mean
-over the step is returned, so that the impulse is right however long the step is.
-
-Source: Fossen (2021), sec. 9.5: thruster dynamics as a first-order system.
+over the step is returned, so that the impulse is right however long the step is. The first demand
+is taken to have acted for long.
 """
 
 import math
 
-from rov_ident.effects.base import Array, Effect, EffectParameter
+from rov_ident.effects.base import Effect, EffectParameter
+from rov_ident.jit import kernel
 
 
-def start(wrench: Array) -> Array:
-    """In equilibrium with the first demand."""
-    return wrench.copy()
-
-
-def step(state: Array, wrench: Array, dt: float, time_constant: float) -> tuple[Array, Array]:
+@kernel
+def act(p, state, t, dt, wrench):
+    time_constant = p[0]
+    if state[0] == 0.0:
+        state[0] = 1.0
+        state[1:7] = wrench
     if time_constant <= 0.0:
-        return wrench, wrench
-    if dt <= 0.0:
-        return state, state
+        state[1:7] = wrench
+        return
     approach = -math.expm1(-dt / time_constant)
-    after = state + (wrench - state) * approach
-    return after, wrench + (state - wrench) * (approach * time_constant / dt)
+    share = approach * time_constant / dt if dt > 0.0 else 1.0
+    for i in range(6):
+        before = state[1 + i]
+        state[1 + i] += (wrench[i] - before) * approach
+        wrench[i] += (before - wrench[i]) * share
 
 
 EFFECT = Effect(
     name="thruster_lag",
     place="input",
     summary="The thrusters follow their demand with a first-order lag, the same on every axis.",
+    manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
-    parameters=(EffectParameter("time_constant", "s", "time constant of the lag", 0.0, 0.0, 3.0),),
-    start=start,
-    step=step,
+    parameters=(
+        EffectParameter("time_constant", "s", "time constant of the lag", 0.0, 0.0, 3.0, 0.1),
+    ),
+    act=act,
+    order=50,
 )

@@ -304,6 +304,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             )
             for level in (Level.OK, Level.WARN, Level.ERROR)
         }
+        values["condition number"] = f"{report.condition:.3g}"
         ratios = np.concatenate([np.zeros((0, 6)), *self._ratios])
         self._ratios.clear()
         for i, axis in enumerate("XYZKMN"):

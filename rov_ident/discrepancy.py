@@ -1,0 +1,516 @@
+"""The search for what a model of the dynamics lacks.
+
+1. The coefficients that the model has are refitted: what that gains is tuning, not physics.
+2. Every effect of the library is scored about that fit, all at once (linear, with the base
+   coefficients refitted along); the best few are fitted in full, and the best of them, if it is
+   significant, joins the model. This repeats until nothing is left.
+3. Each named effect is tried against its rivals once more, with the others in place: other effects,
+   and patterns of no known cause. What does not earn its place leaves.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.coefficients import parse
+from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import Effect
+from rov_ident.evidence import Evidence, Fitted
+from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
+from rov_ident.model import Array
+from rov_ident.patterns import Pattern, patterns
+from rov_ident.scores import PRICE, SURE, Scores, inflation
+from rov_ident.streams import Streams
+
+Progress = Callable[[str], None]
+
+PLAIN = ("quadratic_damping", "linear_damping")
+"""Terms that every hull has: what a model lacks of them is the first thing to suspect."""
+
+_LIKELIER = 0.5  # share of what a plain term explains that a rival must explain beyond it
+_NEARBY = 14.0  # s; in which a better onset is looked for
+_FITTED = 6  # candidates that are fitted in full at each step
+_MOST = 6  # effects at most
+_BOLD = 3.0  # typical sizes: the farthest from null that a fit begins for what is not linear
+_SCORED = 2  # patterns of each axis that are scored properly
+_ROUNDS = 3  # of trials in which effects may give way to rivals
+_MOST_PATTERNS = 3
+_PATTERNS_TRIED = 2
+_PATTERN_ROUNDS = 4
+_IMITATION = 0.05  # share of what a named effect explains that a pattern must explain beyond it
+_SHARE = 0.3  # of the best promise: what promises less is not fitted
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Something that might be there: parameters to add, where to start, what is promised.
+
+    ``promise`` is what it takes off the scaled squared residuals beyond its price.
+    """
+
+    name: str
+    start: Mapping[Key, float]
+    promise: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A named effect put to the test: the model without it, and with each rival in its stead."""
+
+    rest: Fitted
+    rivals: Mapping[str, Fitted]
+
+
+Trials = dict[str, Trial]
+
+
+class Search:
+    """A bag searched for what a configuration lacks."""
+
+    def __init__(
+        self, streams: Streams, config: Config, spans: Sequence[tuple[float, float]]
+    ) -> None:
+        self.streams, self.config = streams, config
+        self.evidence = Evidence(streams, spans)
+        base = {
+            (COEFFICIENTS, name): float(value)
+            for name, value in zip(config.model.names, config.model.theta, strict=True)
+            if name in config.estimate
+        }
+        duration = {
+            (e.name, p.name): streams.duration
+            for e in EFFECTS.values()
+            for p in e.parameters
+            if p.role == "fixed"
+        }
+        self.given = Hypothesis(config, base, duration)
+        self._screened: dict[frozenset[Key], list[Candidate]] = {}
+
+    # -------------------------------------------------------------- the search
+
+    def run(self, progress: Progress | None = None) -> list[Fitted]:
+        """The fit of the model as it is structured, then that of each longer one."""
+        start = self.evidence.fit(self.given)
+        if start is None:
+            return []
+        path = [start]
+        while len(path) <= _MOST:
+            longer = self.longer(path[-1], progress)
+            if longer is None:
+                break
+            path.append(longer)
+        return path
+
+    def unexplained(self, final: Fitted) -> list[Fitted]:
+        """Fits with what patterns are left, one after the other."""
+        found: list[Fitted] = []
+        while len(found) < _MOST_PATTERNS:
+            screened = self.screen_patterns(final)
+            if not screened or screened[0][0].promise < SURE:
+                break
+            candidate, pattern = screened[0]
+            longer = self.fit_pattern(final, candidate, pattern)
+            if longer is None or self.cost(final, longer) - self.cost(longer, longer) < SURE:
+                break
+            final = longer
+            found.append(final)
+        return found
+
+    def longer(self, now: Fitted, progress: Progress | None = None) -> Fitted | None:
+        """The model with the one effect more that explains most; None where nothing is left."""
+        candidates = self.screen(now)
+        fits = self.fit_best(now, candidates)
+        if progress is not None:
+            progress(", ".join(f"{c.name} {c.promise:.0f}" for c in candidates[:5]))
+        if not fits:
+            return None
+        closest = min(fits, key=lambda f: f.rss)
+        best = min(fits, key=lambda f: self.cost(f, closest))
+        plain = [
+            f
+            for f in fits
+            if self.newest(now, f) in PLAIN
+            and self.cost(now, closest) - self.cost(f, closest) > SURE
+        ]
+        best = min(plain or [best], key=lambda f: self.cost(f, closest))
+        if self.cost(now, closest) - self.cost(best, closest) < SURE:
+            return None
+        return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
+
+    def settle(self, final: Fitted, progress: Progress | None = None) -> tuple[Fitted, Trials]:
+        """Every effect against its rivals, the others in place, until nothing changes."""
+        trials: Trials = {}
+        for last in (False,) * _ROUNDS + (True,):
+            trials, better = {}, None
+            for name in self.named(final):
+                rest = self.evidence.fit(self._without(final, name), final.look)
+                if rest is None:
+                    continue
+                trials[name] = Trial(rest, self.rivals(rest, name))
+                better = self._better(final, name, trials[name])
+                if better is not None and last:
+                    better = None  # no end in sight: what is there stays
+                elif better is not None:
+                    if progress is not None:
+                        progress(f"{name} gives way")
+                    break
+            if better is None:
+                break
+            final = self.evidence.fit(better.hypothesis, better.look, update_noise=True) or better
+            final = self.longer(final) or final
+        return final, trials
+
+    def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
+        """What should stand in the stead of ``name``, if anything.
+
+        A pattern can imitate any cause, with the freedom to follow noise besides, and what a model
+        should have anyway is likelier than what few vehicles meet: the rival must explain clearly
+        more.
+        """
+        now = self.cost(final, final)
+        explained = max(trial.rest.rss - final.rss, 1e-9)
+        choices = [trial.rest]
+        for rival, fit in trial.rivals.items():
+            margin = 0.0
+            if rival.startswith(UNKNOWN) and not name.startswith(UNKNOWN):
+                margin = _IMITATION
+            elif name in PLAIN and rival not in PLAIN:
+                margin = _LIKELIER
+            if margin == 0.0 or (
+                now - self.cost(fit, final) > 3.0 * SURE
+                and final.rss - fit.rss > margin * explained
+            ):
+                choices.append(fit)
+        best = min(choices, key=lambda f: self.cost(f, final))
+        return best if self.cost(best, final) < now else None
+
+    def _without(self, fitted: Fitted, name: str) -> Hypothesis:
+        return fitted.hypothesis.without(self.keys_of(fitted, name))
+
+    def rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
+        """What else might explain what ``name`` explains: fits by the name of the rival."""
+        candidates = [c for c in self.screen(rest) if c.name != name]
+        fits = {self.newest(rest, f): f for f in self.fit_best(rest, candidates)}
+        for candidate, pattern in self.screen_patterns(rest)[:_PATTERNS_TRIED]:
+            fit = self.fit_pattern(rest, candidate, pattern)
+            if fit is not None:
+                fits[candidate.name] = fit
+        return fits
+
+    def fit_pattern(self, now: Fitted, candidate: Candidate, pattern: Pattern) -> Fitted | None:
+        """With a pattern; its columns follow the motion that the fit arrives at."""
+        best: Fitted | None = None
+        h, look = now.hypothesis.having(candidate.start), now.look
+        for _ in range(_PATTERN_ROUNDS):
+            self.adopt(pattern)
+            fit = self.evidence.fit(h, look)
+            if fit is None or (best is not None and fit.rss > 0.98 * best.rss):
+                break
+            best, h, look = fit, fit.hypothesis, fit.look
+            if pattern.frequency:
+                break
+            pattern = next(p for p in self._patterns(best) if p.name == pattern.name)
+            more, start, _ = self._score(best, pattern)
+            h = h.having(dict(zip(more, start, strict=True)))
+        return best
+
+    def _score(self, now: Fitted, pattern: Pattern) -> tuple[list[Key], list[float], float]:
+        """Columns of a pattern that are worth adding, how much of each, and what they promise."""
+        h, look = now.hypothesis, now.look
+        columns = [i for i, k in enumerate(pattern.keys) if k not in h.values]
+        keys = [pattern.keys[i] for i in columns]
+        if not keys:
+            return [], [], 0.0
+        scores = Scores(look.having(keys, look.of(pattern.force()[:, :, columns])), h.keys)
+        units = [keys] if pattern.frequency else [(k,) for k in keys]
+        chosen, change, promise = scores.best(units, bounds)
+        return chosen, change.tolist(), promise - (PRICE if pattern.frequency else 0.0)
+
+    def newest(self, rest: Fitted, longer: Fitted) -> str:
+        old = set(rest.hypothesis.keys)
+        return next(group_of(k) for k in longer.hypothesis.keys if k not in old)
+
+    def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
+        fits = []
+        for candidate in candidates[:_FITTED]:
+            if candidate.promise < max(_SHARE * candidates[0].promise, 0.0):
+                break
+            there = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
+            if there is not None:
+                fits.append(self.dated(there, candidate))
+        return fits
+
+    def dated(self, fitted: Fitted, candidate: Candidate) -> Fitted:
+        """The same with the best onset near by: in held-out data it has no gradient to follow."""
+        for key in candidate.start:
+            if key[0] not in EFFECTS or parameter(key).role != "onset":
+                continue
+            now = fitted.hypothesis.values[key]
+            best, earliest = fitted.rss, now
+            for onset in now + np.arange(-_NEARBY, _NEARBY + 0.1, 1.0):
+                there = fitted.hypothesis.having({key: float(max(onset, 0.0))})
+                look = self.evidence.look(there, fitted.look.starts, fitted.noise)
+                if look is not None and look.linear.rss.sum() < 0.99 * best:
+                    best, earliest = float(look.linear.rss.sum()), float(max(onset, 0.0))
+            if earliest != now:
+                there = fitted.hypothesis.having({key: earliest})
+                again = self.evidence.fit(there, fitted.look)
+                if again is not None and again.rss < fitted.rss:
+                    fitted = again
+        return fitted
+
+    def cost(self, fitted: Fitted, best: Fitted) -> float:
+        """Squared residuals in the units of ``best``, and the price of the added parameters.
+
+        Comparable between fits of the same noise.
+        """
+        linear = best.linear
+        kappa = inflation(linear, linear.index(best.hypothesis.keys))
+        extra = len(fitted.hypothesis.keys) - len(self.given.keys)
+        scale = (fitted.noise / best.noise) ** 2
+        rss = fitted.rss if np.allclose(scale, 1.0) else self._rescored(fitted, best.noise)
+        return rss / kappa + PRICE * extra
+
+    def _rescored(self, fitted: Fitted, noise: Array) -> float:
+        look = self.evidence.look(fitted.hypothesis, fitted.look.starts, noise)
+        assert look is not None
+        return float(look.linear.rss.sum())
+
+    def named(self, fitted: Fitted) -> list[str]:
+        """The effects (and patterns) that a model has beyond the given one."""
+        own = set(self.given.keys)
+        return list(dict.fromkeys(group_of(k) for k in fitted.hypothesis.keys if k not in own))
+
+    def keys_of(self, fitted: Fitted, name: str) -> list[Key]:
+        own = set(self.given.keys)
+        return [k for k in fitted.hypothesis.keys if k not in own and group_of(k) == name]
+
+    # -------------------------------------------------------------- candidates
+
+    def screen(self, now: Fitted) -> list[Candidate]:
+        """Candidates, the most promising first; remembered for each set of parameters."""
+        keys = frozenset(now.hypothesis.keys)
+        if keys not in self._screened:
+            self._screened[keys] = self._screen(now)
+        return self._screened[keys]
+
+    def _screen(self, now: Fitted) -> list[Candidate]:
+        h, look = now.hypothesis, now.look
+        plain = {
+            e.name: self.units(e, h)
+            for e in EFFECTS.values()
+            if all(p.role in ("amplitude", "fixed") for p in e.parameters)
+        }
+        extra = list(dict.fromkeys(k for units in plain.values() for u in units for k in u))
+        columns = look.of(self.evidence.columns(h, look.motion, extra))
+        scores = Scores(look.having(extra, columns), h.keys)
+        candidates = []
+        for name, units in plain.items():
+            chosen, change, promise = scores.best(units, bounds)
+            if chosen:
+                start = self._start(dict(zip(chosen, change.tolist(), strict=True)))
+                candidates.append(Candidate(name, start, promise))
+        for effect in EFFECTS.values():
+            roles = {p.role for p in effect.parameters}
+            if effect.name in h.effects:
+                continue
+            if "onset" in roles:
+                candidates += self._beginning(now, effect)
+            elif "place" in roles:
+                candidates += self._attached(now, effect)
+            elif "frequency" in roles:
+                candidates += self._oscillating(now, effect)
+        return sorted(candidates, key=lambda c: -c.promise)
+
+    def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
+        """Parameters of an effect that h lacks, in the groups in which they may join."""
+        if effect.sense is not None:
+            return []
+        if effect.coefficients:
+            have = {parse(n).place for n in h.coefficients}
+            return [((COEFFICIENTS, n),) for n in effect.coefficients if parse(n).place not in have]
+        mine = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        if any(p.axis for p in effect.parameters):
+            return [(key,) for key in mine if key not in h.values]
+        return [] if effect.name in h.effects else [tuple(mine)]
+
+    def _start(self, change: Mapping[Key, float]) -> dict[Key, float]:
+        """Start values from a linear estimate, inside the bounds and not too bold."""
+        start = {}
+        for key, delta in change.items():
+            null, lower, upper = bounds(key)
+            if key[0] in EFFECTS and EFFECTS[key[0]].act is not None:
+                reach = _BOLD * parameter(key).typical
+                if parameter(key).unit in ("N", "N m"):
+                    reach = np.inf
+                delta = float(np.clip(delta, -reach, reach))
+            start[key] = float(np.clip(null + delta, lower, upper))
+        return start
+
+    def _beginning(self, now: Fitted, effect: Effect) -> list[Candidate]:
+        """An effect that begins at a time: scanned coarsely, then around the best."""
+        duration = self.streams.duration
+        best = self._scan(
+            now, effect, [{"onset": t * duration} for t in np.linspace(0.04, 0.96, 24)]
+        )
+        if best is None:
+            return []
+        near = best[1]["onset"] + np.linspace(-0.04, 0.04, 17) * duration
+        best = self._scan(now, effect, [{"onset": float(t)} for t in near]) or best
+        return [self._scanned(effect, best)]
+
+    def _attached(self, now: Fitted, effect: Effect) -> list[Candidate]:
+        """An effect that attaches somewhere: the neighbourhood of the origin is scanned."""
+        places = [p for p in effect.parameters if p.role == "place"]
+        grid = [
+            {p.name: s * p.typical for p, s in zip(places, signs, strict=True)}
+            for signs in itertools.product((-1.0, 0.0, 1.0), repeat=len(places))
+        ]
+        best = self._scan(now, effect, grid)
+        return [] if best is None else [self._scanned(effect, best)]
+
+    def _scan(
+        self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]
+    ) -> tuple[float, Mapping[str, float], dict[Key, float]] | None:
+        """The most promising shape (onset, place) of an effect, with its linear amplitudes.
+
+        Where a place is not part of the shape, the moments that it makes are fitted as well: a
+        wrench is linear in amplitude times place.
+        """
+        h, look = now.hypothesis, now.look
+        keys = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        places = [p for p in effect.parameters if p.role == "place" and p.name not in shapes[0]]
+        moments = [(f"{effect.name} moment", p.name) for p in places]
+
+        def column(shape: Mapping[str, float]) -> Array:
+            values = {(effect.name, n): v for n, v in shape.items()}
+            return self.evidence.columns(h.having(values), look.motion, keys)
+
+        columns = []
+        for shape in shapes:
+            at_origin = column(shape)
+            columns += [at_origin, *(column({**shape, p.name: 1.0}) - at_origin for p in places)]
+        sensitivities = look.of(np.concatenate(columns, axis=2))
+        best = None
+        each = len(keys) + len(places)
+        for i, shape in enumerate(shapes):
+            mine = sensitivities[:, i * each : (i + 1) * each]
+            scores = Scores(look.having([*keys, *moments], mine), h.keys)
+            units = [(*keys, *moments)] if moments else [(k,) for k in keys]
+            chosen, change, promise = scores.best(units, bounds)
+            if chosen and (best is None or promise > best[0]):
+                found = dict(zip(chosen, change.tolist(), strict=True))
+                there = {
+                    p.name: float(
+                        np.clip(found[m] / found[keys[0]], -3.0 * p.typical, 3.0 * p.typical)
+                    )
+                    for p, m in zip(places, moments, strict=True)
+                }
+                best = promise, {**shape, **there}, {k: found[k] for k in keys if k in found}
+        return best
+
+    def _scanned(
+        self, effect: Effect, best: tuple[float, Mapping[str, float], dict[Key, float]]
+    ) -> Candidate:
+        promise, shape, change = best
+        start = self._start(change)
+        start |= {
+            (effect.name, p.name): shape.get(p.name, p.null)
+            for p in effect.parameters
+            if p.role in ("onset", "place")
+        }
+        return Candidate(effect.name, start, promise - PRICE)
+
+    def _oscillating(self, now: Fitted, effect: Effect) -> list[Candidate]:
+        """Sinusoidal forces in the world: the spectrum of the adjoint shows their frequency."""
+        h, look = now.hypothesis, now.look
+        keys = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        candidates = []
+        _, lowest, highest = bounds((effect.name, "frequency"))
+        for frequency in look.frequencies(count=3):
+            if not lowest <= frequency <= highest:
+                continue
+            columns = []
+            for phase in (0.5 * np.pi, 0.0):
+                values = {(effect.name, "frequency"): frequency, (effect.name, "phase"): phase}
+                columns.append(self.evidence.columns(h.having(values), look.motion, keys))
+            labels = [(f"{effect.name} {part}", k[1]) for part in ("cos", "sin") for k in keys]
+            scores = Scores(look.having(labels, look.of(np.concatenate(columns, axis=2))), h.keys)
+            change, gain = scores.solve(labels)
+            # one phase for all directions: the best approximation of rank one
+            cosine, sine = change[: len(keys)], change[len(keys) :]
+            turn = 0.5 * np.arctan2(2.0 * cosine @ sine, cosine @ cosine - sine @ sine)
+            amplitude = np.cos(turn) * cosine + np.sin(turn) * sine
+            start = dict(zip(keys, amplitude.tolist(), strict=True))
+            start[effect.name, "frequency"] = frequency
+            start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
+            promise = gain / scores.kappa - PRICE * len(start)
+            candidates.append(Candidate(effect.name, start, promise))
+        return sorted(candidates, key=lambda c: -c.promise)[:1]
+
+    # -------------------------------------------------------------- patterns
+
+    def screen_patterns(self, now: Fitted) -> list[tuple[Candidate, Pattern]]:
+        """Wrenches of no known cause that would explain something, the best first.
+
+        On each axis all are ranked by how well they follow what the fit lacks (the adjoint); the
+        first few are scored properly.
+        """
+        h, look = now.hypothesis, now.look
+        tried = self._patterns(now)
+        wanted = look.adjoint()
+        inside = np.flatnonzero(wanted.any(axis=1))
+        wanted = wanted[inside]
+        own = self.evidence.columns(h, look.motion, h.keys)[inside]
+        price = 2.0 * np.log(len(tried))
+        found = []
+        for axis in range(6):
+            mine = own[:, axis]
+            basis = np.linalg.qr(mine[:, mine.any(axis=0)])[0]
+            ranked = sorted(
+                (p for p in tried if p.axis == axis and p.direction is None),
+                key=lambda p: -p.follows(wanted[:, p.axis], basis, inside),
+            )
+            world = [p for p in tried if p.axis == axis and p.direction is not None]
+            for pattern in ranked[:_SCORED] + world:
+                chosen, start, promise = self._score(now, pattern)
+                if chosen and promise > price:
+                    values = dict(zip(chosen, start, strict=True))
+                    found.append((Candidate(group_of(chosen[0]), values, promise - price), pattern))
+        return sorted(found, key=lambda f: -f[0].promise)
+
+    def _patterns(self, now: Fitted) -> list[Pattern]:
+        """Patterns along the simulated motion: the measured one has the residual's noise in it."""
+        streams, steps, look = self.streams, self.evidence.steps, now.look
+        middle = 0.5 * (steps.t[1:] + steps.t[:-1])
+        position = None
+        if streams.has_pose:
+            position = np.stack(
+                [np.interp(middle, streams.t, x) for x in streams.position.T], axis=1
+            )
+        found = list(patterns(steps, position, look.motion.middle))
+        for axis in range(6):
+            for frequency in look.frequencies(1, axis):
+                angle = 2.0 * np.pi * frequency * middle
+                waves = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+                found.append(Pattern(axis, "time", waves, frequency=frequency))
+        return found
+
+    def adopt(self, pattern: Pattern) -> None:
+        """Make the parameters of a pattern known to the evidence."""
+        force = pattern.force()
+        for i, key in enumerate(pattern.keys):
+            self.evidence.patterns[key] = force[:, :, i]
+
+
+def group_of(key: Key) -> str:
+    """The effect that a parameter belongs to; of a pattern its axis and dependence."""
+    section, name = key
+    if section == UNKNOWN:
+        return f"{UNKNOWN} " + name.rpartition("|")[0]
+    if section != COEFFICIENTS:
+        return section
+    return next((e.name for e in EFFECTS.values() if name in e.coefficients), "coupled_damping")

@@ -1,0 +1,66 @@
+"""Demands act later: ``acting(t) = demand(t - delay)``.
+
+Exact for demands that are held between calls: what is returned is the mean of the past demands over
+the step, each for as long as it acted. The first demand is taken to have acted for long.
+"""
+
+from rov_ident.effects.base import MEMORY, Effect, EffectParameter
+from rov_ident.jit import kernel
+
+_ROOM = (MEMORY - 1) // 7
+# of past demands, each with its instant: half a second of changes at 290 Hz. With more of them the
+# oldest is forgotten, as if the next one had acted in its place.
+
+
+@kernel
+def act(p, state, t, dt, wrench):
+    delay = p[0]
+    if delay <= 0.0:
+        return
+    queue = state[1 : 1 + 7 * _ROOM].reshape(_ROOM, 7)  # instant, demand; oldest first
+    count = int(state[0])
+    new = count == 0
+    for i in range(6):
+        new = new or wrench[i] != queue[count - 1, 1 + i]
+    if new:
+        if count == _ROOM:
+            _forget(queue, 1, count)
+            count -= 1
+        queue[count, 0] = t
+        queue[count, 1:] = wrench
+        count += 1
+    begin, end = t - delay, t + dt - delay
+    past = 0  # entries that have ended before
+    while past + 1 < count and queue[past + 1, 0] <= begin:
+        past += 1
+    _forget(queue, past, count)
+    count -= past
+    state[0] = count
+    wrench[:] = queue[0, 1:]
+    if count == 1 or not queue[1, 0] < end:
+        return
+    wrench *= (queue[1, 0] - begin) / dt
+    for k in range(1, count):
+        until = min(queue[k + 1, 0], end) if k + 1 < count else end
+        if until > queue[k, 0]:
+            for i in range(6):
+                wrench[i] += (until - queue[k, 0]) / dt * queue[k, 1 + i]
+
+
+@kernel
+def _forget(queue, entries, count):
+    if entries > 0:
+        for k in range(entries, count):
+            queue[k - entries] = queue[k]
+
+
+EFFECT = Effect(
+    name="actuation_delay",
+    place="input",
+    summary="The thrusters follow their demand a little later.",
+    manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
+    source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
+    parameters=(EffectParameter("delay", "s", "time from demand to thrust", 0.0, 0.0, 0.5, 0.05),),
+    act=act,
+    order=10,
+)

@@ -1,0 +1,27 @@
+"""Water that moves steadily and without rotation; the equations of motion say what that does.
+
+See :func:`rov_ident.model.current_wrench`.
+"""
+
+import numpy as np
+
+from rov_ident.effects.base import Array, Effect, EffectParameter
+
+
+def water(north: float, east: float, down: float) -> Array:
+    return np.array([north, east, down])
+
+
+EFFECT = Effect(
+    name="ocean_current",
+    place="motion",
+    summary="The water moves: the vehicle is faster or slower through it than over ground.",
+    manoeuvre="runs at headings 90 degrees apart, and drifting without thrust",
+    source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.3",
+    parameters=(
+        EffectParameter("north", "m/s", "velocity of the water, north", 0.0, -3.0, 3.0, 0.1),
+        EffectParameter("east", "m/s", "east", 0.0, -3.0, 3.0, 0.1),
+        EffectParameter("down", "m/s", "down", 0.0, -3.0, 3.0, 0.1),
+    ),
+    water=water,
+)

@@ -1,0 +1,49 @@
+"""Something taken up at a time: its wet weight pulls down at a point of the body.
+
+``f = mass_wet g`` along world down and ``r x f``, from ``onset`` on. Its inertia is left out: what
+a small ROV carries has little beside the vehicle and its added mass.
+"""
+
+from rov_ident.effects.base import Effect, EffectParameter
+from rov_ident.jit import kernel
+
+GRAVITY = 9.81  # m/s2
+
+
+@kernel
+def wrench(p, t, nu, rotation, out):
+    if t < p[4]:
+        return
+    weight = GRAVITY * p[0]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] += weight * rotation[2, i]
+        out[3 + i] += weight * (p[1 + j] * rotation[2, k] - p[1 + k] * rotation[2, j])
+
+
+EFFECT = Effect(
+    name="payload",
+    place="wrench",
+    summary="Something heavy (or buoyant) is taken up at a time, or was there from the start.",
+    manoeuvre="drifting without thrust, level and tilted, before and after it was taken up",
+    source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
+    parameters=(
+        EffectParameter("mass_wet", "kg", "mass less that of the water", 0.0, -1e4, 1e4, 0.3),
+        EffectParameter(
+            "x",
+            "m",
+            "where it hangs, forward of the body origin",
+            0.0,
+            -5.0,
+            5.0,
+            0.1,
+            role="place",
+        ),
+        EffectParameter("y", "m", "to starboard", 0.0, -5.0, 5.0, 0.1, role="place"),
+        EffectParameter("z", "m", "below", 0.0, -5.0, 5.0, 0.1, role="place"),
+        EffectParameter(
+            "onset", "s", "when, since the first message", 0.0, 0.0, 1e6, 60.0, role="onset"
+        ),
+    ),
+    wrench=wrench,
+)

@@ -1,0 +1,483 @@
+"""What a bag says of a hypothesis: output error over windows, linearised and minimised.
+
+:class:`Evidence` cuts a bag into windows. :meth:`Evidence.look` simulates a hypothesis and gives a
+:class:`Look`: residuals and their sensitivities, with the windows' starting velocities eliminated
+(projected out), so that further parameters can be tried on it at little cost.
+"""
+
+import contextlib
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from rov_ident.coefficients import AXES, parse
+from rov_ident.effects import EFFECTS, compiled
+from rov_ident.effects.base import Effect
+from rov_ident.errors import UserError
+from rov_ident.frames import quaternion_to_matrix
+from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, precision, reach
+from rov_ident.model import Array, Model, RigidBody
+from rov_ident.shooting import (
+    Indices,
+    Motion,
+    Steps,
+    adjoint,
+    equations,
+    regressors,
+    shoot,
+    tangent,
+    thrust,
+    wrenches,
+)
+from rov_ident.simulate import simulate
+from rov_ident.streams import Streams, orientation_at
+
+_MAX_STEP = 0.05  # s
+_MAX_GAP = 0.5  # s without odometry: no window reaches across
+_ITERATIONS = 15
+_ONSET_STEP = 0.2  # s; of the difference quotient
+_OUTLIER = 8.0  # robust standard deviations
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Least squares in the neighbourhood of a hypothesis, in units of the noise.
+
+    normal (P, P) = J'J over the parameters ``keys``, gradient (W, P) = J'r of each window, ``rss``
+    (W,) its squared residuals, ``count`` the number of residuals less that of the starts.
+    """
+
+    keys: tuple[Key, ...]
+    normal: Array
+    gradient: Array
+    rss: Array
+    count: int
+
+    def index(self, keys: Iterable[Key]) -> Indices:
+        place = {key: i for i, key in enumerate(self.keys)}
+        return np.array([place[key] for key in keys], dtype=np.int64)
+
+
+class Look:
+    """A hypothesis simulated through all windows: residuals and sensitivities."""
+
+    def __init__(
+        self, evidence: "Evidence", h: Hypothesis, starts: Array, noise: Array, motion: Motion
+    ) -> None:
+        self.evidence, self.hypothesis, self.starts = evidence, h, starts
+        self.noise, self.motion = noise, motion
+        error = (evidence.measured - motion.nu[evidence.nodes]) / noise
+        spread = 1.4826 * np.median(np.abs(error), axis=0)
+        self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
+        error = error * (self._weight > 0.0)
+        self._rows = np.flatnonzero(np.diff(evidence.window, prepend=-1))  # first of each window
+        own = evidence.columns(h, motion, h.keys)
+        j, j0 = tangent(motion, evidence.first, evidence.last, own, evidence.nodes)
+        j0 *= self._weight[:, :, None]
+        self._q, self._r = [], []
+        for a, b in self._spans():
+            q, r = np.linalg.qr(j0[a:b].reshape(-1, 6))
+            self._q.append(q)
+            self._r.append(r)
+        raw = (j * self._weight[:, :, None]).reshape(-1, len(h.keys))
+        self._starting = [
+            (q.T @ raw[6 * a : 6 * b], q.T @ error[a:b].ravel())
+            for q, (a, b) in zip(self._q, self._spans(), strict=True)
+        ]
+        self.columns = self._projected(raw)
+        self.error = self._projected(error.reshape(-1, 1))[:, 0]
+        self.linear = self._linear(h.keys, self.columns)
+
+    def _spans(self) -> Iterable[tuple[int, int]]:
+        edges = [*self._rows.tolist(), len(self.evidence.nodes)]
+        return itertools.pairwise(edges)
+
+    def _projected(self, raw: Array) -> Array:
+        """Columns (6 N, P) without what the starts can explain."""
+        for q, (a, b) in zip(self._q, self._spans(), strict=True):
+            part = raw[6 * a : 6 * b]
+            part -= q @ (q.T @ part)
+        return raw
+
+    def _linear(self, keys: Sequence[Key], columns: Array) -> Linear:
+        rows = 6 * self._rows
+        return Linear(
+            tuple(keys),
+            columns.T @ columns,
+            np.add.reduceat(columns * self.error[:, None], rows),
+            np.add.reduceat(self.error**2, rows),
+            int(np.count_nonzero(self._weight)) - 6 * len(rows),
+        )
+
+    def of(self, force: Array) -> Array:
+        """Sensitivities (6 N, C) of the residuals to wrenches (K, 6, C)."""
+        e = self.evidence
+        j, _ = tangent(self.motion, e.first, e.last, force, e.nodes)
+        return self._projected((j * self._weight[:, :, None]).reshape(-1, force.shape[2]))
+
+    def having(self, keys: Sequence[Key], columns: Array) -> Linear:
+        """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
+        cross = self.columns.T @ columns
+        gradient = np.add.reduceat(columns * self.error[:, None], 6 * self._rows)
+        return Linear(
+            (*self.linear.keys, *keys),
+            np.block([[self.linear.normal, cross], [cross.T, columns.T @ columns]]),
+            np.hstack([self.linear.gradient, gradient]),
+            self.linear.rss,
+            self.linear.count,
+        )
+
+    def starts_after(self, change: Array) -> Array:
+        """The starts (W, 6) that suit a change (P,) of the parameters."""
+        moves = [
+            np.linalg.solve(r, e - a @ change)
+            for r, (a, e) in zip(self._r, self._starting, strict=True)
+        ]
+        return self.starts + np.array(moves)
+
+    def residual(self) -> Array:
+        """Measured minus simulated velocity (N, 6), outliers as they are."""
+        return self.evidence.measured - self.motion.nu[self.evidence.nodes]
+
+    def clean(self) -> Array:
+        """The residual (N, 6), outliers and what the starts can explain taken out."""
+        error: Array = self.error.reshape(-1, 6) * self.noise
+        return error
+
+    def rescaled(self) -> Array:
+        """Standard deviation (6,) of the residual, outliers left out."""
+        good = self._weight > 0.0
+        power = np.sum(np.where(good, self.residual(), 0.0) ** 2, axis=0)
+        std: Array = np.sqrt(np.maximum(power / np.maximum(good.sum(axis=0), 1), 1e-16))
+        return std
+
+    def adjoint(self) -> Array:
+        """Per step, how the fit would improve with a wrench there: (K, 6)."""
+        e = self.evidence
+        error = self.error.reshape(-1, 6) * self._weight
+        return adjoint(self.motion, e.first, e.last, error, e.nodes)
+
+    def frequencies(self, count: int, axis: int | None = None) -> list[float]:
+        """Frequencies [Hz] at which a force in the world, or along a body axis, would help most."""
+        e = self.evidence
+        wrench = self.adjoint()
+        if axis is None:
+            force = np.einsum("kij,kj->ki", e.steps.middle, wrench[:, :3])
+        else:
+            force = wrench[:, axis : axis + 1]
+        t = 0.5 * (e.steps.t[1:] + e.steps.t[:-1])
+        step = 2.0 * _MAX_STEP
+        bins = ((t - t[0]) / step).astype(int)
+        size = 4 * (bins[-1] + 1)
+        power = np.zeros(size // 2 + 1)
+        for column in force.T:
+            power += np.abs(np.fft.rfft(np.bincount(bins, column), size)) ** 2
+        frequency = np.fft.rfftfreq(size, step)
+        power[(frequency < 1.0 / (t[-1] - t[0])) | (frequency > 2.0)] = 0.0
+        level = median_filter(power, max(5, size // 64)) + 1e-3 * power.max()
+        peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+        strongest = peaks[np.argsort(-(power / level)[peaks])]
+        return [float(frequency[i]) for i in strongest[:count]]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The best values of a hypothesis on the windows of an :class:`Evidence`."""
+
+    hypothesis: Hypothesis
+    look: Look
+    converged: bool
+
+    @property
+    def linear(self) -> Linear:
+        return self.look.linear
+
+    @property
+    def noise(self) -> Array:
+        return self.look.noise
+
+    @property
+    def rss(self) -> float:
+        return float(self.linear.rss.sum())
+
+
+class Evidence:
+    """The windows of one or more bags on which hypotheses are fitted."""
+
+    def __init__(self, streams: Streams, spans: Sequence[tuple[float, float]]) -> None:
+        """``spans``: from and to [s] of each window."""
+        self.streams = streams
+        keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
+        t = streams.t[keep]
+        nodes = _subdivided(t)
+        pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
+        pieces = pieces[(pieces >= nodes[0]) & (pieces <= nodes[-1])]
+        held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
+        self.orientation = orientation_at(streams, nodes)
+        self.steps = Steps(
+            nodes,
+            quaternion_to_matrix(self.orientation),
+            quaternion_to_matrix(orientation_at(streams, 0.5 * (nodes[1:] + nodes[:-1]))),
+            pieces,
+            streams.demand[held],
+            np.searchsorted(pieces, nodes[:-1]),
+        )
+        at = np.searchsorted(nodes, t)
+        first, last = [], []
+        for begin, end in spans:
+            inside = np.flatnonzero((t >= begin) & (t < end))
+            for run in np.split(inside, np.flatnonzero(np.diff(t[inside]) > _MAX_GAP) + 1):
+                if len(run) >= 8:
+                    first.append(at[run[0]])
+                    last.append(at[run[-1]])
+        self.first, self.last = np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
+        window = np.searchsorted(self.first, at, side="right") - 1
+        inside = (window >= 0) & (at <= self.last[np.maximum(window, 0)])
+        self.nodes, self.window = at[inside], window[inside]
+        self.measured = streams.nu[keep][inside]
+        self.times = t[inside]
+        self.patterns: dict[Key, Array] = {}  # wrenches (K, 6) of no known cause, by key
+        self._thrusts: dict[object, Array] = {}
+        self._remembered: tuple[Array | None, dict[object, Array]] = (None, {})
+
+    def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+        """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
+        inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
+        key = tuple(sorted(inputs.items()))
+        if key not in self._thrusts:
+            if len(self._thrusts) > 64:
+                self._thrusts.clear()
+            self._thrusts[key] = thrust(self.steps, compiled(effects))
+        return self._thrusts[key]
+
+    def look(self, h: Hypothesis, starts: Array, noise: Array) -> Look | None:
+        """Simulate; None where that diverges."""
+        wrench = self.thrust(h.effects)
+        for key, value in h.values.items():
+            if key in self.patterns:
+                wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
+        motion = shoot(h.equations, self.steps, wrench, self.first, self.last, starts)
+        if not np.isfinite(motion.nu[self.nodes]).all():
+            return None
+        return Look(self, h, starts, noise, motion)
+
+    def columns(self, h: Hypothesis, motion: Motion, keys: Sequence[Key]) -> Array:
+        """How the wrench on the vehicle changes with each parameter, (K, 6, P)."""
+        out = np.zeros((len(motion.middle), 6, len(keys)))
+        place = {key: i for i, key in enumerate(keys)}
+        names = [n for section, n in keys if section == COEFFICIENTS]
+        if names:
+            found = sorted((parse(n) for n in names), key=lambda c: not c.is_added_mass)
+            model = Model(h.model.body, tuple(found), np.zeros(len(found)))
+            at = [place[COEFFICIENTS, c.name] for c in found]
+            relative = self._relative(h, motion)
+            out[:, :, at] = regressors(equations(model, h.equations.acting), relative)
+        for key in keys:
+            if key in self.patterns:
+                out[:, :, place[key]] = self.patterns[key]
+        for section in dict.fromkeys(s for s, _ in keys if s in EFFECTS):
+            effect = EFFECTS[section]
+            mine = [p for p in effect.parameters if (section, p.name) in place]
+            # parameters of single axes do not disturb each other: all of them in one go
+            alone = [[p] for p in mine if not p.axis]
+            for group in [*alone, [p for p in mine if p.axis]]:
+                if not group:
+                    continue
+                change = self._difference(h, motion, effect, [p.name for p in group])
+                for p in group:
+                    column = out[:, :, place[section, p.name]]
+                    if p.axis:
+                        axis = AXES.index(p.axis)
+                        column[:, axis] = change[:, axis]
+                    else:
+                        column[:] = change
+        return out
+
+    def _relative(self, h: Hypothesis, motion: Motion) -> Motion:
+        """The motion through the water, where there is a current."""
+        water = h.equations.acting.water
+        if not water.any():
+            return motion
+        drift = np.einsum("kji,j->ki", self.steps.middle, water)
+        turning = np.cross(motion.middle[:, 3:], drift)
+        zero = np.zeros_like(drift)
+        return motion._replace(
+            middle=motion.middle - np.hstack([drift, zero]),
+            pace=motion.pace + np.hstack([turning, zero]),
+        )
+
+    def _wrenches(
+        self, h: Hypothesis, effects: Mapping[str, Mapping[str, float]], motion: Motion
+    ) -> Array:
+        """Wrench effects and current (K, 6) along a motion; the last few are remembered."""
+        acting = compiled(effects)
+        key = (acting.wrench_parameters.tobytes(), acting.water.tobytes())
+        if self._remembered[0] is not motion.middle:
+            self._remembered = motion.middle, {}
+        known = self._remembered[1]
+        if key not in known:
+            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, motion)
+        return known[key]
+
+    def _difference(
+        self, h: Hypothesis, motion: Motion, effect: Effect, names: Sequence[str]
+    ) -> Array:
+        """Change (K, 6) of the wrench per unit of the named parameters, all moved at once."""
+        now = h.effects.get(effect.name) or h.nulls(effect.name)
+        steps, moved = {}, dict(now)
+        for p in effect.parameters:
+            if p.name in names:
+                step = _ONSET_STEP if p.role == "onset" else 1e-3 * p.typical
+                if effect.act is not None and p.role == "amplitude":
+                    step = 0.05 * p.typical
+                steps[p.name] = step if now[p.name] + step <= p.upper else -step
+                moved[p.name] = now[p.name] + steps[p.name]
+        per_unit = np.ones(6)
+        for p in effect.parameters:
+            if p.name in names:
+                per_unit[AXES.index(p.axis) if p.axis else slice(None)] = steps[p.name]
+        before, after = {**h.effects, effect.name: now}, {**h.effects, effect.name: moved}
+        if effect.act is not None:
+            change = self.thrust(after)[0] - self.thrust(before)[0]
+        elif effect.body is not None:
+            base = h.model.body
+            there = effect.body(base, **{k: moved[k] - now[k] for k in now})
+            change = _of_body(there, motion, self.steps) - _of_body(base, motion, self.steps)
+        else:
+            change = self._wrenches(h, after, motion) - self._wrenches(h, before, motion)
+        return change / per_unit
+
+    def errors(self, h: Hypothesis) -> Array:
+        """Measured minus simulated (N, 6) in open loop: velocity and attitude of each window begin
+        as measured and are the simulation's own from there. NaN where it diverges."""
+        mean, slope = self.thrust(h.effects)
+        acting = compiled(h.effects)
+        simulated = np.full((len(self.steps.t), 6), np.nan)
+        for first, last, start in zip(self.first, self.last, self.begin(), strict=True):
+            nodes = slice(first, last + 1)
+            at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
+            with contextlib.suppress(UserError):
+                simulated[nodes] = simulate(
+                    h.model,
+                    self.steps.t[nodes],
+                    mean[at],
+                    start,
+                    orientation=self.orientation[first],
+                    wrench_slope=slope[at],
+                    effects=acting,
+                ).nu
+        return self.measured - simulated[self.nodes]
+
+    # -------------------------------------------------------------- fit
+
+    def begin(self) -> Array:
+        """Starts (W, 6) as measured."""
+        at = np.flatnonzero(np.diff(self.window, prepend=-1))
+        return self.measured[at].copy()
+
+    def fit(
+        self,
+        h: Hypothesis,
+        start: Look | None = None,
+        iterations: int = _ITERATIONS,
+        update_noise: bool = False,
+    ) -> Fitted | None:
+        """Gauss-Newton with step halving, inside the bounds; None where nothing simulates.
+
+        Begins with the starts and the noise of ``start``; the noise is estimated where there is
+        none, or on demand.
+        """
+        if start is None:
+            look, update_noise = self.look(h, self.begin(), np.full(6, 0.02)), True
+        else:
+            look = self.look(h, start.starts, start.noise)
+        if look is None:
+            return None
+        fitted = self._descend(look, iterations)
+        for _ in range(4 if update_noise else 0):
+            noise = fitted.look.rescaled()
+            settled = np.abs(np.log(noise / fitted.noise)).max() < 0.05
+            again = self.look(fitted.hypothesis, fitted.look.starts, noise)
+            assert again is not None
+            if settled:
+                return Fitted(fitted.hypothesis, again, fitted.converged)
+            fitted = self._descend(again, iterations)
+        return fitted
+
+    def _descend(self, look: Look, iterations: int) -> Fitted:
+        """Gauss-Newton at fixed noise."""
+        h = look.hypothesis
+        prior, mean = precision(h), np.array([centre(h.config, key) for key in h.keys])
+        lower, upper = np.array([bounds(k)[1:] for k in h.keys]).reshape(-1, 2).T
+        limit = np.array([reach(key) for key in h.keys])
+        for _ in range(iterations):
+            linear = look.linear
+            value = np.array(list(h.values.values()))
+            slope = linear.gradient.sum(axis=0) + prior * (mean - value)
+            change = _bounded(
+                linear.normal + np.diag(prior),
+                slope,
+                np.maximum(lower - value, -limit),
+                np.minimum(upper - value, limit),
+            )
+            if slope @ change < 1e-4 * linear.count:
+                return Fitted(h, look, True)
+            cost = linear.rss.sum() + prior @ (mean - value) ** 2
+            factor = 1.0
+            while factor > 0.05:
+                there = h.at(dict(zip(h.keys, (value + factor * change).tolist(), strict=True)))
+                found = self.look(there, look.starts_after(factor * change), look.noise)
+                if found is not None:
+                    new = found.linear.rss.sum() + prior @ (mean - value - factor * change) ** 2
+                    if new < cost:
+                        break
+                factor *= 0.4
+            else:
+                return Fitted(h, look, True)
+            assert found is not None
+            h, look = there, found
+            if cost - new < 1e-4 * linear.count:
+                return Fitted(h, look, True)
+        return Fitted(h, look, False)
+
+
+def _bounded(normal: Array, slope: Array, lower: Array, upper: Array) -> Array:
+    """The change that solves ``normal change = slope`` within bounds (active set)."""
+    free = np.ones(len(slope), dtype=bool)
+    change = np.zeros(len(slope))
+    size = np.sqrt(np.diag(normal)) + 1e-12
+    for _ in range(len(slope)):
+        rest = slope - normal[:, ~free] @ change[~free]
+        a = (normal / np.outer(size, size))[np.ix_(free, free)] + 1e-10 * np.eye(free.sum())
+        change[free] = np.linalg.solve(a, (rest / size)[free]) / size[free]
+        beyond = free & ((change < lower) | (change > upper))
+        if not beyond.any():
+            break
+        change[beyond] = np.clip(change[beyond], lower[beyond], upper[beyond])
+        free &= ~beyond
+    return change
+
+
+def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:
+    """What the rigid body adds to the wrench side of the equations, (K, 6)."""
+    mass = body.mass_matrix
+    nu = motion.middle
+    p = nu @ mass.T
+    linear, angular = p[:, :3], p[:, 3:]
+    v, omega = nu[:, :3], nu[:, 3:]
+    coriolis = np.hstack([np.cross(omega, linear), np.cross(omega, angular) + np.cross(v, linear)])
+    down = steps.middle[:, 2, :]
+    wrench: Array = down @ body.restoring.T - motion.pace @ mass.T - coriolis
+    return wrench
+
+
+def _subdivided(t: Array) -> Array:
+    """The instants t and as many between them that no step is longer than _MAX_STEP."""
+    parts = [
+        np.linspace(a, b, max(1, int(np.ceil((b - a) / _MAX_STEP - 1e-6))), endpoint=False)
+        for a, b in itertools.pairwise(t)
+    ]
+    return np.append(np.concatenate(parts), t[-1])

@@ -1,0 +1,477 @@
+"""`explain`: from bags and a configuration to findings, an extended configuration and the series
+that the report draws."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident import config as configuration
+from rov_ident import kinematics
+from rov_ident.coefficients import AXES, VELOCITIES, parse
+from rov_ident.config import Config
+from rov_ident.discrepancy import Search, Trial, Trials
+from rov_ident.effects import EFFECTS
+from rov_ident.errors import UserError
+from rov_ident.evidence import Evidence, Fitted
+from rov_ident.excitation import authority
+from rov_ident.findings import (
+    Alternative,
+    Change,
+    Finding,
+    Findings,
+    Gain,
+    Residual,
+    Value,
+    Verdict,
+)
+from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
+from rov_ident.model import Array
+from rov_ident.scores import SURE, inflation
+from rov_ident.streams import Streams, joined
+
+BLOCK = 10.0  # s; held-out data are whole blocks, and windows for judging are as long
+_WINDOW = 5.0  # s; of the windows of the fit
+_MARGIN = 0.25  # s; cut off beside held-out blocks
+_CHUNK = 2.5  # s; of the bootstrap
+_WORTH = 0.02  # gain from which an effect has practical weight
+_AS_WELL = "fits this bag as well"
+_LIMIT = 3.0  # a simulation further off than so many standard deviations of the motion has failed
+
+Spans = list[tuple[float, float]]
+
+
+def split(duration: float) -> tuple[Spans, Spans]:
+    """Spans to fit and spans to judge on: of ten blocks the second, sixth and ninth are held out.
+
+    A bag of less than four blocks holds out its last third.
+    """
+    fit: Spans = []
+    held: Spans = []
+    count = round(duration / BLOCK)
+    if count < 4:
+        edge = 0.7 * duration
+        return _halved(0.0, edge - _MARGIN), [(edge + _MARGIN, duration)]
+    for i in range(count):
+        begin, end = i * BLOCK, (i + 1) * BLOCK if i + 1 < count else duration
+        if (3 * i + 7) // 10 > (3 * i + 4) // 10:
+            held.append((begin, end))
+        else:
+            fit += _halved(begin + _MARGIN, end - _MARGIN)
+    return fit, held
+
+
+def _halved(begin: float, end: float) -> Spans:
+    edges = np.linspace(begin, end, max(1, round((end - begin) / _WINDOW)) + 1)
+    return list(itertools.pairwise(edges.tolist()))
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Everything that `explain` made of the bags.
+
+    ``extended`` is the configuration with what was found. For pictures: measured velocities (N, 6)
+    at ``t`` (N,) and, by label ("as configured", "retuned", "extended"), open-loop simulations
+    (N, 6) in windows of BLOCK seconds (NaN: diverged); ``held`` are the spans [s] that no fit saw.
+    """
+
+    findings: Findings
+    extended: Config
+    t: Array
+    measured: Array
+    simulated: Mapping[str, Array]
+    held: Sequence[tuple[float, float]]
+
+
+def explain(
+    bags: Sequence[Streams],
+    config: Config,
+    validate: Streams | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Explanation:
+    """Find what the configured simulation lacks.
+
+    ``progress(what, share)`` is called now and then with the share that is done.
+
+    Raises
+    ------
+    UserError
+        If the bags are too short, or the model cannot be simulated at all.
+    """
+    streams, begins = joined(bags)
+    _check(streams, bags)
+    say = progress or (lambda what, share: None)
+    fit: Spans = []
+    held: Spans = []
+    for bag, begin in zip(bags, begins, strict=True):
+        mine, others = split(bag.duration) if validate is None else (whole(bag.duration), [])
+        fit += [(begin + a, begin + b) for a, b in mine]
+        held += [(begin + a, begin + b) for a, b in others]
+
+    say("comparing the sensors", 0.05)
+    judge_streams, judge_spans = (
+        (streams, held) if validate is None else (validate, blocks(validate))
+    )
+    sensors, sensor_std = kinematics.search(streams, config, _inside(fit))
+    sensor_findings = _sensor_findings(
+        streams, judge_streams, config, sensors, sensor_std, fit, judge_spans
+    )
+    sensors = {f.effect: sensors[f.effect] for f in sensor_findings if weighty(f)}
+    streams = kinematics.corrected(streams, sensors)
+    judge_streams = kinematics.corrected(judge_streams, sensors)
+
+    say("refitting the coefficients", 0.1)
+    search = Search(streams, config, fit)
+    path = search.run(lambda what: say("searching: " + what, 0.3))
+    if not path:
+        raise UserError(
+            "the configured model diverges within seconds of simulation: check the signs and sizes "
+            "of its coefficients and the axes of the bag"
+        )
+    say("trying rivals", 0.6)
+    final, trials = search.settle(path[-1], lambda what: say("trying rivals: " + what, 0.7))
+    say("looking at what is left", 0.8)
+    left = search.unexplained(final)
+    if left:
+        final, trials = search.settle(left[-1])
+    residual = _residual(search, final, trials)
+
+    say("judging on held-out data", 0.9)
+    judge = Judge(Evidence(judge_streams, judge_spans))
+    retuned = path[0].hypothesis
+    known = {n: t for n, t in trials.items() if not n.startswith(UNKNOWN)}
+    found = [_finding(search, judge, final, name, trial) for name, trial in known.items()]
+    minor = [f for f in found if not weighty(f)]
+    slight = [k for f in minor for k in search.keys_of(final, f.effect)]
+    patterns = [k for k in final.hypothesis.keys if k[0] == UNKNOWN]
+    if slight or patterns:
+        kept = search.evidence.fit(final.hypothesis.without([*slight, *patterns]), final.look)
+        final = kept or path[0]
+    everything = Evidence(streams, [s for a, b in blocks(streams) for s in _halved(a, b)])
+    last = everything.fit(final.hypothesis, None) or final
+    findings = sorted(
+        [
+            *(f for f in sensor_findings if weighty(f)),
+            *(_with_parameters(search, last, f) for f in found if weighty(f)),
+        ],
+        key=lambda f: -f.gain.percent,
+    )
+    minor += [f for f in sensor_findings if not weighty(f)]
+    extended = _extended(config, last.hypothesis, sensors)
+    tuning = judge.gain(search.given, retuned)
+    verdict: Verdict = "agrees"
+    if residual:
+        verdict = "unexplained"
+    elif findings:
+        verdict = "explained"
+    elif tuning.percent >= 100.0 * _WORTH and tuning.low > 0.0:
+        verdict = "retuned"
+    evidence = Evidence(streams, blocks(streams))
+    simulated = {
+        label: evidence.measured - evidence.errors(h)
+        for label, h in (
+            ("as configured", search.given),
+            ("retuned", retuned),
+            ("extended", final.hypothesis),
+        )
+    }
+    say("done", 1.0)
+    return Explanation(
+        Findings(
+            judge.rmse(search.given),
+            judge.rmse(retuned),
+            _changed(config, path[0]),
+            tuple(findings),
+            tuple(minor),
+            tuple(residual),
+            judge.rmse(final.hypothesis),
+            verdict,
+        ),
+        extended,
+        evidence.times,
+        evidence.measured,
+        simulated,
+        judge_spans if validate is None else [],
+    )
+
+
+def weighty(finding: Finding) -> bool:
+    """Whether an effect is of practical weight."""
+    return finding.gain.percent >= 100.0 * _WORTH and finding.gain.low > 0.0
+
+
+def whole(duration: float) -> Spans:
+    """Spans to fit where everything may be used."""
+    return _halved(0.0, duration)
+
+
+def blocks(streams: Streams) -> Spans:
+    """The whole bag in blocks."""
+    count = max(1, int(streams.t[-1] // BLOCK))
+    edges = [*(BLOCK * i for i in range(count)), float(streams.t[-1]) + 1e-6]
+    return list(itertools.pairwise(edges))
+
+
+def _inside(spans: Spans) -> Callable[[Array], NDArray[np.bool_]]:
+    def inside(t: Array) -> NDArray[np.bool_]:
+        out: NDArray[np.bool_] = np.zeros(len(t), dtype=bool)
+        for begin, end in spans:
+            out |= (t >= begin) & (t < end)
+        return out
+
+    return inside
+
+
+def _check(streams: Streams, bags: Sequence[Streams]) -> None:
+    total = sum(bag.duration for bag in bags)
+    if total < 20.0:
+        raise UserError(
+            f"the bags hold {total:.0f} s of data: at least 20 s are needed to find anything"
+        )
+
+
+class Judge:
+    """Open-loop simulation on data that no fit has seen."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self._evidence = evidence
+        self._limit = _LIMIT * evidence.measured.std(axis=0) + 1e-9
+        times = evidence.times
+        self._chunk = (times / _CHUNK).astype(int)
+
+    def squares(self, h: Hypothesis) -> Array:
+        """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
+        error = np.abs(self._evidence.errors(h))
+        capped: Array = np.where(error < self._limit, error, self._limit) ** 2
+        return capped
+
+    def rmse(self, h: Hypothesis) -> dict[str, float]:
+        error = np.sqrt(self.squares(h).mean(axis=0))
+        return dict(zip(VELOCITIES, error.tolist(), strict=True))
+
+    def gain(self, before: Hypothesis, after: Hypothesis) -> Gain:
+        """Of the component that gains most."""
+        a, b = self.squares(before), self.squares(after)
+        ratio = np.sqrt(b.mean(axis=0) / a.mean(axis=0))
+        best = int(np.argmin(ratio))
+        return gain_of(VELOCITIES[best], a[:, best], b[:, best], self._chunk)
+
+
+def gain_of(component: str, before: Array, after: Array, chunk: NDArray[np.int64]) -> Gain:
+    """Gain from squared errors (N,), its interval from resampled chunks of time."""
+    _, at = np.unique(chunk, return_inverse=True)
+    a, b = np.bincount(at, before), np.bincount(at, after)
+    rng = np.random.default_rng(0)
+    draws = rng.integers(0, len(a), (1000, len(a)))
+    percent = 100.0 * (1.0 - np.sqrt(b[draws].sum(axis=1) / a[draws].sum(axis=1)))
+    low, high = np.quantile(percent, [0.025, 0.975])
+    return Gain(
+        component,
+        float(np.sqrt(before.mean())),
+        float(np.sqrt(after.mean())),
+        float(100.0 * (1.0 - np.sqrt(b.sum() / a.sum()))),
+        float(low),
+        float(high),
+    )
+
+
+# ------------------------------------------------------------------ findings
+
+
+def _sensor_findings(
+    streams: Streams,
+    judge_streams: Streams,
+    config: Config,
+    found: Mapping[str, Mapping[str, float]],
+    std: Mapping[Key, float],
+    fit: Spans,
+    held: Spans,
+) -> list[Finding]:
+    findings = []
+    inside, outside = _inside(fit), _inside(held)
+    for name in found:
+        others = [n for n in found if n != name]
+        rest, _ = kinematics.search(streams, config, inside, others)
+        a = kinematics.blocks(judge_streams, config, rest)
+        b = kinematics.blocks(judge_streams, config, found)
+        gains = []
+        for before, after in zip(a, b, strict=True):
+            scale = after.scale / before.scale
+            x, y = outside(before.t), outside(after.t)
+            t, common = np.unique(np.round(before.t[x], 6)), np.unique(np.round(after.t[y], 6))
+            t = np.intersect1d(t, common)
+            p = _by_time(before.t[x], (before.r[x] / scale) ** 2, t)
+            q = _by_time(after.t[y], after.r[y] ** 2, t)
+            gains.append(gain_of("kinematic", p, q, (t / _CHUNK).astype(int)))
+        gain = max(gains, key=lambda g: g.percent)
+        parameters = {
+            p.name: Value(found[name][p.name], std[name, p.name], p.unit)
+            for p in EFFECTS[name].parameters
+        }
+        findings.append(
+            Finding(
+                name,
+                (),
+                parameters,
+                None,
+                gain,
+                True,
+                None,
+                (),
+                sentence(name, parameters, gain),
+            )
+        )
+    return findings
+
+
+def _by_time(t: Array, squares: Array, at: Array) -> Array:
+    index = np.searchsorted(at, np.round(t, 6))
+    good = (index < len(at)) & (at[np.minimum(index, len(at) - 1)] == np.round(t, 6))
+    return np.asarray(np.bincount(index[good], squares[good], len(at)), dtype=np.float64)
+
+
+def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Trial) -> Finding:
+    keys = search.keys_of(final, name)
+    gain = judge.gain(trial.rest.hypothesis, final.hypothesis)
+    best = search.cost(final, final)
+    explained = trial.rest.rss - final.rss
+    alternatives, separable = [], True
+    for rival, fitted in trial.rivals.items():
+        if rival.startswith(UNKNOWN):
+            continue
+        share = (trial.rest.rss - fitted.rss) / max(explained, 1e-9)
+        if search.cost(fitted, final) - best < SURE:
+            separable = False
+            why = _AS_WELL
+        else:
+            why = f"fitted in its stead, it explains only {100 * share:.0f} % of this"
+        alternatives.append((share, Alternative(rival, why)))
+    if not separable:
+        alternatives = [a for a in alternatives if a[1].why_not == _AS_WELL]
+    parameters = parameters_of(search.config, final, keys)
+    onset = parameters.get("onset")
+    return Finding(
+        name,
+        _axes(search, final, keys),
+        parameters,
+        None if onset is None else onset.value,
+        gain,
+        separable,
+        None if separable else manoeuvre(name),
+        tuple(a for _, a in sorted(alternatives, key=lambda x: -x[0])),
+        sentence(name, parameters, gain),
+    )
+
+
+def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
+    """The finding with the values that all of the data give."""
+    keys = search.keys_of(last, finding.effect)
+    parameters = parameters_of(search.config, last, keys)
+    onset = parameters.get("onset")
+    return dataclasses.replace(
+        finding,
+        parameters=parameters,
+        onset_s=None if onset is None else onset.value,
+        sentence=sentence(finding.effect, parameters, finding.gain),
+    )
+
+
+def covariance(final: Fitted) -> Array:
+    """Covariance (P, P) of the parameters, widened by what coloured residuals take away."""
+    linear = final.linear
+    size = np.sqrt(np.maximum(np.diag(linear.normal), 1e-30))
+    inverse = np.linalg.pinv(linear.normal / np.outer(size, size), hermitian=True)
+    kappa = inflation(linear, np.arange(len(linear.keys)))
+    out: Array = kappa * inverse / np.outer(size, size)
+    return out
+
+
+def parameters_of(config: Config, final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:
+    h, linear = final.hypothesis, final.linear
+    wide = covariance(final)
+    out = {}
+    for key in keys:
+        at = linear.index([key])[0]
+        value, variance = h.values[key], wide[at, at]
+        section, name = key
+        unit = parse(name).unit if section == COEFFICIENTS else parameter(key).unit
+        positive = name.removesuffix("_neg")
+        if positive != name:  # told as the coefficient that holds for negative velocity
+            name, other = positive, (COEFFICIENTS, positive)
+            value += h.coefficients.get(positive, 0.0)
+            if other in h.values:
+                o = linear.index([other])[0]
+                variance += wide[o, o] + 2.0 * wide[at, o]
+        out[name] = Value(float(value), float(np.sqrt(max(variance, 0.0))), unit)
+    return out
+
+
+def _axes(search: Search, final: Fitted, keys: Sequence[Key]) -> tuple[str, ...]:
+    """The axes on which an effect acts, by what it does to the wrench."""
+    h, look = final.hypothesis, final.look
+    force = search.evidence.columns(h, look.motion, keys)
+    change = force @ np.array([h.values[k] - bounds(k)[0] for k in keys])
+    power = np.sqrt(np.mean(change**2, axis=0)) / authority(search.config.model)
+    return tuple(a for a, p in zip(AXES, power, strict=True) if p > 0.2 * power.max() > 0.0)
+
+
+def manoeuvre(name: str) -> str:
+    """The run that tells an effect from its neighbours."""
+    return EFFECTS[name].manoeuvre
+
+
+def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
+    """A finding in one sentence."""
+    values = ", ".join(
+        f"{n} = {v.value:.3g}{'' if v.unit == '1' else ' ' + v.unit} (± {1.96 * v.std:.2g})"
+        for n, v in parameters.items()
+    )
+    if gain.component == "kinematic":
+        what = "agreement of the sensors"
+    else:
+        what = f"{BLOCK:.0f} s prediction of {_MOTIONS[gain.component]}"
+    return f"{EFFECTS[name].summary} {values}. The {what} improves by {gain.percent:.0f} %."
+
+
+_MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll", "pitch", "yaw"), strict=True))
+
+
+def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:
+    """What the patterns in a model say: where something is left that has no name."""
+    found = []
+    for name, trial in trials.items():
+        if not name.startswith(UNKNOWN):
+            continue
+        axis, depends_on, frequency = name.removeprefix(f"{UNKNOWN} ").split("|")
+        i = AXES.index(axis)
+        before, after = (np.sum(f.look.clean()[:, i] ** 2) for f in (trial.rest, final))
+        share = float(1.0 - after / before)
+        if share >= _WORTH:
+            found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
+    return sorted(found, key=lambda r: -r.share)
+
+
+def _changed(config: Config, retuned: Fitted) -> dict[str, Change]:
+    wide = covariance(retuned)
+    changed = {}
+    for i, ((_, name), value) in enumerate(retuned.hypothesis.values.items()):
+        before = float(config.model.theta[config.model.names.index(name)])
+        std = float(np.sqrt(wide[i, i]))
+        if abs(value - before) > 2.0 * std:
+            changed[name] = Change(before, float(value), std, parse(name).unit)
+    return changed
+
+
+def _extended(config: Config, h: Hypothesis, sensors: Mapping[str, Mapping[str, float]]) -> Config:
+    """The configuration with what was found."""
+    document = configuration.to_parameters(config)
+    document["coefficients"] = {**document["coefficients"], **h.coefficients}
+    effects = {**h.effects}
+    for name, values in sensors.items():
+        effects[name] = dict(values)
+    if effects:
+        document["effects"] = effects
+    return configuration.from_parameters(document)

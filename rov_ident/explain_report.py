@@ -1,0 +1,568 @@
+"""What `explain` found, told: the page, and the sentences that page and terminal share."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from rov_ident import config as configuration
+from rov_ident import plots, report
+from rov_ident.coefficients import AXES, VELOCITIES, parse
+from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
+from rov_ident.explain import BLOCK, Explanation
+from rov_ident.findings import Finding, Findings, Gain, Residual, Value
+from rov_ident.fit import write_text
+from rov_ident.model import Array
+
+Mask = NDArray[np.bool_]
+
+
+class Source(NamedTuple):
+    """A bag that was read."""
+
+    name: str
+    sha256: str
+
+
+UNITS = dict(zip(VELOCITIES, ("m/s",) * 3 + ("rad/s",) * 3))
+MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
+SENSES = dict(
+    zip(
+        VELOCITIES,
+        (
+            ("astern", "forward"), ("to port", "to starboard"), ("up", "down"),
+            ("to port", "to starboard"), ("bow down", "bow up"), ("to port", "to starboard"),
+        ),
+    )
+)  # fmt: skip
+"""What a negative and a positive velocity mean."""
+
+_TOLD = 3  # parameters of an effect in the verdict
+_SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
+_STRETCH = 30.0  # s of motion that is shown
+_BIN = 5.0  # s; of the error over time
+_MOST_BINS = 60
+_SPEED_BINS = 11
+_LEAST = 20  # samples in a bin, below which its error means nothing
+_STILL = 0.05  # of the largest motion: below it an axis counts as not moved
+_GAP = 1.0  # s without a measurement: curves break
+
+
+# ------------------------------------------------------------------ in words
+
+
+def number(x: float, digits: int = 3) -> str:
+    """With so many significant digits, without an exponent where that can be read."""
+    if not math.isfinite(x):
+        return "-"
+    if x == 0.0:
+        return "0"
+    decimals = digits - 1 - math.floor(math.log10(abs(x)))
+    if decimals > 7:
+        return f"{x:.{digits - 1}e}"
+    return f"{round(x, decimals):.{max(decimals, 0)}f}"
+
+
+def estimate(value: float, std: float) -> tuple[str, str]:
+    """A value with the digits that its standard deviation leaves, and the standard deviation."""
+    if not (math.isfinite(std) and std > 0.0):
+        return number(value, 4), "-"
+    decimals = 1 - math.floor(math.log10(std))
+    return f"{round(value, decimals):.{min(max(decimals, 0), 9)}f}", number(std, 2)
+
+
+def with_unit(text: str, unit: str) -> str:
+    return text if unit == "1" else f"{text} {unit}"
+
+
+def valued(name: str, v: Value) -> str:
+    """A parameter with its standard deviation and unit."""
+    value, std = estimate(v.value, v.std)
+    return with_unit(f"{name} {value} ± {std}", v.unit)
+
+
+def called(effect: str) -> str:
+    """The name of an effect as words."""
+    return effect.replace("_", " ").replace("imu", "IMU").replace("cog", "CG")
+
+
+def predicted(component: str) -> str:
+    return f"{BLOCK:.0f} s prediction of {MOTIONS[component]}"
+
+
+def listed(items: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(items[:-1]), *items[-1:]]))
+
+
+def verdict(findings: Findings) -> str:
+    """The whole result in two or three sentences."""
+    named = _named(findings.effects)
+    if findings.verdict == "agrees":
+        return "The simulation agrees with the measurement: there is nothing to change."
+    if findings.verdict == "retuned":
+        return (
+            "The structure of the simulation is right, its coefficients are off. "
+            + _improvement("Retuned", findings.baseline, findings.retuned)
+        )
+    if findings.verdict == "explained":
+        return named
+    left = (
+        "Something is left that no effect of the library explains: "
+        + "; ".join(dependence(r) for r in findings.residual)
+        + "."
+    )
+    return f"{left} {named}".strip()
+
+
+def _named(effects: Sequence[Finding]) -> str:
+    """What is missing, and what it gains."""
+    if not effects:
+        return ""
+    sensors = [brief(f) for f in effects if EFFECTS[f.effect].sense is not None]
+    others = [brief(f) for f in effects if EFFECTS[f.effect].sense is None]
+    parts = [f"The simulation lacks {listed(others)}"] if others else []
+    parts += [f"{'the' if others else 'The'} sensors show {listed(sensors)}"] if sensors else []
+    gains = listed([_gained(f.gain) for f in effects])
+    return f"{'; '.join(parts)}. With {'it' if len(effects) == 1 else 'these'}, {gains}."
+
+
+def brief(finding: Finding) -> str:
+    """An effect with the parameters that matter most, in the middle of a sentence."""
+    declared = {p.name: p for p in EFFECTS[finding.effect].parameters}
+    size = {}  # how far from nothing, in typical sizes; coefficients are not told apart
+    for name, v in finding.parameters.items():
+        p = declared.get(name)
+        if p is None:
+            size[name] = 1.0
+        elif p.role in ("amplitude", "place"):
+            size[name] = abs(v.value - p.null) / p.typical
+    told = [name for name, s in size.items() if s > _SMALL * max(size.values())][:_TOLD]
+    told += [p.name for p in declared.values() if p.role in ("onset", "frequency")]
+    values = [
+        f"{name.replace('_', ' ') if name in declared else name} "
+        + with_unit(number(v.value, 2), v.unit)
+        for name, v in finding.parameters.items()
+        if name in told
+    ]
+    doubt = "" if finding.separable else "; this run cannot tell it from others"
+    return f"{called(finding.effect)} ({', '.join(values)}{doubt})"
+
+
+def _gained(gain: Gain) -> str:
+    what = (
+        "the agreement of the sensors"
+        if gain.component == "kinematic"
+        else f"the {predicted(gain.component)}"
+    )
+    return f"{what} improves by {gain.percent:.0f} %"
+
+
+def _improvement(subject: str, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    """Of the component that improves most."""
+    best = max(before, key=lambda c: 1.0 - after[c] / max(before[c], 1e-12))
+    percent = 100.0 * (1.0 - after[best] / max(before[best], 1e-12))
+    return f"{subject}, the {predicted(best)} improves by {percent:.0f} %."
+
+
+def dependence(r: Residual) -> str:
+    """What is left on an axis, in words."""
+    kind = "force" if r.axis in AXES[:3] else "moment"
+    at = "" if r.frequency_hz is None else f" at {number(r.frequency_hz, 2)} Hz"
+    return (
+        f"a {kind} {r.axis} that depends on {r.depends_on}{at} "
+        f"({100.0 * r.share:.0f} % of what is left on {r.axis})"
+    )
+
+
+def interval(gain: Gain) -> str:
+    """A gain with its interval, on what it was measured, from what to what."""
+    if gain.component == "kinematic":
+        what, unit = "disagreement of the sensors", "times their noise"
+    else:
+        what, unit = predicted(gain.component), UNITS[gain.component]
+    return (
+        f"{gain.percent:.1f} % (95 %: {gain.low:.1f} to {gain.high:.1f} %) on the {what}: RMSE "
+        f"{number(gain.rmse_before)} without it, {number(gain.rmse_after)} {unit} with it"
+    )
+
+
+def origin(bags: Sequence[Source], config: Path, validate: Source | None) -> dict[str, Any]:
+    """What the findings were made from."""
+    made: dict[str, Any] = {
+        "rov_ident": version("rov_ident"),
+        "config": config.name,
+        "bags": [bag._asdict() for bag in bags],
+    }
+    return made if validate is None else made | {"validate": validate._asdict()}
+
+
+def write(explanation: Explanation, before: Config, folder: Path) -> None:
+    """findings.json, report.html and extended.yaml, each whole or not at all.
+
+    Raises
+    ------
+    UserError
+        If they cannot be written there.
+    """
+    findings = explanation.findings
+    html, bags = page(explanation, before), findings.provenance.get("bags", [])
+    comment = f"{verdict(findings)}\nFound by rov-ident explain in {_plain(bags)}."
+    write_text(folder / "findings.json", findings.to_json())
+    write_text(folder / "report.html", html)
+    configuration.dump(explanation.extended, folder / "extended.yaml", comment)
+
+
+# ------------------------------------------------------------------ the page
+
+
+def page(explanation: Explanation, before: Config) -> str:
+    """The report as one HTML document; ``before`` is the configuration that was judged."""
+    f = explanation.findings
+    shown = _shown(explanation)
+    rmse = {"as configured": f.baseline, "retuned": f.retuned, "extended": f.extended}
+    rmse = {label: rmse[label] for label in shown}
+    key = _legend(shown)
+    sections = [
+        report.beside(
+            [report.heading("What to change"), *_change(before, explanation)],
+            [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))],
+        ),
+        report.heading("Measured and simulated"),
+        _legend([plots.MEASURED, *shown]),
+        *_motion(explanation, shown),
+        report.heading("Where and when it departs"),
+        report.paragraph(_worst(explanation, f.baseline)),
+        key,
+        *_departures(explanation, shown),
+    ]
+    if f.effects:
+        sections.append(report.heading("What is missing, and how sure that is"))
+        sections += [_card(finding) for finding in f.effects]
+    if f.minor:
+        sections.append(report.heading("Minor effects"))
+        sections.append(
+            report.paragraph("Seen in the data, but of less than 2 % gain or not surely of any.")
+        )
+        rows = [
+            [called(m.effect), ", ".join(valued(n, v) for n, v in m.parameters.items()),
+             f"{m.gain.percent:.1f} %"]
+            for m in f.minor
+        ]  # fmt: skip
+        sections.append(report.table(["effect", "parameters", "gain"], rows, text=(1,)))
+    sections.append(report.heading("What is left"))
+    if f.residual:
+        sections.append(report.bullets([f"{dependence(r)[2:]}." for r in f.residual]))
+        sections.append(
+            report.paragraph(
+                "No effect of the library has this form: look for a cause that depends on the "
+                "same thing, on the vehicle or in the recording."
+            )
+        )
+    else:
+        sections.append(report.paragraph("Nothing that depends on motion, place or time."))
+    sections += _retuned(f)
+    if f.notes:
+        sections += [report.heading("Notes"), report.bullets(f.notes)]
+    return report.page(
+        f"{before.name}: what the simulation lacks", verdict(f), sections, _origin(f)
+    )
+
+
+def _shown(explanation: Explanation) -> dict[str, Array]:
+    """Simulations by label; without effects there is nothing that extends the retuned model."""
+    f = explanation.findings
+    shown = {label: explanation.simulated[label] for label in plots.MODELS}
+    if not f.effects:
+        del shown["extended"]
+    return shown
+
+
+def _legend(labels: Iterable[str]) -> str:
+    entries = {}
+    for label in labels:
+        if label == plots.MEASURED:
+            entries[label] = "currentColor", "none", 0.35
+            continue
+        colour, dashes = plots.MODELS[label]
+        pattern = " ".join(f"{3.0 * d:g}" for d in dashes) or "none"
+        entries[label] = plots.css(colour), pattern, 1.0
+    return report.legend(entries)
+
+
+def _change(before: Config, explanation: Explanation) -> list[str]:
+    old = configuration.to_parameters(before)
+    new = configuration.to_parameters(explanation.extended)
+    news = {k: new[k] for k in sorted(new, key=lambda k: k != "effects")}  # what is new first
+    lines = _lines(old, news)
+    if explanation.findings.verdict == "agrees" or not lines:
+        return [
+            report.paragraph(
+                "Nothing. extended.yaml holds the refitted coefficients, which predict no better."
+            )
+        ]
+    width = max(len(line) for line, _ in lines)
+    text = "\n".join(f"{line:<{width}}  {was}".rstrip() for line, was in lines)
+    return [
+        report.code(text),
+        report.paragraph("extended.yaml has these lines in full and is ready for every command."),
+    ]
+
+
+def _lines(old: Any, new: Mapping[str, Any], depth: int = 0) -> list[tuple[str, str]]:
+    """What differs, as lines of YAML, each with a comment that tells what was there."""
+    lines = []
+    for key, value in new.items():
+        was = old.get(key) if isinstance(old, Mapping) else None
+        start = "  " * depth + f"{key}:"
+        if isinstance(value, Mapping):
+            inside = _lines(was, value, depth + 1)
+            lines += [(start, ""), *inside] if inside else []
+        elif value != was:
+            comment = "# new" if was is None else f"# was {_yaml(was)}"
+            lines.append((f"{start} {_yaml(value)}", comment))
+    return lines
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, float):
+        return number(value, 4)
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_yaml, value)) + "]"
+    return str(value)
+
+
+def _gains(rmse: Mapping[str, Mapping[str, float]], held: bool) -> list[str]:
+    pictures = []
+    for name, group in (("linear", VELOCITIES[:3]), ("angular", VELOCITIES[3:])):
+        values = {label: np.array([by[c] for c in group]) for label, by in rmse.items()}
+        figure = plots.bars([MOTIONS[c] for c in group], values, "", f"RMSE [{UNITS[group[0]]}]")
+        pictures.append(plots.to_svg(figure, f"bars-{name}-"))
+    where = "data that no fit has seen" if held else "the bag given by --validate"
+    caption = f"Error of the {BLOCK:.0f} s open-loop prediction on {where}; lower is better."
+    return [report.panels(pictures, caption)]
+
+
+def _motion(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
+    t, measured = explanation.t, explanation.measured
+    part, pauses, starts = _stretch(explanation)
+    pictures = [
+        plots.to_svg(
+            plots.curves(
+                t[part],
+                {label: np.where(starts, np.nan, run[part, i]) for label, run in shown.items()},
+                MOTIONS[c],
+                "time [s]",
+                f"{c} [{UNITS[c]}]",
+                measured=np.where(pauses, np.nan, measured[part, i]),
+                shaded=explanation.held,
+            ),
+            f"motion-{c}-",
+        )
+        for i, c in enumerate(VELOCITIES)
+    ]
+    held = bool(explanation.held)
+    block = "held-out block (shaded: seen by no fit)" if held else "block"
+    caption = (
+        f"{min(_STRETCH, t[-1] - t[0]):.0f} s around the {block} in which the simulation as "
+        f"configured is furthest off. Every {BLOCK:.0f} s each simulation starts anew from the "
+        "measured state; from there the recorded wrench alone drives it."
+    )
+    return [report.panels(pictures, caption, wide=True)]
+
+
+def _stretch(explanation: Explanation) -> tuple[Mask, Mask, Mask]:
+    """Which samples the picture shows; of these, which follow a gap, and which begin a window."""
+    begin = _furthest(explanation)
+    part = (explanation.t >= begin) & (explanation.t < begin + _STRETCH)
+    t = explanation.t[part]
+    pauses = np.diff(t, prepend=t[0]) > _GAP
+    # a simulation starts anew from the measurement in every window: no line joins two of them
+    starts = pauses | (np.diff(t // BLOCK, prepend=-1.0) != 0.0)
+    return part, pauses, starts
+
+
+def _furthest(explanation: Explanation) -> float:
+    """Where the stretch begins: around the held-out block in which today's simulation is worst."""
+    t = explanation.t
+    error = explanation.measured - explanation.simulated["as configured"]
+    size = explanation.measured.std(axis=0) + 1e-9
+    relative = np.nan_to_num(np.minimum(np.abs(error / size), 3.0), nan=3.0) ** 2
+    spans = explanation.held or [(b, b + BLOCK) for b in np.arange(t[0], t[-1], BLOCK)]
+    parts = [(t >= begin) & (t < end) for begin, end in spans]
+    begin, end = spans[int(np.argmax([relative[p].mean() if p.any() else 0.0 for p in parts]))]
+    first = BLOCK * round((0.5 * (begin + end) - 0.5 * _STRETCH) / BLOCK)
+    return max(float(t[0]), min(first, float(t[-1]) - _STRETCH))
+
+
+def _worst(explanation: Explanation, baseline: Mapping[str, float]) -> str:
+    size = explanation.measured.std(axis=0)
+    largest = np.repeat([size[:3].max(), size[3:].max()], 3)
+    moving = {c: float(s) for c, s, m in zip(VELOCITIES, size, largest) if s > _STILL * m}
+    if not moving:
+        return "The vehicle does not move."
+    worst = max(moving, key=lambda c: baseline[c] / moving[c])
+    return (
+        f"As configured it is furthest off in {MOTIONS[worst]}, measured by how much the vehicle "
+        f"moves: an error of {number(baseline[worst], 2)} {UNITS[worst]} on a motion of "
+        f"{number(moving[worst], 2)} {UNITS[worst]} (RMS)."
+    )
+
+
+def _departures(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
+    """Errors over time and over the vehicle's own speed."""
+    t, measured = explanation.t, explanation.measured
+    errors = {label: run - measured for label, run in shown.items()}
+    step = max(_BIN, float(t[-1]) / _MOST_BINS)
+    edges = np.arange(0.0, float(t[-1]) + step, step)
+    over_time, over_speed = [], []
+    for i, c in enumerate(VELOCITIES):
+        unit = UNITS[c]
+        figure = plots.curves(
+            0.5 * (edges[1:] + edges[:-1]),
+            {label: binned(t, e[:, i], edges) for label, e in errors.items()},
+            MOTIONS[c],
+            "time [s]",
+            f"RMS error [{unit}]",
+            shaded=explanation.held,
+        )
+        over_time.append(plots.to_svg(figure, f"time-{c}-"))
+        slots, by_speed = _by_speed(explanation, shown, i)
+        figure = plots.curves(
+            slots,
+            by_speed,
+            MOTIONS[c],
+            _directions(c),
+            f"RMS error [{unit}]",
+            marker="o",
+        )
+        over_speed.append(plots.to_svg(figure, f"speed-{c}-"))
+    return [
+        report.panels(over_time, f"Over the time of the bag, in steps of {step:.0f} s."),
+        report.panels(
+            over_speed,
+            "Over the vehicle's own velocity: an error that grows with speed points to damping or "
+            "thrust, one that differs left and right of zero to an asymmetry, one at rest to "
+            "weight, current or deadband. All data, fitted and held out.",
+        ),
+    ]
+
+
+def _by_speed(
+    explanation: Explanation, shown: Mapping[str, Array], i: int
+) -> tuple[Array, dict[str, Array]]:
+    """RMS errors of component i over its own velocity: the middles of the bins, and by label."""
+    own = explanation.measured[:, i]
+    low, high = np.quantile(own, [0.01, 0.99])
+    edges = np.linspace(low, high, _SPEED_BINS + 1)
+    errors = {label: binned(own, run[:, i] - own, edges) for label, run in shown.items()}
+    return 0.5 * (edges[1:] + edges[:-1]), errors
+
+
+def _directions(component: str) -> str:
+    backward, forward = SENSES[component]
+    space = "\u2003\u2003"
+    return f"\u2190 {backward}{space}{component} [{UNITS[component]}]{space}{forward} \u2192"
+
+
+def binned(x: Array, error: Array, edges: Array) -> Array:
+    """Root mean square error (n,) between the edges (n + 1,) of x; NaN where there is little."""
+    place = np.digitize(x, edges) - 1
+    inside = (place >= 0) & (place < len(edges) - 1) & np.isfinite(error)
+    count = np.bincount(place[inside], minlength=len(edges) - 1)
+    total = np.bincount(place[inside], error[inside] ** 2, len(edges) - 1)
+    out: Array = np.sqrt(np.where(count >= _LEAST, total, np.nan) / np.maximum(count, 1))
+    return out
+
+
+def _card(finding: Finding) -> str:
+    effect, name = EFFECTS[finding.effect], called(finding.effect)
+    meanings = {p.name: p.meaning for p in effect.parameters}
+    rows = []
+    for symbol, v in finding.parameters.items():
+        meaning = meanings.get(symbol) or parse(symbol).meaning
+        rows.append([symbol, *estimate(v.value, v.std), "" if v.unit == "1" else v.unit, meaning])
+    parts = [
+        report.paragraph(effect.summary),
+        report.table(["", "value", "std", "unit", "meaning"], rows, text=(3, 4)),
+        report.paragraph(f"Gain on data that no fit has seen: {interval(finding.gain)}."),
+    ]
+    if finding.axes:
+        parts.append(report.paragraph(f"It acts on {listed(finding.axes)}."))
+    if finding.alternatives:
+        tried = [f"{called(a.effect)}: {a.why_not}" for a in finding.alternatives]
+        heard = "Why nothing else" if finding.separable else "What else it may be"
+        parts += [report.paragraph(f"{heard}:"), report.bullets(tried)]
+    if not finding.separable:
+        parts.append(
+            report.paragraph(
+                "This bag cannot tell them apart. The run that would: "
+                f"{finding.manoeuvre or effect.manoeuvre}."
+            )
+        )
+    return report.card(name[0].upper() + name[1:], parts)
+
+
+def _retuned(f: Findings) -> list[str]:
+    if not f.changed:
+        return []
+    rows = []
+    for name, c in f.changed.items():
+        after, std = estimate(c.after, c.std)
+        sigma = number(abs(c.after - c.before) / c.std, 2) if c.std > 0.0 else "-"
+        rows.append([name, number(c.before, 4), after, std, c.unit, sigma, parse(name).meaning])
+    return [
+        report.heading("Retuned coefficients"),
+        report.paragraph(
+            "What refitting the coefficients that the simulation already has makes of them, "
+            "before any effect is added. The values in extended.yaml were refitted together with "
+            "the effects and may differ."
+        ),
+        report.table(["", "from", "to", "std", "unit", "off by [std]", "meaning"], rows, (4, 6)),
+    ]
+
+
+def _origin(f: Findings) -> str:
+    """Version, bags and configuration in one line."""
+    return " · ".join(f"{key}: {_plain(value)}" for key, value in f.provenance.items())
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return " ".join(map(_plain, value.values()))
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    return str(value)
+
+
+def picture(explanation: Explanation) -> Figure:
+    """The report in one picture: motion, gain and departure of the velocity that gains most."""
+    gains = [f.gain.component for f in explanation.findings.effects]
+    c = next((c for c in gains if c in VELOCITIES), "u")
+    i = VELOCITIES.index(c)
+    shown, f = _shown(explanation), explanation.findings
+    rmse = {"as configured": f.baseline, "retuned": f.retuned, "extended": f.extended}
+    figure, (motion, linear, angular, speed) = plots.overview(verdict(f))
+    part, pauses, starts = _stretch(explanation)
+    motion.set(xlabel="time [s]", ylabel=f"{MOTIONS[c]} [{UNITS[c]}]")
+    plots.draw_curves(
+        motion,
+        explanation.t[part],
+        {label: np.where(starts, np.nan, run[part, i]) for label, run in shown.items()},
+        measured=np.where(pauses, np.nan, explanation.measured[part, i]),
+        shaded=explanation.held,
+    )
+    for ax, group in ((linear, VELOCITIES[:3]), (angular, VELOCITIES[3:])):
+        values = {label: np.array([rmse[label][c] for c in group]) for label in shown}
+        plots.draw_bars(ax, [MOTIONS[c] for c in group], values)
+        ax.set_ylabel(f"RMSE, {BLOCK:.0f} s ahead [{UNITS[group[0]]}]")
+    slots, errors = _by_speed(explanation, shown, i)
+    plots.draw_curves(speed, slots, errors, marker="o")
+    speed.set(xlabel=_directions(c), ylabel=f"RMS error [{UNITS[c]}]")
+    plots.outside_legend(figure, motion)
+    return figure

@@ -1,0 +1,150 @@
+"""A bag as its raw messages in arrays: what the search for a discrepancy works on.
+
+The estimators see samples (``samples.py``), in which odometry and IMU are already blended. Whether
+one sensor contradicts another shows only before that.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.errors import UserError
+from rov_ident.messages import Array, Message
+from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
+
+_PAUSE = 60.0  # s between two bags that are searched as one
+
+
+@dataclass(frozen=True)
+class Streams:
+    """The three topics in core axes (FRD, NED); times in seconds since the first message.
+
+    odometry: ``t`` (N,), position (N, 3), orientation (N, 4) w x y z, nu (N, 6) as measured.
+    IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
+    wrench: ``demand_t`` (K,), demand (K, 6), each held to the next.
+    ``has_pose`` tells whether the positions mean anything.
+    """
+
+    t: Array
+    position: Array
+    orientation: Array
+    nu: Array
+    imu_t: Array
+    gyro: Array
+    specific_force: Array
+    demand_t: Array
+    demand: Array
+
+    @property
+    def has_pose(self) -> bool:
+        return bool(np.ptp(self.position, axis=0).max() > 0.0)
+
+    @property
+    def duration(self) -> float:
+        return float(self.t[-1])
+
+
+def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
+    """Arrays from messages as they are on the wire; what cannot be used is left out.
+
+    Raises
+    ------
+    UserError
+        If odometry or wrench are missing.
+    """
+    recorder = _Recorder(config)
+    for role, message in messages:
+        recorder.push(role, message)
+    odometry, imu, wrench = (recorder.taken[role] for role in (ODOMETRY, IMU, WRENCH))
+    for name, found in (("odometry", odometry), ("wrench", wrench)):
+        if len(found) < 2:
+            raise UserError(f"the bag holds no usable {name} messages")
+    return Streams(
+        np.array([t for t, _ in odometry]),
+        np.array([m.position for _, m in odometry]),
+        _continuous(np.array([m.orientation for _, m in odometry])),
+        np.array([np.concatenate([m.linear, m.angular]) for _, m in odometry]),
+        np.array([t for t, _ in imu]),
+        np.array([m.angular_velocity for _, m in imu]).reshape(-1, 3),
+        np.array([m.linear_acceleration for _, m in imu]).reshape(-1, 3),
+        np.array([t for t, _ in wrench]),
+        np.array([np.concatenate([m.force, m.torque]) for _, m in wrench]),
+    )
+
+
+def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
+    """Several bags as one, with gaps between them, and the time [s] at which each begins."""
+    begins, begin = [], 0.0
+    for bag in bags:
+        begins.append(begin)
+        begin += bag.duration + _PAUSE
+    if len(bags) == 1:
+        return bags[0], begins
+
+    def times(name: str) -> Array:
+        return np.concatenate([getattr(b, name) + s for b, s in zip(bags, begins, strict=True)])
+
+    def rows(name: str) -> Array:
+        return np.concatenate([getattr(b, name) for b in bags])
+
+    shifted = {name: times(name) for name in ("t", "imu_t", "demand_t")}
+    others = {f.name: rows(f.name) for f in fields(Streams) if f.name not in shifted}
+    return Streams(**shifted, **others), begins
+
+
+class _Recorder(Sampler):
+    """Refuses and converts as the estimators do, but keeps the messages instead of merging them."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: []}
+
+    def _complete(self, final: bool) -> NDArray[np.void]:
+        for role, queue in self._queues.items():
+            self.taken[role].extend(queue)
+            queue.clear()
+        return super()._complete(final)
+
+
+def _continuous(q: Array) -> Array:
+    """Unit quaternions (N, 4), signs chosen so that neighbours are close."""
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    flips = np.sum(q[1:] * q[:-1], axis=1) < 0.0
+    sign = np.where(np.cumsum(np.concatenate([[0], flips])) % 2, -1.0, 1.0)
+    return q * sign[:, None]
+
+
+def orientation_at(streams: Streams, t: Array) -> Array:
+    """Attitude (k, 4) at the instants t (k,): a cubic through the measured attitudes and rates."""
+    i = np.clip(np.searchsorted(streams.t, t, side="right") - 1, 0, len(streams.t) - 2)
+    h = (streams.t[i + 1] - streams.t[i])[:, None]
+    s = (t - streams.t[i])[:, None] / h
+    q0, q1 = streams.orientation[i], streams.orientation[i + 1]
+    d0, d1 = _rate(q0, streams.nu[i, 3:]), _rate(q1, streams.nu[i + 1, 3:])
+    s = np.clip(s, 0.0, 1.0)
+    q = (
+        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q0
+        + s * (1.0 - s) ** 2 * h * d0
+        + s**2 * (3.0 - 2.0 * s) * q1
+        + s**2 * (s - 1.0) * h * d1
+    )
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def _rate(q: Array, omega: Array) -> Array:
+    """q_dot (k, 4) = q (0, omega) / 2."""
+    w, x, y, z = q.T
+    a, b, c = 0.5 * omega.T
+    return np.stack(
+        [
+            -x * a - y * b - z * c,
+            w * a + y * c - z * b,
+            w * b + z * a - x * c,
+            w * c + x * b - y * a,
+        ],
+        axis=1,
+    )

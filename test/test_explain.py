@@ -1,0 +1,141 @@
+"""Explain names what is hidden in a bag: a sample; `make explain-bench` is the whole."""
+
+import pytest
+
+from explain import RULES, TIERS, WEAK, Tier, Trial, bag, brought, explained, sure, trials, wrong
+from hidden import EFFECTS, NESTED, Conditions
+
+STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
+PLACES = {
+    "a minute": Conditions(duration=60.0),
+    "a minute, off 50 %": Conditions(duration=60.0, off=0.5),
+    "a minute, no IMU": Conditions(duration=60.0, imu_rate=0.0),
+}
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch):
+    """Bags of a minute take a third of the time."""
+    for place, conditions in PLACES.items():
+        monkeypatch.setitem(TIERS, place, Tier("first", conditions, [], 1, WEAK))
+
+
+def found_in(name, number, place="a minute"):
+    trial = Trial(place, name, 0, "test")
+    return explained(trial, bag(trial, trial.seed, [STRENGTH] * number))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "quadratic_damping",
+        "added_mass_coupling",
+        "ocean_current",
+        "payload",
+        "thruster_deadband",
+        "thruster_lag",
+        "thruster_failure",
+        "sensor_lever_arm",
+    ],
+)
+def test_a_hidden_effect_is_named_first(name):
+    line = found_in(name, 1)
+    assert [f["effect"] for f in line["found"]][:1] == [name]
+    assert not wrong(line)
+    assert line["verdict"] == "explained"
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_nothing_is_claimed_where_nothing_is_hidden(place):
+    line = found_in("clean", 0, place)
+    assert line["found"] == [] and line["residual"] == []
+    assert line["verdict"] in ("agrees", "retuned")
+
+
+@pytest.mark.parametrize(
+    "name", ["linear_damping+thruster_asymmetry", "actuation_delay+sensor_misalignment"]
+)
+def test_two_effects_are_both_named(name):
+    line = found_in(name, 2)
+    assert {f["effect"] for f in line["found"]} == set(name.split("+"))
+
+
+@pytest.mark.parametrize("name", ["shaking", "reaction"])
+def test_what_has_no_name_is_described(name):
+    line = found_in(name, 1)
+    assert line["verdict"] == "unexplained"
+    described = {(r["axis"], r["depends_on"]) for r in line["residual"]}
+    assert described & {(line["axis"], d) for d in line["depends_on"]}
+    assert not sure(line)
+
+
+# ------------------------------------------------------------------ the study itself
+
+
+def finding(effect, separable=True, manoeuvre=False, alternatives=()):
+    return {
+        "effect": effect, "separable": separable, "manoeuvre": manoeuvre,
+        "alternatives": list(alternatives),
+    }  # fmt: skip
+
+
+def line_of(hidden, *found, verdict="explained", residual=(), axis="", depends_on=()):
+    return {
+        "effects": dict.fromkeys(hidden), "found": list(found), "verdict": verdict,
+        "residual": [{"axis": a, "depends_on": d} for a, d in residual],
+        "axis": axis, "depends_on": list(depends_on),
+    }  # fmt: skip
+
+
+LAG, DELAY, WAVE = finding("thruster_lag"), finding("actuation_delay"), finding("wave")
+EITHER = finding("actuation_delay", separable=False, manoeuvre=True, alternatives=["thruster_lag"])
+SURGE = {"axis": "X", "depends_on": ["u"], "verdict": "unexplained"}
+
+
+@pytest.mark.parametrize(
+    ("rule", "line", "right"),
+    [
+        ("first", line_of(["thruster_lag"], LAG), True),
+        ("first", line_of(["thruster_lag"], WAVE, LAG), False),
+        ("first", line_of(["thruster_lag"], EITHER), False),
+        ("first", line_of(["thruster_lag"]), False),
+        ("group", line_of(["thruster_lag"], EITHER), True),
+        ("group", line_of(["thruster_lag"], {**EITHER, "manoeuvre": False}), False),
+        ("group", line_of(["thruster_lag"], {**EITHER, "separable": True}), False),
+        ("group", line_of(["wave"], EITHER), False),
+        ("all", line_of(["thruster_lag", "wave"], WAVE, LAG), True),
+        ("all", line_of(["thruster_lag", "wave"], WAVE, DELAY), False),
+        ("nested", line_of(["thruster_lag", "actuation_delay"], EITHER), True),
+        ("nested", line_of(["thruster_lag", "actuation_delay"], DELAY), False),
+        ("clean", line_of([], verdict="retuned"), True),
+        ("clean", line_of([], WAVE), False),
+        ("clean", line_of([], verdict="unexplained"), False),
+        ("unknown", line_of([], residual=[("X", "u")], **SURGE), True),
+        ("unknown", line_of([], residual=[("Y", "u")], **SURGE), False),
+        ("unknown", line_of([], residual=[("X", "time")], **SURGE), False),
+        ("unknown", line_of([], WAVE, residual=[("X", "u")], **SURGE), False),
+    ],
+)
+def test_rules_tell_right_from_wrong(rule, line, right):
+    assert RULES[rule][1](line) is right
+
+
+def test_a_wrong_name_counts_unless_it_is_declared_inseparable():
+    assert wrong(line_of(["wave"], WAVE, LAG)) and sure(line_of(["wave"], WAVE, LAG))
+    assert not wrong(line_of(["thruster_lag"], EITHER))
+    assert wrong(line_of(["wave"], EITHER)) and not sure(line_of(["wave"], EITHER))
+
+
+def test_an_effect_is_brought_to_the_gain_of_its_tier():
+    trial = Trial("a minute", "thruster_lag", 0, "test")
+    there = next(b for b in (brought(trial, trial.seed + i) for i in range(6)) if b is not None)
+    assert 0.1 <= there.gains[0] < 0.4
+
+
+def test_the_study_is_as_large_as_asked():
+    assert all(len(trials(tier, 10, "1")) == 10 * len(EFFECTS) for tier in ("medium", "weak"))
+    pairs = {t.effects for t in trials("pairs", 10, "1")}
+    assert len(pairs) == 150 and not {frozenset(p) for p in pairs} & NESTED
+    assert len({t.seed for t in trials("triples", 10, "1")}) == 50
+    clean = trials("clean", 10, "1") + trials("clean off 50 %", 10, "1")
+    assert len(clean) == 300 and not any(t.effects for t in clean)

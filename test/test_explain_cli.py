@@ -1,0 +1,294 @@
+"""`rov-ident explain` as a command: its three files, its words, and wrong use."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from conftest import HEAVY
+from test_cli_edges import refused, run
+
+from hidden import Conditions, draw
+from rov_ident import config as configuration
+from rov_ident import explain_report as told
+from rov_ident.effects import EFFECTS
+from rov_ident.findings import Finding, Findings, Gain, Residual, Value
+from rov_ident.recording import write_messages
+from rov_ident.sensors import dive
+
+FILES = ["extended.yaml", "findings.json", "report.html"]
+VOID = {"meta", "br", "img", "link", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Tags that do not match, ids, references and text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.references, self.words, self.tags = [], [], [], [], set()
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.handle_startendtag(tag, attributes)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.add(tag)
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            elif name in ("src", "href", "xlink:href", "action", "data"):
+                self.references.append(value)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A minute of well-excited motion; the configuration knows nothing of the thruster lag."""
+    return draw(3, ("thruster_lag",), conditions=Conditions(duration=60.0))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, case):
+    path = tmp_path_factory.mktemp("explain")
+    write_messages(path / "dive.mcap", case.messages)
+    configuration.dump(case.config, path / "today.yaml")
+    return path
+
+
+def explain(folder, *options, bag="dive.mcap", config="today.yaml", out="new/out"):
+    return run(
+        "explain", folder / bag, "--config", folder / config, "--out", folder / out, *options
+    )
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    return explain(folder)
+
+
+@pytest.fixture(scope="module")
+def page(done, folder):
+    return (folder / "new/out/report.html").read_text()
+
+
+def test_files_are_written_whole_into_a_new_folder(done, folder):
+    assert done.returncode == 0, done.stderr
+    assert sorted(p.name for p in (folder / "new/out").iterdir()) == FILES
+
+
+def test_findings_are_those_of_the_contract(done, folder, case):
+    found = json.loads((folder / "new/out/findings.json").read_text())
+    assert found["verdict"] == "explained"
+    assert [e["effect"] for e in found["effects"]] == ["thruster_lag"]
+    (effect,) = found["effects"]
+    lag = effect["parameters"]["time_constant"]
+    truth = case.effects["thruster_lag"]["time_constant"]
+    assert abs(lag["value"] - truth) < 4.0 * lag["std"] + 0.02 * truth
+    assert set(effect["gain"]) >= {
+        "component",
+        "rmse_before",
+        "rmse_after",
+        "percent",
+        "low",
+        "high",
+    }
+    for model in ("baseline", "retuned", "extended"):
+        assert list(found[model]["rmse"]) == list("uvwpqr")
+    assert found["residual"] == []
+    (bag,) = found["provenance"]["bags"]
+    assert bag["name"] == "dive.mcap" and len(bag["sha256"]) == 64
+
+
+def test_terminal_tells_the_verdict_the_errors_and_the_effect(done):
+    first, *rest = done.stdout.splitlines()
+    assert first.startswith("The simulation lacks thruster lag (time constant ")
+    assert any("as configured" in line and "extended" in line for line in rest)
+    assert any(line.startswith("thruster_lag: ") for line in rest)
+    assert "report.html" in done.stderr and "report.html" not in done.stdout
+
+
+def test_extended_configuration_simulates_better(done, folder, case):
+    path = folder / "new/out/extended.yaml"
+    extended = configuration.load(path)
+    assert set(extended.effects) == {"thruster_lag"}
+    comment = [line for line in path.read_text().splitlines() if line.startswith("#")]
+    assert "thruster lag" in comment[0] and "dive.mcap" in comment[1]
+    score = {}
+    for name in ("today.yaml", "new/out/extended.yaml"):
+        made = run(
+            "simulate", "--bag", folder / "dive.mcap", "--config", folder / name,
+            "--out", folder / "simulated.mcap",
+        )  # fmt: skip
+        assert made.returncode == 0, made.stderr
+        numbers = [
+            re.findall(r"[\d.]+", line) for line in made.stdout.splitlines() if "m/s" in line
+        ]
+        score[name] = np.array([float(n[2]) for n in numbers[:3]])
+    assert (score["new/out/extended.yaml"] < 0.7 * score["today.yaml"]).all()
+
+
+def test_page_stands_alone(page):
+    parsed = Page(page)
+    assert all(r.startswith("#") for r in parsed.references), parsed.references
+    assert not parsed.tags & {"script", "link", "img", "iframe", "object"}
+    assert "@import" not in page and not re.search(r"url\((?!#)", page)
+    outside = set(re.findall(r"https?://[^\s\"'<]+", page))
+    assert all(u.startswith(("http://www.w3.org/", "https://www.w3.org/")) for u in outside)
+
+
+def test_page_has_every_id_once_and_every_reference_is_there(page):
+    parsed = Page(page)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    wanted = {r[1:] for r in parsed.references} | set(re.findall(r"url\(#([^)]+)\)", page))
+    assert wanted <= set(parsed.ids)
+
+
+def test_page_tells_what_to_change_and_why(page):
+    text = "".join(Page(page).words)
+    for part in (
+        "The simulation lacks thruster lag", "What to change", "time_constant: ", "# was ",
+        "Measured and simulated", "Where and when it departs", "What is left",
+        "Retuned coefficients", "dive.mcap",
+    ):  # fmt: skip
+        assert part in text, part
+    assert "nan" not in text.lower().split()
+
+
+def test_page_follows_the_colours_of_the_reader(page):
+    assert "prefers-color-scheme: dark" in page and "@media print" in page
+    assert "currentColor" in page and "var(--colour-2" in page
+    assert "#000000" not in page
+
+
+def test_validation_on_another_bag(folder, case):
+    other = draw(3, ("thruster_lag",), conditions=Conditions(duration=30.0, noise=1.01))
+    write_messages(folder / "other.mcap", other.messages)
+    made = explain(folder, "--validate", folder / "other.mcap", out="validated")
+    assert made.returncode == 0, made.stderr
+    found = json.loads((folder / "validated/findings.json").read_text())
+    assert found["provenance"]["validate"]["name"] == "other.mcap"
+    assert "--validate" in (folder / "validated/report.html").read_text()
+
+
+def test_every_effect_is_in_the_documentation():
+    text = (HEAVY.parents[1] / "docs" / "explain.md").read_text()
+    assert not [name for name in EFFECTS if f"`{name}`" not in text]
+
+
+# ------------------------------------------------------------------ wrong use
+
+
+@pytest.fixture(scope="module")
+def short(folder):
+    messages = dive(configuration.load(HEAVY), duration=8.0, seed=1).messages
+    write_messages(folder / "short.mcap", messages)
+    return "short.mcap"
+
+
+def test_missing_bag_is_one_sentence(folder):
+    refused(explain(folder, bag="none.mcap", out="none"), "none.mcap")
+    assert not list((folder / "none").glob("*"))
+
+
+def test_missing_configuration_is_one_sentence(folder):
+    refused(explain(folder, config="none.yaml"), "none.yaml")
+
+
+def test_missing_validation_bag_is_one_sentence(folder):
+    refused(explain(folder, "--validate", folder / "none.mcap"), "none.mcap")
+
+
+def test_too_short_a_bag_is_one_sentence_and_leaves_nothing(folder, short):
+    refused(explain(folder, bag=short, out="short"), "8 s", "at least")
+    assert not list((folder / "short").glob("*"))
+
+
+def test_folder_that_cannot_be_is_one_sentence(folder):
+    refused(explain(folder, out="today.yaml/out"), "today.yaml")
+    refused(explain(folder, out="dive.mcap"), "dive.mcap")
+
+
+def test_result_never_replaces_what_is_read(done, folder):
+    path = folder / "new/out/extended.yaml"
+    before = path.read_bytes()
+    refused(explain(folder, config="new/out/extended.yaml"), "extended.yaml", "replaced")
+    assert path.read_bytes() == before
+
+
+# ------------------------------------------------------------------ words
+
+
+@pytest.mark.parametrize(
+    "x, digits, text",
+    [
+        (0.0, 3, "0"), (-141.04, 4, "-141.0"), (1234.5, 3, "1230"), (0.00598, 2, "0.0060"),
+        (9.996, 3, "10.00"), (float("nan"), 3, "-"), (1.2e-9, 3, "1.20e-09"),
+    ],
+)  # fmt: skip
+def test_numbers_have_sensible_digits(x, digits, text):
+    assert told.number(x, digits) == text
+
+
+def test_values_have_the_digits_that_their_deviation_leaves():
+    assert told.estimate(-141.234, 3.14) == ("-141.2", "3.1")
+    assert told.estimate(0.123456, 0.0021) == ("0.1235", "0.0021")
+    assert told.estimate(12.0, 0.0) == ("12.00", "-")
+
+
+def finding(effect, component="u", separable=True, **parameters):
+    values = {name: Value(value, 0.01, unit) for name, (value, unit) in parameters.items()}
+    gain = Gain(component, 0.08, 0.04, 50.0, 45.0, 55.0)
+    return Finding(effect, (), values, None, gain, separable, None, (), "")
+
+
+def findings(verdict, effects=(), residual=()):
+    rmse = dict.fromkeys("uvwpqr", 0.1)
+    return Findings(
+        rmse, rmse | {"v": 0.05}, {}, tuple(effects), (), tuple(residual), rmse, verdict
+    )
+
+
+def test_verdicts_in_words():
+    lag = finding("thruster_lag", time_constant=(0.24, "s"))
+    bias = finding("imu_bias", "kinematic", ax=(0.1, "m/s2"))
+    drag = finding("quadratic_damping", "v", separable=False, Y_vv=(-210.0, "N s2/m2"))
+    noise = Residual("N", "time", 0.314, 0.4)
+    assert told.verdict(findings("agrees")) == (
+        "The simulation agrees with the measurement: there is nothing to change."
+    )
+    assert told.verdict(findings("retuned")) == (
+        "The structure of the simulation is right, its coefficients are off. "
+        "Retuned, the 10 s prediction of sway improves by 50 %."
+    )
+    assert told.verdict(findings("explained", [lag])) == (
+        "The simulation lacks thruster lag (time constant 0.24 s). "
+        "With it, the 10 s prediction of surge improves by 50 %."
+    )
+    assert told.verdict(findings("explained", [lag, drag, bias])) == (
+        "The simulation lacks thruster lag (time constant 0.24 s) and quadratic damping "
+        "(Y_vv -210 N s2/m2; this run cannot tell it from others); the sensors show IMU bias "
+        "(ax 0.10 m/s2). With these, the 10 s prediction of surge improves by 50 %, the 10 s "
+        "prediction of sway improves by 50 % and the agreement of the sensors improves by 50 %."
+    )
+    assert told.verdict(findings("unexplained", [], [noise])) == (
+        "Something is left that no effect of the library explains: a moment N that depends on "
+        "time at 0.31 Hz (40 % of what is left on N)."
+    )
+
+
+def test_error_is_averaged_in_bins_that_hold_enough():
+    x = np.repeat([0.5, 1.5, 2.5], [30, 30, 3])
+    error = np.where(x < 1.0, 3.0, -4.0)
+    error[0] = np.nan
+    rms = told.binned(x, error, np.arange(4.0))
+    np.testing.assert_allclose(rms[:2], [3.0, 4.0])
+    assert np.isnan(rms[2])
