@@ -154,6 +154,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     import_.set_defaults(run=_import)
 
+    export = commands.add_parser("export", help="write the model for a controller or simulator")
+    export.add_argument("--config", required=True, type=Path)
+    export.add_argument("--format", required=True, choices=("auv_controllers", "gazebo", "mss"))
+    export.add_argument("--out", required=True, type=Path, metavar="FILE")
+    export.set_defaults(run=_export)
+
+    model = commands.add_parser(
+        "import-model", help="a configuration from a Gazebo model or auv_controllers' parameters"
+    )
+    model.add_argument("file", type=Path, metavar="FILE")
+    model.add_argument("--out", required=True, type=Path, metavar="CONFIG")
+    model.set_defaults(run=_import_model)
+
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
     return parser
@@ -434,6 +447,29 @@ def _import(options: argparse.Namespace) -> None:
         f"{options.out}: {report.odometry} odometry messages from {report.rows} rows, "
         f"{report.duration:.1f} s"
     )
+
+
+def _export(options: argparse.Namespace) -> None:
+    from rov_ident.fit import write_text
+    from rov_ident.formats import export
+
+    _check_outputs([options.out], [options.config])
+    written = export(configuration.load(options.config), options.format)
+    write_text(options.out, written.content)
+    for what in written.lost:
+        ERR.print(f"lost in {options.format}: {what}", markup=False, soft_wrap=True)
+    ERR.print(f"written: {options.out}", markup=False, soft_wrap=True)
+
+
+def _import_model(options: argparse.Namespace) -> None:
+    from rov_ident.formats import import_model
+
+    _check_outputs([options.out], [options.file])
+    config, notes = import_model(options.file)
+    configuration.dump(config, options.out, comment=f"From {options.file.name}.")
+    for note in notes:
+        ERR.print(f"note: {note}", markup=False, soft_wrap=True)
+    ERR.print(f"written: {options.out}", markup=False, soft_wrap=True)
 
 
 def _coefficients(options: argparse.Namespace) -> None:
