@@ -26,6 +26,7 @@ setup(
         "mcap>=1.6",
         "rosbags>=0.10",
         "zstandard>=0.21",
+        "lz4>=4",
         "PyYAML>=6.0",
         "rich>=13",
         "matplotlib>=3.6",

@@ -14,6 +14,7 @@ import re
 import shutil
 import struct
 import time
+import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -25,6 +26,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NamedTuple
 
+import lz4.frame
 import yaml
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -32,7 +34,6 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from rov_ident.cdr import DECODERS, IMU_TYPE, ODOMETRY_TYPE, WRENCH_TYPE
@@ -46,6 +47,8 @@ _OPTIONAL_ROLES = ("imu",)
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _RUN_LENGTH = 4096  # messages outside chunks that make one block
+LARGEST_CHUNK = 1 << 28
+"""Bytes: recorders make chunks of about a megabyte; a larger claim is damage, or meant to harm."""
 
 # What zstd, lz4, mcap and struct raise on bytes that are not what they should be.
 _DAMAGE = (zstandard.ZstdError, RuntimeError, McapError, ValueError, struct.error)
@@ -266,7 +269,7 @@ def _files_of_directory(path: Path) -> list[Path]:
         try:
             metadata = yaml.safe_load(metadata_path.read_text("utf-8"))
             information = metadata["rosbag2_bagfile_information"]
-            files = [path / name for name in information["relative_file_paths"]]
+            files = [_inside(path, name) for name in information["relative_file_paths"]]
             compression = str(information.get("compression_mode", "")).lower()
         except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError) as error:
             raise UserError(
@@ -283,6 +286,14 @@ def _files_of_directory(path: Path) -> list[Path]:
     if not files:
         raise UserError(f"{path} holds no .mcap file: give a rosbag2 directory or a .mcap file.")
     return files
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file of the bag; what points out of its folder is another's file."""
+    file = folder / name
+    if not file.resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{folder / 'metadata.yaml'} names {name}, which is outside the bag.")
+    return file
 
 
 def _natural_order(path: Path) -> list[tuple[int, str]]:
@@ -441,8 +452,23 @@ def _messages(buffer: bytes, topics: Mapping[int, tuple[str, str]]) -> list[RawM
 
 
 def _unpack(chunk: Chunk) -> bytes:
-    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    return stream.read(length)
+    """The records of a chunk; never more bytes than it says, whatever its compressed data say."""
+    size = chunk.uncompressed_size
+    if size > LARGEST_CHUNK:
+        raise McapError(f"a chunk of {size} bytes")
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise McapError(f"compression {chunk.compression!r} is unknown")
+    if len(data) != size:
+        raise McapError(f"a chunk of {size} bytes holds another number")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise McapError("wrong checksum")
+    return data
 
 
 def _stream(data: bytes) -> ReadDataStream:

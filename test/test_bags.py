@@ -3,14 +3,18 @@
 import os
 import random
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
 import time
+import tracemalloc
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -266,6 +270,35 @@ def test_a_damaged_chunk_is_passed_over(tmp_path, summary):
     assert set(got) < set(rows)
 
 
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_a_decompression_bomb_is_passed_over(tmp_path, compression):
+    """A chunk whose megabytes of zeros claim to be few, and one that claims to be endless."""
+    rows = list(entries(500))
+    path = write_mcap(tmp_path / "dive.mcap", rows, chunk_size=10_000, compression=compression)
+    zeros = bytes(200_000_000)
+    small = {
+        CompressionType.ZSTD: zstandard.compress(zeros),
+        CompressionType.LZ4: lz4.frame.compress(zeros),
+    }[compression]
+    del zeros
+    name = compression.name.lower().encode()
+    for claimed in (1000, 1 << 62):
+        body = struct.pack("<QQQI", 0, 1, claimed, 0)
+        body += struct.pack("<I", len(name)) + name + struct.pack("<Q", len(small)) + small
+        bomb = struct.pack("<BQ", 6, len(body)) + body
+        data = path.read_bytes()
+        bag_path = tmp_path / "bomb.mcap"
+        bag_path.write_bytes(data[:8] + bomb + data[8:-1])  # cut, so that it is walked through
+        tracemalloc.start()
+        bag = Bag(bag_path)
+        got = [tuple(raw) for raw in bag.iter_raw()]
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert got == rows
+        assert bag.damaged_chunks == 1
+        assert peak < 20_000_000
+
+
 @pytest.mark.parametrize("name", ["dive.mcap", "dive"])
 def test_a_killed_recorder_leaves_a_readable_bag(tmp_path, name):
     path = tmp_path / name
@@ -356,6 +389,9 @@ def test_bad_metadata(tmp_path):
         Bag(path)
     metadata.write_text(text.replace("dive_0.mcap", "dive_1.mcap"))
     with pytest.raises(UserError, match=r"dive_1\.mcap cannot be read"):
+        Bag(path)
+    metadata.write_text(text.replace("dive_0.mcap", "../other/dive_0.mcap"))
+    with pytest.raises(UserError, match="outside the bag"):
         Bag(path)
     metadata.write_text("{")
     with pytest.raises(UserError, match="metadata"):
