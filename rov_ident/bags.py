@@ -36,11 +36,10 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from rov_ident.cdr import DECODERS, IMU_TYPE, ODOMETRY_TYPE, WRENCH_TYPE
+from rov_ident.cdr import DECODERS, ROLE_TYPES
 from rov_ident.errors import UserError
 from rov_ident.messages import Message
 
-ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
 ROLE_NAMES = {"odom": "odom", "imu": "imu/data", "wrench": "thruster_wrench"}
 _OPTIONAL_ROLES = ("imu",)
 

@@ -17,6 +17,7 @@ from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
+ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian, no options
 _STAMP = struct.Struct("<iI")

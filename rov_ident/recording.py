@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from rov_ident.bags import ROLE_NAMES, ROLE_TYPES, BagWriter
-from rov_ident.cdr import encode
+from rov_ident.bags import ROLE_NAMES, BagWriter
+from rov_ident.cdr import ROLE_TYPES, encode
 from rov_ident.messages import Message
 
 

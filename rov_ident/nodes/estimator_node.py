@@ -30,8 +30,7 @@ from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
 
 from rov_ident import config as configuration
-from rov_ident.bags import ROLE_TYPES
-from rov_ident.cdr import DECODERS, encode
+from rov_ident.cdr import DECODERS, ROLE_TYPES, encode
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.frames import from_core
