@@ -290,6 +290,26 @@ def _copy(a, b):
 
 
 @kernel
+def filtered_rows(task, state, samples, period, out):
+    """Into out (K, 6, n + 1) the rows [Phi y] that the estimator sees, one each ``period`` s.
+
+    In prior standard deviations about the prior. Returns how many there are.
+    """
+    work, used = _work(task, state), 0
+    c, y = state.scalars[0], state.filters[1]
+    for k in range(len(samples)):
+        if not is_finite(samples[k]):
+            continue
+        if _filtered(task, state, work, samples[k]) and c.since_update >= period - 1e-6:
+            for i in range(6):
+                for j in range(y.shape[1]):
+                    out[used, i, j] = y[i, j]
+            used += 1
+            c.since_update = 0.0
+    return used
+
+
+@kernel
 def _fold(task, state, samples, info):
     work = _work(task, state)
     for k in range(len(samples)):
@@ -301,7 +321,6 @@ def _fold(task, state, samples, info):
 @inlined
 def _step(task, state, work, sample, info):
     s, c = task.settings[0], state.scalars[0]
-    n, w, dt = len(task.scale), s.corner, sample.dt
     info.t = sample.t
     info.forgetting = 1.0
     info.condition = np.nan
@@ -312,6 +331,26 @@ def _step(task, state, work, sample, info):
         info.reason = NOT_FINITE
         return
 
+    if not _filtered(task, state, work, sample):
+        for j in range(len(task.scale)):
+            state.lagged[j] = 0.0
+        info.reason = RESTARTED
+        return
+    y = state.filters[1]
+    _residuals(y, work.deviation, info.residual)
+    if c.since_update < s.period - 1e-6:
+        info.reason = WAITING
+        return
+    in_motion(task.structure, sample.moving, work.moves)
+    _update(task, state, work, y, info)
+    c.since_update = 0.0
+
+
+@inlined
+def _filtered(task, state, work, sample):
+    """Take a sample into the filters; False where they began anew."""
+    s, c = task.settings[0], state.scalars[0]
+    n, w, dt = len(task.scale), s.corner, sample.dt
     _regress(task, work, sample)
     now = work.now
     x, y, u, last = state.filters[0], state.filters[1], state.filters[2], state.filters[3]
@@ -325,10 +364,7 @@ def _step(task, state, work, sample, info):
                 u[i, j] = now[0, i, j]
                 last[i, j] = now[1, i, j]
         c.since_update = 0.0
-        for j in range(n):
-            state.lagged[j] = 0.0
-        info.reason = RESTARTED
-        return
+        return False
 
     a, b0, b1 = first_order(w, dt)
     _filter(state.filters, work, w, a, b0, b1)
@@ -340,14 +376,7 @@ def _step(task, state, work, sample, info):
         c.wrench[i] = a * c.wrench[i] + (1.0 - a) * sample.wrench[i]
         c.drive[i] += min(dt / _DRIVE_TIME, 1.0) * (c.wrench[i] ** 2 - c.drive[i])
     c.since_update += dt
-
-    _residuals(y, work.deviation, info.residual)
-    if c.since_update < s.period - 1e-6:
-        info.reason = WAITING
-        return
-    in_motion(task.structure, sample.moving, work.moves)
-    _update(task, state, work, y, info)
-    c.since_update = 0.0
+    return True
 
 
 @reordered
