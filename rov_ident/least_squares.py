@@ -5,8 +5,8 @@ through one low-pass filter, so that nothing is differentiated::
 
     y = F[tau - known],   Phi = s F[P] + F[H],   y = Phi theta + noise
 
-Least squares is the solution of ``sum w Phi' (y - Phi theta) = 0``. Its regressors hold the noise of
-the velocities: the squares |u|u and the products u v of the Munk moments have means and
+Least squares is the solution of ``sum w Phi' (y - Phi theta) = 0``. Its regressors hold the noise
+of the velocities: the squares |u|u and the products u v of the Munk moments have means and
 correlations of their own, so that the estimate is biased however long the record. *Instrumental
 variables* replace the left factor by what is not noisy::
 
@@ -39,7 +39,6 @@ from rov_ident.records import HORIZON, predicted
 
 PERIOD = 0.1  # s between rows
 _LAG = 2.0  # s; window over the correlation of the residuals
-_OUTLIER = 6.0  # robust standard deviations
 _ROUNDS = 4  # of instruments, each simulated with the coefficients of the one before
 _KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
 # quarters of the prior variance are gone
@@ -50,16 +49,13 @@ Mapper = Callable[..., list]  # type: ignore[type-arg]
 
 
 class Moments(NamedTuple):
-    """Sums of ``[Z y]' [Phi y]`` over rows, axis by axis, (6, n + 1, n + 1); count (6,) of rows.
+    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,).
 
     In prior standard deviations about the prior's mean.
     """
 
     sums: Array
-    count: Array
-
-    def __add__(self, other: "Moments") -> "Moments":  # type: ignore[override]
-        return Moments(self.sums + other.sums, self.count + other.count)
+    rows: Array
 
 
 class Batch(NamedTuple):
@@ -75,8 +71,8 @@ class Batch(NamedTuple):
 class Solution:
     """values and covariance of the estimated coefficients, in their units.
 
-    ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, of which neighbours
-    in time count once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
+    ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
+    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
     """
 
     values: Array
@@ -99,13 +95,13 @@ def solve(
     """Least squares over every bag, the estimated coefficients those of the configuration.
 
     ``weighted``: by the residual of each axis, found in a first, ordinary round (in units of the
-    axis's own forces); ``precision`` multiplies the prior's, 1 taking the configuration at its word.
+    axis's own forces). ``precision`` multiplies the prior's: 1 takes the configuration as it is.
     """
     free = np.ones(6, dtype=bool) if free is None else free
     say = progress or (lambda what: None)
     batch = Batch(rls.problem(config), free, None, compiled(config.effects))
     n = len(batch.task.scale)
-    prior = np.eye(n) * precision
+    prior: Array = np.eye(n) * precision
     repeats = 2.0 / (float(batch.task.settings["corner"][0]) * PERIOD)
     # ordinary: forces and moments in units of their own size, else a metre would decide
     weight = np.where(free, 1.0 / (30.0 * batch.task.settings["floor"][0]) ** 2, 0.0)
@@ -113,24 +109,26 @@ def solve(
     def estimate(batch: Batch, weight: Array) -> tuple[Array, Moments]:
         moments = _total(each(moments_of, batch))
         a, b = _weighted(moments.sums, weight / repeats)
-        return np.linalg.solve(a + prior, b), moments
+        x: Array = np.linalg.solve(a + prior, b)
+        return x, moments
 
     def residual(moments: Moments, x: Array) -> Array:
         tail = np.append(-x, 1.0)
         squares = np.einsum("i,kij,j->k", tail, moments.sums, tail)
-        return np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.count, 1.0))
+        std: Array = np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
+        return std
 
     say("least squares")
     x, moments = estimate(batch, weight)
     least = 1e-3 * batch.task.settings["floor"][0]
     if weighted:
         for _ in range(3):
-            weight = np.where(free, 1.0 / np.maximum(residual(moments, x), least) ** 2, 0.0)
-            a, b = _weighted(moments.sums, weight / repeats)
-            x = np.linalg.solve(a + prior, b)
+            weight[:] = np.where(free, 1.0 / np.maximum(residual(moments, x), least) ** 2, 0.0)
+            left, b = _weighted(moments.sums, weight / repeats)
+            x[:] = np.linalg.solve(left + prior, b)
     noise = residual(moments, x)
     information = _weighted(moments.sums, weight / repeats)[0]
-    a = information + prior
+    a: Array = information + prior
     if instrumental:
         for round_ in range(_ROUNDS):
             say(f"instruments, round {round_ + 1}")
@@ -138,11 +136,11 @@ def solve(
             if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0.0:
                 break
             batch = batch._replace(instruments=model)
-            old = x
+            old = x.copy()
             moments = _total(each(moments_of, batch))
             a, b = _weighted(moments.sums, weight / repeats)
             a = a + prior
-            x = np.linalg.solve(a, b)
+            x[:] = np.linalg.solve(a, b)
             if np.abs(x - old).max() < 1e-4:
                 break
     say("residuals")
@@ -157,15 +155,12 @@ def solve(
         covariance * np.outer(widen, widen),
         information,
         noise,
-        int(moments.count[free].sum()),
+        int(moments.rows[free].sum()),
     )
 
 
 def _total(parts: Sequence[Moments]) -> Moments:
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
+    return Moments(*(sum(values) for values in zip(*parts, strict=True)))
 
 
 def _weighted(sums: Array, weight: Array) -> tuple[Array, Array]:
@@ -207,7 +202,6 @@ def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
         z = rows(batch.task, _simulated(samples, batch))
         z[:, :, -1] = phi[:, :, -1]
     good = np.isfinite(z).all(axis=(1, 2))
-    # an outlier by itself, whatever the coefficients: the wrench there is out of proportion
     return phi[good], z[good]
 
 
@@ -268,9 +262,9 @@ class Combination:
 class BaseParameters:
     """Which coefficients, or combinations of them, the data identify.
 
-    ``combinations``: identifiable. ``unidentified``: coefficients for which only such a combination,
-    or nothing at all (``unexcited``), is known. ``condition``: of the regressor with columns of unit
-    length; ``collinear``: pairs of columns with the cosine between them.
+    ``combinations``: identifiable. ``unidentified``: coefficients of which only a combination with
+    others, or nothing at all (``unexcited``), is known. ``condition``: of the regressor, its
+    columns of unit length; ``collinear``: pairs of columns with the cosine between them.
     """
 
     combinations: tuple[Combination, ...]

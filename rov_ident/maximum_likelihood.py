@@ -90,19 +90,21 @@ class Pass(NamedTuple):
     """One pass of the filter over samples; sums over bags are sums of these.
 
     information (n, n); score (n,) = minus half the cost's gradient; ``scatter`` (n, n) the
-    covariance of the accumulated score, correlation in time included; ``cost``; ``count`` of
-    innovations used; ``outliers``.
+    covariance of the accumulated score, correlation in time included; ``cost``; number
+    of innovations ``used`` and of ``outliers``.
     """
 
     information: Array
     score: Array
     scatter: Array
     cost: float
-    count: int
+    used: int
     outliers: int
 
-    def __add__(self, other: "Pass") -> "Pass":  # type: ignore[override]
-        return Pass(*(a + b for a, b in zip(self, other, strict=True)))
+
+def total(parts: Sequence[Pass]) -> Pass:
+    """The sum over bags."""
+    return Pass(*(sum(values) for values in zip(*parts, strict=True)))
 
 
 def free_axes(channels: Sequence[int] | None) -> NDArray[np.bool_]:
@@ -114,7 +116,7 @@ def free_axes(channels: Sequence[int] | None) -> NDArray[np.bool_]:
     return free
 
 
-def _equations(model: Model, estimated: Array, free: NDArray[np.bool_]) -> _Equations:
+def _equations(model: Model, estimated: NDArray[np.int64], free: NDArray[np.bool_]) -> _Equations:
     mass = model.mass_matrix
     at = np.flatnonzero(free)
     inverse = np.zeros((6, 6))
@@ -285,18 +287,15 @@ def maximise(
         moved[estimated] = theta
         there = model.with_theta(moved)
         if np.linalg.eigvalsh(there.mass_matrix)[0] <= 0.0:
-            return total, np.inf
-        parts = each(one_pass, there, estimated, noise, free, gate)
-        found = parts[0]
-        for part in parts[1:]:
-            found = found + part
-        cost = found.cost + precision @ (theta - mean) ** 2
+            return nothing, np.inf
+        found = total(each(one_pass, there, estimated, noise, free, gate))
+        cost = float(found.cost + precision @ (theta - mean) ** 2)
         # an outlier is worth its gate, so that refusing one gains nothing
         if np.isfinite(gate):
             cost += found.outliers * gate**2
         return found, cost if np.isfinite(cost) else np.inf
 
-    total = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
+    nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
     theta, count, converged = model.theta[estimated].copy(), 0, False
     for stage, gate in enumerate((np.inf, _GATE, _GATE)):
         if stage:
@@ -304,11 +303,11 @@ def maximise(
             moved = model.theta.copy()
             moved[estimated] = theta
             noise = _noise_levels(each, model.with_theta(moved), noise, free, process)
-        total, cost = look(theta, gate)
+        at, cost = look(theta, gate)
         for _ in range(_ITERATIONS):
             say(f"step {count + 1}")
-            information = total.information + np.diag(precision)
-            slope = total.score + precision * (mean - theta)
+            information = at.information + np.diag(precision)
+            slope = at.score + precision * (mean - theta)
             change = solved(information, slope)
             if slope @ change < 1e-6 * len(theta):
                 converged = True
@@ -323,18 +322,18 @@ def maximise(
                 converged = True
                 break
             count += 1
-            theta, total, gained, cost = theta + factor * change, found, cost - there, there
+            theta, at, gained, cost = theta + factor * change, found, cost - there, there
             if gained < 1e-6 * len(theta):
                 converged = True
                 break
         else:
             converged = False
-    bound = inverse_of(total.information + np.diag(precision))
-    covariance = bound @ (total.scatter + np.diag(precision)) @ bound
+    bound = inverse_of(at.information + np.diag(precision))
+    covariance = bound @ (at.scatter + np.diag(precision)) @ bound
     # From few data the scatter is itself uncertain: never thinner than the bound.
     widen = np.sqrt(np.maximum(np.diag(bound) / np.maximum(np.diag(covariance), 1e-300), 1.0))
     covariance = covariance * np.outer(widen, widen)
-    return Likelihood(theta, covariance, bound, noise, total, count, converged)
+    return Likelihood(theta, covariance, bound, noise, at, count, converged)
 
 
 def _noise_levels(
