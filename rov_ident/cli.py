@@ -4,11 +4,12 @@ Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,8 +32,10 @@ ERR = Console(stderr=True, highlight=False)
 OUT = Console(highlight=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
+BATCH = ("ls", "iv", "ml")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 CHANNELS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+PAIRS = {"lateral": ("sway", "yaw"), "longitudinal": ("heave", "pitch")}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,14 +83,42 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--out", type=Path, help="bag to write")
     replay.set_defaults(run=_replay)
 
-    fit = commands.add_parser("fit", help="identify offline, with the same code as the nodes")
+    fit = commands.add_parser(
+        "fit", help="identify offline, by the code of the nodes or from all the data at once"
+    )
     fit.add_argument("bags", nargs="+", type=Path, metavar="BAG")
     fit.add_argument("--config", required=True, type=Path)
-    fit.add_argument("--estimator", choices=LIVE, required=True)
+    fit.add_argument(
+        "--estimator",
+        choices=(*LIVE, *BATCH),
+        required=True,
+        help="rls, ukf: as the nodes; ls: least squares; iv: instrumental variables; "
+        "ml: maximum likelihood",
+    )
     fit.add_argument("--json", type=Path, help="write the result here")
     fit.add_argument(
         "--save", type=Path, metavar="FILE", help="write a configuration with the fitted values"
     )
+    fit.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    batch = fit.add_argument_group("ls, iv and ml")
+    batch.add_argument(
+        "--channels",
+        type=_channels,
+        action="append",
+        metavar="surge,sway,...",
+        help="fit these alone, the others as measured (also lateral, longitudinal); "
+        "given again: one group after the other",
+    )
+    batch.add_argument(
+        "--no-prior", action="store_true", help="the configured values count for nothing"
+    )
+    batch.add_argument(
+        "--ordinary", action="store_true", help="ls, iv: do not weigh the axes by their residuals"
+    )
+    batch.add_argument("--output-error", action="store_true", help="ml: take the wrench as exact")
+    batch.add_argument("--jobs", type=_count, help="processes that read bags (all processors)")
+    batch.add_argument("--dask", default="", metavar="ADDRESS", help="a Dask scheduler, or `local`")
+    fit.add_argument("--quiet", action="store_true", help="no progress on standard error")
     fit.set_defaults(run=_fit)
 
     explain = commands.add_parser(
@@ -267,10 +298,17 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 1024:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 1024")
+    return int(text)
+
+
 def _channels(text: str) -> "np.ndarray":
-    names = text.split(",")
+    names = [axis for name in text.split(",") for axis in PAIRS.get(name, (name,))]
     if unknown := set(names) - set(CHANNELS):
-        raise argparse.ArgumentTypeError(f"no channel {min(unknown)!r}: use {','.join(CHANNELS)}")
+        known = ",".join((*CHANNELS, *PAIRS))
+        raise argparse.ArgumentTypeError(f"no channel {min(unknown)!r}: use {known}")
     return np.array([name in names for name in CHANNELS])
 
 
@@ -320,20 +358,50 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
+    from rov_ident import archive
+    from rov_ident.batch import Settings, curves, fit_batch
     from rov_ident.fit import fit_online, write_text
 
-    _check_outputs([options.json, options.save], [*options.bags, options.config])
-    config = configuration.load(options.config, f"{options.estimator}_node")
-    records = [_read(path, config) for path in options.bags]
-    fit = fit_online(records, config, options.estimator)
+    outputs = [options.json, options.save, options.report]
+    _check_outputs(outputs, [*options.bags, options.config])
+    live = options.estimator in LIVE
+    _check_batch_options(options, live)
+    config = configuration.load(options.config, f"{options.estimator}_node" if live else "")
+    with _steps(options.quiet) as say, contextlib.ExitStack() as stack:
+        if live:
+            records = [_read(path, config) for path in options.bags]
+            bags = archive.of_records(records)
+            fit = fit_online(records, config, options.estimator)
+        else:
+            jobs = options.jobs or archive.default_jobs()
+            bags = stack.enter_context(
+                archive.opened(
+                    options.bags, config, jobs, options.dask,
+                    lambda name, done, total: say(f"read {name} ({done} of {total})"),
+                )
+            )  # fmt: skip
+            stages = tuple(
+                tuple(name for name, use in zip(CHANNELS, marks) if use)
+                for marks in options.channels or ()
+            )
+            settings = Settings(
+                stages, not options.no_prior, not options.ordinary, not options.output_error
+            )
+            fit = fit_batch(bags, config, options.estimator, settings, say)
+        fitted = config.with_model(fit.model)
+        drawn = curves(bags, config, fitted) if options.report else []
     if options.json:
         write_text(options.json, fit.to_json())
+    if options.report:
+        from rov_ident.fit_report import page
+
+        write_text(options.report, page(fit, config, drawn))
     if options.save:
-        bags = ", ".join(path.name for path in options.bags)
+        bags_read = ", ".join(path.name for path in options.bags)
         configuration.dump(
-            config.with_model(fit.model),
+            fitted,
             options.save,
-            comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags}.",
+            comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags_read}.",
         )
 
     table = _table(
@@ -345,6 +413,32 @@ def _fit(options: argparse.Namespace) -> None:
         yes = "yes" if row[4] else "no: the prior decides"
         table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
     OUT.print(table)
+    for note in () if live else fit.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
+
+
+def _check_batch_options(options: argparse.Namespace, live: bool) -> None:
+    """Refuse options that the estimator would not heed."""
+    given = {
+        "--channels": options.channels, "--no-prior": options.no_prior,
+        "--ordinary": options.ordinary, "--output-error": options.output_error,
+        "--jobs": options.jobs, "--dask": options.dask,
+    }  # fmt: skip
+    heeded = set() if live else {"--channels", "--no-prior", "--jobs", "--dask"}
+    heeded |= {"--output-error"} if options.estimator == "ml" else set()
+    heeded |= {"--ordinary"} if options.estimator in ("ls", "iv") else set()
+    for name, value in given.items():
+        if value and name not in heeded:
+            raise UserError(f"{name} has no meaning with --estimator {options.estimator}")
+
+
+@contextlib.contextmanager
+def _steps(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A line on standard error that says what is being done; nothing where nobody looks."""
+    shown = ERR.is_terminal and not quiet
+    with Progress(console=ERR, transient=True, disable=not shown) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda what: progress.update(bar, description=what)
 
 
 def _explain(options: argparse.Namespace) -> None:

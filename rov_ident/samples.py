@@ -69,6 +69,7 @@ SAMPLE = np.dtype(
         ("odometry_variance", "f8", (6,)),
         ("gyro", "f8", (3,)),  # rad/s, bias removed; NaN: not measured
         ("gyro_variance", "f8"),
+        ("gyro_bias", "f8", (3,)),  # rad/s: what was taken off the gyro here
     ],
     align=True,
 )
@@ -469,6 +470,7 @@ def fuse(
     started = k.inertial
     for i in range(3):
         out.gyro[i] = nan
+        out.gyro_bias[i] = k.gyro_bias[i]
         out.odometry[i] = nan
         out.odometry[3 + i] = nan
     variance = np.empty(6)

@@ -1,0 +1,311 @@
+"""Batch least squares over the 6-DOF regressor, and instrumental variables.
+
+*From a record*: the rows ``y = Phi theta + noise`` are those of :mod:`rov_ident.regression`, every
+channel through one low-pass filter, so that nothing is differentiated. Least squares is the
+solution of ``sum w Phi' (y - Phi theta) = 0``. Its regressors hold the noise of the velocities: the
+squares |u|u and the products u v of the Munk moments have means and correlations of their own, so
+that the estimate is biased however long the record. *Instrumental
+variables* replace the left factor by what is not noisy::
+
+    sum w Z' (y - Phi theta) = 0,   Z: the same rows along the *simulated* motion
+
+simulated from the wrench with the present coefficients, and again with the new ones (refined
+instrumental variables; Young 2011; Ljung 1999, sec. 7.6).
+
+*From a log with accelerations* (:func:`equation_error`), a million samples take one pass in bounded
+memory: normal equations, or blockwise Householder (TSQR; Demmel et al. 2012), which keeps all
+digits where the normal equations lose half.
+
+Sums over the samples of several bags are sums over bags: an archive is one fit.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+from rov_ident.config import Config
+from rov_ident.effects import compiled
+from rov_ident.excitation import authority
+from rov_ident.jit import kernel
+from rov_ident.model import Array, Model
+from rov_ident.records import HORIZON, predicted
+from rov_ident.regression import Regression, filtered_rows, regression
+
+PERIOD = 0.1  # s between rows
+_LAG = 2.0  # s; window over the correlation of the residuals
+_ROUNDS = 4  # of instruments, each simulated with the coefficients of the one before
+_KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
+# quarters of the prior variance are gone
+
+Samples = NDArray[np.void]
+Mapper = Callable[..., list]  # type: ignore[type-arg]
+"""``mapper(function, *arguments)``: function(samples, *arguments) of every bag, in order."""
+
+
+class Moments(NamedTuple):
+    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,).
+
+    In prior standard deviations about the prior's mean.
+    """
+
+    sums: Array
+    rows: Array
+
+
+class Batch(NamedTuple):
+    """What the passes over the bags need to know."""
+
+    task: Regression
+    free: NDArray[np.bool_]  # (6,) axes whose rows count
+    instruments: Model | None  # the model along whose motion the instruments are taken
+    effects: object  # effects.Acting, of the simulation
+
+
+@dataclass(frozen=True)
+class Solution:
+    """values and covariance of the estimated coefficients, in their units.
+
+    ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
+    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
+    """
+
+    values: Array
+    covariance: Array
+    information: Array
+    noise: Array
+    rows: int
+
+
+def solve(
+    each: Mapper,
+    config: Config,
+    free: NDArray[np.bool_] | None = None,
+    *,
+    instrumental: bool = False,
+    weighted: bool = True,
+    precision: float = 1.0,
+    progress: Callable[[str], None] | None = None,
+) -> Solution:
+    """Least squares over every bag, the estimated coefficients those of the configuration.
+
+    ``weighted``: by the residual of each axis, found in a first, ordinary round (in units of the
+    axis's own forces). ``precision`` multiplies the prior's: 1 takes the configuration as it is.
+    """
+    free = np.ones(6, dtype=bool) if free is None else free
+    say = progress or (lambda what: None)
+    batch = Batch(regression(config), free, None, compiled(config.effects))
+    n = len(batch.task.scale)
+    prior: Array = np.eye(n) * precision
+    repeats = 2.0 / (batch.task.corner * PERIOD)
+    # ordinary: forces and moments in units of their own size, else a metre would decide
+    weight = np.where(free, 1.0 / (0.03 * authority(config.dynamics)) ** 2, 0.0)
+
+    def estimate(batch: Batch, weight: Array) -> tuple[Array, Moments]:
+        moments = _total(each(moments_of, batch))
+        a, b = _weighted(moments.sums, weight / repeats)
+        x: Array = np.linalg.solve(a + prior, b)
+        return x, moments
+
+    def residual(moments: Moments, x: Array) -> Array:
+        tail = np.append(-x, 1.0)
+        squares = np.einsum("i,kij,j->k", tail, moments.sums, tail)
+        std: Array = np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
+        return std
+
+    say("least squares")
+    x, moments = estimate(batch, weight)
+    least = 1e-6 * authority(config.dynamics)
+    if weighted:
+        for _ in range(3):
+            weight[:] = np.where(free, 1.0 / np.maximum(residual(moments, x), least) ** 2, 0.0)
+            left, b = _weighted(moments.sums, weight / repeats)
+            x[:] = np.linalg.solve(left + prior, b)
+    noise = residual(moments, x)
+    information = _weighted(moments.sums, weight / repeats)[0]
+    a: Array = information + prior
+    if instrumental:
+        for round_ in range(_ROUNDS):
+            say(f"instruments, round {round_ + 1}")
+            model = _model_at(config, batch.task, x)
+            if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0.0:
+                break
+            batch = batch._replace(instruments=model)
+            old = x.copy()
+            moments = _total(each(moments_of, batch))
+            a, b = _weighted(moments.sums, weight / repeats)
+            a = a + prior
+            x[:] = np.linalg.solve(a, b)
+            if np.abs(x - old).max() < 1e-4:
+                break
+    say("residuals")
+    scatter = sum(each(scatter_of, batch, x, weight / repeats)) + prior
+    inverse = np.linalg.inv(a)
+    covariance = inverse @ scatter @ inverse.T
+    spread = np.diag(np.linalg.inv(information + prior))
+    widen = np.sqrt(np.maximum(spread / np.diag(covariance), 1.0)) * batch.task.scale
+    task = batch.task
+    return Solution(
+        task.theta[task.estimated] + task.scale * x,
+        covariance * np.outer(widen, widen),
+        information,
+        noise,
+        int(moments.rows[free].sum()),
+    )
+
+
+def _total(parts: Sequence[Moments]) -> Moments:
+    return Moments(*(sum(values) for values in zip(*parts, strict=True)))
+
+
+def _weighted(sums: Array, weight: Array) -> tuple[Array, Array]:
+    """A (n, n) and b (n,) of A x = b."""
+    total = np.einsum("k,kij->ij", weight, sums)
+    return total[:-1, :-1], total[:-1, -1]
+
+
+def _model_at(config: Config, task: Regression, x: Array) -> Model:
+    theta = config.dynamics.theta.copy()
+    theta[task.estimated] += task.scale * x
+    return config.dynamics.with_theta(theta)
+
+
+# ------------------------------------------------------------------ of one bag
+
+
+def moments_of(samples: Samples, batch: Batch) -> Moments:
+    """The sums of one bag's samples (k,) of SAMPLE."""
+    phi, z = _both(samples, batch)
+    return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(len(phi))))
+
+
+def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
+    """Covariance (n, n) of one bag's accumulated ``sum w Z' e``, correlation in time included."""
+    phi, z = _both(samples, batch)
+    error = phi[:, :, -1] - phi[:, :, :-1] @ x
+    score = np.einsum("ka,kai->ki", error * weight, z[:, :, :-1])
+    total, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
+    _scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
+    return total
+
+
+def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+    phi = filtered_rows(batch.task, samples, PERIOD)
+    if batch.instruments is None:
+        z = phi
+    else:
+        z = filtered_rows(batch.task, _simulated(samples, batch), PERIOD)
+        z[:, :, -1] = phi[:, :, -1]
+    good = np.isfinite(z).all(axis=(1, 2))
+    return phi[good], z[good]
+
+
+def _simulated(samples: Samples, batch: Batch) -> Samples:
+    """The samples with the motion that the model says, through the water."""
+    assert batch.instruments is not None
+    model, effects = batch.instruments, batch.effects
+    nu = predicted(model, samples, np.inf, effects=effects)  # type: ignore[arg-type]
+    if not np.isfinite(nu).all():
+        nu = predicted(model, samples, HORIZON, effects=effects)  # type: ignore[arg-type]
+    out = samples.copy()
+    out["nu"] = nu
+    out["nu"][:, :3] -= samples["water"]
+    return out
+
+
+@kernel
+def _scatter(score, fade, total, lagged):
+    n = len(lagged)
+    for k in range(len(score)):
+        for i in range(n):
+            lagged[i] *= fade
+        for i in range(n):
+            f, h = score[k, i], lagged[i]
+            for j in range(n):
+                total[i, j] += f * (score[k, j] + lagged[j]) + h * score[k, j]
+        for i in range(n):
+            lagged[i] += score[k, i]
+
+
+# ------------------------------------------------------------------ what a bag can tell
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A combination that the data determine: ``name + sum of factor * other``."""
+
+    name: str
+    others: tuple[tuple[str, float], ...]
+
+    def __str__(self) -> str:
+        parts = [f"{'+' if f > 0 else '-'} {abs(f):.3g} {name}" for name, f in self.others]
+        return " ".join([self.name, *parts])
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """Which coefficients, or combinations of them, the data identify.
+
+    ``combinations``: identifiable. ``unidentified``: coefficients of which only a combination with
+    others, or nothing at all (``unexcited``), is known. ``condition``: of the regressor, its
+    columns of unit length; ``collinear``: pairs of columns with the cosine between them.
+    """
+
+    combinations: tuple[Combination, ...]
+    unidentified: tuple[str, ...]
+    unexcited: tuple[str, ...]
+    condition: float
+    collinear: tuple[tuple[str, str, float], ...]
+
+
+def base_parameters(names: Sequence[str], information: Array, scale: Array) -> BaseParameters:
+    """From the information (n, n) in units of ``scale`` (n,), the prior's standard deviations.
+
+    A QR decomposition with pivoting puts the columns that add most first; those after the numerical
+    rank are combinations of these (Gautier 1991). The rank counts directions of which the data
+    remove three quarters of the prior variance.
+    """
+    n = len(names)
+    eigenvalues, vectors = np.linalg.eigh(information)
+    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
+    length = np.sqrt(np.maximum(np.diag(information), 0.0))
+    seen = length**2 >= _KNOWN
+    unexcited = tuple(name for name, s in zip(names, seen, strict=True) if not s)
+    at = np.flatnonzero(seen)
+    if len(at) == 0:
+        return BaseParameters((), unexcited, unexcited, np.inf, ())
+    r, pivot = qr(root[:, at], mode="r", pivoting=True)
+    r = r[: len(at)]
+    rank = int(np.count_nonzero(np.diag(r) ** 2 >= _KNOWN))
+    base, rest = at[pivot[:rank]], at[pivot[rank:]]
+    mixed = np.linalg.solve(r[:rank, :rank], r[:rank, rank:])
+    combinations, order = [], np.argsort(base)
+    for i in order:
+        others = [
+            (names[k], float(mixed[i, j] * scale[base[i]] / scale[k]))
+            for j, k in enumerate(rest)
+            if abs(mixed[i, j]) > 0.02
+        ]
+        combinations.append(Combination(names[base[i]], tuple(others)))
+    unit = root[:, at] / length[at]
+    cosine = unit.T @ unit
+    singular = np.linalg.svd(unit, compute_uv=False)
+    pairs = [
+        (names[at[i]], names[at[j]], float(cosine[i, j]))
+        for i in range(len(at))
+        for j in range(i)
+        if abs(cosine[i, j]) > 0.95
+    ]
+    pairs.sort(key=lambda p: -abs(p[2]))
+    mixed_in = {name for c in combinations for name, _ in c.others}
+    mixed_in |= {c.name for c in combinations if c.others}
+    unidentified = tuple(
+        name for name in names if name in unexcited or name in mixed_in
+        or name in {names[k] for k in rest}
+    )  # fmt: skip
+    condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else np.inf
+    assert n == len(scale)
+    return BaseParameters(tuple(combinations), unidentified, unexcited, condition, tuple(pairs))
