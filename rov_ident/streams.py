@@ -44,6 +44,15 @@ class Streams:
         return bool(np.ptp(self.position, axis=0).max() > 0.0)
 
     @property
+    def guided(self) -> NDArray[np.bool_]:
+        """Axes (6,) whose velocity a simulation can only take as measured.
+
+        Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
+        computed, without. What turns the vehicle is then unknown.
+        """
+        return np.repeat([False, not self.demand[:, 3:].any()], 3)
+
+    @property
     def duration(self) -> float:
         return float(self.t[-1])
 
