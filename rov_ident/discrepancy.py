@@ -124,20 +124,37 @@ class Search:
         fits = self.fit_best(now, candidates)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.promise:.0f}" for c in candidates[:5]))
+        best = self._best(now, fits)
+        if best is None:
+            best = self._ahead(now, candidates)
+        if best is None:
+            return None
+        return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
+
+    def _best(self, now: Fitted, fits: Sequence[Fitted]) -> Fitted | None:
+        """The fit that is worth most, if any is; a plain term first."""
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.rss)
-        best = min(fits, key=lambda f: self.cost(f, closest))
-        plain = [
-            f
-            for f in fits
-            if self.newest(now, f) in PLAIN
-            and self.cost(now, closest) - self.cost(f, closest) > SURE
-        ]
-        best = min(plain or [best], key=lambda f: self.cost(f, closest))
-        if self.cost(now, closest) - self.cost(best, closest) < SURE:
-            return None
-        return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
+        worth = [f for f in fits if self.cost(now, closest) - self.cost(f, closest) >= SURE]
+        plain = [f for f in worth if self.newest(now, f) in PLAIN]
+        return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
+
+    def _ahead(self, now: Fitted, candidates: Sequence[Candidate]) -> Fitted | None:
+        """A plain term with one effect more, where neither shows without the other."""
+        for candidate in candidates:
+            if candidate.name not in PLAIN:
+                continue
+            first = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
+            if first is None:
+                continue
+            others = [c for c in self.screen(first) if not self._early(c.name, now.hypothesis)]
+            fits = [self.pruned(f, now) for f in self.fit_best(first, others)]
+            both = [f for f in fits if f and set(candidate.start) & set(f.hypothesis.keys)]
+            best = self._best(now, both)
+            if best is not None:
+                return best
+        return None
 
     def settle(self, final: Fitted, progress: Progress | None = None) -> tuple[Fitted, Trials]:
         """Every effect against its rivals, the others in place, until nothing changes."""
@@ -252,7 +269,9 @@ class Search:
         """Without the parameters beyond ``base`` that are not worth their price."""
         while fitted is not None:
             h, linear = fitted.hypothesis, fitted.linear
-            added = [k for k in h.keys if k not in base.hypothesis.values]
+            added = [
+                k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS
+            ]
             size = np.sqrt(np.maximum(np.diag(linear.normal), 1e-30))
             inverse = np.linalg.pinv(linear.normal / np.outer(size, size), hermitian=True)
             width = np.sqrt(np.maximum(np.diag(inverse), 1e-30)) / size
@@ -260,7 +279,7 @@ class Search:
             worth = [
                 (h.values[k] - bounds(k)[0]) ** 2 / width[linear.index([k])[0]] ** 2 for k in added
             ]
-            if not added or min(worth) > PRICE * kappa:
+            if min(worth, default=np.inf) > PRICE * kappa:
                 return fitted
             less = h.without([added[int(np.argmin(worth))]])
             fitted = self.evidence.fit(less, fitted.look)

@@ -185,7 +185,7 @@ def explain(
             ("extended", final.hypothesis),
         )
     }
-    notes = (_NO_TORQUE,) if streams.guided.any() else ()
+    notes = (*streams.notes, *((_NO_TORQUE,) if streams.guided.any() else ()))
     say("done", 1.0)
     return Explanation(
         Findings(

@@ -90,11 +90,10 @@ class Scores:
             keys = [k for u in have for k in u]
             change, reached = self.solve(keys, bounds)
             kappa = self.scatter(keys, change)
+            without = [[k for o in have if o is not u for k in o] for u in have]
             lost = [
-                (reached - self.solve([k for o in have if o is not u for k in o], bounds)[1])
-                / kappa
-                - PRICE * len(u)
-                for u in have
+                (reached - self.solve(rest, bounds)[1]) / kappa - PRICE * len(u)
+                for rest, u in zip(without, have, strict=True)
             ]
             worst = int(np.argmin(lost))
             if lost[worst] > 0.0:
