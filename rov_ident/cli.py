@@ -442,12 +442,23 @@ def _steps(quiet: bool) -> Iterator[Callable[[str], None]]:
 
 
 def _explain(options: argparse.Namespace) -> None:
+    config = configuration.load(options.config)
+    outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
+    new = not options.out.exists()
+    _check_outputs(outputs, [*options.bags, options.config, options.validate])
+    try:
+        _explained(options, config)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            if new:
+                options.out.rmdir()  # which leaves what is not empty
+        raise
+
+
+def _explained(options: argparse.Namespace, config: configuration.Config) -> None:
     from rov_ident import explain_report
     from rov_ident.explain import BLOCK, explain
 
-    config = configuration.load(options.config)
-    outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
-    _check_outputs(outputs, [*options.bags, options.config, options.validate])
     read = [_gather(path, config) for path in options.bags]
     judge = _gather(options.validate, config) if options.validate else None
     with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
@@ -464,6 +475,8 @@ def _explain(options: argparse.Namespace) -> None:
     findings = dataclasses.replace(explanation.findings, provenance=made)
     explanation = dataclasses.replace(explanation, findings=findings)
     explain_report.write(explanation, config, options.out)
+    for note in findings.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
 
     OUT.print(explain_report.verdict(findings), markup=False)
     table = _table(
