@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,8 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.errors import UserError
+from rov_ident.hindsight import hindsight
 from rov_ident.records import Record, read_record
-
-_LOOK_AHEAD = 120.0  # s; the gyro's bias is known that much later
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of the bag just read, how many are done, and how many there are."""
@@ -120,25 +118,6 @@ def opened(
 def default_jobs() -> int:
     """As many processes as this one may use processors."""
     return len(os.sched_getaffinity(0))
-
-
-def hindsight(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """The samples as they look afterwards: without the error of the gyro bias in the beginning.
-
-    The sampler finds the bias from odometry and gyro as it goes; the first seconds know it worst.
-    Each sample here takes the bias known some minutes later, or at the end of its stretch.
-    """
-    out = samples.copy()
-    edges = np.flatnonzero(samples["restart"])
-    edges = np.unique(np.concatenate([[0], edges, [len(samples)]]))
-    for first, end in pairwise(edges):
-        part = out[first:end]
-        later = np.searchsorted(part["t"], part["t"] + _LOOK_AHEAD, side="right") - 1
-        change = part["gyro_bias"] - part["gyro_bias"][later]
-        change[~np.isfinite(part["gyro"][:, 0])] = 0.0
-        part["gyro"] += change
-        part["nu"][:, 3:] += change
-    return out
 
 
 # ------------------------------------------------------------------ one bag

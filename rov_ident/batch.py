@@ -272,7 +272,8 @@ def predicted_information(
 ) -> Array:
     """Information (n, n) about the coefficients to estimate that the bags' motion holds, at the
     configured values and noise."""
-    estimated, noise = prior_of(config).estimated, maximum_likelihood.assumed(config)
+    estimated = prior_of(config).estimated
+    noise = maximum_likelihood.assumed(config, maximum_likelihood.LIKELY)
     parts = archive.each(maximum_likelihood.one_pass, config.dynamics, estimated, noise, free)
     return maximum_likelihood.total(parts).information
 

@@ -121,6 +121,38 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--quiet", action="store_true", help="no progress on standard error")
     fit.set_defaults(run=_fit)
 
+    check = commands.add_parser(
+        "check", help="is this bag fit for identification, and what would it tell"
+    )
+    _bag_and_config(check)
+    check.add_argument("--json", type=Path, help="write what was found here")
+    check.set_defaults(run=_check)
+
+    plan = commands.add_parser(
+        "plan", help="the manoeuvre to run next: safe, and best for the worst known coefficient"
+    )
+    plan.add_argument("--config", required=True, type=Path)
+    plan.add_argument(
+        "--bag", type=Path, nargs="+", default=[], help="what has been recorded already"
+    )
+    plan.add_argument("--duration", type=_positive, default=60.0, help="s (60)")
+    plan.add_argument(
+        "--tank",
+        type=_box,
+        default=(6.0, 6.0, 2.0),
+        metavar="L,W,D",
+        help="m; of free water about the start: length, width, depth (6,6,2)",
+    )
+    plan.add_argument(
+        "--thrust",
+        type=_positive,
+        default=1.0,
+        help="the largest wrench on each axis, relative to what holds working speed (1)",
+    )
+    plan.add_argument("--json", type=Path, help="write the plan here")
+    plan.add_argument("--out", type=Path, metavar="BAG", help="write the simulated manoeuvre here")
+    plan.set_defaults(run=_plan)
+
     explain = commands.add_parser(
         "explain", help="what the simulation gets wrong, why, and what mending it gains"
     )
@@ -298,6 +330,13 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _box(text: str) -> tuple[float, ...]:
+    sides = tuple(_positive(part) for part in text.split(","))
+    if len(sides) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} must be three lengths: 6,6,2")
+    return sides
+
+
 def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 1024:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 1024")
@@ -439,6 +478,58 @@ def _steps(quiet: bool) -> Iterator[Callable[[str], None]]:
     with Progress(console=ERR, transient=True, disable=not shown) as progress:
         bar = progress.add_task("", total=None)
         yield lambda what: progress.update(bar, description=what)
+
+
+def _check(options: argparse.Namespace) -> None:
+    import json
+
+    from rov_ident.check import check
+    from rov_ident.fit import write_text
+
+    _check_outputs([options.json], [options.bag, options.config])
+    config = configuration.load(options.config)
+    found = check(options.bag, config)
+    if options.json:
+        write_text(options.json, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+    verdict = "fit for identification" if found.fit else "not fit for identification"
+    OUT.print(f"{found.bag}, {found.duration:.1f} s: {verdict}", markup=False)
+    for remark in found.remarks:
+        OUT.print(f"  {remark.level:<8} {remark.subject}: {remark.text}", markup=False)
+    table = _table("what a fit of it would give", "configured", "std", "unit", "known")
+    for p in found.prospects:
+        known = {"well": "well", "roughly": "roughly", "not": "no: the prior decides"}[p.verdict]
+        table.add_row(p.name, f"{p.value:.4g}", f"{p.std:.2g}", p.unit, known)
+    OUT.print(table)
+
+
+def _plan(options: argparse.Namespace) -> None:
+    import json
+
+    from rov_ident import archive
+    from rov_ident.fit import write_text
+    from rov_ident.plan import Limits, propose
+
+    _check_outputs([options.json, options.out], [*options.bag, options.config])
+    config = configuration.load(options.config)
+    limits = Limits(options.tank, options.thrust)
+    with _steps(False) as say, contextlib.ExitStack() as stack:
+        bags = None
+        if options.bag:
+            bags = stack.enter_context(archive.opened(options.bag, config))
+        found = propose(config, bags, options.duration, limits, say)
+    if options.json:
+        write_text(options.json, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+    if options.out:
+        from rov_ident.recording import write_messages
+
+        write_messages(options.out, found.best.dive(config, seed=0).messages)
+    OUT.print(found.sentence, markup=False, soft_wrap=True)
+    table = _table("predicted standard deviations", "configured", "now", "after it", "unit")
+    for before, after in zip(found.before, found.after):
+        table.add_row(
+            before.name, f"{before.value:.4g}", f"{before.std:.2g}", f"{after.std:.2g}", before.unit
+        )
+    OUT.print(table)
 
 
 def _explain(options: argparse.Namespace) -> None:

@@ -269,9 +269,7 @@ class Search:
         """Without the parameters beyond ``base`` that are not worth their price."""
         while fitted is not None:
             h, linear = fitted.hypothesis, fitted.linear
-            added = [
-                k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS
-            ]
+            added = [k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS]
             size = np.sqrt(np.maximum(np.diag(linear.normal), 1e-30))
             inverse = np.linalg.pinv(linear.normal / np.outer(size, size), hermitian=True)
             width = np.sqrt(np.maximum(np.diag(inverse), 1e-30)) / size

@@ -21,17 +21,19 @@ Sums over the samples of several bags are sums over bags: an archive is one fit.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
+from scipy.linalg import cho_factor, cho_solve, qr
 
+from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.effects import compiled
+from rov_ident.errors import UserError
 from rov_ident.excitation import authority
-from rov_ident.jit import kernel
-from rov_ident.model import Array, Model
+from rov_ident.jit import inlined, kernel, reordered
+from rov_ident.model import Array, Model, coriolis_of, extend, six, symmetric_product
 from rov_ident.records import HORIZON, predicted
 from rov_ident.regression import Regression, filtered_rows, regression
 
@@ -107,8 +109,7 @@ def solve(
     def estimate(batch: Batch, weight: Array) -> tuple[Array, Moments]:
         moments = _total(each(moments_of, batch))
         a, b = _weighted(moments.sums, weight / repeats)
-        x: Array = np.linalg.solve(a + prior, b)
-        return x, moments
+        return np.array(np.linalg.solve(a + prior, b)), moments
 
     def residual(moments: Moments, x: Array) -> Array:
         tail = np.append(-x, 1.0)
@@ -228,6 +229,269 @@ def _scatter(score, fade, total, lagged):
                 total[i, j] += f * (score[k, j] + lagged[j]) + h * score[k, j]
         for i in range(n):
             lagged[i] += score[k, i]
+
+
+# ------------------------------------------------------------------ logs with accelerations
+
+
+@dataclass(frozen=True)
+class Log:
+    """A motion with its accelerations: nu, nu_dot, wrench (N, 6), down (N, 3), in core axes."""
+
+    nu: Array
+    nu_dot: Array
+    wrench: Array
+    down: Array
+
+
+def equation_error(
+    model: Model, log: Log, weight: Array | None = None, tsqr: bool = False
+) -> Array:
+    """All coefficients (n,) of the model by least squares on ``tau = Y theta + known``.
+
+    One pass over the log in blocks: besides the log, memory does not grow with it. ``weight`` (6,)
+    of each axis's squared residual. ``tsqr``: blockwise Householder instead of normal equations,
+    right for condition numbers of the regressor up to 1e15 instead of 1e7, and slower.
+
+    Raises
+    ------
+    UserError
+        If the log does not tell all coefficients.
+    """
+    weight = np.ones(6) if weight is None else weight
+    n = len(model.theta)
+    pattern, count = _pattern(model)
+    known = model.with_theta(np.zeros(n))
+    arguments: tuple[Any, ...] = (
+        known.structure, known.body.mass_matrix[:, :, None], known.body.restoring,
+        *(np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)),
+    )  # fmt: skip
+    if tsqr:
+        root = _householder(arguments, pattern, count, weight, n)
+        length = np.sqrt(np.sum(root[:, :n] ** 2, axis=0))
+        _check_told(model.names, length)
+        scaled = root[:, :n] / length
+        if np.abs(np.diag(scaled)).min() < 1e-13:
+            raise UserError(_NOT_TOLD)
+        return np.array(np.linalg.solve(scaled[:n], root[:n, n]) / length)
+    sums = np.zeros((6, n + 1, n + 1))
+    _accumulate(*arguments, pattern, count, sums)
+    whole = np.einsum("k,kij->ij", weight, sums)
+    a, b = whole[:-1, :-1] + np.tril(whole[:-1, :-1], -1).T, whole[-1, :-1]
+    length = np.sqrt(np.diag(a))
+    _check_told(model.names, length)
+    try:
+        factor = cho_factor(a / np.outer(length, length), lower=True)
+    except np.linalg.LinAlgError as error:
+        raise UserError(_NOT_TOLD) from error
+    solution: Array = cho_solve(factor, b / length) / length
+    return solution
+
+
+_NOT_TOLD = (
+    "the log does not tell all coefficients apart: leave some out of the model, or drive the "
+    "vehicle at more than one speed on every axis"
+)
+
+
+def _check_told(names: Sequence[str], length: Array) -> None:
+    if not np.isfinite(length).all():
+        raise UserError("the log holds values that are not finite: leave those rows out")
+    if (length == 0.0).any():
+        missing = ", ".join(n for n, size in zip(names, length, strict=True) if size == 0.0)
+        raise UserError(f"the log says nothing of {missing}: leave these out of the model")
+
+
+def _pattern(model: Model) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns (6, n + 1) of the regressor that are not always zero, axis by axis, the goal last;
+    their number (6,)."""
+    n, rng = len(model.theta), np.random.default_rng(0)
+    found = np.zeros((6, n), dtype=bool)
+    for _ in range(8):
+        nu, nu_dot = rng.standard_normal((2, 6))
+        found |= model.regressor(nu, nu_dot) != 0.0
+    pattern, count = np.full((6, n + 1), n, dtype=np.int64), np.zeros(6, dtype=np.int64)
+    for axis, row in enumerate(found):
+        columns = np.append(np.flatnonzero(row), n)
+        pattern[axis, : len(columns)], count[axis] = columns, len(columns)
+    return pattern, count
+
+
+def _householder(
+    arguments: tuple[Any, ...],
+    pattern: NDArray[np.int64],
+    count: NDArray[np.int64],
+    weight: Array,
+    n: int,
+) -> Array:
+    """The triangular root (n + 1, n + 1) of all rows, block by block and axis by axis."""
+    block = np.zeros((6, n + 1, _BLOCK))
+    roots: list[Array] = [np.zeros((0, c)) for c in count]
+    total = len(arguments[3])
+    for first in range(0, total, _BLOCK):
+        size = min(_BLOCK, total - first)
+        _fill(*arguments, first, block)
+        for axis in range(6):
+            mine = block[axis, pattern[axis, : count[axis]], :size].T
+            stacked = np.vstack([roots[axis], mine])
+            roots[axis] = np.array(np.linalg.qr(stacked, mode="r"))
+    whole = np.zeros((sum(len(r) for r in roots) + n + 1, n + 1))
+    row = n + 1
+    for axis, root in enumerate(roots):
+        columns = pattern[axis, : count[axis]]
+        whole[row : row + len(root), columns] = np.sqrt(weight[axis]) * root
+        row += len(root)
+    return np.array(np.linalg.qr(whole, mode="r"))
+
+
+_BLOCK = 8192  # samples of TSQR
+_LANES = 128  # samples of the normal equations side by side: the block stays in the cache
+
+
+# One record, so that the compiler knows that its parts do not overlap; a loop along the lanes then
+# becomes vector instructions.
+_SCRATCH = np.dtype(
+    [
+        ("nu", "f8", (6, _LANES)),
+        ("nu_dot", "f8", (6, _LANES)),
+        ("h", "f8", (6, _LANES)),
+        ("extended", "f8", (EXTENDED_SIZE, _LANES)),
+    ],
+    align=True,
+)
+
+
+@reordered
+def _load(restoring, nu, nu_dot, wrench, down, first, s):
+    """Samples from ``first`` on into the lanes, their goal without inertia into ``h``."""
+    size = min(_LANES, len(nu) - first)
+    for k in range(size):
+        for i in range(6):
+            s.nu[i, k] = nu[first + k, i]
+            s.nu_dot[i, k] = nu_dot[first + k, i]
+            s.h[i, k] = wrench[first + k, i]
+            for j in range(3):
+                s.h[i, k] += restoring[i, j] * down[first + k, j]
+    for i in range(6):
+        for k in range(size, _LANES):
+            s.nu[i, k] = 0.0
+            s.nu_dot[i, k] = 0.0
+            s.h[i, k] = 0.0
+
+
+@reordered
+def _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, s, block):
+    """Into block (6, n + 1, _LANES) regressor and goal from ``first`` on; zeros beyond the end."""
+    _load(restoring, nu, nu_dot, wrench, down, first, s)
+    masses, terms = len(structure.mass_row), len(structure.row)
+    for k in range(_LANES):
+        v = six(s.nu, k)
+        a = symmetric_product(mass, six(s.nu_dot, k), 0)
+        h = coriolis_of(symmetric_product(mass, v, 0), v)
+        s.h[0, k] -= a[0] + h[0]
+        s.h[1, k] -= a[1] + h[1]
+        s.h[2, k] -= a[2] + h[2]
+        s.h[3, k] -= a[3] + h[3]
+        s.h[4, k] -= a[4] + h[4]
+        s.h[5, k] -= a[5] + h[5]
+    for i in range(6):
+        _copied(s.h, i, block[i, masses + terms])
+    for c in range(masses):
+        i, j = structure.mass_row[c], structure.mass_column[c]
+        e0, e1, e2, e3, e4, e5 = _unit(i)
+        f0, f1, f2, f3, f4, f5 = _unit(j) if i != j else _unit(-1)
+        for k in range(_LANES):
+            g, m = -s.nu[j, k], -s.nu[i, k]
+            momentum = (
+                e0 * g + f0 * m, e1 * g + f1 * m, e2 * g + f2 * m,
+                e3 * g + f3 * m, e4 * g + f4 * m, e5 * g + f5 * m,
+            )  # fmt: skip
+            h = coriolis_of(momentum, six(s.nu, k))
+            s.h[0, k] = h[0]
+            s.h[1, k] = h[1]
+            s.h[2, k] = h[2]
+            s.h[3, k] = h[3]
+            s.h[4, k] = h[4]
+            s.h[5, k] = h[5]
+        for k in range(_LANES):
+            s.h[i, k] -= s.nu_dot[j, k]
+        if i != j:
+            for k in range(_LANES):
+                s.h[j, k] -= s.nu_dot[i, k]
+        for q in range(6):
+            _copied(s.h, q, block[q, c])
+    extend(_LANES, s.nu, s.extended)
+    for t in range(terms):
+        out, left, right = (
+            block[structure.row[t], masses + t],
+            structure.left[t],
+            structure.right[t],
+        )
+        for k in range(_LANES):
+            out[k] = -s.extended[left, k] * s.extended[right, k]
+
+
+@inlined
+def _copied(a, i, out):
+    for k in range(_LANES):
+        out[k] = a[i, k]
+
+
+@inlined
+def _unit(i):
+    return (
+        1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0,
+        1.0 if i == 3 else 0.0, 1.0 if i == 4 else 0.0, 1.0 if i == 5 else 0.0,
+    )  # fmt: skip
+
+
+@kernel
+def _fill(structure, mass, restoring, nu, nu_dot, wrench, down, first, out):
+    """Into out (6, n + 1, size) the samples from ``first`` on."""
+    s = np.zeros(1, dtype=_SCRATCH)[0]
+    block = np.zeros((6, out.shape[1], _LANES))
+    for begin in range(0, out.shape[2], _LANES):
+        if first + begin >= len(nu):
+            break
+        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first + begin, s, block)
+        for i in range(6):
+            for j in range(out.shape[1]):
+                for k in range(_LANES):
+                    out[i, j, begin + k] = block[i, j, k]
+
+
+@kernel
+def _accumulate(structure, mass, restoring, nu, nu_dot, wrench, down, pattern, count, sums):
+    """Add to sums (6, n + 1, n + 1), lower halves, the squares of all rows, axis by axis."""
+    s = np.zeros(1, dtype=_SCRATCH)[0]
+    block = np.zeros((6, sums.shape[1], _LANES))
+    for first in range(0, len(nu), _LANES):
+        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, s, block)
+        for axis in range(6):
+            _squares(block[axis], pattern[axis], count[axis], sums[axis])
+
+
+@reordered
+def _squares(x, pattern, count, sums):
+    """Two rows and two columns of the lower half at a time: each number is read for both."""
+    for a in range(0, count, 2):
+        i0, i1 = pattern[a], pattern[min(a + 1, count - 1)]
+        for b in range(0, a + 1, 2):
+            j0, j1 = pattern[b], pattern[min(b + 1, count - 1)]
+            s00, s01, s10, s11 = 0.0, 0.0, 0.0, 0.0
+            for k in range(_LANES):
+                f, g, p, q = x[i0, k], x[i1, k], x[j0, k], x[j1, k]
+                s00 += f * p
+                s01 += f * q
+                s10 += g * p
+                s11 += g * q
+            sums[i0, j0] += s00
+            if a + 1 < count:
+                sums[i1, j0] += s10
+                if b + 1 <= a + 1 and b + 1 < count:
+                    sums[i1, j1] += s11
+            if b + 1 <= a:
+                sums[i0, j1] += s01
 
 
 # ------------------------------------------------------------------ what a bag can tell

@@ -44,6 +44,7 @@ _GATE = 6.0  # standard deviations; an innovation further off is an outlier
 _NOISE_SAMPLES = 60_000  # of a bag, from which its noise levels are estimated
 _ITERATIONS = 25
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
+LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
 
 Samples = NDArray[np.void]
 
@@ -68,11 +69,14 @@ class Noise:
         return density
 
 
-def assumed(config: Config) -> Noise:
-    """The noise that a configuration states."""
+def assumed(config: Config, least: float = _SMALLEST) -> Noise:
+    """The noise that a configuration states.
+
+    ``least``: that of the wrench where there is none, relative to the axis's authority.
+    """
     w = config.wrench
-    least = _SMALLEST * authority(config.dynamics)
-    floor = np.maximum(np.array(w.floor_std), least) ** 2 * w.correlation_time
+    smallest = least * authority(config.dynamics)
+    floor = np.maximum(np.array(w.floor_std), smallest) ** 2 * w.correlation_time
     return Noise(np.ones(6), floor, w.relative_std, w.correlation_time)
 
 
