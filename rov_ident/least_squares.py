@@ -275,7 +275,7 @@ def equation_error(
     n = len(model.theta)
     pattern, count = _pattern(model)
     known = model.with_theta(np.zeros(n))
-    arguments = (
+    arguments: tuple[Any, ...] = (
         known.structure, known.body.mass_matrix[:, :, None], known.body.restoring,
         *(np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)),
     )  # fmt: skip
