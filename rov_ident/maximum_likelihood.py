@@ -41,7 +41,7 @@ _POINTS = 7  # a velocity and its displacements along the six components, for th
 _STEP = 1e-6  # m/s, rad/s; of these displacements
 _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; an innovation further off is an outlier
-_NOISE_SAMPLES = 60_000  # of a bag, from which its noise levels are estimated
+_NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
 _ITERATIONS = 25
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
 LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
@@ -198,7 +198,9 @@ _KNOWN = np.log(30.0)  # prior standard deviation of such a logarithm
 def _levels(noise: Noise) -> Array:
     """(13,) logarithms: measurement, floor, relative (as a variance)."""
     return np.log(
-        np.concatenate([noise.measurement, noise.floor, [max(noise.relative, 1e-5) ** 2]])
+        np.concatenate(
+            [noise.measurement, np.maximum(noise.floor, 1e-300), [max(noise.relative, 1e-5) ** 2]]
+        )
     )
 
 
@@ -301,8 +303,13 @@ def maximise(
 
     nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
     theta, count, converged = model.theta[estimated].copy(), 0, False
+    settled, at = theta.copy(), nothing
     for stage, gate in enumerate((np.inf, _GATE, _GATE)):
+        far = theta - settled
+        if stage == 2 and far @ at.information @ far < 0.1 * len(theta):
+            break  # the noise levels would be the same
         if stage:
+            settled = theta.copy()
             say("noise levels")
             moved = model.theta.copy()
             moved[estimated] = theta
