@@ -179,6 +179,15 @@ class Search:
             final = self.longer(final) or final
         return final, trials
 
+    def trials(self, final: Fitted) -> Trials:
+        """Every effect against its rivals, the others in place."""
+        rests = {
+            n: self.evidence.fit(self._without(final, n), final.look) for n in self.named(final)
+        }
+        return {
+            n: Trial(rest, self.rivals(rest, n)) for n, rest in rests.items() if rest is not None
+        }
+
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
         """What should stand in the stead of ``name``, if anything.
 
@@ -269,9 +278,7 @@ class Search:
         """Without the parameters beyond ``base`` that are not worth their price."""
         while fitted is not None:
             h, linear = fitted.hypothesis, fitted.linear
-            added = [
-                k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS
-            ]
+            added = [k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS]
             size = np.sqrt(np.maximum(np.diag(linear.normal), 1e-30))
             inverse = np.linalg.pinv(linear.normal / np.outer(size, size), hermitian=True)
             width = np.sqrt(np.maximum(np.diag(inverse), 1e-30)) / size
@@ -426,15 +433,11 @@ class Search:
             values = {(effect.name, n): v for n, v in shape.items()}
             return self.evidence.columns(h.having(values), look.motion, keys)
 
-        columns = []
+        best = None
         for shape in shapes:
             at_origin = column(shape)
-            columns += [at_origin, *(column({**shape, p.name: 1.0}) - at_origin for p in places)]
-        sensitivities = look.of(np.concatenate(columns, axis=2))
-        best = None
-        each = len(keys) + len(places)
-        for i, shape in enumerate(shapes):
-            mine = sensitivities[:, i * each : (i + 1) * each]
+            moved = [column({**shape, p.name: 1.0}) - at_origin for p in places]
+            mine = look.of(np.concatenate([at_origin, *moved], axis=2))
             scores = scores_of(look, [*keys, *moments], mine)
             units = [(*keys, *moments)] if moments else [(k,) for k in keys]
             chosen, change, promise = scores.best(units, bounds)
