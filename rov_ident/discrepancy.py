@@ -179,6 +179,15 @@ class Search:
             final = self.longer(final) or final
         return final, trials
 
+    def trials(self, final: Fitted) -> Trials:
+        """Every effect against its rivals, the others in place."""
+        rests = {
+            n: self.evidence.fit(self._without(final, n), final.look) for n in self.named(final)
+        }
+        return {
+            n: Trial(rest, self.rivals(rest, n)) for n, rest in rests.items() if rest is not None
+        }
+
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
         """What should stand in the stead of ``name``, if anything.
 
@@ -424,15 +433,11 @@ class Search:
             values = {(effect.name, n): v for n, v in shape.items()}
             return self.evidence.columns(h.having(values), look.motion, keys)
 
-        columns = []
+        best = None
         for shape in shapes:
             at_origin = column(shape)
-            columns += [at_origin, *(column({**shape, p.name: 1.0}) - at_origin for p in places)]
-        sensitivities = look.of(np.concatenate(columns, axis=2))
-        best = None
-        each = len(keys) + len(places)
-        for i, shape in enumerate(shapes):
-            mine = sensitivities[:, i * each : (i + 1) * each]
+            moved = [column({**shape, p.name: 1.0}) - at_origin for p in places]
+            mine = look.of(np.concatenate([at_origin, *moved], axis=2))
             scores = scores_of(look, [*keys, *moments], mine)
             units = [(*keys, *moments)] if moments else [(k,) for k in keys]
             chosen, change, promise = scores.best(units, bounds)

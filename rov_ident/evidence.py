@@ -11,6 +11,7 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from rov_ident.coefficients import AXES, parse
@@ -245,6 +246,7 @@ class Evidence:
         """``spans``: from and to [s] of each window."""
         self.streams = streams
         keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
+        keep &= within(spans, streams.t)
         t = streams.t[keep]
         nodes = _subdivided(t)
         pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
@@ -589,9 +591,18 @@ def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:
 
 
 def _subdivided(t: Array) -> Array:
-    """The instants t and as many between them that no step is longer than _MAX_STEP."""
-    parts = [
-        np.linspace(a, b, max(1, int(np.ceil((b - a) / _MAX_STEP - 1e-6))), endpoint=False)
-        for a, b in itertools.pairwise(t)
-    ]
-    return np.append(np.concatenate(parts), t[-1])
+    """The instants t and as many between them that no step is longer than _MAX_STEP, gaps aside."""
+    length = np.diff(t)
+    count = np.where(length > _MAX_GAP, 1, np.ceil(length / _MAX_STEP - 1e-6)).astype(int)
+    count = np.maximum(count, 1)
+    at = np.repeat(np.arange(len(length)), count)
+    part = np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)
+    return np.append(t[at] + part * length[at] / count[at], t[-1])
+
+
+def within(spans: Iterable[tuple[float, float]], t: Array) -> NDArray[np.bool_]:
+    """Which of the instants t (k,) lie in one of the spans (from and to [s])."""
+    out: NDArray[np.bool_] = np.zeros(len(t), dtype=bool)
+    for begin, end in spans:
+        out |= (t >= begin) & (t < end)
+    return out

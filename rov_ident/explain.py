@@ -16,7 +16,7 @@ from rov_ident.config import Config
 from rov_ident.discrepancy import Search, Trial, Trials
 from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
-from rov_ident.evidence import Evidence, Fitted, onsets
+from rov_ident.evidence import Evidence, Fitted, onsets, within
 from rov_ident.excitation import authority
 from rov_ident.findings import (
     Alternative,
@@ -40,6 +40,7 @@ _CHUNK = 2.5  # s; of the bootstrap
 _CLUSTERS = 8  # windows from which their scatter tells anything
 _WORTH = 0.02  # gain from which an effect has practical weight
 _AS_WELL = "fits this bag as well"
+_ENOUGH = 600.0  # s; of data to fit
 _LIMIT = 3.0  # a simulation further off than so many standard deviations of the motion has failed
 
 _NO_TORQUE = (
@@ -130,7 +131,7 @@ def explain(
     judge_streams = kinematics.corrected(judge_streams, sensors)
 
     say("refitting the coefficients", 0.1)
-    search = Search(streams, config, fit)
+    search = Search(streams, config, thinned(fit))
     path = search.run(lambda what: say("searching: " + what, 0.3))
     if not path:
         raise UserError(
@@ -148,15 +149,15 @@ def explain(
     say("judging on held-out data", 0.9)
     judge = Judge(Evidence(judge_streams, judge_spans))
     retuned = path[0].hypothesis
-    known = {n: t for n, t in trials.items() if not n.startswith(UNKNOWN)}
-    found = [_finding(search, judge, final, name, trial) for name, trial in known.items()]
+    final, found = _judged(search, judge, final, trials)
     minor = [f for f in found if not weighty(f)]
     slight = [k for f in minor for k in search.keys_of(final, f.effect)]
     patterns = [k for k in final.hypothesis.keys if k[0] == UNKNOWN]
     if slight or patterns:
         kept = search.evidence.fit(final.hypothesis.without([*slight, *patterns]), final.look)
         final = kept or path[0]
-    everything = Evidence(streams, [s for a, b in blocks(streams) for s in _halved(a, b)])
+    halves = [s for a, b in blocks(streams) for s in _halved(a, b)]
+    everything = Evidence(streams, thinned(halves))
     last = everything.fit(final.hypothesis, None) or final
     last = everything.dated(last)
     findings = sorted(
@@ -167,6 +168,7 @@ def explain(
         key=lambda f: -f.gain.percent,
     )
     minor += [f for f in sensor_findings if not weighty(f)]
+    minor = [f for f in minor if f.gain.low > 0.0 or f.gain.percent >= 100.0 * _WORTH]
     extended = _extended(config, last.hypothesis, sensors)
     tuning = judge.gain(search.given, retuned)
     verdict: Verdict = "agrees"
@@ -207,6 +209,25 @@ def explain(
     )
 
 
+def _judged(
+    search: Search, judge: "Judge", final: Fitted, trials: Trials
+) -> tuple[Fitted, list[Finding]]:
+    """The findings of a model, without those that others can stand in for.
+
+    Two effects that do the same on the held-out data gain nothing beside each other, and all
+    together: the slightest leaves, and the rest is judged anew.
+    """
+    while True:
+        known = {n: t for n, t in trials.items() if not n.startswith(UNKNOWN)}
+        found = [_finding(search, judge, final, name, trial) for name, trial in known.items()]
+        slight = [f for f in found if not weighty(f)]
+        if len(slight) < 2:
+            return final, found
+        least = min(slight, key=lambda f: f.gain.percent)
+        rest = known[least.effect].rest
+        final, trials = rest, search.trials(rest)
+
+
 def weighty(finding: Finding) -> bool:
     """Whether an effect is of practical weight."""
     return finding.gain.percent >= 100.0 * _WORTH and finding.gain.low > 0.0
@@ -225,13 +246,15 @@ def blocks(streams: Streams) -> Spans:
 
 
 def _inside(spans: Spans) -> Callable[[Array], NDArray[np.bool_]]:
-    def inside(t: Array) -> NDArray[np.bool_]:
-        out: NDArray[np.bool_] = np.zeros(len(t), dtype=bool)
-        for begin, end in spans:
-            out |= (t >= begin) & (t < end)
-        return out
+    return lambda t: within(spans, t)
 
-    return inside
+
+def thinned(spans: Spans) -> Spans:
+    """As many of the spans, evenly spread, as it takes: more would cost time and tell little."""
+    every = sum(end - begin for begin, end in spans) / _ENOUGH
+    if every <= 1.0:
+        return spans
+    return [spans[int(i)] for i in np.arange(0.0, len(spans), every)]
 
 
 def _check(streams: Streams, bags: Sequence[Streams]) -> None:
