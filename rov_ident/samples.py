@@ -124,7 +124,8 @@ class Sampler:
     """Merges the three topics into samples; the only part of the estimation that waits.
 
     ``counts`` holds how many messages of each kind were taken or, by reason, refused; bad data
-    never raises. ``origin`` is the stamp [ns] of t = 0.
+    never raises. ``origin`` is the stamp [ns] of t = 0. Who wants the single demands (t [s], wrench
+    (6,)) that the samples are made of sets ``demands`` to a list, and empties it.
     """
 
     def __init__(self, config: Config) -> None:
@@ -135,6 +136,7 @@ class Sampler:
         self._frame_ids: dict[str, tuple[str, ...]] = {}
         self._last_stamp: dict[str, int] = {}
         self._suspect: dict[str, int] = {}  # a stamp out of line, by topic
+        self.demands: list[tuple[float, Array]] | None = None
         self._clear()
 
     def configure(self, config: Config) -> None:
@@ -366,6 +368,8 @@ class Sampler:
             elif self._demand is None:
                 start = now = max(at, start)
             self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
+            if self.demands is not None:
+                self.demands.append((at, self._demand))
         if self._demand is None or end - self._demand_time > self._hold:
             self._demand = None
             self._memory = memory()

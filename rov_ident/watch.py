@@ -1,0 +1,413 @@
+"""What the model may lack, watched while it runs: the cheap part of :mod:`rov_ident.explain`.
+
+The motion is cut into windows of a few seconds. Each is simulated with the coefficients as they are
+estimated then, and every effect of the library that acts on the wrench is scored at its null:
+sensitivities of the simulated velocity to its parameters against what the simulation leaves
+unexplained (:mod:`rov_ident.evidence`, the same as the offline search). What is remembered of a
+window is its normal equations about a common origin, so that windows of different coefficients add
+up::
+
+    J'J,  J'(r + J theta_w),  r'r + 2 r'J theta_w + (J theta_w)'(J theta_w)
+
+The score of an effect is what it takes off the squared residuals of the last minutes, beyond what
+another choice of the estimated coefficients can, over how much more whole windows scatter than
+white residuals (:func:`rov_ident.scores.inflation`). It is worth a word when it passes the price
+for the number of effects tried and explains a share of the residual that matters.
+
+Effects on sensors are not watched: they do not act on the wrench, and what gives them away is that
+two sensors disagree. Nor is what has a frequency: it takes a search. Those with an onset are
+watched as if they had always been there; the memory is short enough for that.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.coefficients import ABSOLUTE, AXES, NEGATIVE, ONE, VELOCITIES, parse
+from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import Effect
+from rov_ident.estimate import typical
+from rov_ident.evidence import Evidence, Linear
+from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, parameter
+from rov_ident.messages import Array
+from rov_ident.scores import SURE, inflation
+from rov_ident.streams import Streams
+
+WINDOW = 5.0  # s
+MEMORY = 36  # windows
+FEWEST = 8  # windows, from which on their scatter says something
+ALARM = 1e-4
+"""How often a memory full of windows with nothing missing may raise a false alarm."""
+SHARE = 0.05
+"""The least share of the residual's power that an effect must explain."""
+
+_SPACING = 0.045  # s; measurements closer than that add cost, hardly information
+_SHORTEST = 0.5 * WINDOW  # s; of a window that a gap has cut off
+_NOISE_TIME = 60.0  # s; over which the size of the residual is followed
+_MOST = 3  # effects named at once
+_FITTED = 12  # units that are scored in full
+
+MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """An effect that the model seems to lack, or one of ``rivals`` that these data cannot tell.
+
+    ``axes`` are letters of XYZKMN, where it shows most; ``parameters`` {name: value}, a linear
+    estimate from the effect's null, with ``units``; ``score`` is what it takes off the scaled
+    squared residuals, ``price`` what that must exceed, ``share`` of the residual's power.
+    """
+
+    effect: str
+    axes: str
+    parameters: Mapping[str, float]
+    units: Mapping[str, str]
+    score: float
+    price: float
+    share: float
+    rivals: tuple[str, ...]
+    sentence: str
+
+
+class Window(NamedTuple):
+    """What is remembered of a window; P parameters: the estimated ones, then those watched."""
+
+    t: float  # s, of its end
+    normal: Array  # (P, P)
+    moment: Array  # (P,): J'(r + J theta), theta zero for those watched
+    power: float  # of r + J theta
+    count: int  # residuals
+    energy: Array  # (6, P): squared sensitivities by velocity component
+
+
+class Task(NamedTuple):
+    """What does not change from window to window."""
+
+    config: Config
+    base: tuple[Key, ...]
+    units: tuple[tuple[Key, ...], ...]
+    prior: Array  # (B,) precision of the base about its values in the configuration
+    centre: Array  # (B,)
+
+
+class State(NamedTuple):
+    """All that the next window needs."""
+
+    windows: tuple[Window, ...]
+    noise: Array  # (6,): standard deviation of what a window leaves unexplained
+
+
+def watched(effect: Effect) -> bool:
+    """Whether an effect can be scored as it stands: it acts on the wrench, without a frequency."""
+    return effect.sense is None and all(p.role != "frequency" for p in effect.parameters)
+
+
+def problem(config: Config) -> Task:
+    """What is to be watched in the model of a configuration."""
+    model = config.model
+    base = tuple((COEFFICIENTS, name) for name in config.estimate)
+    size = dict(
+        zip(model.names, np.maximum(np.abs(model.theta), 0.2 * typical(model)), strict=True)
+    )
+    units = [u for e in EFFECTS.values() if watched(e) for u in _units(e, config)]
+    return Task(
+        config,
+        base,
+        tuple(units),
+        np.array([size[name] ** -2.0 for name in config.estimate]),
+        np.array([centre(config, key) for key in base]),
+    )
+
+
+def _units(effect: Effect, config: Config) -> list[tuple[Key, ...]]:
+    """The parameters of an effect that the model lacks, in the groups that belong together."""
+    if effect.coefficients:
+        have = {parse(name).place for name in config.model.names}
+        return [
+            ((COEFFICIENTS, name),) for name in effect.coefficients if parse(name).place not in have
+        ]
+    if effect.name in config.effects:
+        return []
+    mine = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+    return [(key,) for key in mine] if effect.parameters[0].axis else [tuple(mine)]
+
+
+def init(task: Task) -> State:
+    """Nothing seen."""
+    odometry, imu = task.config.odometry, task.config.imu
+    angular = min(odometry.angular_std, imu.gyro_std)
+    return State((), np.repeat([odometry.linear_std, angular], 3))
+
+
+def step(
+    task: Task, state: State, samples: NDArray[np.void], demands: Array, values: Mapping[str, float]
+) -> State:
+    """Take in a window: samples (k,) of SAMPLE, the demands (d, 7) [t, wrench] that led to them,
+    and the estimated coefficients; the next state. The same state where it says nothing."""
+    streams = _streams(samples, demands)
+    if streams is None:
+        return state
+    evidence = Evidence(streams, [(float(streams.t[0]), float(streams.t[-1]) + 1e-6)])
+    if len(evidence.first) != 1:
+        return state
+    h = Hypothesis(task.config, {key: values[key[1]] for key in task.base}, _constants(streams))
+    look = evidence.look(h, evidence.begin(), state.noise)
+    if look is None:
+        return state
+    extra = tuple(key for unit in task.units for key in unit)
+    columns = look.of(evidence.columns(h, look.motion, extra))
+    linear = look.having(extra, columns)
+    theta = np.array(list(h.values.values()))
+    b = len(theta)
+    through = linear.normal[:, :b] @ theta
+    gradient = linear.gradient[0]
+    window = Window(
+        float(streams.t[-1]),
+        linear.normal,
+        gradient + through,
+        float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b]),
+        linear.count,
+        np.hstack([(c**2).reshape(-1, 6, c.shape[1]).sum(axis=0) for c in (look.columns, columns)]),
+    )
+    blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
+    seen = np.sqrt(np.mean(look.clean() ** 2, axis=0))
+    noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
+    return State((*state.windows[-(MEMORY - 1) :], window), noise)
+
+
+def _constants(streams: Streams) -> dict[Key, float]:
+    """Parameters that are known: a fade over the dive is watched as if it had begun with it."""
+    return {
+        (e.name, p.name): max(streams.duration, p.lower)
+        for e in EFFECTS.values()
+        for p in e.parameters
+        if p.role == "fixed"
+    }
+
+
+def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
+    """The measured part of the samples as the offline search has it, over ground."""
+    kept, last = [], -np.inf
+    for i in np.flatnonzero(samples["measured"]).tolist():
+        if samples["t"][i] - last >= _SPACING:
+            kept.append(i)
+            last = samples["t"][i]
+    if len(kept) < 8 or len(demands) == 0:
+        return None
+    rows = samples[kept]
+    nu = rows["nu"].copy()
+    nu[:, :3] += rows["water"]
+    n, none = len(rows), np.zeros((0, 3))
+    return Streams(
+        rows["t"].copy(), np.zeros((n, 3)), rows["orientation"].copy(), nu,
+        np.zeros(0), none, none, demands[:, 0].copy(), demands[:, 1:].copy(),
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------ judgement
+
+
+def suspicions(task: Task, state: State) -> list[Suspicion]:
+    """What the remembered windows say is missing, the plainest first; empty when nothing is."""
+    if len(state.windows) < FEWEST:
+        return []
+    memory = _Memory(task, state.windows)
+    chosen: list[Key] = []
+    found: list[Suspicion] = []
+    while len(found) < _MOST:
+        left = [u for u in task.units if not set(u) & set(chosen)]
+        best = memory.best(chosen, left)
+        if best is None:
+            break
+        found.append(best)
+        chosen += [_key(best.effect, name) for name in best.parameters]
+    return found
+
+
+def price(size: int, tried: int) -> float:
+    """What ``size`` parameters must take off the scaled squared residuals.
+
+    Chance makes it x with a probability of at most exp(-(x - size) / 2) (x / size)^(size / 2)
+    (Chernoff), and that ``tried`` times.
+    """
+    x = 0.0
+    for _ in range(50):
+        x = size + size * np.log(max(x, size) / size) + 2.0 * np.log(tried / ALARM)
+    return float(x)
+
+
+class _Memory:
+    """The sum of windows, ready to be solved for any choice of parameters."""
+
+    def __init__(self, task: Task, windows: Sequence[Window]) -> None:
+        self.task, self.windows = task, windows
+        self.keys = (*task.base, *(key for unit in task.units for key in unit))
+        self.place = {key: i for i, key in enumerate(self.keys)}
+        self.normal = sum(w.normal for w in windows)
+        self.moment = sum(w.moment for w in windows)
+        self.power = sum(w.power for w in windows)
+        self.count = sum(w.count for w in windows)
+        self.energy = sum(w.energy for w in windows)
+
+    def solve(self, extra: Sequence[Key]) -> tuple[Array, Linear]:
+        """The best values (B + E,) of base and extra, and the linear problem there."""
+        b = len(self.task.base)
+        at = np.array([*range(b), *(self.place[key] for key in extra)])
+        prior = np.zeros(len(at))
+        prior[:b] = 1e-6 * self.task.prior
+        n, m = self.normal[np.ix_(at, at)] + np.diag(prior), self.moment[at]
+        m[:b] += prior[:b] * self.task.centre
+        size = np.sqrt(np.maximum(np.diag(n), 1e-30))
+        value = np.linalg.solve(n / np.outer(size, size) + 1e-9 * np.eye(len(at)), m / size) / size
+        gradient = np.array([w.moment[at] - w.normal[np.ix_(at, at)] @ value for w in self.windows])
+        rss = np.array(
+            [
+                w.power - value @ (w.moment[at] + g)
+                for w, g in zip(self.windows, gradient, strict=True)
+            ]
+        )
+        keys = tuple(self.keys[i] for i in at)
+        return value, Linear(keys, n, gradient, np.maximum(rss, 0.0), self.count)
+
+    def best(self, chosen: list[Key], units: Sequence[tuple[Key, ...]]) -> Suspicion | None:
+        """The unit most worth adding to the chosen parameters, with those that do as well."""
+        _, before = self.solve(chosen)
+        rss = float(before.rss.sum())
+        trials = []
+        for unit in self._promising(chosen, units):
+            value, after = self.solve([*chosen, *unit])
+            change = value[len(before.keys) :]
+            if all(_allowed(key, delta) for key, delta in zip(unit, change, strict=True)):
+                trials.append((unit, change, after))
+        if not trials:
+            return None
+        tried = len(self.task.units)
+        unit, change, after = min(trials, key=lambda t: t[2].rss.sum())
+        kappa = inflation(after, np.arange(len(after.keys)))
+
+        def worth(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
+            return (rss - float(trial[2].rss.sum())) / kappa - price(len(trial[0]), tried)
+
+        unit, change, after = max(trials, key=worth)
+        score, asked = (rss - float(after.rss.sum())) / kappa, price(len(unit), tried)
+        share = 1.0 - float(after.rss.sum()) / rss
+        if score < asked or share < SHARE:
+            return None
+        most = score - asked
+        rivals = [t[0] for t in trials if t[0] != unit and most - worth(t) < SURE]
+        axes = self._axes(unit, change)
+        return Suspicion(
+            _effect(unit),
+            axes,
+            {key[1]: bounds(key)[0] + d for key, d in zip(unit, change.tolist(), strict=True)},
+            {key[1]: _unit(key) for key in unit},
+            score,
+            asked,
+            share,
+            tuple(dict.fromkeys(_effect(u) for u in rivals if _effect(u) != _effect(unit))),
+            _sentence(unit, axes, [u for u in rivals if _effect(u) != _effect(unit)]),
+        )
+
+    def _promising(
+        self, chosen: Sequence[Key], units: Sequence[tuple[Key, ...]]
+    ) -> list[tuple[Key, ...]]:
+        """The units that take most off the residuals, by normal equations alone."""
+        b = np.array([*range(len(self.task.base)), *(self.place[key] for key in chosen)])
+        n = self.normal
+        size = np.sqrt(np.maximum(np.diag(n), 1e-30))
+        scaled, moment = n / np.outer(size, size), self.moment / size
+        onto = np.linalg.solve(scaled[np.ix_(b, b)] + 1e-9 * np.eye(len(b)), scaled[b])
+        left = scaled - scaled[:, b] @ onto
+        gradient = moment - moment[b] @ onto
+        gains = []
+        for unit in units:
+            at = np.array([self.place[key] for key in unit])
+            a, g = left[np.ix_(at, at)], gradient[at]
+            # what the base can mimic to four digits cannot be told from it
+            if np.linalg.eigvalsh(a)[0] < 1e-4:
+                gains.append(0.0)
+            else:
+                gains.append(float(g @ np.linalg.solve(a, g)))
+        order = np.argsort(gains)[::-1][:_FITTED]
+        return [units[i] for i in order if gains[i] > 0.0]
+
+    def _axes(self, unit: Sequence[Key], change: Array) -> str:
+        """Where a unit acts: as its name says, or where it moves the vehicle most."""
+        own = [_axis(key) for key in unit]
+        if all(own):
+            return "".join(dict.fromkeys(own))
+        at = [self.place[key] for key in unit]
+        energy = self.energy[:, at] @ change**2
+        return "".join(AXES[i] for i in np.flatnonzero(energy > 0.3 * energy.max()))
+
+
+def _allowed(key: Key, delta: float) -> bool:
+    """Whether a parameter may leave its null this way."""
+    null, lower, upper = bounds(key)
+    return not ((null == lower and delta < 0.0) or (null == upper and delta > 0.0))
+
+
+def _key(effect: str, name: str) -> Key:
+    return (COEFFICIENTS if EFFECTS[effect].coefficients else effect, name)
+
+
+def _effect(unit: Sequence[Key]) -> str:
+    section, name = unit[0]
+    if section != COEFFICIENTS:
+        return section
+    return next(e.name for e in EFFECTS.values() if name in e.coefficients)
+
+
+def _axis(key: Key) -> str:
+    """The axis that the name of a parameter says, or none."""
+    section, name = key
+    return AXES[parse(name).row] if section == COEFFICIENTS else parameter(key).axis
+
+
+def _unit(key: Key) -> str:
+    section, name = key
+    return parse(name).unit if section == COEFFICIENTS else parameter(key).unit
+
+
+def _sentence(unit: Sequence[Key], axes: str, rivals: Sequence[Sequence[Key]]) -> str:
+    where = " and ".join(MOTIONS[AXES.index(a)] for a in axes)
+    names = dict.fromkeys(_words(u) for u in [unit, *rivals])
+    return f"residual in {where} follows {_pattern(unit)}: {' or '.join(names)} missing?"
+
+
+def _words(unit: Sequence[Key]) -> str:
+    return _effect(unit).replace("_", " ")
+
+
+def _pattern(unit: Sequence[Key]) -> str:
+    """What the residual follows, as a pilot would say or write it."""
+    section, name = unit[0]
+    if section != COEFFICIENTS:
+        return _FOLLOWS.get(EFFECTS[section].place, "").format(_words(unit))
+    c = parse(name)
+    if c.is_added_mass:
+        return f"the acceleration in {MOTIONS[c.column]}"
+    right = _factor(c.right)
+    return right if c.left == ONE else f"{_factor(c.left)}{right}"
+
+
+_FOLLOWS = {
+    "input": "the thrust",
+    "wrench": "attitude, motion or heading",
+    "motion": "the heading",
+}
+
+
+def _factor(place: int) -> str:
+    """An entry of the extended velocity [1, nu, |nu|, min(nu, 0)]."""
+    v = VELOCITIES[(place - 1) % 6]
+    if place >= NEGATIVE:
+        return f"min({v}, 0)"
+    return f"|{v}|" if place >= ABSOLUTE else v
+
+
