@@ -248,11 +248,12 @@ class _Memory:
         self.task, self.windows = task, windows
         self.keys = (*task.base, *(key for unit in task.units for key in unit))
         self.place = {key: i for i, key in enumerate(self.keys)}
-        self.normal = sum(w.normal for w in windows)
-        self.moment = sum(w.moment for w in windows)
-        self.power = sum(w.power for w in windows)
+        self.normals = np.array([w.normal for w in windows])
+        self.moments = np.array([w.moment for w in windows])
+        self.powers = np.array([w.power for w in windows])
+        self.normal, self.moment = self.normals.sum(axis=0), self.moments.sum(axis=0)
         self.count = sum(w.count for w in windows)
-        self.energy = sum(w.energy for w in windows)
+        self.energy = np.sum([w.energy for w in windows], axis=0)
 
     def solve(self, extra: Sequence[Key]) -> tuple[Array, Linear]:
         """The best values (B + E,) of base and extra, and the linear problem there."""
@@ -264,22 +265,17 @@ class _Memory:
         m[:b] += prior[:b] * self.task.centre
         size = np.sqrt(np.maximum(np.diag(n), 1e-30))
         value = np.linalg.solve(n / np.outer(size, size) + 1e-9 * np.eye(len(at)), m / size) / size
-        gradient = np.array([w.moment[at] - w.normal[np.ix_(at, at)] @ value for w in self.windows])
-        rss = np.array(
-            [
-                w.power - value @ (w.moment[at] + g)
-                for w, g in zip(self.windows, gradient, strict=True)
-            ]
-        )
-        keys = tuple(self.keys[i] for i in at)
-        return value, Linear(keys, n, gradient, np.maximum(rss, 0.0), self.count)
+        gradient = self.moments[:, at] - self.normals[:, at[:, None], at] @ value
+        rss = np.maximum(self.powers - (self.moments[:, at] + gradient) @ value, 0.0)
+        return value, Linear(tuple(self.keys[i] for i in at), n, gradient, rss, self.count)
 
     def best(self, chosen: list[Key], units: Sequence[tuple[Key, ...]]) -> Suspicion | None:
         """The unit most worth adding to the chosen parameters, with those that do as well."""
         _, before = self.solve(chosen)
         rss = float(before.rss.sum())
         trials = []
-        for unit in self._promising(chosen, units):
+        least = max(price(1, len(self.task.units)) * rss / self.count, SHARE * rss)
+        for unit in self._promising(chosen, units, least):
             value, after = self.solve([*chosen, *unit])
             change = value[len(before.keys) :]
             if all(_allowed(key, delta) for key, delta in zip(unit, change, strict=True)):
@@ -314,9 +310,9 @@ class _Memory:
         )
 
     def _promising(
-        self, chosen: Sequence[Key], units: Sequence[tuple[Key, ...]]
+        self, chosen: Sequence[Key], units: Sequence[tuple[Key, ...]], least: float
     ) -> list[tuple[Key, ...]]:
-        """The units that take most off the residuals, by normal equations alone."""
+        """The units that take most off the squared residuals, and at least that much."""
         b = np.array([*range(len(self.task.base)), *(self.place[key] for key in chosen)])
         n = self.normal
         size = np.sqrt(np.maximum(np.diag(n), 1e-30))
@@ -334,7 +330,7 @@ class _Memory:
             else:
                 gains.append(float(g @ np.linalg.solve(a, g)))
         order = np.argsort(gains)[::-1][:_FITTED]
-        return [units[i] for i in order if gains[i] > 0.0]
+        return [units[i] for i in order if gains[i] > least]
 
     def _axes(self, unit: Sequence[Key], change: Array) -> str:
         """Where a unit acts: as its name says, or where it moves the vehicle most."""
