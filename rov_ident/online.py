@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from rov_ident.config import Config
 from rov_ident.estimate import Estimate, physical, prior_of
 from rov_ident.messages import Array, Message
 from rov_ident.samples import Sampler
+
+if TYPE_CHECKING:
+    from rov_ident.watch import Watcher
 
 Kind = Literal["rls", "ukf"]
 ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
@@ -72,6 +75,7 @@ class OnlineEstimator:
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
+        self.watcher: Watcher | None = None
         self._enabled = True
         self._paused = False
         self.reset()
@@ -86,12 +90,19 @@ class OnlineEstimator:
         self._variance = self._estimate().std ** 2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
+        if self.watcher is not None:
+            self.watcher.reset()
 
     def configure(self, config: Config) -> None:
         """Take other settings of the same model and coefficients; what is learnt stays."""
         self.config = config
         self._task = self._module.problem(config)
         self.sampler.configure(config)
+
+    def show(self, watcher: "Watcher") -> None:
+        """Let a watcher see from now on what the estimator sees."""
+        self.sampler.demands = []
+        self.watcher = watcher
 
     @property
     def enabled(self) -> bool:
@@ -134,6 +145,12 @@ class OnlineEstimator:
             if count := int(np.count_nonzero(info["reason"] == reason)):
                 self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
         self._watch(float(samples["dt"].sum()))
+        if self.watcher is not None and self.sampler.demands is not None:
+            window = self.watcher.take(samples, self.sampler.demands)
+            if window is not None:
+                report = self.report()
+                values = zip(report.names, report.values.tolist(), strict=True)
+                self.watcher.look(window, dict(values))
         return info
 
     def _watch(self, elapsed: float) -> None:

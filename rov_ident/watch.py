@@ -15,25 +15,31 @@ white residuals (:func:`rov_ident.scores.inflation`). It is worth a word when it
 for the number of effects tried and explains a share of the residual that matters.
 
 Effects on sensors are not watched: they do not act on the wrench, and what gives them away is that
-two sensors disagree. Nor is what has a frequency: it takes a search. Those with an onset are
-watched as if they had always been there; the memory is short enough for that.
+two sensors disagree. Nor is a wave, whose frequency takes a search, nor the slow fade of a battery,
+which in the memory of some minutes looks like a thruster gain. Effects with an onset are watched as
+if they had always been there; the memory is short enough for that. A point of attachment is taken
+to be the body origin.
 """
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.coefficients import ABSOLUTE, AXES, NEGATIVE, ONE, VELOCITIES, parse
-from rov_ident.config import Config
+from rov_ident.config import Config, from_parameters
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
 from rov_ident.estimate import typical
 from rov_ident.evidence import Evidence, Linear
 from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, parameter
 from rov_ident.messages import Array
+from rov_ident.samples import SAMPLE, joined
 from rov_ident.scores import SURE, inflation
 from rov_ident.streams import Streams
 
@@ -46,7 +52,6 @@ SHARE = 0.05
 """The least share of the residual's power that an effect must explain."""
 
 _SPACING = 0.045  # s; measurements closer than that add cost, hardly information
-_SHORTEST = 0.5 * WINDOW  # s; of a window that a gap has cut off
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed
 _MOST = 3  # effects named at once
 _FITTED = 12  # units that are scored in full
@@ -81,8 +86,9 @@ class Window(NamedTuple):
     normal: Array  # (P, P)
     moment: Array  # (P,): J'(r + J theta), theta zero for those watched
     power: float  # of r + J theta
-    count: int  # residuals
+    residuals: int  # so many of them
     energy: Array  # (6, P): squared sensitivities by velocity component
+    seen: Array  # (6,): power of r by velocity component
 
 
 class Task(NamedTuple):
@@ -103,8 +109,9 @@ class State(NamedTuple):
 
 
 def watched(effect: Effect) -> bool:
-    """Whether an effect can be scored as it stands: it acts on the wrench, without a frequency."""
-    return effect.sense is None and all(p.role != "frequency" for p in effect.parameters)
+    """Whether an effect can be scored as it stands: it acts on the wrench, and at once."""
+    searched = {"frequency", "fixed"}
+    return effect.sense is None and not any(p.role in searched for p in effect.parameters)
 
 
 def problem(config: Config) -> Task:
@@ -155,7 +162,7 @@ def step(
     evidence = Evidence(streams, [(float(streams.t[0]), float(streams.t[-1]) + 1e-6)])
     if len(evidence.first) != 1:
         return state
-    h = Hypothesis(task.config, {key: values[key[1]] for key in task.base}, _constants(streams))
+    h = Hypothesis(task.config, {key: values[key[1]] for key in task.base})
     look = evidence.look(h, evidence.begin(), state.noise)
     if look is None:
         return state
@@ -173,21 +180,12 @@ def step(
         float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b]),
         linear.count,
         np.hstack([(c**2).reshape(-1, 6, c.shape[1]).sum(axis=0) for c in (look.columns, columns)]),
+        np.sum(look.error.reshape(-1, 6) ** 2, axis=0),
     )
     blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
     seen = np.sqrt(np.mean(look.clean() ** 2, axis=0))
     noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
     return State((*state.windows[-(MEMORY - 1) :], window), noise)
-
-
-def _constants(streams: Streams) -> dict[Key, float]:
-    """Parameters that are known: a fade over the dive is watched as if it had begun with it."""
-    return {
-        (e.name, p.name): max(streams.duration, p.lower)
-        for e in EFFECTS.values()
-        for p in e.parameters
-        if p.role == "fixed"
-    }
 
 
 def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
@@ -207,6 +205,88 @@ def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
         rows["t"].copy(), np.zeros((n, 3)), rows["orientation"].copy(), nu,
         np.zeros(0), none, none, demands[:, 0].copy(), demands[:, 1:].copy(),
     )  # fmt: skip
+
+
+class Watcher:
+    """Cuts samples into windows and keeps the suspicions up to date: what a node asks for.
+
+    ``run`` calls a function with its arguments, now or later (a thread's ``submit``); later calls
+    must keep their order.
+    """
+
+    def __init__(self, config: Config, run: Callable[..., object] | None = None) -> None:
+        self._run = run or _at_once
+        self._task = problem(config)
+        self._samples: list[NDArray[np.void]] = []
+        self._demands: list[tuple[float, Array]] = []
+        self._begin = np.nan
+        self._forget()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._samples.clear()
+        self._demands.clear()
+        self._run(self._forget)
+
+    def _forget(self) -> None:
+        self._state = init(self._task)
+        self.suspicions: list[Suspicion] = []
+
+    def take(
+        self, samples: NDArray[np.void], demands: list[tuple[float, Array]]
+    ) -> tuple[NDArray[np.void], Array] | None:
+        """Take samples (k,) and the demands so far, which are emptied; a window that is full."""
+        self._demands += demands
+        demands.clear()
+        t = float(samples["t"][-1])
+        if samples["restart"].any():
+            self._samples.clear()
+        if not self._samples:
+            self._begin = float(samples["t"][0])
+        self._samples.append(samples)
+        if t - self._begin < WINDOW:
+            return None
+        rows = joined(self._samples)
+        told = np.array([[at, *wrench] for at, wrench in self._demands]).reshape(-1, 7)
+        # a window begins at the last sample of the one before, with the demand that holds then
+        self._samples, self._begin = [rows[-1:]], t
+        first = max(int(np.searchsorted(told[:, 0], t, side="right")) - 1, 0)
+        self._demands = self._demands[first:]
+        return rows, told
+
+    def look(self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float]) -> None:
+        """Judge a window by the coefficients as they are now, when there is time for it."""
+        self._run(self._look, *window, values)
+
+    def _look(self, samples: NDArray[np.void], demands: Array, values: Mapping[str, float]) -> None:
+        self._state = step(self._task, self._state, samples, demands, values)
+        self.suspicions = suspicions(self._task, self._state)
+
+
+def is_compiled() -> bool:
+    """Whether :func:`compile_all` has been through on this computer."""
+    return _COMPILED.exists()
+
+
+def compile_all() -> None:
+    """Compile all kernels on a vehicle at rest, or fetch them compiled."""
+    vehicle = {"name": "any", "frame": "frd", "mass": 10.0, "buoyancy": 98.1, "cog": [0.0] * 3}
+    vehicle |= {"cob": [0.0] * 3, "inertia": [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]}
+    config = from_parameters({"vehicle": vehicle, "coefficients": {"X_u": -1.0}})
+    rest = np.zeros(101, dtype=SAMPLE)
+    rest["t"] = np.linspace(0.0, WINDOW, len(rest))
+    rest["measured"], rest["orientation"][:, 0], rest["down"][:, 2] = True, 1.0, 1.0
+    task = problem(config)
+    step(task, init(task), rest, np.zeros((1, 7)), {"X_u": -1.0})
+    with contextlib.suppress(OSError):
+        _COMPILED.touch()
+
+
+_COMPILED = Path(numba.config.CACHE_DIR) / "watch"
+
+
+def _at_once(function: Callable[..., object], *arguments: object) -> None:
+    function(*arguments)
 
 
 # ------------------------------------------------------------------ judgement
@@ -252,8 +332,9 @@ class _Memory:
         self.moments = np.array([w.moment for w in windows])
         self.powers = np.array([w.power for w in windows])
         self.normal, self.moment = self.normals.sum(axis=0), self.moments.sum(axis=0)
-        self.count = sum(w.count for w in windows)
+        self.count = sum(w.residuals for w in windows)
         self.energy = np.sum([w.energy for w in windows], axis=0)
+        self.seen = np.sum([w.seen for w in windows], axis=0)
 
     def solve(self, extra: Sequence[Key]) -> tuple[Array, Linear]:
         """The best values (B + E,) of base and extra, and the linear problem there."""
@@ -274,7 +355,7 @@ class _Memory:
         _, before = self.solve(chosen)
         rss = float(before.rss.sum())
         trials = []
-        least = max(price(1, len(self.task.units)) * rss / self.count, SHARE * rss)
+        least = price(1, len(self.task.units)) * rss / self.count
         for unit in self._promising(chosen, units, least):
             value, after = self.solve([*chosen, *unit])
             change = value[len(before.keys) :]
@@ -291,12 +372,13 @@ class _Memory:
 
         unit, change, after = max(trials, key=worth)
         score, asked = (rss - float(after.rss.sum())) / kappa, price(len(unit), tried)
-        share = 1.0 - float(after.rss.sum()) / rss
+        axes = self._axes(unit, change)
+        there = self.seen[[AXES.index(a) for a in axes]].sum() / self.seen.sum()
+        share = (1.0 - float(after.rss.sum()) / rss) / there
         if score < asked or share < SHARE:
             return None
         most = score - asked
         rivals = [t[0] for t in trials if t[0] != unit and most - worth(t) < SURE]
-        axes = self._axes(unit, change)
         return Suspicion(
             _effect(unit),
             axes,
@@ -407,3 +489,5 @@ def _factor(place: int) -> str:
     return f"|{v}|" if place >= ABSOLUTE else v
 
 
+if __name__ == "__main__":
+    compile_all()

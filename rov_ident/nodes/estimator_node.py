@@ -4,15 +4,20 @@ Nothing here computes a coefficient. Timers run on the steady clock, so that a n
 `use_sim_time` works where nothing publishes `/clock`; a sample's time is its stamp in any case.
 """
 
+import contextlib
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -45,6 +50,7 @@ _OWN_PARAMETERS = ("save_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
 _DIAGNOSTICS_PERIOD = 1.0  # s
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
+_LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
 _LOG_PERIOD = 10.0  # s; between two equal complaints
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 # Not worth a warning: the consequence of something that is named itself.
@@ -128,6 +134,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             for role, (name, type_) in INPUTS.items()
         }
         self._publish()
+        self._begin_watching()
         self.get_logger().info(
             f"active after {time.monotonic() - started:.1f} s of compiling: estimating "
             f"{len(config.estimate)} coefficients of {config.name}"
@@ -214,6 +221,58 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._coefficients.publish(to_diagnostics(shown, self._config.name))
         return shown
 
+    # ---------------------------------------------------------------- what the model lacks
+
+    def _begin_watching(self) -> None:
+        """Look for what the model lacks in a thread of its own, which may take its time.
+
+        What is not compiled yet is compiled by another process: a thread of ours would stop us.
+        """
+        self._judge = ThreadPoolExecutor(1, "watch")
+        self._compiling: subprocess.Popen[bytes] | None = None
+        begun = self._judge.submit(self._load_watcher)
+        begun.add_done_callback(self._complain)
+        if self._lockstep:
+            with contextlib.suppress(TimeoutError):
+                begun.result(_LOADING_TIME)
+
+    def _load_watcher(self) -> None:
+        from rov_ident import watch  # here: not needed to begin with
+
+        if not watch.is_compiled():
+            self._compiling = subprocess.Popen([sys.executable, "-m", watch.__name__])
+            self._compiling.wait()
+        watch.compile_all()
+        self._online.show(watch.Watcher(self._config, self._when_idle))
+
+    def _when_idle(self, function: Callable[..., object], *arguments: object) -> None:
+        self._judge.submit(function, *arguments).add_done_callback(self._complain)
+
+    def _complain(self, job: "Future[Any]") -> None:
+        if not job.cancelled() and (error := job.exception()):
+            self.get_logger().error(f"watching what the model lacks failed: {error!r}")
+
+    def _model_status(self) -> DiagnosticStatus:
+        """What the model seems to lack, in words and numbers."""
+        watcher = self._online.watcher
+        found = [] if watcher is None else watcher.suspicions
+        values = {}
+        for i, suspicion in enumerate(found):
+            number = f" {i + 1}" if i else ""
+            values[f"effect{number}"] = suspicion.effect
+            values[f"axis{number}"] = suspicion.axes
+            values[f"score{number}"] = f"{suspicion.score:.3g}"
+            values[f"price{number}"] = f"{suspicion.price:.3g}"
+            values[f"share{number}"] = f"{suspicion.share:.3g}"
+            values[f"alternatives{number}"] = " ".join(suspicion.rivals)
+            for name, value in suspicion.parameters.items():
+                values[f"{suspicion.effect}.{name}"] = f"{value:.4g} {suspicion.units[name]}"
+        level = Level.WARN if found else Level.OK
+        words = "; ".join(s.sentence for s in found) or (
+            "the watch is being compiled" if watcher is None else "nothing is seen to be missing"
+        )
+        return to_status(f"{self.get_name()}: model", self._config.name, level, words, values)
+
     # ---------------------------------------------------------------- watching
 
     def _watch(self) -> None:
@@ -274,7 +333,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
         complaints = self._complaints()
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [self._input_status(complaints, period), self._estimation_status()]
+        message.status = [
+            self._input_status(complaints, period),
+            self._estimation_status(),
+            self._model_status(),
+        ]
         self._diagnostics.publish(message)
         # Without the numbers, which differ each time.
         complaint = "; ".join(text.partition(" (")[0] for text in complaints)
@@ -362,11 +425,16 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _flush(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Use what still waits for a late topic; answers with the stamp [ns] of the last sample."""
         self._show(self._online.flush())
+        if self._online.watcher is not None:
+            self._judge.submit(int).result()  # whatever waits in front of it
         self._diagnose()
         response.success, response.message = True, str(self._publish().stamp)
         return response
 
     def take_leave(self) -> None:
+        self._judge.shutdown(wait=False, cancel_futures=True)
+        if self._compiling is not None:
+            self._compiling.terminate()
         used = self._online.counts["sample: used"]
         self.get_logger().info(f"ended: {used} samples used")
 
