@@ -141,6 +141,12 @@ class Sampler:
 
     def configure(self, config: Config) -> None:
         """Take other settings; the buffered messages and the motion stay."""
+        self._sensitivity = None
+        if config.estimate_effects:
+            from rov_ident.sensitivity import Sensitivity  # here: few need it
+
+            self._sensitivity = Sensitivity(config)
+        self._none = np.zeros(0, dtype=sample_type(len(config.estimate_effects)))
         self._grace = config.grace
         self._hold = config.timeout
         self._effects = config.effects
@@ -166,6 +172,8 @@ class Sampler:
         self._demand: Array | None = None
         self._demand_time = -math.inf
         self._memory = memory()
+        if self._sensitivity is not None:
+            self._sensitivity.forget()
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
 
     # -------------------------------------------------------------- messages in
@@ -175,7 +183,7 @@ class Sampler:
         reason = self._refusal(role, message)
         if reason:
             self.counts[f"{role}: {reason}"] += 1
-            return _NONE
+            return self._none
         if self.origin is None:
             self.origin = message.stamp
         t = (message.stamp - self.origin) * 1e-9
@@ -185,7 +193,7 @@ class Sampler:
             if step < -1.0 or step > _MAX_JUMP:
                 if not self._is_new_clock(role, message.stamp):
                     self.counts[f"{role}: stamp jumps"] += 1
-                    return _NONE
+                    return self._none
                 done = self.flush()
                 self.counts["clock: jumps, buffers restarted"] += 1
                 self._clear()
@@ -195,13 +203,13 @@ class Sampler:
                 return done
             if step <= 0.0:
                 self.counts[f"{role}: {'duplicate' if step == 0.0 else 'backward'} stamp"] += 1
-                return _NONE
+                return self._none
         self._last_stamp[role] = message.stamp
         self._suspect.pop(role, None)
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
             if role != WRENCH:
-                return _NONE
+                return self._none
         self._enqueue(role, t, message)
         return self._complete(final=False)
 
@@ -293,7 +301,7 @@ class Sampler:
             if sample is not None:
                 samples.append(sample)
         if not samples:
-            return _NONE
+            return self._none
         return samples[0] if len(samples) == 1 else joined(samples)
 
     def _reached(self, t: float) -> bool:
@@ -320,6 +328,11 @@ class Sampler:
         mean, slope = (_ZERO_WRENCH, _ZERO_WRENCH) if wrench is None else wrench
         sample = np.zeros(1, dtype=SAMPLE)
         odometry, shift = _ABSENT, 0.0
+        if self._sensitivity is not None:
+            raw = None if pose is None else pose[1]
+            assert raw is None or isinstance(raw, Odometry)
+            assert imu is None or isinstance(imu, Imu)
+            self._sensitivity.measure(raw, imu, self._settings["imu_rotation"][0])
         if pose is not None:
             given = self._corrected(pose[1])
             assert isinstance(given, Odometry)
@@ -352,6 +365,9 @@ class Sampler:
             return None
         if self._surrounded:
             _surround(self._acting, sample, self._around)
+        if self._sensitivity is not None:
+            sides = self._sensitivity.take(sample[0], rotation(sample["orientation"][0]))
+            return np.frombuffer(bytearray(sample.tobytes() + sides.tobytes()), self._none.dtype)
         return sample
 
     def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array] | None:
@@ -373,6 +389,8 @@ class Sampler:
         if self._demand is None or end - self._demand_time > self._hold:
             self._demand = None
             self._memory = memory()
+            if self._sensitivity is not None:
+                self._sensitivity.forget()
             return None
         acting = self._act(now, end - now)
         if not pieces:
@@ -397,12 +415,45 @@ class Sampler:
         wrench = self._demand.copy()
         if self._acts:
             act(self._acting, self._memory, t, dt, wrench)
+        if self._sensitivity is not None:
+            self._sensitivity.act(t, dt, self._demand)
         return wrench
 
 
 def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
     """One array of the samples in all parts, as np.concatenate, which is slow with records."""
-    return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=SAMPLE)
+    return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=parts[0].dtype)
+
+
+def sample_type(size: int) -> np.dtype[np.void]:
+    """The dtype of samples that know how they change with ``size`` parameters of effects.
+
+    A SAMPLE, then ``by_wrench`` and ``by_velocity`` (6, size): see :mod:`rov_ident.sensitivity`.
+    """
+    if size == 0:
+        return SAMPLE
+    first, step = SAMPLE.itemsize, 48 * size
+    names = list(SAMPLE.names or ())
+    kinds = [SAMPLE.fields[name] for name in names] if SAMPLE.fields else []
+    return np.dtype(
+        {
+            "names": [*names, "by_wrench", "by_velocity"],
+            "formats": [*(kind[0] for kind in kinds), *([("f8", (6, size))] * 2)],
+            "offsets": [*(kind[1] for kind in kinds), first, first + step],
+        }
+    )
+
+
+def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
+    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 2, 6, size),
+    the wrench and the measured velocity."""
+    if samples.dtype == SAMPLE:
+        return samples, _NO_SIDES
+    size = (samples.dtype.itemsize - SAMPLE.itemsize) // 96
+    rows = np.ascontiguousarray(samples).view(np.uint8).reshape(len(samples), -1)
+    plain = np.ascontiguousarray(rows[:, : SAMPLE.itemsize]).view(SAMPLE)[:, 0]
+    sides = np.ascontiguousarray(rows[:, SAMPLE.itemsize :]).view(np.float64)
+    return plain, sides.reshape(len(samples), 2, 6, size)
 
 
 def _settings(config: Config) -> NDArray[np.void]:
@@ -426,8 +477,8 @@ def _settings(config: Config) -> NDArray[np.void]:
     return settings
 
 
-_NONE = np.zeros(0, dtype=SAMPLE)
 _ABSENT = np.full(16, math.nan)
+_NO_SIDES = np.zeros((0, 2, 6, 0))
 _ZERO = np.zeros(3)
 _ZERO_WRENCH = np.zeros(6)
 

@@ -17,8 +17,7 @@ for the number of effects tried and explains a share of the residual that matter
 Effects on sensors are not watched: they do not act on the wrench, and what gives them away is that
 two sensors disagree. Nor is a wave, whose frequency takes a search, nor the slow fade of a battery,
 which in the memory of some minutes looks like a thruster gain. Effects with an onset are watched as
-if they had always been there; the memory is short enough for that. A point of attachment is taken
-to be the body origin.
+if they had always been there; the memory is short enough for that.
 """
 
 import contextlib
@@ -37,23 +36,26 @@ from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
 from rov_ident.estimate import typical
 from rov_ident.evidence import Evidence, Linear
+from rov_ident.excitation import authority
 from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, parameter
 from rov_ident.messages import Array
 from rov_ident.samples import SAMPLE, joined
 from rov_ident.scores import SURE, inflation
+from rov_ident.shooting import Motion
 from rov_ident.streams import Streams
 
 WINDOW = 5.0  # s
 MEMORY = 36  # windows
-FEWEST = 8  # windows, from which on their scatter says something
+FEWEST = 12  # windows, from which on their scatter says something
 ALARM = 1e-4
 """How often a memory full of windows with nothing missing may raise a false alarm."""
-SHARE = 0.05
-"""The least share of the residual's power that an effect must explain."""
+SHARE = 0.5
+"""The least that an effect must explain: of the residual's power in one of six components."""
 
 _SPACING = 0.045  # s; measurements closer than that add cost, hardly information
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed
 _MOST = 3  # effects named at once
+_AS_GOOD = 0.8  # of what the best explains: what explains more may be it, beyond first order
 _FITTED = 12  # units that are scored in full
 
 MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -65,7 +67,8 @@ class Suspicion:
 
     ``axes`` are letters of XYZKMN, where it shows most; ``parameters`` {name: value}, a linear
     estimate from the effect's null, with ``units``; ``score`` is what it takes off the scaled
-    squared residuals, ``price`` what that must exceed, ``share`` of the residual's power.
+    squared residuals, ``price`` what that must exceed, ``share`` what it explains over the mean
+    power of a component of the residual.
     """
 
     effect: str
@@ -87,8 +90,7 @@ class Window(NamedTuple):
     moment: Array  # (P,): J'(r + J theta), theta zero for those watched
     power: float  # of r + J theta
     residuals: int  # so many of them
-    energy: Array  # (6, P): squared sensitivities by velocity component
-    seen: Array  # (6,): power of r by velocity component
+    strength: Array  # (6, P): squared wrenches of a unit of each, over those of work
 
 
 class Task(NamedTuple):
@@ -140,7 +142,8 @@ def _units(effect: Effect, config: Config) -> list[tuple[Key, ...]]:
         ]
     if effect.name in config.effects:
         return []
-    mine = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+    roles = ("amplitude", "place")
+    mine = [(effect.name, p.name) for p in effect.parameters if p.role in roles]
     return [(key,) for key in mine] if effect.parameters[0].axis else [tuple(mine)]
 
 
@@ -167,8 +170,8 @@ def step(
     if look is None:
         return state
     extra = tuple(key for unit in task.units for key in unit)
-    columns = look.of(evidence.columns(h, look.motion, extra))
-    linear = look.having(extra, columns)
+    force = _columns(task, evidence, h, look.motion)
+    linear = look.having(extra, look.of(force))
     theta = np.array(list(h.values.values()))
     b = len(theta)
     through = linear.normal[:, :b] @ theta
@@ -179,13 +182,35 @@ def step(
         gradient + through,
         float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b]),
         linear.count,
-        np.hstack([(c**2).reshape(-1, 6, c.shape[1]).sum(axis=0) for c in (look.columns, columns)]),
-        np.sum(look.error.reshape(-1, 6) ** 2, axis=0),
+        np.sum((force / authority(h.model)[:, None]) ** 2, axis=0),
     )
     blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
     seen = np.sqrt(np.mean(look.clean() ** 2, axis=0))
     noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
     return State((*state.windows[-(MEMORY - 1) :], window), noise)
+
+
+def _columns(task: Task, evidence: Evidence, h: Hypothesis, motion: Motion) -> Array:
+    """The wrench (K, 6, C) of a unit of each watched parameter.
+
+    Of an effect that attaches somewhere the columns are those of its amplitude at the body origin,
+    and of the amplitude times each coordinate of the place.
+    """
+    extra = [key for unit in task.units for key in unit]
+    plain = [key for key in extra if not _is_place(key)]
+    found = dict(zip(plain, evidence.columns(h, motion, plain).transpose(2, 0, 1), strict=True))
+    for key in extra:
+        if _is_place(key):
+            amplitude = next(k for k in plain if k[0] == key[0])
+            arm = parameter(key).typical
+            there = Hypothesis(h.config, h.values, {key: arm})
+            column = evidence.columns(there, motion, [amplitude])[:, :, 0]
+            found[key] = (column - found[amplitude]) / arm
+    return np.stack([found[key] for key in extra], axis=2)
+
+
+def _is_place(key: Key) -> bool:
+    return key[0] != COEFFICIENTS and parameter(key).role == "place"
 
 
 def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
@@ -299,13 +324,15 @@ def suspicions(task: Task, state: State) -> list[Suspicion]:
     memory = _Memory(task, state.windows)
     chosen: list[Key] = []
     found: list[Suspicion] = []
+    units = list(task.units)
     while len(found) < _MOST:
-        left = [u for u in task.units if not set(u) & set(chosen)]
-        best = memory.best(chosen, left)
+        best = memory.best(chosen, units)
         if best is None:
             break
         found.append(best)
         chosen += [_key(best.effect, name) for name in best.parameters]
+        # The remainder of an effect looks like others, to second order: only its own axes follow.
+        units = [u for u in units if _effect(u) == best.effect and not set(u) & set(chosen)]
     return found
 
 
@@ -333,8 +360,7 @@ class _Memory:
         self.powers = np.array([w.power for w in windows])
         self.normal, self.moment = self.normals.sum(axis=0), self.moments.sum(axis=0)
         self.count = sum(w.residuals for w in windows)
-        self.energy = np.sum([w.energy for w in windows], axis=0)
-        self.seen = np.sum([w.seen for w in windows], axis=0)
+        self.strength = np.sum([w.strength for w in windows], axis=0)
 
     def solve(self, extra: Sequence[Key]) -> tuple[Array, Linear]:
         """The best values (B + E,) of base and extra, and the linear problem there."""
@@ -359,7 +385,8 @@ class _Memory:
         for unit in self._promising(chosen, units, least):
             value, after = self.solve([*chosen, *unit])
             change = value[len(before.keys) :]
-            if all(_allowed(key, delta) for key, delta in zip(unit, change, strict=True)):
+            amplitudes = [(k, d) for k, d in zip(unit, change, strict=True) if not _is_place(k)]
+            if all(_allowed(key, delta) for key, delta in amplitudes):
                 trials.append((unit, change, after))
         if not trials:
             return None
@@ -367,28 +394,39 @@ class _Memory:
         unit, change, after = min(trials, key=lambda t: t[2].rss.sum())
         kappa = inflation(after, np.arange(len(after.keys)))
 
-        def worth(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
-            return (rss - float(trial[2].rss.sum())) / kappa - price(len(trial[0]), tried)
+        def taken(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
+            return rss - float(trial[2].rss.sum())
 
-        unit, change, after = max(trials, key=worth)
-        score, asked = (rss - float(after.rss.sum())) / kappa, price(len(unit), tried)
-        axes = self._axes(unit, change)
-        there = self.seen[[AXES.index(a) for a in axes]].sum() / self.seen.sum()
-        share = (1.0 - float(after.rss.sum()) / rss) / there
+        def worth(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
+            return taken(trial) / kappa - price(len(trial[0]), tried) - _has_onset(trial[0])
+
+        best = max(trials, key=worth)
+        unit, change, after = best
+        score, asked = taken(best) / kappa, price(len(unit), tried)
+        share = 6.0 * taken(best) / rss
         if score < asked or share < SHARE:
             return None
-        most = score - asked
-        rivals = [t[0] for t in trials if t[0] != unit and most - worth(t) < SURE]
+        rivals = [
+            t[0]
+            for t in trials
+            if _effect(t[0]) != _effect(unit)
+            and (worth(best) - worth(t) < SURE or taken(t) > _AS_GOOD * taken(best))
+        ]
+        axes = self._axes(unit, change)
+        values = [bounds(key)[0] + d for key, d in zip(unit, change.tolist(), strict=True)]
+        for i, key in enumerate(unit):
+            if _is_place(key):
+                values[i] = change[i] / change[0] if change[0] else 0.0
         return Suspicion(
             _effect(unit),
             axes,
-            {key[1]: bounds(key)[0] + d for key, d in zip(unit, change.tolist(), strict=True)},
+            {key[1]: float(v) for key, v in zip(unit, values, strict=True)},
             {key[1]: _unit(key) for key in unit},
-            score,
+            float(score),
             asked,
-            share,
-            tuple(dict.fromkeys(_effect(u) for u in rivals if _effect(u) != _effect(unit))),
-            _sentence(unit, axes, [u for u in rivals if _effect(u) != _effect(unit)]),
+            float(share),
+            tuple(dict.fromkeys(_effect(u) for u in rivals)),
+            _sentence(unit, axes, rivals),
         )
 
     def _promising(
@@ -420,14 +458,19 @@ class _Memory:
         if all(own):
             return "".join(dict.fromkeys(own))
         at = [self.place[key] for key in unit]
-        energy = self.energy[:, at] @ change**2
-        return "".join(AXES[i] for i in np.flatnonzero(energy > 0.3 * energy.max()))
+        strength = self.strength[:, at] @ change**2
+        return "".join(AXES[i] for i in np.flatnonzero(strength > 0.3 * strength.max()))
 
 
 def _allowed(key: Key, delta: float) -> bool:
     """Whether a parameter may leave its null this way."""
     null, lower, upper = bounds(key)
     return not ((null == lower and delta < 0.0) or (null == upper and delta > 0.0))
+
+
+def _has_onset(unit: Sequence[Key]) -> bool:
+    section = unit[0][0]
+    return section != COEFFICIENTS and any(p.role == "onset" for p in EFFECTS[section].parameters)
 
 
 def _key(effect: str, name: str) -> Key:

@@ -94,6 +94,32 @@ def affects_sensors(effects: Values) -> bool:
     return any(effect.name in effects for effect in _SENSE)
 
 
+def estimable(name: str) -> dict[str, float | None]:
+    """The parameters of an effect that an estimator can follow while the vehicle moves.
+
+    With each of them the value at which it is better left alone unless asked for: the null of a
+    parameter of one axis, of which an effect has several; None for others. An onset, a frequency
+    and a phase are not among them, nor what shows in no velocity (the sampler finds the biases of
+    an IMU itself).
+    """
+    effect = EFFECTS[name]
+    if effect.sense is not None and effect.correct is not None:
+        given = Reading(*np.arange(1.0, 13.0).reshape(4, 3))
+        nulls = {p.name: p.null for p in effect.parameters}
+        same = effect.correct(given, **nulls)
+        moved = [
+            effect.correct(given, **{**nulls, p.name: p.null + p.typical})
+            for p in effect.parameters
+        ]
+        if all((m.linear == same.linear).all() for m in moved):
+            return {}
+    return {
+        p.name: p.null if p.axis else None
+        for p in effect.parameters
+        if p.role in ("amplitude", "place")
+    }
+
+
 def memory() -> Array:
     """The state of all input effects before the first demand."""
     return np.zeros((len(_INPUT), MEMORY))
