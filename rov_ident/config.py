@@ -218,10 +218,11 @@ class Rls:
         "variable", "how old data lose weight", choices=("variable", "constant")
     )
     forgetting_factor: float = option(
-        1.0, "weight kept per sample by constant forgetting", lower=POSITIVE, upper=1.0, live=True
-    )
-    filter_corner: float = option(
-        3.0, "corner of the filter on every channel of the regression", "rad/s", lower=POSITIVE
+        1.0,
+        "weight kept per 0.1 s by constant forgetting, in directions that move",
+        lower=POSITIVE,
+        upper=1.0,
+        live=True,
     )
     gate: float = option(
         5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
@@ -243,13 +244,6 @@ class Ukf:
         "normalised innovation squared, over 2 s, from which the vehicle is taken to have changed "
         "and its coefficients are learnt anew; 1 is expected, higher where the model is rough",
         lower=1.0,
-    )
-    process_std: Vector = option(
-        (0.003, 0.003, 0.003, 0.003, 0.003, 0.003),
-        "density of the acceleration that the model does not explain, besides the noise of the "
-        "wrench: surge sway heave, roll pitch yaw",
-        "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
-        lower=0.0,
     )
     random_walk: float = option(
         0.005, "drift of a coefficient relative to its value", "1/sqrt(h)", lower=0.0
@@ -293,6 +287,16 @@ class Config:
     odometry: OdometrySensor = OdometrySensor()
     imu: ImuSensor = ImuSensor()
     wrench: WrenchNoise = WrenchNoise()
+    process_std: Vector = option(
+        (0.0005,) * 6,
+        "least density of the acceleration that the model does not explain, besides the noise of "
+        "the wrench (more is found from the innovations): surge sway heave, roll pitch yaw",
+        "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
+        lower=0.0,
+    )
+    residual_corner: float = option(
+        3.0, "corner of the filter on the published wrench residual", "rad/s", lower=POSITIVE
+    )
     rls: Rls = Rls()
     ukf: Ukf = Ukf()
     qos: Qos = Qos()
@@ -310,6 +314,25 @@ class Config:
     def dynamics(self) -> Model:
         """The model with the effects on the rigid body: that of simulation and estimation."""
         return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
+
+    def with_values(self, values: Mapping[str, float]) -> "Config":
+        """The same with other values of coefficients, and of parameters of its effects by names
+        such as thruster_lag.time_constant.
+
+        Raises
+        ------
+        UserError
+            If there is no such coefficient or parameter.
+        """
+        effects = {name: dict(own) for name, own in self.effects.items()}
+        for key, value in values.items():
+            effect, _, name = key.partition(".")
+            if name and name not in effects.get(effect, {}):
+                raise UserError(f"the configuration has no {key} under effects")
+            if name:
+                effects[effect][name] = value
+        model = self.model.with_values({k: v for k, v in values.items() if "." not in k})
+        return dataclasses.replace(self, model=model, effects=effects)
 
     def with_model(self, model: Model) -> "Config":
         """The same with another model: what was held stays held, new coefficients are estimated."""

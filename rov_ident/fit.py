@@ -97,9 +97,10 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         estimator.take(record.samples)
     report = estimator.report()
     removed = 1.0 - (report.std / estimator.prior.std) ** 2
-    model = config.model.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    model = found.model
     samples = sum(len(record.samples) for record in records)
-    moves, effects = config.with_model(model).dynamics, compiled(config.effects)
+    moves, effects = found.dynamics, compiled(found.effects)
     scores = [score(moves, record.samples, effects=effects) for record in records]
     squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
     return Fit(

@@ -185,7 +185,7 @@ class OnlineEstimator:
             for i in range(len(values))
         ]
         # A bound cuts the interval too: no part of it is physically possible.
-        upper = values + _QUANTILE * std
+        upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
         upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
         return Report(
             self._stamp(),
@@ -193,7 +193,7 @@ class OnlineEstimator:
             self.prior.units,
             values,
             std,
-            values - _QUANTILE * std,
+            np.maximum(values - _QUANTILE * std, self.prior.lower),
             upper,
             covariance,
             excitation,

@@ -26,6 +26,7 @@ from rov_ident.effects import (
     compiled,
     correct,
     memory,
+    parameter,
     rigid_body,
 )
 from rov_ident.effects.base import EffectParameter, Reading
@@ -52,7 +53,7 @@ class Sensitivity:
         mass, restoring = [], []
         for i, (name, own) in enumerate(config.estimate_effects):
             effect = EFFECTS[name]
-            p = next(p for p in effect.parameters if p.name == own)
+            p = parameter(name, own)
             low, high = self._moved(name, p, effect.act is not None)
             self._width[i] = high[name][own] - low[name][own]
             if p.axis:

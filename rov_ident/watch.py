@@ -56,6 +56,7 @@ _SPACING = 0.045  # s; measurements closer than that add cost, hardly informatio
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed
 _MOST = 3  # effects named at once
 _AS_GOOD = 0.8  # of what the best explains: what explains more may be it, beyond first order
+_ALIKE = 0.9  # of it: what explains that much, with fewer parameters, is named instead
 _FITTED = 12  # units that are scored in full
 
 MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -90,7 +91,9 @@ class Window(NamedTuple):
     moment: Array  # (P,): J'(r + J theta), theta zero for those watched
     power: float  # of r + J theta
     residuals: int  # so many of them
-    strength: Array  # (6, P): squared wrenches of a unit of each, over those of work
+    strength: (
+        Array  # (6, C) of those watched: squared wrenches of a unit of each, over those of work
+    )
 
 
 class Task(NamedTuple):
@@ -119,17 +122,21 @@ def watched(effect: Effect) -> bool:
 def problem(config: Config) -> Task:
     """What is to be watched in the model of a configuration."""
     model = config.model
-    base = tuple((COEFFICIENTS, name) for name in config.estimate)
+    base = (*((COEFFICIENTS, name) for name in config.estimate), *config.estimate_effects)
     size = dict(
         zip(model.names, np.maximum(np.abs(model.theta), 0.2 * typical(model)), strict=True)
     )
+    prior = [size[name] ** -2.0 for name in config.estimate]
+    prior += [parameter(key).typical ** -2.0 for key in config.estimate_effects]
     units = [u for e in EFFECTS.values() if watched(e) for u in _units(e, config)]
     return Task(
         config,
         base,
         tuple(units),
-        np.array([size[name] ** -2.0 for name in config.estimate]),
-        np.array([centre(config, key) for key in base]),
+        np.array(prior),
+        np.array(
+            [config.effects[e][n] if e in EFFECTS else centre(config, (e, n)) for e, n in base]
+        ),
     )
 
 
@@ -165,7 +172,7 @@ def step(
     evidence = Evidence(streams, [(float(streams.t[0]), float(streams.t[-1]) + 1e-6)])
     if len(evidence.first) != 1:
         return state
-    h = Hypothesis(task.config, {key: values[key[1]] for key in task.base})
+    h = Hypothesis(task.config, {key: values[_label(key)] for key in task.base})
     look = evidence.look(h, evidence.begin(), state.noise)
     if look is None:
         return state
@@ -188,6 +195,11 @@ def step(
     seen = np.sqrt(np.mean(look.clean() ** 2, axis=0))
     noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
     return State((*state.windows[-(MEMORY - 1) :], window), noise)
+
+
+def _label(key: Key) -> str:
+    """A parameter's name among the estimated ones."""
+    return key[1] if key[0] == COEFFICIENTS else ".".join(key)
 
 
 def _columns(task: Task, evidence: Evidence, h: Hypothesis, motion: Motion) -> Array:
@@ -398,9 +410,12 @@ class _Memory:
             return rss - float(trial[2].rss.sum())
 
         def worth(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
-            return taken(trial) / kappa - price(len(trial[0]), tried) - _has_onset(trial[0])
+            return taken(trial) / kappa - price(len(trial[0]), tried)
 
-        best = max(trials, key=worth)
+        # the plainest of those that explain about as much
+        most = max(trials, key=worth)
+        alike = [t for t in trials if taken(t) >= _ALIKE * taken(most)]
+        best = min(alike, key=lambda t: (len(t[0]), _has_onset(t[0]), -worth(t)))
         unit, change, after = best
         score, asked = taken(best) / kappa, price(len(unit), tried)
         share = 6.0 * taken(best) / rss
@@ -457,7 +472,7 @@ class _Memory:
         own = [_axis(key) for key in unit]
         if all(own):
             return "".join(dict.fromkeys(own))
-        at = [self.place[key] for key in unit]
+        at = [self.place[key] - len(self.task.base) for key in unit]
         strength = self.strength[:, at] @ change**2
         return "".join(AXES[i] for i in np.flatnonzero(strength > 0.3 * strength.max()))
 

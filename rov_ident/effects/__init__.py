@@ -13,7 +13,7 @@ import numpy as np
 from numba import literal_unroll
 from numpy.typing import NDArray
 
-from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, Reading
+from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
 from rov_ident.jit import kernel
 from rov_ident.model import RigidBody, current_wrench
 
@@ -92,6 +92,11 @@ def correct(reading: Reading, effects: Values) -> Reading:
 def affects_sensors(effects: Values) -> bool:
     """Whether :func:`correct` changes anything."""
     return any(effect.name in effects for effect in _SENSE)
+
+
+def parameter(effect: str, name: str) -> EffectParameter:
+    """A parameter by its effect and its name."""
+    return next(p for p in EFFECTS[effect].parameters if p.name == name)
 
 
 def estimable(name: str) -> dict[str, float | None]:

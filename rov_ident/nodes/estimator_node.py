@@ -137,7 +137,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._begin_watching()
         self.get_logger().info(
             f"active after {time.monotonic() - started:.1f} s of compiling: estimating "
-            f"{len(config.estimate)} coefficients of {config.name}"
+            f"{len(self._online.prior.names)} coefficients of {config.name}"
         )
 
     def _own_parameter(self, name: str, default: object, description: str) -> object:
@@ -405,8 +405,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Write the configuration with the coefficients as they are now."""
         report = self._online.report()
-        theta = self._config.model.theta.copy()
-        theta[self._online.prior.estimated] = report.values
+        values = dict(zip(report.names, report.values.tolist(), strict=True))
         lines = [f"Written by {self.get_name()}; standard deviations at {report.stamp} ns:"]
         lines += [
             f"{name}: {std:.3g} {unit}"
@@ -414,8 +413,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         ]
         path = os.path.abspath(str(self._save_path))
         try:
-            model = self._config.model.with_theta(theta)
-            configuration.dump(replace(self._config, model=model), path, "\n".join(lines))
+            configuration.dump(self._config.with_values(values), path, "\n".join(lines))
             response.success, response.message = True, f"saved to {path}"
         except UserError as error:
             response.success, response.message = False, str(error)
