@@ -65,9 +65,6 @@ def prior_of(config: Config) -> Prior:
     )
     chosen = [model.coefficients[i] for i in index]
     effects = [parameter(*key) for key in config.estimate_effects]
-    values = [
-        config.effects[name][p.name] for (name, _), p in zip(config.estimate_effects, effects)
-    ]
     k, none = len(effects), np.full(len(chosen), np.inf)
     return Prior(
         (*config.estimate, *(".".join(key) for key in config.estimate_effects)),
@@ -85,6 +82,20 @@ def theta_of(config: Config) -> Array:
     """(m + k,): the coefficients, then the configured values of the estimated parameters."""
     effects = [config.effects[effect][name] for effect, name in config.estimate_effects]
     return np.concatenate([config.model.theta, effects])
+
+
+def calibrated(covariance: Array, score: Array) -> Array:
+    """The covariance (n, n) with its standard deviations widened to those of the sandwich.
+
+    ``score`` (n, n) is the covariance of the accumulated score, the prior's included, with its
+    correlation in time: for white innovations the inverse of ``covariance``, and nothing changes.
+    The sandwich is ``covariance @ score @ covariance``; from a short record it is itself uncertain,
+    and mostly too thin, so that nothing is narrowed.
+    """
+    sandwich = np.sum((covariance @ score) * covariance, axis=1)
+    widen = np.sqrt(np.maximum(sandwich / np.diag(covariance), 1.0))
+    wide: Array = covariance * np.outer(widen, widen)
+    return wide
 
 
 def typical(model: Model) -> Array:

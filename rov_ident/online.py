@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Kind = Literal["rls", "ukf"]
 ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
 
+CENTRING_TIME = 1.0  # s; the sampler takes over the estimated parameters of effects this often
 EXCITATION_TIME = 20.0  # s; the present excitation is that of this window and of the one before
 _EXCITED = 0.05  # share of the prior variance that this motion alone would remove
 _CONVERGED = 0.1  # standard deviation over the value (or the prior's) at which it counts as known
@@ -61,6 +62,12 @@ class Report:
     messages: tuple[str, ...]
     condition: float = math.nan
 
+    @property
+    def effects(self) -> dict[str, float]:
+        """The parameters of effects, by names such as thruster_lag.time_constant."""
+        values = zip(self.names, self.values.tolist(), strict=True)
+        return {name: value for name, value in values if "." in name}
+
 
 class OnlineEstimator:
     """Sampler and estimator in one: :meth:`push` messages, ask for a :meth:`report` at any time.
@@ -84,12 +91,15 @@ class OnlineEstimator:
         """Back to the prior; the input buffers and counts go on."""
         self._state = self._module.init(self._task)
         self._last_t = math.nan
+        self._centred = -math.inf
         # information over the prior's: in the window that is filling, and in the one before
         self._gained = np.zeros((2, len(self.prior.names)))
         self._window = 0.0  # s of the window that is filling
         self._variance = self._estimate().std ** 2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
+        if self.config.estimate_effects:
+            self.sampler.recentre(self.config)
         if self.watcher is not None:
             self.watcher.reset()
 
@@ -98,6 +108,7 @@ class OnlineEstimator:
         self.config = config
         self._task = self._module.problem(config)
         self.sampler.configure(config)
+        self._centred = -math.inf
 
     def show(self, watcher: "Watcher") -> None:
         """Let a watcher see from now on what the estimator sees."""
@@ -145,6 +156,9 @@ class OnlineEstimator:
             if count := int(np.count_nonzero(info["reason"] == reason)):
                 self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
         self._watch(float(samples["dt"].sum()))
+        if self.config.estimate_effects and abs(self._last_t - self._centred) >= CENTRING_TIME:
+            self._centred = self._last_t
+            self.sampler.recentre(self.config.with_values(self.report().effects))
         if self.watcher is not None and self.sampler.demands is not None:
             window = self.watcher.take(samples, self.sampler.demands)
             if window is not None:

@@ -369,7 +369,7 @@ def _fold(task, state, samples, sides, info):
     work = _work(task, state)
     _take_over(task, state, work)
     for k in range(len(samples)):
-        _step(task, state, work, samples[k], sides[k if sides.shape[3] > 0 else 0], info[k])
+        _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
     _copy(work.root, state.root)
     _copy(work.score, state.score)
     _copy(work.sensitivity, state.sensitivity)
@@ -398,7 +398,7 @@ def _step(task, state, work, sample, side, info):
         _judge_motion(task, state, work, sample)
         _take_sides(task, work, sample, side)
         if _predict(task, state, work, sample, side):
-            _update(task, state, work, sample, info)
+            _update(task, state, work, sample, side, info)
         else:
             info.reason = UNPREDICTABLE
             c.started = False
@@ -415,17 +415,17 @@ def _step(task, state, work, sample, side, info):
 @inlined
 def _take_sides(task, work, sample, side):
     """What acts, with the parameters of effects as they are; the columns of what they measure."""
-    wrench, k = work.scratch[0].wrench, side.shape[2]
+    wrench, k = work.scratch[0].wrench, side.shape[1]
     first = len(task.theta) - k
     for i in range(6):
         wrench[i] = sample.wrench[i]
         for j in range(k):
-            wrench[i] += side[0, i, j] * (work.one_theta[first + j, 0] - task.theta[first + j])
+            wrench[i] += side[i, j] * (work.one_theta[first + j, 0] - side[12, j])
     if k > 0:
         for a in range(len(work.estimated)):
             j = work.estimated[a] - first
             for i in range(6):
-                work.direct[i, a] = work.scale[a] * side[1, i, j] if j >= 0 else 0.0
+                work.direct[i, a] = work.scale[a] * side[6 + i, j] if j >= 0 else 0.0
 
 
 @inlined
@@ -521,7 +521,7 @@ def _predict(task, state, work, sample, side):
             for i in range(6):
                 s.middle[i] *= work.moving[i]  # or products with mere noise would be learnt from
         _drive(work, task.structure, s.middle, 0, free)
-        if side.shape[2] > 0:
+        if side.shape[1] > 0:
             _drive_sides(task, work, side)
         _advance(s.transition, sensitivity, s.into, work.drive, work.rows)
         for i in range(6):
@@ -558,11 +558,11 @@ def _drive(work, structure, nu, first, end):
 @inlined
 def _drive_sides(task, work, side):
     """The same of the parameters of effects."""
-    first = len(task.theta) - side.shape[2]
+    first = len(task.theta) - side.shape[1]
     for a in range(len(work.estimated)):
         if work.estimated[a] >= first:
             for i in range(6):
-                work.drive[i, a] = work.scale[a] * side[0, i, work.estimated[a] - first]
+                work.drive[i, a] = work.scale[a] * side[i, work.estimated[a] - first]
 
 
 @reordered
@@ -700,7 +700,7 @@ def _sort(task, state, work):
 
 
 @inlined
-def _update(task, state, work, sample, info):
+def _update(task, state, work, sample, side, info):
     """Linear and angular velocity, one component after another; their rows into the root."""
     s, c, scratch = task.settings[0], state.scalars[0], work.scratch[0]
     nu, p, sensitivity, rows = state.nu, state.p, work.sensitivity, work.rows
@@ -713,9 +713,10 @@ def _update(task, state, work, sample, info):
         if not np.isfinite(z[i]) or not np.isfinite(r[i]):
             z[i] = np.nan
             continue
-        # as measured with the parameters of effects as they are
-        for a in range(n):
-            z[i] -= work.direct[i, a] * state.deviation[a]
+        # less what the parameters of effects, as they are, add to the measurement
+        first = len(task.theta) - side.shape[1]
+        for j in range(side.shape[1]):
+            z[i] -= side[6 + i, j] * (work.one_theta[first + j, 0] - side[12, j])
         for k in range(rows.shape[1]):
             rows[count, k] = sensitivity[i, k] + work.direct[i, k]
         count += 1

@@ -147,6 +147,17 @@ class Sampler:
 
             self._sensitivity = Sensitivity(config)
         self._none = np.zeros(0, dtype=sample_type(len(config.estimate_effects)))
+        self._take_effects(config)
+        self._settings = _settings(config)
+
+    def recentre(self, config: Config) -> None:
+        """Go on with other values of the effects' parameters; their memory stays."""
+        assert self._sensitivity is not None
+        self._sensitivity = self._sensitivity.about(config)
+        self._take_effects(config)
+        self._settings["water"] = self._acting.water
+
+    def _take_effects(self, config: Config) -> None:
         self._grace = config.grace
         self._hold = config.timeout
         self._effects = config.effects
@@ -154,7 +165,6 @@ class Sampler:
         self._corrects = affects_sensors(config.effects)
         self._acts = bool(self._acting.inputs.any())
         self._surrounded = bool(self._acting.wrenches.any())
-        self._settings = _settings(config)
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
@@ -329,10 +339,8 @@ class Sampler:
         sample = np.zeros(1, dtype=SAMPLE)
         odometry, shift = _ABSENT, 0.0
         if self._sensitivity is not None:
-            raw = None if pose is None else pose[1]
-            assert raw is None or isinstance(raw, Odometry)
-            assert imu is None or isinstance(imu, Imu)
-            self._sensitivity.measure(raw, imu, self._settings["imu_rotation"][0])
+            known = self._kinematics[0]
+            self._sensitivity.measure(known["v"], known["rate"], has_imu=imu is not None)
         if pose is not None:
             given = self._corrected(pose[1])
             assert isinstance(given, Odometry)
@@ -428,7 +436,8 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
 def sample_type(size: int) -> np.dtype[np.void]:
     """The dtype of samples that know how they change with ``size`` parameters of effects.
 
-    A SAMPLE, then ``by_wrench`` and ``by_velocity`` (6, size): see :mod:`rov_ident.sensitivity`.
+    A SAMPLE, then ``by_wrench`` and ``by_velocity`` (6, size) and ``about`` (size,): the values of
+    the parameters by which the sample was made. See :mod:`rov_ident.sensitivity`.
     """
     if size == 0:
         return SAMPLE
@@ -437,23 +446,25 @@ def sample_type(size: int) -> np.dtype[np.void]:
     kinds = [SAMPLE.fields[name] for name in names] if SAMPLE.fields else []
     return np.dtype(
         {
-            "names": [*names, "by_wrench", "by_velocity"],
-            "formats": [*(kind[0] for kind in kinds), *([("f8", (6, size))] * 2)],
-            "offsets": [*(kind[1] for kind in kinds), first, first + step],
+            "names": [*names, "by_wrench", "by_velocity", "about"],
+            "formats": [*(k[0] for k in kinds), *([("f8", (6, size))] * 2), ("f8", (size,))],
+            "offsets": [*(k[1] for k in kinds), first, first + step, first + 2 * step],
         }
     )
 
 
 def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
-    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 2, 6, size),
-    the wrench and the measured velocity."""
+    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size).
+
+    Six rows of the wrench, six of the measured velocity, and the values that they are about.
+    """
     if samples.dtype == SAMPLE:
         return samples, _NO_SIDES
-    size = (samples.dtype.itemsize - SAMPLE.itemsize) // 96
+    size = (samples.dtype.itemsize - SAMPLE.itemsize) // 104
     rows = np.ascontiguousarray(samples).view(np.uint8).reshape(len(samples), -1)
     plain = np.ascontiguousarray(rows[:, : SAMPLE.itemsize]).view(SAMPLE)[:, 0]
     sides = np.ascontiguousarray(rows[:, SAMPLE.itemsize :]).view(np.float64)
-    return plain, sides.reshape(len(samples), 2, 6, size)
+    return plain, sides.reshape(len(samples), 13, size)
 
 
 def _settings(config: Config) -> NDArray[np.void]:
@@ -478,7 +489,7 @@ def _settings(config: Config) -> NDArray[np.void]:
 
 
 _ABSENT = np.full(16, math.nan)
-_NO_SIDES = np.zeros((0, 2, 6, 0))
+_NO_SIDES = np.zeros((1, 13, 0))
 _ZERO = np.zeros(3)
 _ZERO_WRENCH = np.zeros(6)
 

@@ -1,7 +1,9 @@
 """How a sample changes with the parameters of the configured effects.
 
-An estimator treats such a parameter as a linear one, about its value p0 in the configuration. With
-``d = p - p0`` the equations of motion and the measured velocity become::
+An estimator treats such a parameter as a linear one, about the value p0 by which the sample was
+made; the sampler follows the estimate (:meth:`rov_ident.samples.Sampler.recentre`), so that what
+bends with the parameter (a lag, the place of a tether) is right in the end. With ``d = p - p0`` the
+equations of motion and the measured velocity become::
 
     M nu_dot + h(nu) - G down = wrench + J d,      measured = nu + V d + noise
 
@@ -9,8 +11,6 @@ An estimator treats such a parameter as a linear one, about its value p0 in the 
 configured ones, and of the wrench effects at the measured motion; of effects on the rigid body
 ``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration of the configured model. ``V`` (6, k)
 is the change of the measured velocity: of moving water, and of effects on the velocity sensors.
-
-What bends with the parameter (a delay, the place of a tether) is right to first order in d only.
 """
 
 import numpy as np
@@ -28,10 +28,12 @@ from rov_ident.effects import (
     memory,
     parameter,
     rigid_body,
+    sense,
 )
 from rov_ident.effects.base import EffectParameter, Reading
+from rov_ident.estimate import theta_of
 from rov_ident.jit import kernel
-from rov_ident.messages import Array, Imu, Odometry
+from rov_ident.messages import Array
 from rov_ident.model import coriolis, force_of_one
 
 _ZERO = np.zeros(3)
@@ -47,6 +49,7 @@ class Sensitivity:
         self._bodies: list[int] = []
         self._senses: list[tuple[int, Values, Values]] = []
         self._water = np.zeros((3, k))  # world
+        self._present = theta_of(config)[len(config.model.theta) :]
         self._mask = np.ones((6, k))
         self._width = np.ones(k)
         sides: list[Acting] = []
@@ -105,24 +108,32 @@ class Sensitivity:
             _act(self._sides, self._memory, t, dt, demand, self._impulse)
             self._time += dt
 
-    def measure(self, odometry: Odometry | None, imu: Imu | None, to_body: Array) -> None:
-        """Messages that belong to the sample, as they came; to_body (3, 3) turns the IMU's axes."""
+    def about(self, config: Config) -> "Sensitivity":
+        """The same of a configuration with other values of the parameters; what is known stays."""
+        new = Sensitivity(config)
+        new._memory, new._around = self._memory, self._around
+        new._impulse, new._time = self._impulse, self._time
+        new._velocity = self._velocity
+        return new
+
+    def measure(self, v: Array, omega: Array, has_imu: bool) -> None:
+        """The velocity (3,) and rate (3,) over ground before the next sample.
+
+        Not the measured ones: their noise would be in column and innovation alike.
+        """
         for i, low, high in self._senses:
-            if odometry is not None:
-                given = Reading(odometry.linear, odometry.angular, _ZERO, _ZERO)
-                change = [correct(given, values) for values in (low, high)]
-                self._velocity[:3, i] = change[0].linear - change[1].linear
-                if imu is None:
-                    self._velocity[3:, i] = change[0].angular - change[1].angular
-            if imu is not None:
-                given = Reading(_ZERO, _ZERO, to_body @ imu.angular_velocity, _ZERO)
-                change = [correct(given, values) for values in (low, high)]
-                self._velocity[3:, i] = change[0].gyro - change[1].gyro
-            self._velocity[:, i] /= self._width[i]
+            given = sense(Reading(v, omega, omega, _ZERO), self.config.effects)
+            before, after = correct(given, low), correct(given, high)
+            rate = before.gyro - after.gyro if has_imu else before.angular - after.angular
+            change = np.concatenate([before.linear - after.linear, rate])
+            self._velocity[:, i] = change / self._width[i]
 
     def take(self, sample: np.void, rotation: Array) -> Array:
-        """J and V (2, 6, k) of a sample; what has acted since the last one is used up."""
-        out = np.zeros((2, 6, self.size))
+        """J and V and the parameters (13, k) of a sample; what has acted before is used up."""
+        sides = np.empty((13, self.size))
+        out = sides[:12].reshape(2, 6, self.size)
+        out[:] = 0.0
+        sides[12] = self._present
         if self._sides is not None:
             count = len(self._sides.inputs)
             now = np.zeros((count, 6))
@@ -146,7 +157,7 @@ class Sensitivity:
             out[0][:, self._bodies] = columns.T
         out[1] = self._velocity
         out[1, :3] += rotation.T @ self._water
-        return out
+        return sides
 
 
 @kernel
