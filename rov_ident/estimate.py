@@ -194,21 +194,22 @@ def is_passive(model: Model, prior: Prior, values: Array) -> bool:
         return False
     if np.linalg.eigvalsh(model.with_theta(theta).mass_matrix)[0] <= 0.0:
         return False
-    linear, power, coupled = np.zeros((6, 6)), np.zeros(len(_DIRECTIONS)), False
     known = dict(zip(model.names, theta.tolist(), strict=True))
+    terms = []
     for c, value in zip(model.coefficients, theta, strict=True):
         both = value + known.get(c.symmetric, 0.0) if c.is_one_sided else value
         if (c.is_diagonal or c.is_one_sided) and both > 0.0:
             return False
-        if c.is_added_mass or (c.left != ONE and c.left < ABSOLUTE):
-            continue
-        coupled = coupled or not (c.is_diagonal or c.is_one_sided)
+        if not c.is_added_mass and (c.left == ONE or c.left >= ABSOLUTE):
+            terms.append((c, value))
+    if all(c.is_diagonal or c.is_one_sided for c, _ in terms):
+        return True
+    linear, power = np.zeros((6, 6)), np.zeros(len(_DIRECTIONS))
+    for c, value in terms:
         if c.left == ONE:  # of the two directions of an axis the one that is damped less
             linear[c.row, c.velocity] += max(value, 0.0) if c.is_one_sided else value
         else:
             power += value * _DIRECTIONS[:, c.row] * _EXTENDED[:, c.left] * _EXTENDED[:, c.right]
-    if not coupled:
-        return True
     largest = np.linalg.eigvalsh(linear + linear.T)[-1]
     return bool(largest <= 1e-9 * np.abs(linear).max() and power.max() <= 1e-9 * -power.min())
 

@@ -72,7 +72,10 @@ def test_jacobian_is_that_of_samples_made_with_other_values(heavy, effect):
             close = np.abs(sides[:, :6, i] - wrench) < 0.02 * tell
             assert close.mean() > 0.98  # steps of a deadband or delay are where they are
         shown = sides[measured, 6:9, i] - velocity[measured, :3]
-        assert np.abs(shown).max() < 0.02 * (np.abs(velocity[measured, :3]).max() + 0.1)
+        allowed = 0.02 * (np.abs(velocity[measured, :3]).max() + 0.1)
+        if EFFECTS[effect].sense is not None:  # of the motion at the sample before, free of noise
+            allowed += 2.0 * np.abs(np.diff(samples["nu"], axis=0)).max()
+        assert np.abs(shown).max() < allowed
 
 
 @pytest.mark.parametrize("effect", ["buoyancy", "cog_offset"])

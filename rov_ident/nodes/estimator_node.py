@@ -5,6 +5,7 @@ Nothing here computes a coefficient. Timers run on the steady clock, so that a n
 """
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
@@ -51,6 +52,7 @@ _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
 _DIAGNOSTICS_PERIOD = 1.0  # s
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
+_SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
 _LOG_PERIOD = 10.0  # s; between two equal complaints
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 # Not worth a warning: the consequence of something that is named itself.
@@ -491,6 +493,10 @@ def run(kind: Kind) -> int:
 def _live(kind: Kind) -> None:
     """Until interrupted, or shut down by the node itself."""
     node = EstimatorNode(kind)
+    # What is there now stays: looking through it again and again would hold up samples.
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(_SWITCHING)
     executor = Executor()
     executor.add_node(node)
     # From here on an interrupt waits for the end of a callback.
