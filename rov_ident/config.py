@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 from rov_ident.coefficients import catalogue, parse, parse_fin
-from rov_ident.effects import EFFECTS, rigid_body
+from rov_ident.effects import EFFECTS, estimable, rigid_body
 from rov_ident.errors import UserError
 from rov_ident.frames import FrameDefaults, to_core
 from rov_ident.messages import Wrench
@@ -270,13 +270,19 @@ class Config:
     """A checked configuration; vectors in forward-starboard-down.
 
     ``estimate`` names the coefficients to estimate, in the order of ``model.names``; the others
-    are held. ``effects`` are part of the simulation: {effect: {parameter: value}}, complete.
+    are held. ``estimate_effects`` are the parameters of effects to estimate, (effect, parameter);
+    in the file both are names under ``estimate``. ``effects`` are part of the simulation: {effect:
+    {parameter: value}}, complete.
     ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what really moves.
     """
 
     name: str
     model: Model
-    estimate: Names = option((), "coefficients to estimate; empty: all")
+    estimate: Names = option(
+        (),
+        "coefficients to estimate, and parameters of effects such as thruster_lag.time_constant; "
+        "empty: all, of effects what is there from the start and not at its null",
+    )
     gravity: float = option(9.81, "acceleration of free fall", "m/s2", lower=9.7, upper=9.9)
     prior: Prior = Prior()
     frames: Frames = Frames()
@@ -305,11 +311,31 @@ class Config:
     )
     grace: float = option(0.3, "how long a late topic is waited for, in stamp time", "s", lower=0.0)
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    estimate_effects: tuple[tuple[str, str], ...] = ()
 
     @property
     def dynamics(self) -> Model:
         """The model with the effects on the rigid body: that of simulation and estimation."""
         return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
+
+    def with_values(self, values: Mapping[str, float]) -> "Config":
+        """The same with other values of coefficients, and of parameters of its effects by names
+        such as thruster_lag.time_constant.
+
+        Raises
+        ------
+        UserError
+            If there is no such coefficient or parameter.
+        """
+        effects = {name: dict(own) for name, own in self.effects.items()}
+        for key, value in values.items():
+            effect, _, name = key.partition(".")
+            if name and name not in effects.get(effect, {}):
+                raise UserError(f"the configuration has no {key} under effects")
+            if name:
+                effects[effect][name] = value
+        model = self.model.with_values({k: v for k, v in values.items() if "." not in k})
+        return dataclasses.replace(self, model=model, effects=effects)
 
     def with_model(self, model: Model) -> "Config":
         """The same with another model: what was held stays held, new coefficients are estimated."""
@@ -379,7 +405,9 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
     coefficients = _numbers(values.pop("coefficients"), "coefficients")
     settings = _read_section(Config, values, "")
     model = _model(vehicle, coefficients, settings.get("gravity", Config.gravity))
-    settings["estimate"] = _estimated(model, settings.get("estimate", ()))
+    settings["estimate"], settings["estimate_effects"] = _estimated(
+        model, settings.get("effects", {}), settings.get("estimate", ())
+    )
     signs = _signs(vehicle.frame)
     for section, names in (("odometry", ("position",)), ("imu", ("position", "rotation"))):
         if section in settings:
@@ -585,10 +613,30 @@ def _model(vehicle: Vehicle, coefficients: Mapping[str, float], gravity: float) 
     return build(body, coefficients)
 
 
-def _estimated(model: Model, names: Iterable[str]) -> Names:
-    """The names to estimate in the order of the model; none given: all."""
-    chosen = {_in_model(model, name, f"estimate: {name}") for name in names}
-    return tuple(name for name in model.names if not chosen or name in chosen)
+def _estimated(
+    model: Model, effects: Mapping[str, Mapping[str, float]], names: Names
+) -> tuple[Names, tuple[tuple[str, str], ...]]:
+    """What to estimate, in the order of the model and of the effects; no names given: all."""
+    possible = {f"{e}.{p}": (e, p) for e, values in effects.items() for p in values}
+    for name in names:
+        effect, _, parameter = name.partition(".")
+        if not parameter:
+            continue
+        if name not in possible:
+            raise UserError(f"estimate: {name} is not in effects: {_suggestion(name, possible)}")
+        if parameter not in estimable(effect):
+            raise UserError(f"estimate: {name} cannot be estimated live: leave it out")
+    chosen = {_in_model(model, n, f"estimate: {n}") for n in names if "." not in n}
+    usual = [
+        f"{name}.{p}"
+        for name, values in effects.items()
+        for p, null in estimable(name).items()
+        if null is None or values[p] != null
+    ]
+    return (
+        tuple(name for name in model.names if not names or name in chosen),
+        tuple(key for name, key in possible.items() if name in (names or usual)),
+    )
 
 
 def _in_model(model: Model, name: str, key: str) -> str:
@@ -630,8 +678,11 @@ def to_parameters(config: Config) -> dict[str, Any]:
     coefficients = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
     coefficients |= config.model.fins
     settings = _changed(config)
-    if config.estimate == config.model.names:
-        del settings["estimate"]
+    estimate = (*config.estimate, *(f"{e}.{p}" for e, p in config.estimate_effects))
+    usual = _estimated(config.model, config.effects, ())
+    settings.pop("estimate", None)
+    if (config.estimate, config.estimate_effects) != usual:
+        settings["estimate"] = list(estimate)
     return {"vehicle": vehicle, "coefficients": coefficients, **settings}
 
 

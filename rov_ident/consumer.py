@@ -78,6 +78,8 @@ class HydrodynamicModel:
         levels: set[Level] = set()
         names = [status.name for status in message.status]
         for status in message.status:
+            if "." in status.name:
+                continue  # a parameter of an effect: no matter of these matrices
             try:
                 if names.count(status.name) > 1:
                     raise ValueError("given twice")

@@ -7,16 +7,18 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import ABSOLUTE, ONE
 from rov_ident.config import Config
+from rov_ident.effects import parameter
 from rov_ident.excitation import WORKING_SPEED, authority
 from rov_ident.model import Array, Model
 
 
 @dataclass(frozen=True)
 class Prior:
-    """The coefficients to estimate, before any data.
+    """What to estimate, before any data: coefficients, then parameters of effects.
 
-    ``estimated`` (n,) are their indices into theta; mean and std (n,) in their own units.
-    ``negative`` (n,) marks those that no passive hull has positive.
+    ``estimated`` (n,) are their indices into theta, behind which the parameters of effects are
+    counted on; mean and std (n,) in their own units. ``negative`` (n,) marks the coefficients that
+    no passive hull has positive; lower and upper (n,) are the bounds of the parameters of effects.
     """
 
     names: tuple[str, ...]
@@ -25,6 +27,8 @@ class Prior:
     mean: Array
     std: Array
     negative: NDArray[np.bool_]
+    lower: Array
+    upper: Array
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,24 @@ def prior_of(config: Config) -> Prior:
         ]
     )
     chosen = [model.coefficients[i] for i in index]
+    effects = [parameter(*key) for key in config.estimate_effects]
+    k, none = len(effects), np.full(len(chosen), np.inf)
     return Prior(
-        tuple(config.estimate),
-        tuple(c.unit for c in chosen),
-        np.array(index, dtype=np.int64),
-        model.theta[index],
-        std,
-        np.array([c.is_diagonal for c in chosen], dtype=bool),
+        (*config.estimate, *(".".join(key) for key in config.estimate_effects)),
+        (*(c.unit for c in chosen), *(p.unit for p in effects)),
+        np.array([*index, *range(len(model.theta), len(model.theta) + k)], dtype=np.int64),
+        theta_of(config)[[*index, *range(len(model.theta), len(model.theta) + len(effects))]],
+        np.concatenate([std, [p.typical for p in effects]]),
+        np.array([c.is_diagonal for c in chosen] + [False] * k, dtype=bool),
+        np.concatenate([-none, [p.lower for p in effects]]),
+        np.concatenate([none, [p.upper for p in effects]]),
     )
+
+
+def theta_of(config: Config) -> Array:
+    """(m + k,): the coefficients, then the configured values of the estimated parameters."""
+    effects = [config.effects[effect][name] for effect, name in config.estimate_effects]
+    return np.concatenate([config.model.theta, effects])
 
 
 def calibrated(covariance: Array, score: Array) -> Array:
@@ -127,7 +141,8 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
         held = multipliers[: len(signed)] > 0.0
         values[signed] = np.where(held, 0.0, np.minimum(values[signed], 0.0))
         for row, bound in zip(rows[len(signed) :], limit[len(signed) :], strict=True):
-            values[np.flatnonzero(row)[-1]] -= max(row @ values - bound, 0.0)  # rounding
+            last = np.flatnonzero(row)[-1]
+            values[last] -= row[last] * max(row @ values - bound, 0.0)  # rounding
     if is_passive(model, prior, values):
         return values
     low, high = 0.0, 1.0  # share of the way from the prior to the estimate
@@ -144,11 +159,15 @@ def _signs(model: Model, prior: Prior) -> tuple[Array, Array]:
     """Rows (k, n) and limits (k,) with ``rows @ values <= limit`` for a passive hull.
 
     First each derivative that is never positive, then the sum of each one-sided derivative with
-    that of both directions.
+    that of both directions, and the bounds of the parameters of effects.
     """
     n = len(prior.names)
     rows, limits = list(np.eye(n)[prior.negative]), [0.0] * int(prior.negative.sum())
-    index = {model.names[i]: k for k, i in enumerate(prior.estimated)}
+    for sign, bounds in ((1.0, prior.upper), (-1.0, -prior.lower)):
+        bounded = np.flatnonzero(np.isfinite(bounds))
+        rows.extend(sign * np.eye(n)[bounded])
+        limits.extend(bounds[bounded].tolist())
+    index = {model.names[i]: k for k, i in enumerate(prior.estimated) if i < len(model.names)}
     known = dict(zip(model.names, model.theta.tolist(), strict=True))
     for c in model.coefficients:
         pair = [name for name in (c.symmetric, c.name) if name in index]
@@ -169,27 +188,28 @@ def is_passive(model: Model, prior: Prior, values: Array) -> bool:
     power of the quadratic damping is checked along fixed directions of motion; products of two
     velocities (lift) may do work of either sign and are left out.
     """
-    theta = model.theta.copy()
-    theta[prior.estimated] = values
+    theta, own = model.theta.copy(), prior.estimated < len(model.theta)
+    theta[prior.estimated[own]] = values[own]
     if not np.isfinite(theta).all():
         return False
     if np.linalg.eigvalsh(model.with_theta(theta).mass_matrix)[0] <= 0.0:
         return False
-    linear, power, coupled = np.zeros((6, 6)), np.zeros(len(_DIRECTIONS)), False
     known = dict(zip(model.names, theta.tolist(), strict=True))
+    terms = []
     for c, value in zip(model.coefficients, theta, strict=True):
         both = value + known.get(c.symmetric, 0.0) if c.is_one_sided else value
         if (c.is_diagonal or c.is_one_sided) and both > 0.0:
             return False
-        if c.is_added_mass or (c.left != ONE and c.left < ABSOLUTE):
-            continue
-        coupled = coupled or not (c.is_diagonal or c.is_one_sided)
+        if not c.is_added_mass and (c.left == ONE or c.left >= ABSOLUTE):
+            terms.append((c, value))
+    if all(c.is_diagonal or c.is_one_sided for c, _ in terms):
+        return True
+    linear, power = np.zeros((6, 6)), np.zeros(len(_DIRECTIONS))
+    for c, value in terms:
         if c.left == ONE:  # of the two directions of an axis the one that is damped less
             linear[c.row, c.velocity] += max(value, 0.0) if c.is_one_sided else value
         else:
             power += value * _DIRECTIONS[:, c.row] * _EXTENDED[:, c.left] * _EXTENDED[:, c.right]
-    if not coupled:
-        return True
     largest = np.linalg.eigvalsh(linear + linear.T)[-1]
     return bool(largest <= 1e-9 * np.abs(linear).max() and power.max() <= 1e-9 * -power.min())
 

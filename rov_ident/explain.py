@@ -522,4 +522,10 @@ def _extended(config: Config, h: Hypothesis, sensors: Mapping[str, Mapping[str, 
         effects[name] = dict(values)
     if effects:
         document["effects"] = effects
-    return configuration.from_parameters(document)
+    chosen = document.pop("estimate", None)
+    extended = configuration.from_parameters(document)
+    if chosen is not None:  # what was found is to be followed live, too
+        own = set(config.model.names) - set(config.estimate)
+        names = tuple(n for n in extended.model.names if n not in own)
+        extended = dataclasses.replace(extended, estimate=names)
+    return extended

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rov_ident.bags import Bag, read_messages, select_topics
 from rov_ident.config import Config
 from rov_ident.effects import compiled
 from rov_ident.errors import UserError
@@ -99,12 +100,20 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     estimator = OnlineEstimator(config, kind)
     for record in records:
         estimator.sampler = Sampler(config)
-        estimator.take(record.samples)
+        if config.estimate_effects:  # samples depend on what is known by then
+            bag = Bag(record.path)
+            for role, message in read_messages(bag, select_topics(bag, vars(config.topics))):
+                if message is not None:
+                    estimator.push(role, message)
+            estimator.flush()
+        else:
+            estimator.take(record.samples)
     report = estimator.report()
     removed = 1.0 - (report.std / estimator.prior.std) ** 2
-    model = config.model.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    model = found.model
     samples = sum(len(record.samples) for record in records)
-    moves, effects = config.with_model(model).dynamics, compiled(config.effects)
+    moves, effects = found.dynamics, compiled(found.effects)
     scores = [score(moves, record.samples, effects=effects) for record in records]
     squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
     return Fit(

@@ -196,12 +196,12 @@ class Model:
 
     def wrench(self, nu: Array, nu_dot: Array, down: Array) -> Array:
         """The thruster wrench (6,) that this motion takes: the inverse dynamics."""
-        h = _force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
+        h = force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
         return self.mass_matrix @ nu_dot + h + self.restoring_force(down)
 
     def acceleration(self, nu: Array, tau: Array, down: Array) -> Array:
         """nu_dot (6,) under the thruster wrench tau: the forward dynamics."""
-        h = _force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
+        h = force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
         return np.linalg.solve(self.mass_matrix, tau - h - self.restoring_force(down))
 
     def regressor(self, nu: Array, nu_dot: Array) -> Array:
@@ -423,8 +423,8 @@ def current_wrench(structure, added_mass, theta, nu, water):
         j, k = (i + 1) % 3, (i + 2) % 3
         relative[i] -= water[i]
         turning[i] = nu[3 + k] * water[j] - nu[3 + j] * water[k]
-    out = _force_of_one(structure, added_mass, theta, nu)
-    through_water = _force_of_one(structure, added_mass, theta, relative)
+    out = force_of_one(structure, added_mass, theta, nu)
+    through_water = force_of_one(structure, added_mass, theta, relative)
     for i in range(6):
         out[i] -= through_water[i]
         for j in range(3):
@@ -433,7 +433,7 @@ def current_wrench(structure, added_mass, theta, nu, water):
 
 
 @kernel
-def _force_of_one(structure, mass, theta, nu):
+def force_of_one(structure, mass, theta, nu):
     """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,) -> (6,)."""
     h = np.empty((6, 1))
     extended = np.empty((EXTENDED_SIZE, 1))

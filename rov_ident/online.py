@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,13 @@ from rov_ident.estimate import Estimate, physical, prior_of
 from rov_ident.messages import Array, Message
 from rov_ident.samples import Sampler
 
+if TYPE_CHECKING:
+    from rov_ident.watch import Watcher
+
 Kind = Literal["rls", "ukf"]
 ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
 
+CENTRING_TIME = 1.0  # s; the sampler takes over the estimated parameters of effects this often
 EXCITATION_TIME = 20.0  # s; the present excitation is that of this window and of the one before
 _EXCITED = 0.05  # share of the prior variance that this motion alone would remove
 _CONVERGED = 0.1  # standard deviation over the value (or the prior's) at which it counts as known
@@ -58,6 +62,12 @@ class Report:
     messages: tuple[str, ...]
     condition: float = math.nan
 
+    @property
+    def effects(self) -> dict[str, float]:
+        """The parameters of effects, by names such as thruster_lag.time_constant."""
+        values = zip(self.names, self.values.tolist(), strict=True)
+        return {name: value for name, value in values if "." in name}
+
 
 class OnlineEstimator:
     """Sampler and estimator in one: :meth:`push` messages, ask for a :meth:`report` at any time.
@@ -72,6 +82,7 @@ class OnlineEstimator:
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
+        self.watcher: Watcher | None = None
         self._enabled = True
         self._paused = False
         self.reset()
@@ -80,18 +91,29 @@ class OnlineEstimator:
         """Back to the prior; the input buffers and counts go on."""
         self._state = self._module.init(self._task)
         self._last_t = math.nan
+        self._centred = -math.inf
         # information over the prior's: in the window that is filling, and in the one before
         self._gained = np.zeros((2, len(self.prior.names)))
         self._window = 0.0  # s of the window that is filling
         self._variance = self._estimate().std ** 2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
+        if self.config.estimate_effects:
+            self.sampler.recentre(self.config)
+        if self.watcher is not None:
+            self.watcher.reset()
 
     def configure(self, config: Config) -> None:
         """Take other settings of the same model and coefficients; what is learnt stays."""
         self.config = config
         self._task = self._module.problem(config)
         self.sampler.configure(config)
+        self._centred = -math.inf
+
+    def show(self, watcher: "Watcher") -> None:
+        """Let a watcher see from now on what the estimator sees."""
+        self.sampler.demands = []
+        self.watcher = watcher
 
     @property
     def enabled(self) -> bool:
@@ -134,6 +156,15 @@ class OnlineEstimator:
             if count := int(np.count_nonzero(info["reason"] == reason)):
                 self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
         self._watch(float(samples["dt"].sum()))
+        if self.config.estimate_effects and abs(self._last_t - self._centred) >= CENTRING_TIME:
+            self._centred = self._last_t
+            self.sampler.recentre(self.config.with_values(self.report().effects))
+        if self.watcher is not None and self.sampler.demands is not None:
+            window = self.watcher.take(samples, self.sampler.demands)
+            if window is not None:
+                report = self.report()
+                values = zip(report.names, report.values.tolist(), strict=True)
+                self.watcher.look(window, dict(values))
         return info
 
     def _watch(self, elapsed: float) -> None:
@@ -168,7 +199,7 @@ class OnlineEstimator:
             for i in range(len(values))
         ]
         # A bound cuts the interval too: no part of it is physically possible.
-        upper = values + _QUANTILE * std
+        upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
         upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
         return Report(
             self._stamp(),
@@ -176,7 +207,7 @@ class OnlineEstimator:
             self.prior.units,
             values,
             std,
-            values - _QUANTILE * std,
+            np.maximum(values - _QUANTILE * std, self.prior.lower),
             upper,
             covariance,
             excitation,

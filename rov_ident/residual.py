@@ -13,9 +13,21 @@ from rov_ident.model import generalized_force, six, symmetric_product
 
 @inlined
 def filtered_residual(
-    structure, theta, mass, restoring, corner, filters, sample, restarted, nu, h, extended, out
+    structure,
+    theta,
+    mass,
+    restoring,
+    corner,
+    filters,
+    sample,
+    wrench,
+    restarted,
+    nu,
+    h,
+    extended,
+    out,
 ):
-    """out (6,) [N, N m] of the coefficients theta (m, 1) with their mass (6, 6, 1).
+    """out (6,) [N, N m] of the coefficients theta (m, 1) with their mass (6, 6, 1), under a wrench.
 
     filters (4, 6) are carried from sample to sample: stage 1, stage 2, last input, last momentum;
     nu (6, 1), h (6, 1) and extended (EXTENDED_SIZE, 1) are work space. At a restart (after a gap)
@@ -38,7 +50,7 @@ def filtered_residual(
         else:
             before = x[i] - w * last[i]
             # the wrench goes in a line from sample to sample, but jumps there
-            x[i] = a * x[i] + b0 * u[i] + b1 * now + (1.0 - a) * sample.wrench[i]
+            x[i] = a * x[i] + b0 * u[i] + b1 * now + (1.0 - a) * wrench[i]
             x[i] += 0.5 * dt * (b1 - b0) * sample.wrench_slope[i]
             y[i] = a * y[i] + b0 * before + b1 * (x[i] - w * p)
             out[i] = y[i]

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
-from rov_ident.estimate import Estimate, Prior, prior_of
+from rov_ident.estimate import Estimate, Prior, prior_of, theta_of
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
     Structure,
@@ -57,7 +57,7 @@ from rov_ident.model import (
 )
 from rov_ident.process_noise import adapt, first_adaptation, interrupt, process
 from rov_ident.residual import filtered_residual
-from rov_ident.samples import SAMPLE
+from rov_ident.samples import parts
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,8 @@ class Problem(NamedTuple):
     process: NDArray[np.void]  # (1,) of PROCESS
     structure: Structure
     estimated: NDArray[np.int64]  # (n,) indices into theta
-    theta: Array  # (m,) values of all coefficients: the prior of the estimated, the held others
+    theta: Array  # (m,) values of all coefficients: the prior of the estimated, the held others;
+    # behind them the estimated parameters of effects
     scale: Array  # (n,) prior standard deviations
     highest: Array  # (n,) scaled deviation that the observer's coefficients do not exceed
     rigid_body: Array  # (6, 6)
@@ -176,7 +177,7 @@ def problem(config: Config) -> Problem:
         process(config),
         model.structure,
         prior.estimated,
-        model.theta,
+        theta_of(config),
         prior.std,
         np.where(prior.negative, np.minimum(-prior.mean / prior.std, _REACH), _REACH),
         model.body.mass_matrix,
@@ -211,13 +212,13 @@ def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State,
     """:func:`step` over samples (k,) of SAMPLE; info (k,) of INFO. The given state is unchanged."""
     state = State(*(part.copy() for part in state))
     info = np.zeros(len(samples), dtype=INFO)
-    _fold(task, state, samples, info)
+    _fold(task, state, *parts(samples), info)
     return state, info
 
 
 def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
     """One sample (1,) of SAMPLE; the next state and what happened (1,) of INFO."""
-    assert sample.dtype == SAMPLE and len(sample) == 1
+    assert len(sample) == 1
     return fold(task, state, sample)
 
 
@@ -274,6 +275,7 @@ _SCRATCH = np.dtype(
         ("one_h", "f8", (6, 1)),
         ("one_extended", "f8", (EXTENDED_SIZE, 1)),
         ("inverse", "f8", (6, 6)),  # of the mass matrix
+        ("wrench", "f8", (6,)),  # that acts
         ("force", "f8", (6,)),  # wrench less restoring in mid-interval
         ("slope", "f8", (6,)),
         ("rate", "f8", (6,)),
@@ -307,6 +309,7 @@ class Work(NamedTuple):
     line: Array  # (columns,)
     sensitivity: Array  # (6, columns)
     drive: Array  # (6, columns)
+    direct: Array  # (6, columns): what a column adds to the measured velocity alone
     root: Array  # (n + 2, columns): [R | z]
     inverse: Array  # (n + 2, columns): R^-1 as of the last time that the observer was told
     score: Array  # (n + 2, columns)
@@ -334,6 +337,7 @@ def _work(task, state):
         np.empty(n),
         np.empty(n),
         np.empty(columns),
+        np.zeros((6, columns)),
         np.zeros((6, columns)),
         np.zeros((6, columns)),
         np.zeros((n + 2, columns)),
@@ -368,18 +372,18 @@ def _name_columns(task, state, work):
 
 
 @kernel
-def _fold(task, state, samples, info):
+def _fold(task, state, samples, sides, info):
     work = _work(task, state)
     _take_over(task, state, work)
     for k in range(len(samples)):
-        _step(task, state, work, samples[k], info[k])
+        _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
     _copy(work.root, state.root)
     _copy(work.score, state.score)
     _copy(work.sensitivity, state.sensitivity)
 
 
 @inlined
-def _step(task, state, work, sample, info):
+def _step(task, state, work, sample, side, info):
     s, c = task.settings[0], state.scalars[0]
     info.t = sample.t
     info.forgetting = 1.0
@@ -395,11 +399,13 @@ def _step(task, state, work, sample, info):
     if sample.restart or not c.started or not sample.dt > 0.0:
         info.reason = RESTARTED
         _restart(state, work, sample)
+        _take_sides(task, work, sample, side)
     else:
         c.since_update += sample.dt
         _judge_motion(task, state, work, sample)
-        if _predict(task, state, work, sample):
-            _update(task, state, work, sample, info)
+        _take_sides(task, work, sample, side)
+        if _predict(task, state, work, sample, side):
+            _update(task, state, work, sample, side, info)
         else:
             # The model runs away; better begin again with what was known before any data.
             info.reason = UNPREDICTABLE
@@ -413,8 +419,25 @@ def _step(task, state, work, sample, info):
     x = work.scratch[0]
     filtered_residual(
         task.structure, work.one_theta, x.one_mass, task.restoring, s.corner, state.residual,
-        sample, info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended, info.residual,
+        sample, x.wrench, info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended,
+        info.residual,
     )  # fmt: skip
+
+
+@inlined
+def _take_sides(task, work, sample, side):
+    """What acts, with the parameters of effects as they are; the columns of what they measure."""
+    wrench, k = work.scratch[0].wrench, side.shape[1]
+    first = len(task.theta) - k
+    for i in range(6):
+        wrench[i] = sample.wrench[i]
+        for j in range(k):
+            wrench[i] += side[i, j] * (work.one_theta[first + j, 0] - side[12, j])
+    if k > 0:
+        for a in range(len(work.estimated)):
+            j = work.estimated[a] - first
+            for i in range(6):
+                work.direct[i, a] = work.scale[a] * side[6 + i, j] if j >= 0 else 0.0
 
 
 @inlined
@@ -477,13 +500,13 @@ def _take_over(task, state, work):
 
 
 @reordered
-def _predict(task, state, work, sample):
+def _predict(task, state, work, sample, side):
     """Velocities, covariance, sensitivities to the sample's time; False if out of all reason."""
     s, nu, p, sensitivity = work.scratch[0], state.nu, state.p, work.sensitivity
     noise, inverse, constants = s.noise, s.inverse, task.process[0]
     n, free = len(work.scale), state.scalars[0].free
     for i in range(6):
-        s.force[i], s.slope[i] = sample.wrench[i], sample.wrench_slope[i]
+        s.force[i], s.slope[i] = s.wrench[i], sample.wrench_slope[i]
         for j in range(3):
             middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
             s.force[i] += task.restoring[i, j] * middle
@@ -510,6 +533,8 @@ def _predict(task, state, work, sample):
             for i in range(6):
                 s.middle[i] *= work.moving[i]  # or products with mere noise would be learnt from
         _drive(work, task.structure, s.middle, 0, free)
+        if side.shape[1] > 0:
+            _drive_sides(task, work, side)
         _advance(s.transition, sensitivity, s.into, work.drive, work.rows)
         for i in range(6):
             nu[i] += dt * s.rate[i]
@@ -540,6 +565,16 @@ def _drive(work, structure, nu, first, end):
         for a in range(first, end):
             e = work.estimated[a]
             work.drive[i, a] = -work.scale[a] * (work.of_rate[i, e] + work.of_motion[i, e])
+
+
+@inlined
+def _drive_sides(task, work, side):
+    """The same of the parameters of effects."""
+    first = len(task.theta) - side.shape[1]
+    for a in range(len(work.estimated)):
+        if work.estimated[a] >= first:
+            for i in range(6):
+                work.drive[i, a] = work.scale[a] * side[i, work.estimated[a] - first]
 
 
 @reordered
@@ -624,6 +659,8 @@ def _judge_motion(task, state, work, sample):
         c.peak[i] = max(c.peak[i] * decay, surely)
         work.moving[i] = 1 if c.peak[i] > _MOVING * max(c.noise[i], 1.0) * r else 0
     in_motion(task.structure, work.moving, work.moves)
+    for e in range(len(task.structure.mass_row) + len(task.structure.row), len(task.theta)):
+        work.moves[e] = True
     free, sorted_already = 0, True
     for a in range(len(work.estimated)):
         if work.moves[work.estimated[a]]:
@@ -677,7 +714,7 @@ def _sort(task, state, work):
 
 
 @inlined
-def _update(task, state, work, sample, info):
+def _update(task, state, work, sample, side, info):
     """Linear and angular velocity, one component after another; their rows into the root."""
     s, c, scratch = task.settings[0], state.scalars[0], work.scratch[0]
     nu, p, sensitivity, rows = state.nu, state.p, work.sensitivity, work.rows
@@ -690,8 +727,12 @@ def _update(task, state, work, sample, info):
         if not np.isfinite(z[i]) or not np.isfinite(r[i]):
             z[i] = np.nan
             continue
+        # less what the parameters of effects, as they are, add to the measurement
+        first = len(task.theta) - side.shape[1]
+        for j in range(side.shape[1]):
+            z[i] -= side[6 + i, j] * (work.one_theta[first + j, 0] - side[12, j])
         for k in range(rows.shape[1]):
-            rows[count, k] = sensitivity[i, k]
+            rows[count, k] = sensitivity[i, k] + work.direct[i, k]
         count += 1
     if count == 0:
         info.reason = WAITING
@@ -706,7 +747,7 @@ def _update(task, state, work, sample, info):
         r[i] *= max(c.noise[i], 1.0)
         e = z[i] - nu[i] + rows[count, n]
         for a in range(n):
-            e += sensitivity[i, a] * state.deviation[a]
+            e += (sensitivity[i, a] + work.direct[i, a]) * state.deviation[a]
         spread = p[i, i] + r[i] + scratch.product[0, count]
         count += 1
         info.ratio[i] = e * e / spread
@@ -758,10 +799,12 @@ def _absorb(state, work, n):
         total = p[i, i] + s.r[i]
         weight, e = 1.0 / np.sqrt(total), s.z[i] - nu[i]
         goal = e
-        for a in range(n):
-            goal += sensitivity[i, a] * state.deviation[a]
         for k in range(columns):
-            rows[q, k] = weight * sensitivity[i, k]
+            rows[q, k] = sensitivity[i, k] + work.direct[i, k]
+        for a in range(n):
+            goal += rows[q, a] * state.deviation[a]
+        for k in range(columns):
+            rows[q, k] *= weight
         rows[q, n] = weight * goal
         for a in range(6):
             s.middle[a] = p[a, i]

@@ -126,7 +126,8 @@ class Sampler:
     """Merges the three topics into samples; the only part of the estimation that waits.
 
     ``counts`` holds how many messages of each kind were taken or, by reason, refused; bad data
-    never raises. ``origin`` is the stamp [ns] of t = 0.
+    never raises. ``origin`` is the stamp [ns] of t = 0. Who wants the single demands (t [s], wrench
+    (6,)) that the samples are made of sets ``demands`` to a list, and empties it.
     """
 
     def __init__(self, config: Config) -> None:
@@ -137,10 +138,28 @@ class Sampler:
         self._frame_ids: dict[str, tuple[str, ...]] = {}
         self._last_stamp: dict[str, int] = {}
         self._suspect: dict[str, int] = {}  # a stamp out of line, by topic
+        self.demands: list[tuple[float, Array]] | None = None
         self._clear()
 
     def configure(self, config: Config) -> None:
         """Take other settings; the buffered messages and the motion stay."""
+        self._sensitivity = None
+        if config.estimate_effects:
+            from rov_ident.sensitivity import Sensitivity  # here: few need it
+
+            self._sensitivity = Sensitivity(config)
+        self._none = np.zeros(0, dtype=sample_type(len(config.estimate_effects)))
+        self._take_effects(config)
+        self._settings = _settings(config)
+
+    def recentre(self, config: Config) -> None:
+        """Go on with other values of the effects' parameters; their memory stays."""
+        assert self._sensitivity is not None
+        self._sensitivity = self._sensitivity.about(config)
+        self._take_effects(config)
+        self._settings["water"] = self._acting.water
+
+    def _take_effects(self, config: Config) -> None:
         self._grace = config.grace
         self._hold = config.timeout
         self._effects = config.effects
@@ -148,7 +167,6 @@ class Sampler:
         self._corrects = affects_sensors(config.effects)
         self._acts = bool(self._acting.inputs.any())
         self._surrounded = bool(self._acting.wrenches.any())
-        self._settings = _settings(config)
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
@@ -166,6 +184,8 @@ class Sampler:
         self._demand: Array | None = None
         self._demand_time = -math.inf
         self._memory = memory()
+        if self._sensitivity is not None:
+            self._sensitivity.forget()
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
 
     # -------------------------------------------------------------- messages in
@@ -175,7 +195,7 @@ class Sampler:
         reason = self._refusal(role, message)
         if reason:
             self.counts[f"{role}: {reason}"] += 1
-            return _NONE
+            return self._none
         if self.origin is None:
             self.origin = message.stamp
         t = (message.stamp - self.origin) * 1e-9
@@ -185,7 +205,7 @@ class Sampler:
             if step < -1.0 or step > _MAX_JUMP:
                 if not self._is_new_clock(role, message.stamp):
                     self.counts[f"{role}: stamp jumps"] += 1
-                    return _NONE
+                    return self._none
                 done = self.flush()
                 self.counts["clock: jumps, buffers restarted"] += 1
                 self._clear()
@@ -195,13 +215,13 @@ class Sampler:
                 return done
             if step <= 0.0:
                 self.counts[f"{role}: {'duplicate' if step == 0.0 else 'backward'} stamp"] += 1
-                return _NONE
+                return self._none
         self._last_stamp[role] = message.stamp
         self._suspect.pop(role, None)
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
             if role != WRENCH:
-                return _NONE
+                return self._none
         self._enqueue(role, t, message)
         return self._complete(final=False)
 
@@ -293,7 +313,7 @@ class Sampler:
             if sample is not None:
                 samples.append(sample)
         if not samples:
-            return _NONE
+            return self._none
         return samples[0] if len(samples) == 1 else joined(samples)
 
     def _reached(self, t: float) -> bool:
@@ -320,6 +340,9 @@ class Sampler:
         mean, slope = (_ZERO_WRENCH, _ZERO_WRENCH) if wrench is None else wrench
         sample = np.zeros(1, dtype=SAMPLE)
         odometry, shift = _ABSENT, 0.0
+        if self._sensitivity is not None:
+            known = self._kinematics[0]
+            self._sensitivity.measure(known["v"], known["rate"], has_imu=imu is not None)
         if pose is not None:
             given = self._corrected(pose[1])
             assert isinstance(given, Odometry)
@@ -352,6 +375,9 @@ class Sampler:
             return None
         if self._surrounded:
             _surround(self._acting, sample, self._around)
+        if self._sensitivity is not None:
+            sides = self._sensitivity.take(sample[0], rotation(sample["orientation"][0]))
+            return np.frombuffer(bytearray(sample.tobytes() + sides.tobytes()), self._none.dtype)
         return sample
 
     def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array] | None:
@@ -368,9 +394,13 @@ class Sampler:
             elif self._demand is None:
                 start = now = max(at, start)
             self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
+            if self.demands is not None:
+                self.demands.append((at, self._demand))
         if self._demand is None or end - self._demand_time > self._hold:
             self._demand = None
             self._memory = memory()
+            if self._sensitivity is not None:
+                self._sensitivity.forget()
             return None
         acting = self._act(now, end - now)
         if not pieces:
@@ -395,12 +425,48 @@ class Sampler:
         wrench = self._demand.copy()
         if self._acts:
             act(self._acting, self._memory, t, dt, wrench)
+        if self._sensitivity is not None:
+            self._sensitivity.act(t, dt, self._demand)
         return wrench
 
 
 def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
     """One array of the samples in all parts, as np.concatenate, which is slow with records."""
-    return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=SAMPLE)
+    return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=parts[0].dtype)
+
+
+def sample_type(size: int) -> np.dtype[np.void]:
+    """The dtype of samples that know how they change with ``size`` parameters of effects.
+
+    A SAMPLE, then ``by_wrench`` and ``by_velocity`` (6, size) and ``about`` (size,): the values of
+    the parameters by which the sample was made. See :mod:`rov_ident.sensitivity`.
+    """
+    if size == 0:
+        return SAMPLE
+    first, step = SAMPLE.itemsize, 48 * size
+    names = list(SAMPLE.names or ())
+    kinds = [SAMPLE.fields[name] for name in names] if SAMPLE.fields else []
+    return np.dtype(
+        {
+            "names": [*names, "by_wrench", "by_velocity", "about"],
+            "formats": [*(k[0] for k in kinds), *([("f8", (6, size))] * 2), ("f8", (size,))],
+            "offsets": [*(k[1] for k in kinds), first, first + step, first + 2 * step],
+        }
+    )
+
+
+def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
+    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size).
+
+    Six rows of the wrench, six of the measured velocity, and the values that they are about.
+    """
+    if samples.dtype == SAMPLE:
+        return samples, _NO_SIDES
+    size = (samples.dtype.itemsize - SAMPLE.itemsize) // 104
+    rows = np.ascontiguousarray(samples).view(np.uint8).reshape(len(samples), -1)
+    plain = np.ascontiguousarray(rows[:, : SAMPLE.itemsize]).view(SAMPLE)[:, 0]
+    sides = np.ascontiguousarray(rows[:, SAMPLE.itemsize :]).view(np.float64)
+    return plain, sides.reshape(len(samples), 13, size)
 
 
 def _settings(config: Config) -> NDArray[np.void]:
@@ -424,8 +490,8 @@ def _settings(config: Config) -> NDArray[np.void]:
     return settings
 
 
-_NONE = np.zeros(0, dtype=SAMPLE)
 _ABSENT = np.full(16, math.nan)
+_NO_SIDES = np.zeros((1, 13, 0))
 _ZERO = np.zeros(3)
 _ZERO_WRENCH = np.zeros(6)
 

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
-from rov_ident.estimate import Estimate, Prior, calibrated, prior_of
+from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
     Structure,
@@ -50,7 +50,7 @@ from rov_ident.model import (
 from rov_ident.process_noise import adapt, first_adaptation, interrupt, process
 from rov_ident.residual import filtered_residual
 from rov_ident.rls import INFO, is_finite
-from rov_ident.samples import SAMPLE
+from rov_ident.samples import parts
 
 Array = NDArray[np.float64]
 
@@ -146,7 +146,7 @@ def problem(config: Config) -> Problem:
         process(config),
         model.structure,
         prior.estimated,
-        model.theta,
+        theta_of(config),
         prior.std,
         prior.mean / prior.std,
         (u.random_walk * prior.mean / prior.std) ** 2 / 3600.0,
@@ -178,13 +178,13 @@ def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State,
     """:func:`step` over samples (k,) of SAMPLE; info (k,) of INFO. The given state is unchanged."""
     state = State(*(part.copy() for part in state))
     info = np.zeros(len(samples), dtype=INFO)
-    _fold(task, state, samples, info)
+    _fold(task, state, *parts(samples), info)
     return state, info
 
 
 def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
     """One sample (1,) of SAMPLE; the next state and what happened (1,) of INFO."""
-    assert sample.dtype == SAMPLE and len(sample) == 1
+    assert len(sample) == 1
     return fold(task, state, sample)
 
 
@@ -221,6 +221,7 @@ _SCRATCH = np.dtype(
         ("extended", "f8", (EXTENDED_SIZE, LANES)),
         ("stage", "f8", (6, LANES)),
         ("total", "f8", (6, LANES)),
+        ("push", "f8", (6, LANES)),  # wrench that parameters of effects add
         # the centre point
         ("centre", "f8", (6,)),  # nu
         ("centre_inverse", "f8", (6, 6)),
@@ -235,6 +236,7 @@ _SCRATCH = np.dtype(
         ("mean_nu", "f8", (6, 1)),
         ("mean_mass", "f8", (6, 6, 1)),
         ("mean_h", "f8", (6, 1)),
+        ("mean_wrench", "f8", (6,)),
         ("mean_extended", "f8", (EXTENDED_SIZE, 1)),
     ],
     align=True,
@@ -298,15 +300,15 @@ def _copy(a, b):
 
 
 @kernel
-def _fold(task, state, samples, info):
+def _fold(task, state, samples, sides, info):
     work = _work(task, state)
     for k in range(len(samples)):
-        _step(task, state, work, samples[k], info[k])
+        _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
     _copy(work.p, state.p)
 
 
 @inlined
-def _step(task, state, work, sample, out):
+def _step(task, state, work, sample, side, out):
     out.t = sample.t
     out.forgetting = 1.0
     out.condition = np.nan
@@ -323,17 +325,19 @@ def _step(task, state, work, sample, out):
         out.reason = RESTARTED
     else:
         _take_root(task, work, out)
-        _move(task, state.x, work, sample)
+        _move(task, state.x, work, sample, side)
         if not _collect(task, state, work, sample):
             out.reason = UNPREDICTABLE
             state.scalars[0].started = False
             return
         in_motion(task.structure, sample.moving, work.moves)
+        for e in range(len(task.theta) - side.shape[1], len(task.theta)):
+            work.moves[e] = True
         for i in range(len(state.x)):
             work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
-        _update(task, state, work, sample, out)
+        _update(task, state, work, sample, side, out)
         _look_back(task, state, work, sample.dt)
-    _residual(task, state, work, sample, out)
+    _residual(task, state, work, sample, side, out)
 
 
 @inner
@@ -405,7 +409,7 @@ def _cholesky(p, upper, root):
 
 
 @inlined
-def _move(task, x, work, sample):
+def _move(task, x, work, sample, side):
     """Move the sigma points to the sample's time: work.moved, and the centre's inverse mass."""
     s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
     for i in range(6):
@@ -416,13 +420,14 @@ def _move(task, x, work, sample):
             s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
     steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
     dt = sample.dt / steps
-    for side in range(2):
+    for sign in range(2):
         for first in range(0, columns, LANES):
-            _spread(task, x, work, first, spread if side == 0 else -spread)
+            _spread(task, x, work, first, spread if sign == 0 else -spread)
+            _push(task, work, side)
             for k in range(steps):
                 _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt)
             for i in range(6):
-                row = work.moved[side, i, first : first + LANES]
+                row = work.moved[sign, i, first : first + LANES]
                 for k in range(LANES):
                     row[k] = s.nu[i, k]
     for i in range(6):  # the last column is one of zeros
@@ -457,6 +462,18 @@ def _spread(task, x, work, first, spread):
     _invert(s.mass, task.lightest, s.inverse)
 
 
+@inlined
+def _push(task, work, side):
+    """What the parameters of effects add to the wrench on the sigma points."""
+    s, first = work.scratch[0], len(task.theta) - side.shape[1]
+    for i in range(6):
+        for k in range(LANES):
+            s.push[i, k] = 0.0
+        for j in range(side.shape[1]):
+            for k in range(LANES):
+                s.push[i, k] += side[i, j] * (work.theta[first + j, k] - side[12, j])
+
+
 _NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta step
 _WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 _AHEAD = (0.5, 0.5, 1.0, 0.0)  # from a stage's slope to the next stage
@@ -467,6 +484,7 @@ def _propagate(structure, work, late, dt):
     """One Runge-Kutta step of the sigma points, beginning ``late`` seconds after mid-interval."""
     s = work.scratch[0]
     nu, stage, total, h, force, slope = s.nu, s.stage, s.total, s.h, s.force, s.slope
+    push = s.push
     for i in range(6):
         for k in range(LANES):
             stage[i, k] = nu[i, k]
@@ -478,7 +496,10 @@ def _propagate(structure, work, late, dt):
         d, e, f = force[3] + at * slope[3], force[4] + at * slope[4], force[5] + at * slope[5]
         weight, ahead = _WEIGHTS[n] * dt, _AHEAD[n] * dt
         for k in range(LANES):
-            rest = (a - h[0, k], b - h[1, k], c - h[2, k], d - h[3, k], e - h[4, k], f - h[5, k])
+            rest = (
+                a + push[0, k] - h[0, k], b + push[1, k] - h[1, k], c + push[2, k] - h[2, k],
+                d + push[3, k] - h[3, k], e + push[4, k] - h[4, k], f + push[5, k] - h[5, k],
+            )  # fmt: skip
             nu_dot = symmetric_product(s.inverse, rest, k)
             for i in range(6):
                 total[i, k] += weight * nu_dot[i]
@@ -638,7 +659,7 @@ def _invert(m, lightest, inverse):
 
 
 @inlined
-def _update(task, state, work, sample, out):
+def _update(task, state, work, sample, side, out):
     """Linear and angular velocity, each behind its own gate."""
     s, c, scratch = task.settings[0], state.scalars[0], work.scratch[0]
     x, p, z, r = state.x, work.p, scratch.z, scratch.r
@@ -648,6 +669,8 @@ def _update(task, state, work, sample, out):
             z[i], r[i] = sample.gyro[i - 3], sample.gyro_variance
         if not np.isfinite(r[i]):
             z[i] = np.nan
+        for j in range(side.shape[1]):
+            z[i] += side[6 + i, j] * side[12, j]
     surprise, count = 0.0, 0
     for i in range(6):
         state.adaptation[i].since += sample.dt
@@ -656,7 +679,8 @@ def _update(task, state, work, sample, out):
             continue
         worst = 0.0
         for i in range(first, first + 3):
-            innovation = (z[i] - x[i]) / np.sqrt(p[i, i] + r[i])
+            predicted, spread = _seen(task, x, p, side, i)
+            innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
             out.ratio[i] = innovation**2
             worst = max(worst, out.ratio[i])
             surprise += min(out.ratio[i], s.gate**2)
@@ -666,7 +690,7 @@ def _update(task, state, work, sample, out):
             out.reason = GATED
             continue
         c.refused = 0.0
-        _absorb(x, work, first)
+        _absorb(task, x, work, side, first)
     if out.reason == GATED:
         c.refused += sample.dt
         if c.refused > _LOST:
@@ -677,8 +701,22 @@ def _update(task, state, work, sample, out):
         c.surprise += blend * (surprise / count - c.surprise)
 
 
+@inlined
+def _seen(task, x, p, side, i):
+    """A velocity as measured, with what parameters of effects add to it, and its variance."""
+    predicted, spread, k = x[i], p[i, i], side.shape[1]
+    first, scale = len(x) - k, len(task.scale) - k
+    for j in range(k):
+        f = side[6 + i, j] * task.scale[scale + j]
+        predicted += f * x[first + j]
+        spread += 2.0 * f * p[i, first + j]
+        for l in range(k):
+            spread += f * side[6 + i, l] * task.scale[scale + l] * p[first + j, first + l]
+    return predicted, spread
+
+
 @reordered
-def _absorb(x, work, first):
+def _absorb(task, x, work, side, first):
     """Take in three measured velocities, from ``first`` on, one after the other.
 
     With w the covariance with the innovation over its standard deviation, p loses w w', but for the
@@ -686,16 +724,28 @@ def _absorb(x, work, first):
     """
     p, cross, gain, free = work.p, work.cross, work.gain, work.free
     s, size, columns = work.scratch[0], p.shape[0], p.shape[1]
+    last = len(task.scale) - side.shape[1]  # so many coefficients, then parameters of effects
     for c in range(3):
         i = first + c
         for k in range(columns):
             cross[c, k] = p[i, k]
+        for j in range(side.shape[1]):
+            f = side[6 + i, j] * task.scale[last + j]
+            for k in range(columns):
+                cross[c, k] += f * p[6 + last + j, k]
         for b in range(c):
             f = cross[b, i]
+            for j in range(side.shape[1]):
+                f += side[6 + i, j] * task.scale[last + j] * cross[b, 6 + last + j]
             for k in range(columns):
                 cross[c, k] -= f * cross[b, k]
-        f = 1.0 / np.sqrt(cross[c, i] + s.r[i])
-        innovation = f * (s.z[i] - x[i])
+        total, predicted = cross[c, i], x[i]
+        for j in range(side.shape[1]):
+            f = side[6 + i, j] * task.scale[last + j]
+            total += f * cross[c, 6 + last + j]
+            predicted += f * x[6 + last + j]
+        f = 1.0 / np.sqrt(total + s.r[i])
+        innovation = f * (s.z[i] - predicted)
         for k in range(columns):
             cross[c, k] *= f
             gain[c, k] = cross[c, k] * free[k]
@@ -819,17 +869,21 @@ def _solve(root, n, x):
 
 
 @inlined
-def _residual(task, state, work, sample, out):
+def _residual(task, state, work, sample, side, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     s, theta = work.scratch[0], work.mean
-    nu, mass, h = s.mean_nu, s.mean_mass, s.mean_h
+    nu, mass, h, wrench = s.mean_nu, s.mean_mass, s.mean_h, s.mean_wrench
     for j in range(len(task.scale)):
         theta[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
+    first = len(task.theta) - side.shape[1]
     for i in range(6):
+        wrench[i] = sample.wrench[i]
+        for j in range(side.shape[1]):
+            wrench[i] += side[i, j] * (theta[first + j, 0] - side[12, j])
         for j in range(6):
             mass[i, j, 0] = task.rigid_body[i, j]
     add_added_mass(task.structure, theta, mass)
     filtered_residual(
         task.structure, theta, mass, task.restoring, task.settings[0].corner, state.residual,
-        sample, out.reason == RESTARTED, nu, h, s.mean_extended, out.residual,
+        sample, wrench, out.reason == RESTARTED, nu, h, s.mean_extended, out.residual,
     )  # fmt: skip

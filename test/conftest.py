@@ -161,8 +161,8 @@ def live(domain):
     """Starts a node; gives the vehicle that is connected to it. In the end both must end well."""
     started = []
 
-    def start(*options, estimator="rls", **kwargs):
-        process = start_node(estimator, HEAVY, "qos.reliability:=reliable", *options)
+    def start(*options, estimator="rls", parameters=HEAVY, **kwargs):
+        process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
         vehicle = Vehicle(estimator, **kwargs)
         started.append((process, vehicle))
         vehicle.until(vehicle.connected, 120.0)  # it may have to compile

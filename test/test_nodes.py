@@ -16,6 +16,7 @@ from rov_ident.frames import FLIP_BODY, from_core
 from rov_ident.messages import Odometry, Wrench
 from rov_ident.nodes.conversions import from_diagnostics, from_time
 from rov_ident.online import Level, OnlineEstimator
+from rov_ident.sensors import dive
 
 STALE = bytes([Level.STALE])
 
@@ -264,3 +265,46 @@ def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
     assert status == 0, said
     assert time.monotonic() - began < 5.0
     assert "] active" not in said and "Traceback" not in said
+
+
+@pytest.mark.parametrize("estimator", ["rls", "ukf"])
+def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
+    """An effect that is configured is estimated; one that is missing is named in /diagnostics."""
+    document = config.to_parameters(heavy)
+    document["effects"] = {"thruster_lag": {"time_constant": 0.12}}
+    messages = dive(config.from_parameters(document), "steps", 75.0).messages
+    document["effects"] = {"thruster_lag": {"time_constant": 0.1}}
+    del document["coefficients"]["X_uu"]
+    lacking = config.from_parameters(document)
+    config.dump(lacking, tmp_path / "lacking.yaml")
+    reference, _ = offline(lacking, messages, estimator)
+    expected = reference.report()
+    assert expected.names[-1] == "thruster_lag.time_constant"
+
+    vehicle = live(estimator=estimator, parameters=tmp_path / "lacking.yaml")
+    vehicle.until(lambda: "nothing is seen to be missing" in vehicle.words(), 120.0)
+    vehicle.drive(messages)
+    vehicle.until(
+        lambda: any(from_time(m.header.stamp) == expected.stamp for m in vehicle.coefficients[-1:])
+    )
+    report = from_diagnostics(vehicle.coefficients[-1])
+    assert (report.names, report.units) == (expected.names, expected.units)
+    np.testing.assert_array_equal(report.values, expected.values)
+    assert abs(report.values[-1] - 0.12) < 0.01
+
+    vehicle.until(lambda: "quadratic damping missing?" in vehicle.words())
+    status = next(
+        status
+        for message in vehicle.diagnostics
+        for status in message.status
+        if "quadratic damping missing?" in status.message
+    )
+    assert status.name == f"{estimator}_node: model"
+    assert status.level == bytes([Level.WARN])
+    values = {v.key: v.value for v in status.values}
+    assert values["effect"] == "quadratic_damping"
+    assert values["axis"] == "X"
+    assert float(values["score"]) > float(values["price"])
+    found, unit = values["quadratic_damping.X_uu"].split(" ", 1)
+    assert unit == "N s2/m2"
+    assert float(found) < 0.0

@@ -13,7 +13,7 @@ import numpy as np
 from numba import literal_unroll
 from numpy.typing import NDArray
 
-from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, Reading
+from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
 from rov_ident.jit import kernel
 from rov_ident.model import RigidBody, current_wrench
 
@@ -92,6 +92,37 @@ def correct(reading: Reading, effects: Values) -> Reading:
 def affects_sensors(effects: Values) -> bool:
     """Whether :func:`correct` changes anything."""
     return any(effect.name in effects for effect in _SENSE)
+
+
+def parameter(effect: str, name: str) -> EffectParameter:
+    """A parameter by its effect and its name."""
+    return next(p for p in EFFECTS[effect].parameters if p.name == name)
+
+
+def estimable(name: str) -> dict[str, float | None]:
+    """The parameters of an effect that an estimator can follow while the vehicle moves.
+
+    With each of them the value at which it is better left alone unless asked for: the null of a
+    parameter of one axis, of which an effect has several; None for others. An onset, a frequency
+    and a phase are not among them, nor what shows in no velocity (the sampler finds the biases of
+    an IMU itself).
+    """
+    effect = EFFECTS[name]
+    if effect.sense is not None and effect.correct is not None:
+        given = Reading(*np.arange(1.0, 13.0).reshape(4, 3))
+        nulls = {p.name: p.null for p in effect.parameters}
+        same = effect.correct(given, **nulls)
+        moved = [
+            effect.correct(given, **{**nulls, p.name: p.null + p.typical})
+            for p in effect.parameters
+        ]
+        if all((m.linear == same.linear).all() for m in moved):
+            return {}
+    return {
+        p.name: p.null if p.axis else None
+        for p in effect.parameters
+        if p.role in ("amplitude", "place")
+    }
 
 
 def memory() -> Array:

@@ -4,15 +4,21 @@ Nothing here computes a coefficient. Timers run on the steady clock, so that a n
 `use_sim_time` works where nothing publishes `/clock`; a sample's time is its stamp in any case.
 """
 
+import contextlib
+import gc
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -45,6 +51,8 @@ _OWN_PARAMETERS = ("save_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
 _DIAGNOSTICS_PERIOD = 1.0  # s
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
+_LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
+_SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
 _LOG_PERIOD = 10.0  # s; between two equal complaints
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 # Not worth a warning: the consequence of something that is named itself.
@@ -128,9 +136,10 @@ class EstimatorNode(Node):  # type: ignore[misc]
             for role, (name, type_) in INPUTS.items()
         }
         self._publish()
+        self._begin_watching()
         self.get_logger().info(
             f"active after {time.monotonic() - started:.1f} s of compiling: estimating "
-            f"{len(config.estimate)} coefficients of {config.name}"
+            f"{len(self._online.prior.names)} coefficients of {config.name}"
         )
 
     def _own_parameter(self, name: str, default: object, description: str) -> object:
@@ -214,6 +223,58 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._coefficients.publish(to_diagnostics(shown, self._config.name))
         return shown
 
+    # ---------------------------------------------------------------- what the model lacks
+
+    def _begin_watching(self) -> None:
+        """Look for what the model lacks in a thread of its own, which may take its time.
+
+        What is not compiled yet is compiled by another process: a thread of ours would stop us.
+        """
+        self._judge = ThreadPoolExecutor(1, "watch")
+        self._compiling: subprocess.Popen[bytes] | None = None
+        begun = self._judge.submit(self._load_watcher)
+        begun.add_done_callback(self._complain)
+        if self._lockstep:
+            with contextlib.suppress(TimeoutError):
+                begun.result(_LOADING_TIME)
+
+    def _load_watcher(self) -> None:
+        from rov_ident import watch  # here: not needed to begin with
+
+        if not watch.is_compiled():
+            self._compiling = subprocess.Popen([sys.executable, "-m", watch.__name__])
+            self._compiling.wait()
+        watch.compile_all()
+        self._online.show(watch.Watcher(self._config, self._when_idle))
+
+    def _when_idle(self, function: Callable[..., object], *arguments: object) -> None:
+        self._judge.submit(function, *arguments).add_done_callback(self._complain)
+
+    def _complain(self, job: "Future[Any]") -> None:
+        if not job.cancelled() and (error := job.exception()):
+            self.get_logger().error(f"watching what the model lacks failed: {error!r}")
+
+    def _model_status(self) -> DiagnosticStatus:
+        """What the model seems to lack, in words and numbers."""
+        watcher = self._online.watcher
+        found = [] if watcher is None else watcher.suspicions
+        values = {}
+        for i, suspicion in enumerate(found):
+            number = f" {i + 1}" if i else ""
+            values[f"effect{number}"] = suspicion.effect
+            values[f"axis{number}"] = suspicion.axes
+            values[f"score{number}"] = f"{suspicion.score:.3g}"
+            values[f"price{number}"] = f"{suspicion.price:.3g}"
+            values[f"share{number}"] = f"{suspicion.share:.3g}"
+            values[f"alternatives{number}"] = " ".join(suspicion.rivals)
+            for name, value in suspicion.parameters.items():
+                values[f"{suspicion.effect}.{name}"] = f"{value:.4g} {suspicion.units[name]}"
+        level = Level.WARN if found else Level.OK
+        words = "; ".join(s.sentence for s in found) or (
+            "the watch is being compiled" if watcher is None else "nothing is seen to be missing"
+        )
+        return to_status(f"{self.get_name()}: model", self._config.name, level, words, values)
+
     # ---------------------------------------------------------------- watching
 
     def _watch(self) -> None:
@@ -274,7 +335,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
         complaints = self._complaints()
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [self._input_status(complaints, period), self._estimation_status()]
+        message.status = [
+            self._input_status(complaints, period),
+            self._estimation_status(),
+            self._model_status(),
+        ]
         self._diagnostics.publish(message)
         # Without the numbers, which differ each time.
         complaint = "; ".join(text.partition(" (")[0] for text in complaints)
@@ -342,8 +407,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Write the configuration with the coefficients as they are now."""
         report = self._online.report()
-        theta = self._config.model.theta.copy()
-        theta[self._online.prior.estimated] = report.values
+        values = dict(zip(report.names, report.values.tolist(), strict=True))
         lines = [f"Written by {self.get_name()}; standard deviations at {report.stamp} ns:"]
         lines += [
             f"{name}: {std:.3g} {unit}"
@@ -351,8 +415,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         ]
         path = os.path.abspath(str(self._save_path))
         try:
-            model = self._config.model.with_theta(theta)
-            configuration.dump(replace(self._config, model=model), path, "\n".join(lines))
+            configuration.dump(self._config.with_values(values), path, "\n".join(lines))
             response.success, response.message = True, f"saved to {path}"
         except UserError as error:
             response.success, response.message = False, str(error)
@@ -362,11 +425,16 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _flush(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Use what still waits for a late topic; answers with the stamp [ns] of the last sample."""
         self._show(self._online.flush())
+        if self._online.watcher is not None:
+            self._judge.submit(int).result()  # whatever waits in front of it
         self._diagnose()
         response.success, response.message = True, str(self._publish().stamp)
         return response
 
     def take_leave(self) -> None:
+        self._judge.shutdown(wait=False, cancel_futures=True)
+        if self._compiling is not None:
+            self._compiling.terminate()
         used = self._online.counts["sample: used"]
         self.get_logger().info(f"ended: {used} samples used")
 
@@ -425,6 +493,10 @@ def run(kind: Kind) -> int:
 def _live(kind: Kind) -> None:
     """Until interrupted, or shut down by the node itself."""
     node = EstimatorNode(kind)
+    # What is there now stays: looking through it again and again would hold up samples.
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(_SWITCHING)
     executor = Executor()
     executor.add_node(node)
     # From here on an interrupt waits for the end of a callback.

@@ -1,0 +1,122 @@
+"""What the nodes say of a model that lacks something, and of one that lacks nothing.
+
+The dives come from ``bench/hidden.py``, which knows none of the package's equations.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import hidden
+from rov_ident import watch
+from rov_ident.effects import EFFECTS
+from rov_ident.messages import Array
+from rov_ident.online import OnlineEstimator
+from rov_ident.sensors import Suite, dive
+
+
+def watching(config, kind="rls"):
+    online = OnlineEstimator(config, kind)
+    online.show(watch.Watcher(config))
+    return online
+
+
+def play(online, messages):
+    """Push all messages; the suspicions after each window."""
+    seen, last = [], None
+    for _, role, message in messages:
+        online.push(role, message)
+        if online.watcher.suspicions is not last:
+            last = online.watcher.suspicions
+            seen.append(last)
+    return seen
+
+
+@pytest.mark.parametrize(
+    "effect, axes",
+    [("quadratic_damping", "XY"), ("constant_force", "XYZ"), ("thruster_deadband", "NY")],
+)
+def test_what_is_missing_is_named(effect, axes):
+    case = hidden.draw(200, (effect,), 0.5, conditions=hidden.Conditions(duration=90.0))
+    found = play(watching(case.config), case.messages)[-1]
+    assert found and found[0].effect == effect
+    assert set(found[0].axes) <= set(axes)
+    assert effect.replace("_", " ") in found[0].sentence
+    truth = case.effects[effect]
+    for name, value in found[0].parameters.items():
+        assert value == pytest.approx(truth[name], rel=0.3, abs=0.3 * max(map(abs, truth.values())))
+
+
+def test_the_plain_words():
+    case = hidden.draw(200, ("quadratic_damping",), 0.5, conditions=hidden.Conditions(duration=70))
+    sentences = [s.sentence for s in play(watching(case.config), case.messages)[-1]]
+    assert "residual in surge follows |u|u: quadratic damping missing?" in sentences
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
+    case = hidden.draw(102, conditions=hidden.Conditions(duration=150.0))
+    assert not any(play(watching(case.config, kind), case.messages))
+
+
+def test_what_ends_is_forgotten(heavy):
+    """Pulled by something for a minute, then let go."""
+    pulled = dataclasses.replace(
+        heavy, effects={"constant_force": {"fx": 6.0, "fy": 0.0, "fz": 0.0}}
+    )
+    online = watching(heavy)
+    first = play(online, dive(pulled, "steps", 70.0, Suite(), 1).messages)
+    assert first[-1] and "constant_force" in (first[-1][0].effect, *first[-1][0].rivals)
+    memory = watch.MEMORY * watch.WINDOW
+    later = [
+        (arrival, role, message._replace(stamp=message.stamp + 80_000_000_000))
+        for arrival, role, message in dive(heavy, "steps", memory + 20.0, Suite(), 2).messages
+    ]
+    assert not play(online, later)[-1]
+
+
+def test_watching_changes_no_estimate():
+    case = hidden.draw(200, ("lift",), 0.5, conditions=hidden.Conditions(duration=70.0))
+    online, alone = watching(case.config), OnlineEstimator(case.config, "rls")
+    play(online, case.messages)
+    for _, role, message in case.messages:
+        alone.push(role, message)
+    np.testing.assert_array_equal(online.report().values, alone.report().values)
+    np.testing.assert_array_equal(online.report().covariance, alone.report().covariance)
+
+
+def test_which_effects_are_watched():
+    """Sensors disagree among themselves, waves need a frequency, a battery fades too slowly."""
+    sensors = {name for name, effect in EFFECTS.items() if effect.sense is not None}
+    left = {name for name, effect in EFFECTS.items() if not watch.watched(effect)}
+    assert left == sensors | {"wave", "battery_sag"}
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_chance_pays_the_price_as_rarely_as_it_should(size):
+    """Against the chi-squared distribution, whose tail the price bounds."""
+    from scipy.stats import chi2
+
+    chance = 100 * chi2.sf(watch.price(size, 100), size)
+    assert watch.ALARM / 50.0 < chance <= watch.ALARM
+
+
+def test_at_rest_and_in_gaps_nothing_is_said(heavy):
+    online = watching(heavy)
+    run = dive(heavy, "steps", 100.0, Suite(), 3)
+    kept = [m for m in run.messages if (m[2].stamp // 1_000_000_000) % 7 > 1]
+    assert not any(play(online, kept))
+
+
+def test_windows_do_not_reach_across_gaps(heavy):
+    watcher = watch.Watcher(heavy)
+    rows = np.zeros(10, dtype=watch.SAMPLE)
+    rows["t"] = np.arange(10)
+    demands: list[tuple[float, Array]] = [(0.0, np.zeros(6))]
+    assert watcher.take(rows[:4], demands) is None
+    assert demands == []
+    again = rows[4:].copy()
+    again["restart"][0] = True
+    window = watcher.take(again, [])
+    assert window is not None and window[0]["t"][0] == 4.0
