@@ -4,11 +4,12 @@ Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +20,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from rov_ident import config as configuration
-from rov_ident.coefficients import catalogue
+from rov_ident.coefficients import catalogue, fin_catalogue
 from rov_ident.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,8 +32,10 @@ ERR = Console(stderr=True, highlight=False)
 OUT = Console(highlight=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
+BATCH = ("ls", "iv", "ml")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 CHANNELS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+PAIRS = {"lateral": ("sway", "yaw"), "longitudinal": ("heave", "pitch")}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,15 +83,75 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("--out", type=Path, help="bag to write")
     replay.set_defaults(run=_replay)
 
-    fit = commands.add_parser("fit", help="identify offline, with the same code as the nodes")
+    fit = commands.add_parser(
+        "fit", help="identify offline, by the code of the nodes or from all the data at once"
+    )
     fit.add_argument("bags", nargs="+", type=Path, metavar="BAG")
     fit.add_argument("--config", required=True, type=Path)
-    fit.add_argument("--estimator", choices=LIVE, required=True)
+    fit.add_argument(
+        "--estimator",
+        choices=(*LIVE, *BATCH),
+        required=True,
+        help="rls, ukf: as the nodes; ls: least squares; iv: instrumental variables; "
+        "ml: maximum likelihood",
+    )
     fit.add_argument("--json", type=Path, help="write the result here")
     fit.add_argument(
         "--save", type=Path, metavar="FILE", help="write a configuration with the fitted values"
     )
+    fit.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    batch = fit.add_argument_group("ls, iv and ml")
+    batch.add_argument(
+        "--channels",
+        type=_channels,
+        action="append",
+        metavar="surge,sway,...",
+        help="fit these alone, the others as measured (also lateral, longitudinal); "
+        "given again: one group after the other",
+    )
+    batch.add_argument(
+        "--no-prior", action="store_true", help="the configured values count for nothing"
+    )
+    batch.add_argument(
+        "--ordinary", action="store_true", help="ls, iv: do not weigh the axes by their residuals"
+    )
+    batch.add_argument("--output-error", action="store_true", help="ml: take the wrench as exact")
+    batch.add_argument("--jobs", type=_count, help="processes that read bags (all processors)")
+    batch.add_argument("--dask", default="", metavar="ADDRESS", help="a Dask scheduler, or `local`")
+    fit.add_argument("--quiet", action="store_true", help="no progress on standard error")
     fit.set_defaults(run=_fit)
+
+    check = commands.add_parser(
+        "check", help="is this bag fit for identification, and what would it tell"
+    )
+    _bag_and_config(check)
+    check.add_argument("--json", type=Path, help="write what was found here")
+    check.set_defaults(run=_check)
+
+    plan = commands.add_parser(
+        "plan", help="the manoeuvre to run next: safe, and best for the worst known coefficient"
+    )
+    plan.add_argument("--config", required=True, type=Path)
+    plan.add_argument(
+        "--bag", type=Path, nargs="+", default=[], help="what has been recorded already"
+    )
+    plan.add_argument("--duration", type=_positive, default=60.0, help="s (60)")
+    plan.add_argument(
+        "--tank",
+        type=_box,
+        default=(6.0, 6.0, 2.0),
+        metavar="L,W,D",
+        help="m; of free water about the start: length, width, depth (6,6,2)",
+    )
+    plan.add_argument(
+        "--thrust",
+        type=_positive,
+        default=1.0,
+        help="the largest wrench on each axis, relative to what holds working speed (1)",
+    )
+    plan.add_argument("--json", type=Path, help="write the plan here")
+    plan.add_argument("--out", type=Path, metavar="BAG", help="write the simulated manoeuvre here")
+    plan.set_defaults(run=_plan)
 
     explain = commands.add_parser(
         "explain", help="what the simulation gets wrong, why, and what mending it gains"
@@ -167,9 +230,72 @@ def _parser() -> argparse.ArgumentParser:
     model.add_argument("--out", required=True, type=Path, metavar="CONFIG")
     model.set_defaults(run=_import_model)
 
+    _add_nomoto(commands)
+    _add_forces(commands)
+
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
     return parser
+
+
+def _add_nomoto(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    nomoto = commands.add_parser("nomoto", help="K and T of Nomoto's steering model from zigzags")
+    nomoto.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE",
+        help="CSV (t_s, heading_rad or heading_deg, rudder_rad or rudder_deg) or bag",
+    )  # fmt: skip
+    nomoto.add_argument("--order", type=int, choices=(1, 2), default=1)
+    nomoto.add_argument("--nonlinear", action="store_true", help="with Norrbin's cubic term")
+    nomoto.add_argument(
+        "--interpolate", choices=("none", "spline", "spiral"), default="none",
+        help="densify sparse headings before the fit (default none)",
+    )  # fmt: skip
+    nomoto.add_argument(
+        "--step", type=_positive, metavar="S",
+        help="of the densified heading (default: that of the rows, or a fifth of the heading's)",
+    )  # fmt: skip
+    nomoto.add_argument(
+        "--method", choices=("oe", "fd", "iv", "rls"), default="oe",
+        help="output error (default), forward differences, instruments, recursive",
+    )  # fmt: skip
+    nomoto.add_argument("--validate", type=Path, metavar="FILE", help="predict this run as well")
+    nomoto.add_argument("--json", type=Path, help="write the result here")
+    nomoto.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    nomoto.set_defaults(run=_nomoto)
+
+
+def _add_forces(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    forces = commands.add_parser(
+        "forces", help="coefficients from CFD, towing-tank, rotating-arm or PMM tables"
+    )
+    forces.add_argument("table", type=Path, metavar="TABLE.csv")
+    forces.add_argument(
+        "--map", nargs="+", action="extend", default=[], metavar="NAME=HEADING",
+        help='headings that are called otherwise (beta_deg="beta(deg)"), or a YAML file',
+    )  # fmt: skip
+    forces.add_argument(
+        "--nondimensional", metavar="rho=,L=[,T=]",
+        help="forces are over rho/2 U^2 L^2 (with T: L T), moments over L times that",
+    )  # fmt: skip
+    forces.add_argument(
+        "--drift", choices=("auto", "starboard", "port"), default="auto",
+        help="positive beta is a drift to starboard, v = U sin(beta), or to port (default: as a "
+        "hull resists its motion)",
+    )  # fmt: skip
+    forces.add_argument(
+        "--config", type=Path,
+        help="the vehicle: the Coriolis forces of its added mass are not counted twice",
+    )  # fmt: skip
+    forces.add_argument(
+        "--hull", metavar="cylinder:L=,R=",
+        help="with --config: added mass of a cylinder or spheroid of length L, radius R [m], rho",
+    )  # fmt: skip
+    forces.add_argument("--json", type=Path, help="write the result here")
+    forces.add_argument(
+        "--out", type=Path, metavar="CONFIG", help="write the vehicle with the fitted values"
+    )
+    forces.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    forces.set_defaults(run=_forces)
 
 
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
@@ -204,10 +330,24 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _box(text: str) -> tuple[float, ...]:
+    sides = tuple(_positive(part) for part in text.split(","))
+    if len(sides) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} must be three lengths: 6,6,2")
+    return sides
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 1024:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to 1024")
+    return int(text)
+
+
 def _channels(text: str) -> "np.ndarray":
-    names = text.split(",")
+    names = [axis for name in text.split(",") for axis in PAIRS.get(name, (name,))]
     if unknown := set(names) - set(CHANNELS):
-        raise argparse.ArgumentTypeError(f"no channel {min(unknown)!r}: use {','.join(CHANNELS)}")
+        known = ",".join((*CHANNELS, *PAIRS))
+        raise argparse.ArgumentTypeError(f"no channel {min(unknown)!r}: use {known}")
     return np.array([name in names for name in CHANNELS])
 
 
@@ -257,20 +397,50 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
+    from rov_ident import archive
+    from rov_ident.batch import Settings, curves, fit_batch
     from rov_ident.fit import fit_online, write_text
 
-    _check_outputs([options.json, options.save], [*options.bags, options.config])
-    config = configuration.load(options.config, f"{options.estimator}_node")
-    records = [_read(path, config) for path in options.bags]
-    fit = fit_online(records, config, options.estimator)
+    outputs = [options.json, options.save, options.report]
+    _check_outputs(outputs, [*options.bags, options.config])
+    live = options.estimator in LIVE
+    _check_batch_options(options, live)
+    config = configuration.load(options.config, f"{options.estimator}_node" if live else "")
+    with _steps(options.quiet) as say, contextlib.ExitStack() as stack:
+        if live:
+            records = [_read(path, config) for path in options.bags]
+            bags = archive.of_records(records)
+            fit = fit_online(records, config, options.estimator)
+        else:
+            jobs = options.jobs or archive.default_jobs()
+            bags = stack.enter_context(
+                archive.opened(
+                    options.bags, config, jobs, options.dask,
+                    lambda name, done, total: say(f"read {name} ({done} of {total})"),
+                )
+            )  # fmt: skip
+            stages = tuple(
+                tuple(name for name, use in zip(CHANNELS, marks) if use)
+                for marks in options.channels or ()
+            )
+            settings = Settings(
+                stages, not options.no_prior, not options.ordinary, not options.output_error
+            )
+            fit = fit_batch(bags, config, options.estimator, settings, say)
+        fitted = config.with_model(fit.model)
+        drawn = curves(bags, config, fitted) if options.report else []
     if options.json:
         write_text(options.json, fit.to_json())
+    if options.report:
+        from rov_ident.fit_report import page
+
+        write_text(options.report, page(fit, config, drawn))
     if options.save:
-        bags = ", ".join(path.name for path in options.bags)
+        bags_read = ", ".join(path.name for path in options.bags)
         configuration.dump(
-            config.with_model(fit.model),
+            fitted,
             options.save,
-            comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags}.",
+            comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags_read}.",
         )
 
     table = _table(
@@ -282,15 +452,104 @@ def _fit(options: argparse.Namespace) -> None:
         yes = "yes" if row[4] else "no: the prior decides"
         table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
     OUT.print(table)
+    for note in () if live else fit.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
+
+
+def _check_batch_options(options: argparse.Namespace, live: bool) -> None:
+    """Refuse options that the estimator would not heed."""
+    given = {
+        "--channels": options.channels, "--no-prior": options.no_prior,
+        "--ordinary": options.ordinary, "--output-error": options.output_error,
+        "--jobs": options.jobs, "--dask": options.dask,
+    }  # fmt: skip
+    heeded = set() if live else {"--channels", "--no-prior", "--jobs", "--dask"}
+    heeded |= {"--output-error"} if options.estimator == "ml" else set()
+    heeded |= {"--ordinary"} if options.estimator in ("ls", "iv") else set()
+    for name, value in given.items():
+        if value and name not in heeded:
+            raise UserError(f"{name} has no meaning with --estimator {options.estimator}")
+
+
+@contextlib.contextmanager
+def _steps(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """A line on standard error that says what is being done; nothing where nobody looks."""
+    shown = ERR.is_terminal and not quiet
+    with Progress(console=ERR, transient=True, disable=not shown) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda what: progress.update(bar, description=what)
+
+
+def _check(options: argparse.Namespace) -> None:
+    import json
+
+    from rov_ident.check import check
+    from rov_ident.fit import write_text
+
+    _check_outputs([options.json], [options.bag, options.config])
+    config = configuration.load(options.config)
+    found = check(options.bag, config)
+    if options.json:
+        write_text(options.json, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+    verdict = "fit for identification" if found.fit else "not fit for identification"
+    OUT.print(f"{found.bag}, {found.duration:.1f} s: {verdict}", markup=False)
+    for remark in found.remarks:
+        OUT.print(f"  {remark.level:<8} {remark.subject}: {remark.text}", markup=False)
+    table = _table("what a fit of it would give", "configured", "std", "unit", "known")
+    for p in found.prospects:
+        known = {"well": "well", "roughly": "roughly", "not": "no: the prior decides"}[p.verdict]
+        table.add_row(p.name, f"{p.value:.4g}", f"{p.std:.2g}", p.unit, known)
+    OUT.print(table)
+
+
+def _plan(options: argparse.Namespace) -> None:
+    import json
+
+    from rov_ident import archive
+    from rov_ident.fit import write_text
+    from rov_ident.plan import Limits, propose
+
+    _check_outputs([options.json, options.out], [*options.bag, options.config])
+    config = configuration.load(options.config)
+    limits = Limits(options.tank, options.thrust)
+    with _steps(False) as say, contextlib.ExitStack() as stack:
+        bags = None
+        if options.bag:
+            bags = stack.enter_context(archive.opened(options.bag, config))
+        found = propose(config, bags, options.duration, limits, say)
+    if options.json:
+        write_text(options.json, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+    if options.out:
+        from rov_ident.recording import write_messages
+
+        write_messages(options.out, found.best.dive(config, seed=0).messages)
+    OUT.print(found.sentence, markup=False, soft_wrap=True)
+    table = _table("predicted standard deviations", "configured", "now", "after it", "unit")
+    for before, after in zip(found.before, found.after):
+        table.add_row(
+            before.name, f"{before.value:.4g}", f"{before.std:.2g}", f"{after.std:.2g}", before.unit
+        )
+    OUT.print(table)
 
 
 def _explain(options: argparse.Namespace) -> None:
+    config = configuration.load(options.config)
+    outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
+    new = not options.out.exists()
+    _check_outputs(outputs, [*options.bags, options.config, options.validate])
+    try:
+        _explained(options, config)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            if new:
+                options.out.rmdir()  # which leaves what is not empty
+        raise
+
+
+def _explained(options: argparse.Namespace, config: configuration.Config) -> None:
     from rov_ident import explain_report
     from rov_ident.explain import BLOCK, explain
 
-    config = configuration.load(options.config)
-    outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
-    _check_outputs(outputs, [*options.bags, options.config, options.validate])
     read = [_gather(path, config) for path in options.bags]
     judge = _gather(options.validate, config) if options.validate else None
     with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
@@ -307,6 +566,8 @@ def _explain(options: argparse.Namespace) -> None:
     findings = dataclasses.replace(explanation.findings, provenance=made)
     explanation = dataclasses.replace(explanation, findings=findings)
     explain_report.write(explanation, config, options.out)
+    for note in findings.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
 
     OUT.print(explain_report.verdict(findings), markup=False)
     table = _table(
@@ -472,9 +733,88 @@ def _import_model(options: argparse.Namespace) -> None:
     ERR.print(f"written: {options.out}", markup=False, soft_wrap=True)
 
 
+def _nomoto(options: argparse.Namespace) -> None:
+    from rov_ident import nomoto, zigzag
+    from rov_ident.fit import write_text
+
+    _check_outputs([options.json, options.report], [*options.files, options.validate])
+    runs = [zigzag.read(path) for path in options.files]
+    judge = zigzag.read(options.validate) if options.validate else None
+    model = nomoto.fit(
+        runs, options.order, options.nonlinear, options.method, options.interpolate, options.step,
+        )  # fmt: skip
+    validation = nomoto.predict(model, judge)[1] if judge else None
+    if options.json:
+        write_text(options.json, nomoto.to_json(model, validation))
+    if options.report:
+        from rov_ident import table_reports
+
+        others = nomoto.others(model, runs, options.interpolate, options.step)
+        write_text(options.report, table_reports.steering(model, runs, judge, others))
+    table = _table(
+        f"Nomoto's model of order {model.order}, by {model.method}", "value", "std", "unit"
+    )
+    for name, (value, std, unit) in model.parameters().items():
+        table.add_row(name, f"{value:.5g}", f"{std:.2g}", unit)
+    OUT.print(table)
+    OUT.print(f"heading RMSE {model.rmse:.4g} rad ({math.degrees(model.rmse):.3g} deg)")
+    if judge and validation is not None:
+        OUT.print(
+            f"on {judge.name} {validation:.4g} rad ({math.degrees(validation):.3g} deg)",
+            markup=False,
+        )
+    for note in model.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
+
+
+def _forces(options: argparse.Namespace) -> None:
+    from rov_ident import force_tables
+    from rov_ident.added_mass import parse_hull
+    from rov_ident.fit import write_text
+    from rov_ident.importer import parse_columns
+
+    _check_outputs([options.json, options.out, options.report], [options.table, options.config])
+    if not options.config and (options.out or options.hull):
+        raise UserError("--out and --hull need --config: the vehicle's mass, inertia and buoyancy")
+    config = configuration.load(options.config) if options.config else None
+    hull = parse_hull(options.hull) if options.hull else {}
+    scale = options.nondimensional
+    table = force_tables.read_table(
+        options.table,
+        parse_columns(options.map),
+        force_tables.parse_nondimensional(scale) if scale else None,
+        options.drift,
+    )
+    if config:
+        config = force_tables.with_hull(config, hull)
+    fits = force_tables.fit(table, config.model if config else None)
+    notes = (*table.notes, *force_tables.remarks(fits, config is not None))
+    new = force_tables.configured(config, fits) if config and options.out else None
+    if options.json:
+        write_text(options.json, force_tables.to_json(fits, notes))
+    if options.report:
+        from rov_ident import table_reports
+
+        write_text(options.report, table_reports.forces(table.name, fits, notes))
+    if new:
+        configuration.dump(
+            new, options.out, f"Coefficients from {options.table.name} by rov-ident forces."
+        )
+    for axis, f in fits.items():
+        table_ = _table(f"{axis}: R2 {f.r2:.4f}", "value", "std", "unit")
+        for name, value, std in zip(f.terms, f.values, f.std):
+            table_.add_row(name, f"{value:.5g}", f"{std:.2g}", force_tables.unit(name))
+        OUT.print(table_)
+        OUT.print(f"{axis}: {f.why}\n", markup=False)
+    for note in notes:
+        ERR.print(note, markup=False, soft_wrap=True)
+
+
 def _coefficients(options: argparse.Namespace) -> None:
-    for c in catalogue():
-        OUT.print(f"{c.name:<10} {c.unit:<18} {c.meaning}", markup=False)
+    entries = [(c.name, c.unit, c.meaning) for c in catalogue()]
+    entries += [(c.name, c.unit, c.meaning) for c in fin_catalogue()]
+    for name, unit, meaning in entries:
+        OUT.print(f"{name:<10} {unit:<18} {meaning}", markup=False)
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from rov_ident.coefficients import catalogue, parse
+from rov_ident.coefficients import catalogue, parse, parse_fin
 from rov_ident.effects import EFFECTS, estimable, rigid_body
 from rov_ident.errors import UserError
 from rov_ident.frames import FrameDefaults, to_core
@@ -318,6 +318,11 @@ class Config:
         """The model with the effects on the rigid body: that of simulation and estimation."""
         return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
 
+    @property
+    def with_effects_held(self) -> "Config":
+        """The same, with the parameters of effects as they are: samples need not follow them."""
+        return dataclasses.replace(self, estimate_effects=())
+
     def with_values(self, values: Mapping[str, float]) -> "Config":
         """The same with other values of coefficients, and of parameters of its effects by names
         such as thruster_lag.time_constant.
@@ -586,6 +591,8 @@ def _model(vehicle: Vehicle, coefficients: Mapping[str, float], gravity: float) 
     if not coefficients:
         raise UserError("coefficients is empty: give at least one, such as X_udot or X_u")
     for name in coefficients:
+        if parse_fin(name) is not None:
+            continue
         try:
             parse(name)
         except UserError as error:
@@ -674,6 +681,7 @@ def to_parameters(config: Config) -> dict[str, Any]:
         "inertia": inertia.tolist(),
     }
     coefficients = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
+    coefficients |= config.model.fins
     settings = _changed(config)
     estimate = (*config.estimate, *(f"{e}.{p}" for e, p in config.estimate_effects))
     usual = _estimated(config.model, config.effects, ())

@@ -14,15 +14,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rov_ident.coefficients import parse
+from rov_ident.coefficients import AXES, parse
 from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
-from rov_ident.evidence import Evidence, Fitted
+from rov_ident.evidence import Evidence, Fitted, Look
 from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
 from rov_ident.model import Array
 from rov_ident.patterns import Pattern, patterns
-from rov_ident.scores import PRICE, SURE, Scores, inflation
+from rov_ident.scores import PRICE, SURE, inflation, scores_of
 from rov_ident.streams import Streams
 
 Progress = Callable[[str], None]
@@ -31,11 +31,10 @@ PLAIN = ("quadratic_damping", "linear_damping")
 """Terms that every hull has: what a model lacks of them is the first thing to suspect."""
 
 _LIKELIER = 0.5  # share of what a plain term explains that a rival must explain beyond it
-_NEARBY = 14.0  # s; in which a better onset is looked for
 _FITTED = 6  # candidates that are fitted in full at each step
 _MOST = 6  # effects at most
 _BOLD = 3.0  # typical sizes: the farthest from null that a fit begins for what is not linear
-_SCORED = 2  # patterns of each axis that are scored properly
+_SCORED = 10  # patterns that are scored properly
 _ROUNDS = 3  # of trials in which effects may give way to rivals
 _MOST_PATTERNS = 3
 _PATTERNS_TRIED = 2
@@ -78,7 +77,7 @@ class Search:
         base = {
             (COEFFICIENTS, name): float(value)
             for name, value in zip(config.model.names, config.model.theta, strict=True)
-            if name in config.estimate
+            if name in config.estimate and not streams.guided[parse(name).row]
         }
         duration = {
             (e.name, p.name): streams.duration
@@ -121,24 +120,41 @@ class Search:
 
     def longer(self, now: Fitted, progress: Progress | None = None) -> Fitted | None:
         """The model with the one effect more that explains most; None where nothing is left."""
-        candidates = self.screen(now)
+        candidates = [c for c in self.screen(now) if not self._early(c.name, now.hypothesis)]
         fits = self.fit_best(now, candidates)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.promise:.0f}" for c in candidates[:5]))
+        best = self._best(now, fits)
+        if best is None:
+            best = self._ahead(now, candidates)
+        if best is None:
+            return None
+        return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
+
+    def _best(self, now: Fitted, fits: Sequence[Fitted]) -> Fitted | None:
+        """The fit that is worth most, if any is; a plain term first."""
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.rss)
-        best = min(fits, key=lambda f: self.cost(f, closest))
-        plain = [
-            f
-            for f in fits
-            if self.newest(now, f) in PLAIN
-            and self.cost(now, closest) - self.cost(f, closest) > SURE
-        ]
-        best = min(plain or [best], key=lambda f: self.cost(f, closest))
-        if self.cost(now, closest) - self.cost(best, closest) < SURE:
-            return None
-        return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
+        worth = [f for f in fits if self.cost(now, closest) - self.cost(f, closest) >= SURE]
+        plain = [f for f in worth if self.newest(now, f) in PLAIN]
+        return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
+
+    def _ahead(self, now: Fitted, candidates: Sequence[Candidate]) -> Fitted | None:
+        """A plain term with one effect more, where neither shows without the other."""
+        for candidate in candidates:
+            if candidate.name not in PLAIN:
+                continue
+            first = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
+            if first is None:
+                continue
+            others = [c for c in self.screen(first) if not self._early(c.name, now.hypothesis)]
+            fits = [self.pruned(f, now) for f in self.fit_best(first, others)]
+            both = [f for f in fits if f and set(candidate.start) & set(f.hypothesis.keys)]
+            best = self._best(now, both)
+            if best is not None:
+                return best
+        return None
 
     def settle(self, final: Fitted, progress: Progress | None = None) -> tuple[Fitted, Trials]:
         """Every effect against its rivals, the others in place, until nothing changes."""
@@ -163,6 +179,15 @@ class Search:
             final = self.longer(final) or final
         return final, trials
 
+    def trials(self, final: Fitted) -> Trials:
+        """Every effect against its rivals, the others in place."""
+        rests = {
+            n: self.evidence.fit(self._without(final, n), final.look) for n in self.named(final)
+        }
+        return {
+            n: Trial(rest, self.rivals(rest, n)) for n, rest in rests.items() if rest is not None
+        }
+
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
         """What should stand in the stead of ``name``, if anything.
 
@@ -175,6 +200,8 @@ class Search:
         choices = [trial.rest]
         for rival, fit in trial.rivals.items():
             margin = 0.0
+            if rival in EFFECTS and EFFECTS[rival].beyond == name:
+                continue
             if rival.startswith(UNKNOWN) and not name.startswith(UNKNOWN):
                 margin = _IMITATION
             elif name in PLAIN and rival not in PLAIN:
@@ -224,7 +251,7 @@ class Search:
         keys = [pattern.keys[i] for i in columns]
         if not keys:
             return [], [], 0.0
-        scores = Scores(look.having(keys, look.of(pattern.force()[:, :, columns])), h.keys)
+        scores = scores_of(look, keys, look.of(pattern.force()[:, :, columns]))
         units = [keys] if pattern.frequency else [(k,) for k in keys]
         chosen, change, promise = scores.best(units, bounds)
         return chosen, change.tolist(), promise - (PRICE if pattern.frequency else 0.0)
@@ -234,33 +261,36 @@ class Search:
         return next(group_of(k) for k in longer.hypothesis.keys if k not in old)
 
     def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
+        """Full fits of what promises most, and of what every hull has, whatever it promises: a
+        model that lacks it can be too far off for a linear view."""
         fits = []
-        for candidate in candidates[:_FITTED]:
-            if candidate.promise < max(_SHARE * candidates[0].promise, 0.0):
-                break
+        least = max(_SHARE * candidates[0].promise, 0.0) if candidates else 0.0
+        chosen = [c for c in candidates[:_FITTED] if c.promise >= least]
+        for candidate in chosen + [c for c in candidates if c.name in PLAIN and c not in chosen]:
             there = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
-            if there is not None:
-                fits.append(self.dated(there, candidate))
+            if there is not None and candidate.name in PLAIN:
+                there = self.pruned(there, now)
+            if there is not None and there.hypothesis.keys != now.hypothesis.keys:
+                fits.append(self.evidence.dated(there, candidate.start))
         return fits
 
-    def dated(self, fitted: Fitted, candidate: Candidate) -> Fitted:
-        """The same with the best onset near by: in held-out data it has no gradient to follow."""
-        for key in candidate.start:
-            if key[0] not in EFFECTS or parameter(key).role != "onset":
-                continue
-            now = fitted.hypothesis.values[key]
-            best, earliest = fitted.rss, now
-            for onset in now + np.arange(-_NEARBY, _NEARBY + 0.1, 1.0):
-                there = fitted.hypothesis.having({key: float(max(onset, 0.0))})
-                look = self.evidence.look(there, fitted.look.starts, fitted.noise)
-                if look is not None and look.linear.rss.sum() < 0.99 * best:
-                    best, earliest = float(look.linear.rss.sum()), float(max(onset, 0.0))
-            if earliest != now:
-                there = fitted.hypothesis.having({key: earliest})
-                again = self.evidence.fit(there, fitted.look)
-                if again is not None and again.rss < fitted.rss:
-                    fitted = again
-        return fitted
+    def pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
+        """Without the parameters beyond ``base`` that are not worth their price."""
+        while fitted is not None:
+            h, linear = fitted.hypothesis, fitted.linear
+            added = [k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS]
+            size = np.sqrt(np.maximum(np.diag(linear.normal), 1e-30))
+            inverse = np.linalg.pinv(linear.normal / np.outer(size, size), hermitian=True)
+            width = np.sqrt(np.maximum(np.diag(inverse), 1e-30)) / size
+            kappa = inflation(linear, linear.index(h.keys))
+            worth = [
+                (h.values[k] - bounds(k)[0]) ** 2 / width[linear.index([k])[0]] ** 2 for k in added
+            ]
+            if min(worth, default=np.inf) > PRICE * kappa:
+                return fitted
+            less = h.without([added[int(np.argmin(worth))]])
+            fitted = self.evidence.fit(less, fitted.look)
+        return None
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the price of the added parameters.
@@ -306,10 +336,13 @@ class Search:
         }
         extra = list(dict.fromkeys(k for units in plain.values() for u in units for k in u))
         columns = look.of(self.evidence.columns(h, look.motion, extra))
-        scores = Scores(look.having(extra, columns), h.keys)
+        scores = scores_of(look, extra, columns)
         candidates = []
         for name, units in plain.items():
-            chosen, change, promise = scores.best(units, bounds)
+            chosen, change, promise = scores.best(units, bounds, name in PLAIN)
+            if not chosen and units and name in PLAIN:
+                chosen = [k for unit in units for k in unit]
+                change, promise = scores.solve(chosen, bounds)[0], -np.inf
             if chosen:
                 start = self._start(dict(zip(chosen, change.tolist(), strict=True)))
                 candidates.append(Candidate(name, start, promise))
@@ -331,11 +364,22 @@ class Search:
             return []
         if effect.coefficients:
             have = {parse(n).place for n in h.coefficients}
-            return [((COEFFICIENTS, n),) for n in effect.coefficients if parse(n).place not in have]
+            missing = [parse(n) for n in effect.coefficients]
+            missing = [c for c in missing if c.place not in have and self._simulated(c.row)]
+            return [((COEFFICIENTS, c.name),) for c in missing]
         mine = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
         if any(p.axis for p in effect.parameters):
-            return [(key,) for key in mine if key not in h.values]
+            free = [k for k in mine if self._simulated(AXES.index(parameter(k).axis))]
+            return [(key,) for key in free if key not in h.values]
         return [] if effect.name in h.effects else [tuple(mine)]
+
+    def _early(self, name: str, h: Hypothesis) -> bool:
+        """Whether an effect is not to be looked for before another that every vehicle has."""
+        plainer = EFFECTS[name].beyond if name in EFFECTS else ""
+        return bool(plainer) and not set(EFFECTS[plainer].coefficients[:3]) & set(h.coefficients)
+
+    def _simulated(self, axis: int) -> bool:
+        return not self.streams.guided[axis]
 
     def _start(self, change: Mapping[Key, float]) -> dict[Key, float]:
         """Start values from a linear estimate, inside the bounds and not too bold."""
@@ -389,16 +433,12 @@ class Search:
             values = {(effect.name, n): v for n, v in shape.items()}
             return self.evidence.columns(h.having(values), look.motion, keys)
 
-        columns = []
+        best = None
         for shape in shapes:
             at_origin = column(shape)
-            columns += [at_origin, *(column({**shape, p.name: 1.0}) - at_origin for p in places)]
-        sensitivities = look.of(np.concatenate(columns, axis=2))
-        best = None
-        each = len(keys) + len(places)
-        for i, shape in enumerate(shapes):
-            mine = sensitivities[:, i * each : (i + 1) * each]
-            scores = Scores(look.having([*keys, *moments], mine), h.keys)
+            moved = [column({**shape, p.name: 1.0}) - at_origin for p in places]
+            mine = look.of(np.concatenate([at_origin, *moved], axis=2))
+            scores = scores_of(look, [*keys, *moments], mine)
             units = [(*keys, *moments)] if moments else [(k,) for k in keys]
             chosen, change, promise = scores.best(units, bounds)
             if chosen and (best is None or promise > best[0]):
@@ -438,7 +478,7 @@ class Search:
                 values = {(effect.name, "frequency"): frequency, (effect.name, "phase"): phase}
                 columns.append(self.evidence.columns(h.having(values), look.motion, keys))
             labels = [(f"{effect.name} {part}", k[1]) for part in ("cos", "sin") for k in keys]
-            scores = Scores(look.having(labels, look.of(np.concatenate(columns, axis=2))), h.keys)
+            scores = scores_of(look, labels, look.of(np.concatenate(columns, axis=2)))
             change, gain = scores.solve(labels)
             # one phase for all directions: the best approximation of rank one
             cosine, sine = change[: len(keys)], change[len(keys) :]
@@ -447,7 +487,7 @@ class Search:
             start = dict(zip(keys, amplitude.tolist(), strict=True))
             start[effect.name, "frequency"] = frequency
             start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
-            promise = gain / scores.kappa - PRICE * len(start)
+            promise = gain / scores.scatter(labels, change) - PRICE * len(start)
             candidates.append(Candidate(effect.name, start, promise))
         return sorted(candidates, key=lambda c: -c.promise)[:1]
 
@@ -456,31 +496,33 @@ class Search:
     def screen_patterns(self, now: Fitted) -> list[tuple[Candidate, Pattern]]:
         """Wrenches of no known cause that would explain something, the best first.
 
-        On each axis all are ranked by how well they follow what the fit lacks (the adjoint); the
-        first few are scored properly.
+        All are ranked by what they would explain with all their columns, the first few scored
+        properly.
         """
-        h, look = now.hypothesis, now.look
-        tried = self._patterns(now)
-        wanted = look.adjoint()
-        inside = np.flatnonzero(wanted.any(axis=1))
-        wanted = wanted[inside]
-        own = self.evidence.columns(h, look.motion, h.keys)[inside]
+        tried = [p for p in self._patterns(now) if self._simulated(p.axis)]
         price = 2.0 * np.log(len(tried))
+        ranked = sorted(tried, key=lambda p: -self._reach(now.look, p))
         found = []
-        for axis in range(6):
-            mine = own[:, axis]
-            basis = np.linalg.qr(mine[:, mine.any(axis=0)])[0]
-            ranked = sorted(
-                (p for p in tried if p.axis == axis and p.direction is None),
-                key=lambda p: -p.follows(wanted[:, p.axis], basis, inside),
-            )
-            world = [p for p in tried if p.axis == axis and p.direction is not None]
-            for pattern in ranked[:_SCORED] + world:
-                chosen, start, promise = self._score(now, pattern)
-                if chosen and promise > price:
-                    values = dict(zip(chosen, start, strict=True))
-                    found.append((Candidate(group_of(chosen[0]), values, promise - price), pattern))
+        for pattern in ranked[:_SCORED]:
+            chosen, start, promise = self._score(now, pattern)
+            if chosen and promise > price:
+                values = dict(zip(chosen, start, strict=True))
+                found.append((Candidate(group_of(chosen[0]), values, promise - price), pattern))
         return sorted(found, key=lambda f: -f[0].promise)
+
+    def _reach(self, look: Look, pattern: Pattern) -> float:
+        """What all columns of a pattern could take off the squared residuals, less the price of
+        each by the plain criterion of Akaike."""
+        columns = look.of(pattern.force())
+        linear = look.having(pattern.keys, columns)
+        known = len(look.linear.keys)
+        normal, slope = linear.normal, linear.gradient.sum(axis=0)
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+        normal = normal / np.outer(size, size) + 1e-6 * np.eye(len(size))
+        slope = slope / size
+        whole = slope @ np.linalg.solve(normal, slope)
+        base = slope[:known] @ np.linalg.solve(normal[:known, :known], slope[:known])
+        return float(whole - base - 2.0 * columns.shape[1])
 
     def _patterns(self, now: Fitted) -> list[Pattern]:
         """Patterns along the simulated motion: the measured one has the residual's noise in it."""

@@ -7,10 +7,11 @@
 
 import contextlib
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from rov_ident.coefficients import AXES, parse
@@ -18,7 +19,16 @@ from rov_ident.effects import EFFECTS, compiled
 from rov_ident.effects.base import Effect
 from rov_ident.errors import UserError
 from rov_ident.frames import quaternion_to_matrix
-from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, precision, reach
+from rov_ident.hypothesis import (
+    COEFFICIENTS,
+    Hypothesis,
+    Key,
+    bounds,
+    centre,
+    parameter,
+    precision,
+    reach,
+)
 from rov_ident.model import Array, Model, RigidBody
 from rov_ident.shooting import (
     Indices,
@@ -26,19 +36,23 @@ from rov_ident.shooting import (
     Steps,
     adjoint,
     equations,
+    guided_by,
     regressors,
     shoot,
     tangent,
     thrust,
     wrenches,
 )
-from rov_ident.simulate import simulate
+from rov_ident.simulate import Guide, simulate
 from rov_ident.streams import Streams, orientation_at
 
 _MAX_STEP = 0.05  # s
 _MAX_GAP = 0.5  # s without odometry: no window reaches across
 _ITERATIONS = 15
 _ONSET_STEP = 0.2  # s; of the difference quotient
+_NEARBY = 14.0  # s; in which a better onset is looked for
+_SHOWS = 4.0  # scaled squared residuals by which an onset is too far off: two standard deviations
+_FARTHEST = 30.0  # s; an onset less certain than that is not known at all
 _OUTLIER = 8.0  # robust standard deviations
 
 
@@ -72,14 +86,15 @@ class Look:
         error = (evidence.measured - motion.nu[evidence.nodes]) / noise
         spread = 1.4826 * np.median(np.abs(error), axis=0)
         self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
+        self._weight[:, evidence.guided] = 0.0
         error = error * (self._weight > 0.0)
         self._rows = np.flatnonzero(np.diff(evidence.window, prepend=-1))  # first of each window
         own = evidence.columns(h, motion, h.keys)
         j, j0 = tangent(motion, evidence.first, evidence.last, own, evidence.nodes)
-        j0 *= self._weight[:, :, None]
+        j0 = j0[:, :, ~evidence.guided] * self._weight[:, :, None]
         self._q, self._r = [], []
         for a, b in self._spans():
-            q, r = np.linalg.qr(j0[a:b].reshape(-1, 6))
+            q, r = np.linalg.qr(j0[a:b].reshape(6 * (b - a), -1))
             self._q.append(q)
             self._r.append(r)
         raw = (j * self._weight[:, :, None]).reshape(-1, len(h.keys))
@@ -102,14 +117,18 @@ class Look:
             part -= q @ (q.T @ part)
         return raw
 
+    @property
+    def first(self) -> Indices:
+        """Where each window begins in the residuals (6 N,)."""
+        return 6 * self._rows
+
     def _linear(self, keys: Sequence[Key], columns: Array) -> Linear:
-        rows = 6 * self._rows
         return Linear(
             tuple(keys),
             columns.T @ columns,
-            np.add.reduceat(columns * self.error[:, None], rows),
-            np.add.reduceat(self.error**2, rows),
-            int(np.count_nonzero(self._weight)) - 6 * len(rows),
+            np.add.reduceat(columns * self.error[:, None], self.first),
+            np.add.reduceat(self.error**2, self.first),
+            int(np.count_nonzero(self._weight)) - 6 * len(self.first),
         )
 
     def of(self, force: Array) -> Array:
@@ -121,7 +140,7 @@ class Look:
     def having(self, keys: Sequence[Key], columns: Array) -> Linear:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
         cross = self.columns.T @ columns
-        gradient = np.add.reduceat(columns * self.error[:, None], 6 * self._rows)
+        gradient = np.add.reduceat(columns * self.error[:, None], self.first)
         return Linear(
             (*self.linear.keys, *keys),
             np.block([[self.linear.normal, cross], [cross.T, columns.T @ columns]]),
@@ -130,13 +149,29 @@ class Look:
             self.linear.count,
         )
 
+    def left_out(self, at: Indices) -> Array:
+        """How the estimate (W, A) of the parameters ``at`` (A,) moves as each window is left out
+        (the jackknife); the others are taken as known."""
+        linear = self.linear
+        normal, gradient = linear.normal[np.ix_(at, at)], linear.gradient[:, at]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+        edges = [*self.first.tolist(), len(self.columns)]
+        moves = np.empty_like(gradient)
+        for w, (a, b) in enumerate(itertools.pairwise(edges)):
+            own = self.columns[a:b, at] / size
+            rest = normal / np.outer(size, size) - own.T @ own + 1e-9 * np.eye(len(size))
+            moves[w] = np.linalg.solve(rest, gradient[w] / size) / size
+        return moves
+
     def starts_after(self, change: Array) -> Array:
         """The starts (W, 6) that suit a change (P,) of the parameters."""
         moves = [
             np.linalg.solve(r, e - a @ change)
             for r, (a, e) in zip(self._r, self._starting, strict=True)
         ]
-        return self.starts + np.array(moves)
+        starts = self.starts.copy()
+        starts[:, ~self.evidence.guided] += moves
+        return starts
 
     def residual(self) -> Array:
         """Measured minus simulated velocity (N, 6), outliers as they are."""
@@ -179,7 +214,7 @@ class Look:
         power[(frequency < 1.0 / (t[-1] - t[0])) | (frequency > 2.0)] = 0.0
         level = median_filter(power, max(5, size // 64)) + 1e-3 * power.max()
         peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
-        strongest = peaks[np.argsort(-(power / level)[peaks])]
+        strongest = peaks[np.argsort(-power[peaks] / np.maximum(level[peaks], 1e-300))]
         return [float(frequency[i]) for i in strongest[:count]]
 
 
@@ -211,12 +246,13 @@ class Evidence:
         """``spans``: from and to [s] of each window."""
         self.streams = streams
         keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
+        keep &= within(spans, streams.t)
         t = streams.t[keep]
         nodes = _subdivided(t)
         pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
         pieces = pieces[(pieces >= nodes[0]) & (pieces <= nodes[-1])]
         held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
-        self.orientation = orientation_at(streams, nodes)
+        self.orientation, self.guided = orientation_at(streams, nodes), streams.guided
         self.steps = Steps(
             nodes,
             quaternion_to_matrix(self.orientation),
@@ -224,6 +260,7 @@ class Evidence:
             pieces,
             streams.demand[held],
             np.searchsorted(pieces, nodes[:-1]),
+            self._given(nodes),
         )
         at = np.searchsorted(nodes, t)
         first, last = [], []
@@ -243,6 +280,19 @@ class Evidence:
         self._thrusts: dict[object, Array] = {}
         self._remembered: tuple[Array | None, dict[object, Array]] = (None, {})
 
+    def _given(self, nodes: Array) -> Array:
+        """Accelerations (K, 6) of the guided axes, from each node to the next."""
+        if not self.guided.any():
+            return np.empty((0, 6))
+        nu = self._measured_at(nodes)
+        return np.where(self.guided, np.diff(nu, axis=0) / np.diff(nodes)[:, None], 0.0)
+
+    def _measured_at(self, t: Array) -> Array:
+        """Velocities (k, 6) between those measured."""
+        good = np.isfinite(self.streams.nu).all(axis=1)
+        at, nu = self.streams.t[good], self.streams.nu[good]
+        return np.stack([np.interp(t, at, x) for x in nu.T], axis=1)
+
     def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
         inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
@@ -254,12 +304,16 @@ class Evidence:
         return self._thrusts[key]
 
     def look(self, h: Hypothesis, starts: Array, noise: Array) -> Look | None:
-        """Simulate; None where that diverges."""
+        """Simulate; None where that diverges, or the masses are none."""
+        if np.linalg.eigvalsh(h.model.mass_matrix)[0] <= 0.0:
+            return None
         wrench = self.thrust(h.effects)
         for key, value in h.values.items():
             if key in self.patterns:
                 wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
-        motion = shoot(h.equations, self.steps, wrench, self.first, self.last, starts)
+        motion = shoot(
+            guided_by(h.equations, self.guided), self.steps, wrench, self.first, self.last, starts
+        )
         if not np.isfinite(motion.nu[self.nodes]).all():
             return None
         return Look(self, h, starts, noise, motion)
@@ -354,11 +408,14 @@ class Evidence:
         """Measured minus simulated (N, 6) in open loop: velocity and attitude of each window begin
         as measured and are the simulation's own from there. NaN where it diverges."""
         mean, slope = self.thrust(h.effects)
-        acting = compiled(h.effects)
+        acting, guide = compiled(h.effects), None
+        nu = self._measured_at(self.steps.t)
         simulated = np.full((len(self.steps.t), 6), np.nan)
         for first, last, start in zip(self.first, self.last, self.begin(), strict=True):
             nodes = slice(first, last + 1)
             at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
+            if self.guided.any():
+                guide = Guide(~self.guided, nu[nodes], self.orientation[nodes])
             with contextlib.suppress(UserError):
                 simulated[nodes] = simulate(
                     h.model,
@@ -367,6 +424,7 @@ class Evidence:
                     start,
                     orientation=self.orientation[first],
                     wrench_slope=slope[at],
+                    guide=guide,
                     effects=acting,
                 ).nu
         return self.measured - simulated[self.nodes]
@@ -407,6 +465,59 @@ class Evidence:
             fitted = self._descend(again, iterations)
         return fitted
 
+    def dated(self, fitted: Fitted, keys: Container[Key] | None = None) -> Fitted:
+        """The same with the best onset near by, of all effects or of these parameters.
+
+        Where an onset falls between two windows nothing tells how to move it, and a far one looks
+        no better on the way there.
+        """
+        for key in onsets(fitted.hypothesis):
+            if keys is not None and key not in keys:
+                continue
+            now = fitted.hypothesis.values[key]
+            around = now + np.arange(-_NEARBY, _NEARBY + 0.1, _NEARBY / 7.0)
+            rss = [self.rss_at(fitted, key, float(max(onset, 0.0))) for onset in around]
+            best = int(np.argmin(rss))
+            if rss[best] < self.rss_at(fitted, key, now):
+                there = fitted.hypothesis.having({key: float(max(around[best], 0.0))})
+                again = self.fit(there, fitted.look)
+                if again is not None and again.rss < fitted.rss:
+                    fitted = again
+        return fitted
+
+    def rss_at(self, fitted: Fitted, key: Key, value: float) -> float:
+        """Squared residuals with one parameter moved and the others refitted (linearly)."""
+        there = fitted.hypothesis.having({key: value})
+        look = self.look(there, fitted.look.starts, fitted.noise)
+        if look is None:
+            return np.inf
+        linear = look.linear
+        others = linear.index(k for k in linear.keys if k != key)
+        normal = linear.normal[np.ix_(others, others)]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+        slope = linear.gradient.sum(axis=0)[others] / size
+        normal = normal / np.outer(size, size) + 1e-6 * np.eye(len(size))
+        return float(linear.rss.sum() - slope @ np.linalg.solve(normal, slope))
+
+    def onset_std(self, fitted: Fitted, key: Key, kappa: float) -> float:
+        """Standard deviation [s] of an onset, from how far off it can be before that shows.
+
+        Its residuals are far from quadratic in it: flat between windows, steep where thrust steps.
+        """
+        now, limit = fitted.hypothesis.values[key], _SHOWS * kappa
+        base = self.rss_at(fitted, key, now)
+        ends = []
+        for way in (-1.0, 1.0):
+            near, far = 0.0, _ONSET_STEP
+            while far < _FARTHEST and self.rss_at(fitted, key, now + way * far) < base + limit:
+                near, far = far, 2.0 * far
+            for _ in range(4):
+                middle = 0.5 * (near + far)
+                shows = self.rss_at(fitted, key, now + way * middle) >= base + limit
+                near, far = (near, middle) if shows else (middle, far)
+            ends.append(far)
+        return max(ends) / np.sqrt(_SHOWS)
+
     def _descend(self, look: Look, iterations: int) -> Fitted:
         """Gauss-Newton at fixed noise."""
         h = look.hypothesis
@@ -444,6 +555,11 @@ class Evidence:
         return Fitted(h, look, False)
 
 
+def onsets(h: Hypothesis) -> list[Key]:
+    """Parameters that say when something begins."""
+    return [k for k in h.keys if k[0] in EFFECTS and parameter(k).role == "onset"]
+
+
 def _bounded(normal: Array, slope: Array, lower: Array, upper: Array) -> Array:
     """The change that solves ``normal change = slope`` within bounds (active set)."""
     free = np.ones(len(slope), dtype=bool)
@@ -475,9 +591,18 @@ def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:
 
 
 def _subdivided(t: Array) -> Array:
-    """The instants t and as many between them that no step is longer than _MAX_STEP."""
-    parts = [
-        np.linspace(a, b, max(1, int(np.ceil((b - a) / _MAX_STEP - 1e-6))), endpoint=False)
-        for a, b in itertools.pairwise(t)
-    ]
-    return np.append(np.concatenate(parts), t[-1])
+    """The instants t and as many between them that no step is longer than _MAX_STEP, gaps aside."""
+    length = np.diff(t)
+    count = np.where(length > _MAX_GAP, 1, np.ceil(length / _MAX_STEP - 1e-6)).astype(int)
+    count = np.maximum(count, 1)
+    at = np.repeat(np.arange(len(length)), count)
+    part = np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)
+    return np.append(t[at] + part * length[at] / count[at], t[-1])
+
+
+def within(spans: Iterable[tuple[float, float]], t: Array) -> NDArray[np.bool_]:
+    """Which of the instants t (k,) lie in one of the spans (from and to [s])."""
+    out: NDArray[np.bool_] = np.zeros(len(t), dtype=bool)
+    for begin, end in spans:
+        out |= (t >= begin) & (t < end)
+    return out

@@ -16,7 +16,7 @@ from rov_ident.config import Config
 from rov_ident.discrepancy import Search, Trial, Trials
 from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
-from rov_ident.evidence import Evidence, Fitted
+from rov_ident.evidence import Evidence, Fitted, onsets, within
 from rov_ident.excitation import authority
 from rov_ident.findings import (
     Alternative,
@@ -37,9 +37,16 @@ BLOCK = 10.0  # s; held-out data are whole blocks, and windows for judging are a
 _WINDOW = 5.0  # s; of the windows of the fit
 _MARGIN = 0.25  # s; cut off beside held-out blocks
 _CHUNK = 2.5  # s; of the bootstrap
+_CLUSTERS = 8  # windows from which their scatter tells anything
 _WORTH = 0.02  # gain from which an effect has practical weight
 _AS_WELL = "fits this bag as well"
+_ENOUGH = 600.0  # s; of data to fit
 _LIMIT = 3.0  # a simulation further off than so many standard deviations of the motion has failed
+
+_NO_TORQUE = (
+    "the wrench of these bags never holds a moment: how the vehicle turns is taken from the "
+    "measurement, not simulated, and nothing is said about it"
+)
 
 Spans = list[tuple[float, float]]
 
@@ -124,7 +131,7 @@ def explain(
     judge_streams = kinematics.corrected(judge_streams, sensors)
 
     say("refitting the coefficients", 0.1)
-    search = Search(streams, config, fit)
+    search = Search(streams, config, thinned(fit))
     path = search.run(lambda what: say("searching: " + what, 0.3))
     if not path:
         raise UserError(
@@ -142,16 +149,17 @@ def explain(
     say("judging on held-out data", 0.9)
     judge = Judge(Evidence(judge_streams, judge_spans))
     retuned = path[0].hypothesis
-    known = {n: t for n, t in trials.items() if not n.startswith(UNKNOWN)}
-    found = [_finding(search, judge, final, name, trial) for name, trial in known.items()]
+    final, found = _judged(search, judge, final, trials)
     minor = [f for f in found if not weighty(f)]
     slight = [k for f in minor for k in search.keys_of(final, f.effect)]
     patterns = [k for k in final.hypothesis.keys if k[0] == UNKNOWN]
     if slight or patterns:
         kept = search.evidence.fit(final.hypothesis.without([*slight, *patterns]), final.look)
         final = kept or path[0]
-    everything = Evidence(streams, [s for a, b in blocks(streams) for s in _halved(a, b)])
+    halves = [s for a, b in blocks(streams) for s in _halved(a, b)]
+    everything = Evidence(streams, thinned(halves))
     last = everything.fit(final.hypothesis, None) or final
+    last = everything.dated(last)
     findings = sorted(
         [
             *(f for f in sensor_findings if weighty(f)),
@@ -160,6 +168,7 @@ def explain(
         key=lambda f: -f.gain.percent,
     )
     minor += [f for f in sensor_findings if not weighty(f)]
+    minor = [f for f in minor if f.gain.low > 0.0 or f.gain.percent >= 100.0 * _WORTH]
     extended = _extended(config, last.hypothesis, sensors)
     tuning = judge.gain(search.given, retuned)
     verdict: Verdict = "agrees"
@@ -178,6 +187,7 @@ def explain(
             ("extended", final.hypothesis),
         )
     }
+    notes = (*streams.notes, *((_NO_TORQUE,) if streams.guided.any() else ()))
     say("done", 1.0)
     return Explanation(
         Findings(
@@ -189,6 +199,7 @@ def explain(
             tuple(residual),
             judge.rmse(final.hypothesis),
             verdict,
+            notes,
         ),
         extended,
         evidence.times,
@@ -196,6 +207,25 @@ def explain(
         simulated,
         judge_spans if validate is None else [],
     )
+
+
+def _judged(
+    search: Search, judge: "Judge", final: Fitted, trials: Trials
+) -> tuple[Fitted, list[Finding]]:
+    """The findings of a model, without those that others can stand in for.
+
+    Two effects that do the same on the held-out data gain nothing beside each other, and all
+    together: the slightest leaves, and the rest is judged anew.
+    """
+    while True:
+        known = {n: t for n, t in trials.items() if not n.startswith(UNKNOWN)}
+        found = [_finding(search, judge, final, name, trial) for name, trial in known.items()]
+        slight = [f for f in found if not weighty(f)]
+        if len(slight) < 2:
+            return final, found
+        least = min(slight, key=lambda f: f.gain.percent)
+        rest = known[least.effect].rest
+        final, trials = rest, search.trials(rest)
 
 
 def weighty(finding: Finding) -> bool:
@@ -216,13 +246,15 @@ def blocks(streams: Streams) -> Spans:
 
 
 def _inside(spans: Spans) -> Callable[[Array], NDArray[np.bool_]]:
-    def inside(t: Array) -> NDArray[np.bool_]:
-        out: NDArray[np.bool_] = np.zeros(len(t), dtype=bool)
-        for begin, end in spans:
-            out |= (t >= begin) & (t < end)
-        return out
+    return lambda t: within(spans, t)
 
-    return inside
+
+def thinned(spans: Spans) -> Spans:
+    """As many of the spans, evenly spread, as it takes: more would cost time and tell little."""
+    every = sum(end - begin for begin, end in spans) / _ENOUGH
+    if every <= 1.0:
+        return spans
+    return [spans[int(i)] for i in np.arange(0.0, len(spans), every)]
 
 
 def _check(streams: Streams, bags: Sequence[Streams]) -> None:
@@ -238,6 +270,7 @@ class Judge:
 
     def __init__(self, evidence: Evidence) -> None:
         self._evidence = evidence
+        self._guided = evidence.guided
         self._limit = _LIMIT * evidence.measured.std(axis=0) + 1e-9
         times = evidence.times
         self._chunk = (times / _CHUNK).astype(int)
@@ -249,14 +282,14 @@ class Judge:
         return capped
 
     def rmse(self, h: Hypothesis) -> dict[str, float]:
-        error = np.sqrt(self.squares(h).mean(axis=0))
+        error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
 
     def gain(self, before: Hypothesis, after: Hypothesis) -> Gain:
         """Of the component that gains most."""
         a, b = self.squares(before), self.squares(after)
-        ratio = np.sqrt(b.mean(axis=0) / a.mean(axis=0))
-        best = int(np.argmin(ratio))
+        ratio = b.mean(axis=0) / np.maximum(a.mean(axis=0), 1e-300)
+        best = int(np.argmin(np.where(self._guided, np.inf, ratio)))
         return gain_of(VELOCITIES[best], a[:, best], b[:, best], self._chunk)
 
 
@@ -351,7 +384,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
         alternatives.append((share, Alternative(rival, why)))
     if not separable:
         alternatives = [a for a in alternatives if a[1].why_not == _AS_WELL]
-    parameters = parameters_of(search.config, final, keys)
+    parameters = parameters_of(final, keys)
     onset = parameters.get("onset")
     return Finding(
         name,
@@ -369,7 +402,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
 def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
     """The finding with the values that all of the data give."""
     keys = search.keys_of(last, finding.effect)
-    parameters = parameters_of(search.config, last, keys)
+    parameters = parameters_of(last, keys)
     onset = parameters.get("onset")
     return dataclasses.replace(
         finding,
@@ -380,24 +413,39 @@ def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
 
 
 def covariance(final: Fitted) -> Array:
-    """Covariance (P, P) of the parameters, widened by what coloured residuals take away."""
-    linear = final.linear
-    size = np.sqrt(np.maximum(np.diag(linear.normal), 1e-30))
-    inverse = np.linalg.pinv(linear.normal / np.outer(size, size), hermitian=True)
-    kappa = inflation(linear, np.arange(len(linear.keys)))
-    out: Array = kappa * inverse / np.outer(size, size)
+    """Covariance (P, P) of the parameters, widened by what coloured residuals take away.
+
+    The mean of two estimates: white residuals times their common inflation, which varies little,
+    and leaving out each window in turn, which knows where each parameter comes from. Onsets, whose
+    residuals are not linear in them, are taken as known (:meth:`Evidence.onset_std`).
+    """
+    linear, keys = final.linear, final.linear.keys
+    at = linear.index(k for k in keys if k not in onsets(final.hypothesis))
+    normal = linear.normal[np.ix_(at, at)]
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+    wide = inflation(linear, at) * inverse / np.outer(size, size)
+    moves = final.look.left_out(at)
+    w = len(moves)
+    if w >= _CLUSTERS:
+        wide = 0.5 * (wide + (w - 1) / w * moves.T @ moves)
+    out = np.zeros((len(keys), len(keys)))
+    out[np.ix_(at, at)] = wide
     return out
 
 
-def parameters_of(config: Config, final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:
+def parameters_of(final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:
     h, linear = final.hypothesis, final.linear
     wide = covariance(final)
+    evidence, kappa = final.look.evidence, inflation(linear, np.arange(len(linear.keys)))
     out = {}
     for key in keys:
         at = linear.index([key])[0]
         value, variance = h.values[key], wide[at, at]
         section, name = key
         unit = parse(name).unit if section == COEFFICIENTS else parameter(key).unit
+        if section in EFFECTS and parameter(key).role == "onset":
+            variance = evidence.onset_std(final, key, kappa) ** 2
         positive = name.removesuffix("_neg")
         if positive != name:  # told as the coefficient that holds for negative velocity
             name, other = positive, (COEFFICIENTS, positive)

@@ -5,7 +5,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator
 from rov_ident.records import HORIZON, VELOCITIES, Record, score
 from rov_ident.samples import Sampler
 
-_IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
+IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ class Fit:
     duration: float
     rmse: Array
     provenance: dict[str, Any]
+    notes: tuple[str, ...] = ()
+    more: dict[str, Any] = field(default_factory=dict)
+    """Further parts of the JSON that only some estimators have."""
 
     @property
     def std(self) -> Array:
@@ -77,6 +80,8 @@ class Fit:
             "samples": self.samples,
             "duration_s": self.duration,
             "open_loop": {"horizon_s": HORIZON, "rmse": rmse},
+            "notes": list(self.notes),
+            **self.more,
             "provenance": self.provenance,
         }
         return json.dumps(result, indent=2, allow_nan=False) + "\n"
@@ -117,7 +122,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         report.units,
         report.values,
         report.covariance,
-        tuple(bool(r > _IDENTIFIABLE) for r in removed),
+        tuple(bool(r > IDENTIFIABLE) for r in removed),
         model,
         samples,
         sum(record.duration for record in records),

@@ -44,8 +44,17 @@ class Hypothesis:
         return self.at({**self.values, **values})
 
     def at(self, values: Mapping[Key, float]) -> "Hypothesis":
-        """The same with just these free parameters."""
-        return Hypothesis(self.config, dict(values), self.constants)
+        """The same with just these free parameters; damping that differs for negative velocity is
+        kept dissipative."""
+        kept = dict(values)
+        for section, name in values:
+            if section == COEFFICIENTS and name.endswith("_neg"):
+                both = parse(name).symmetric
+                model = self.config.model
+                own = float(model.theta[model.names.index(both)]) if both in model.names else 0.0
+                limit = -values.get((COEFFICIENTS, both), own)
+                kept[section, name] = min(kept[section, name], limit)
+        return Hypothesis(self.config, kept, self.constants)
 
     def without(self, keys: Iterable[Key]) -> "Hypothesis":
         gone = set(keys)
@@ -81,7 +90,8 @@ class Hypothesis:
             change = EFFECTS[name].body
             if change is not None:
                 body = change(body, **parameters)
-        return Model(body, tuple(found), np.array([values[c.name] for c in found]))
+        theta = np.array([values[c.name] for c in found])
+        return Model(body, tuple(found), theta, self.config.model.fins)
 
     @cached_property
     def equations(self) -> Equations:

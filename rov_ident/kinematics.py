@@ -112,7 +112,7 @@ def blocks(
         made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
     if len(streams.imu_t) > 8:
         q = orientation_at(streams, streams.imu_t)
-        _follow(q, streams.imu_t, gyro - np.median(there.gyro - rate_at, axis=0))
+        _follow(q, streams.imu_t, there.gyro - np.median(there.gyro - rate_at, axis=0))
         r_imu = quaternion_to_matrix(q)
         origin = _at_origin(streams.imu_t, there, np.array(config.imu.position))
         shift = [change(there, key) for key in keys]

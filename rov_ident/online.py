@@ -79,7 +79,7 @@ class OnlineEstimator:
     def __init__(self, config: Config, kind: Kind) -> None:
         self.config = config
         self.kind = kind
-        self.prior = prior_of(config)
+        self.prior = prior_of(config, effects=True)
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)

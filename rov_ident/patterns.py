@@ -12,7 +12,7 @@ import numpy as np
 
 from rov_ident.coefficients import AXES, VELOCITIES
 from rov_ident.hypothesis import UNKNOWN, Key
-from rov_ident.model import Array, Indices
+from rov_ident.model import Array
 from rov_ident.shooting import Steps
 
 _KNOTS = 12.0  # s between the knots of a function of time
@@ -38,18 +38,6 @@ class Pattern:
         """One for each column."""
         own = f"{self.name}|{self.frequency or ''}"
         return [(UNKNOWN, f"{own}|{i}") for i in range(self.columns.shape[1])]
-
-    def follows(self, wanted: Array, basis: Array, inside: Indices) -> float:
-        """How much of ``wanted`` (J,), at the steps ``inside`` (J,), its columns can follow.
-
-        What is in the span of the orthonormal ``basis`` (J, B) does not count.
-        """
-        new = self.columns[inside]
-        new = new - basis @ (basis.T @ new)
-        size = new.T @ new
-        size += (1e-6 * np.trace(size) / len(size) + 1e-12) * np.eye(len(size))
-        match = wanted @ new
-        return float(match @ np.linalg.solve(size, match))
 
     @property
     def name(self) -> str:

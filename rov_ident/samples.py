@@ -69,6 +69,8 @@ SAMPLE = np.dtype(
         ("odometry_variance", "f8", (6,)),
         ("gyro", "f8", (3,)),  # rad/s, bias removed; NaN: not measured
         ("gyro_variance", "f8"),
+        ("gyro_bias", "f8", (3,)),  # rad/s: what was taken off the gyro here
+        ("attitude", "f8", (4,)),  # as the odometry has it; NaN: not measured
     ],
     align=True,
 )
@@ -531,10 +533,13 @@ def fuse(
     out.t, out.dt, out.restart = t, dt, restart
     _set(out.wrench, wrench)
     _set(out.wrench_slope, wrench_slope)
+    for i in range(4):
+        out.attitude[i] = nan
     gyro_variance = gyro_given if 0.0 < gyro_given < 1.0 else s.gyro_variance
     started = k.inertial
     for i in range(3):
         out.gyro[i] = nan
+        out.gyro_bias[i] = k.gyro_bias[i]
         out.odometry[i] = nan
         out.odometry[3 + i] = nan
     variance = np.empty(6)
@@ -588,6 +593,7 @@ def fuse(
             e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
             sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
             _set(k.q, turned(k.q, 2.0 * sign * gain * e))
+        _set(out.attitude, q)
     _set(out.orientation, k.q)
     to_world = rotation(k.q)
     down = to_world[2]

@@ -34,6 +34,7 @@ class Steps(NamedTuple):
     piece_t: Array  # (J + 1,) s
     demand: Array  # (J, 6)
     piece: Indices  # (K,)
+    given: Array  # (K, 6) accelerations that guided axes are measured to have, else 0; or (0, 6)
 
 
 class Equations(NamedTuple):
@@ -42,7 +43,7 @@ class Equations(NamedTuple):
     structure: Structure
     mass: Array  # (6, 6, 1)
     added: Array  # (6, 6)
-    inverse: Array  # (6, 6)
+    inverse: Array  # (6, 6); zeros in the rows and columns of axes that are guided
     theta: Array  # (n,)
     restoring: Array  # (6, 3)
     acting: Acting
@@ -69,6 +70,16 @@ def equations(model: Model, acting: Acting) -> Equations:
         model.body.restoring,
         acting,
     )
+
+
+def guided_by(eq: Equations, guided: NDArray[np.bool_]) -> Equations:
+    """The same where some axes (6,) follow the measurement."""
+    if not guided.any():
+        return eq
+    free = np.ix_(~guided, ~guided)
+    inverse = np.zeros((6, 6))
+    inverse[free] = np.linalg.inv(eq.mass[:, :, 0][free])
+    return eq._replace(inverse=inverse)
 
 
 def thrust(steps: Steps, acting: Acting) -> Array:
@@ -168,8 +179,8 @@ def _wrenches(eq, steps, nu, out):
 
 
 @kernel
-def _pace(eq, t, nu, rotation, wrench, out, work):
-    """nu_dot (6,) into out; work (6 + EXTENDED_SIZE, 1) is scratch."""
+def _pace(eq, t, nu, rotation, wrench, given, out, work):
+    """nu_dot (6,) into out, ``given`` on guided axes; work (6 + EXTENDED_SIZE, 1) is scratch."""
     h, extended = work[:6], work[6:]
     theta = eq.theta.reshape(-1, 1)
     generalized_force(1, eq.structure, eq.mass, theta, nu.reshape(6, 1), h, extended)
@@ -179,8 +190,12 @@ def _pace(eq, t, nu, rotation, wrench, out, work):
         for j in range(3):
             total[i] += eq.restoring[i, j] * rotation[2, j]
     _beyond(eq, t, nu, rotation, total)
+    if given.any():
+        for i in range(6):
+            for j in range(6):
+                total[i] -= eq.mass[i, j, 0] * given[j]
     for i in range(6):
-        out[i] = 0.0
+        out[i] = given[i]
         for j in range(6):
             out[i] += eq.inverse[i, j] * total[j]
 
@@ -189,29 +204,31 @@ def _pace(eq, t, nu, rotation, wrench, out, work):
 def _shoot(eq, steps, wrench, first, last, start, motion):
     work = np.empty((6 + EXTENDED_SIZE, 1))
     a, b, c, d, nearby = np.empty(6), np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    jacobian, square = np.empty((6, 6)), np.empty((6, 6))
+    jacobian, square, given = np.empty((6, 6)), np.empty((6, 6)), np.zeros(6)
     for w in range(len(first)):
         nu = start[w].copy()
         for i in range(6):
             motion.nu[first[w], i] = nu[i]
         for k in range(first[w], last[w]):
             t, dt = steps.t[k], steps.t[k + 1] - steps.t[k]
+            if len(steps.given) > 0:
+                given = steps.given[k]
             tau, trend, middle = wrench[0, k], 0.5 * dt * wrench[1, k], steps.middle[k]
-            _pace(eq, t, nu, steps.rotation[k], tau - trend, a, work)
-            _pace(eq, t + 0.5 * dt, nu + 0.5 * dt * a, middle, tau, b, work)
-            _pace(eq, t + 0.5 * dt, nu + 0.5 * dt * b, middle, tau, c, work)
-            _pace(eq, t + dt, nu + dt * c, steps.rotation[k + 1], tau + trend, d, work)
+            _pace(eq, t, nu, steps.rotation[k], tau - trend, given, a, work)
+            _pace(eq, t + 0.5 * dt, nu + 0.5 * dt * a, middle, tau, given, b, work)
+            _pace(eq, t + 0.5 * dt, nu + 0.5 * dt * b, middle, tau, given, c, work)
+            _pace(eq, t + dt, nu + dt * c, steps.rotation[k + 1], tau + trend, given, d, work)
             half = motion.middle[k]
             for i in range(6):
                 begin = nu[i]
                 nu[i] += dt / 6.0 * (a[i] + 2.0 * (b[i] + c[i]) + d[i])
                 half[i] = 0.5 * (begin + nu[i]) + 0.125 * dt * (a[i] - d[i])  # cubic
-            _pace(eq, t + 0.5 * dt, half, middle, tau, b, work)
+            _pace(eq, t + 0.5 * dt, half, middle, tau, given, b, work)
             motion.pace[k] = b
             for j in range(6):
                 nearby[:] = half
                 nearby[j] += 1e-4
-                _pace(eq, t + 0.5 * dt, nearby, middle, tau, c, work)
+                _pace(eq, t + 0.5 * dt, nearby, middle, tau, given, c, work)
                 for i in range(6):
                     jacobian[i, j] = (c[i] - b[i]) / 1e-4 * dt
             square[:] = jacobian @ jacobian

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.messages import Array, Message
-from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
+from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler, describe
 
 _PAUSE = 60.0  # s between two bags that are searched as one
 
@@ -26,7 +26,7 @@ class Streams:
     odometry: ``t`` (N,), position (N, 3), orientation (N, 4) w x y z, nu (N, 6) as measured.
     IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
     wrench: ``demand_t`` (K,), demand (K, 6), each held to the next.
-    ``has_pose`` tells whether the positions mean anything.
+    ``has_pose`` tells whether the positions mean anything; ``notes`` say what was left out.
     """
 
     t: Array
@@ -38,10 +38,20 @@ class Streams:
     specific_force: Array
     demand_t: Array
     demand: Array
+    notes: tuple[str, ...] = ()
 
     @property
     def has_pose(self) -> bool:
         return bool(np.ptp(self.position, axis=0).max() > 0.0)
+
+    @property
+    def guided(self) -> NDArray[np.bool_]:
+        """Axes (6,) whose velocity a simulation can only take as measured.
+
+        Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
+        computed, without. What turns the vehicle is then unknown.
+        """
+        return np.repeat([False, not self.demand[:, 3:].any()], 3)
 
     @property
     def duration(self) -> float:
@@ -73,6 +83,7 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
         np.array([m.linear_acceleration for _, m in imu]).reshape(-1, 3),
         np.array([t for t, _ in wrench]),
         np.array([np.concatenate([m.force, m.torque]) for _, m in wrench]),
+        tuple(f"left out: {reason}" for reason in describe(recorder.counts)),
     )
 
 
@@ -91,16 +102,17 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     def rows(name: str) -> Array:
         return np.concatenate([getattr(b, name) for b in bags])
 
+    notes = tuple(note for bag in bags for note in bag.notes)
     shifted = {name: times(name) for name in ("t", "imu_t", "demand_t")}
-    others = {f.name: rows(f.name) for f in fields(Streams) if f.name not in shifted}
-    return Streams(**shifted, **others), begins
+    others = {f.name: rows(f.name) for f in fields(Streams) if f.name not in (*shifted, "notes")}
+    return Streams(**shifted, **others, notes=notes), begins
 
 
 class _Recorder(Sampler):
     """Refuses and converts as the estimators do, but keeps the messages instead of merging them."""
 
     def __init__(self, config: Config) -> None:
-        super().__init__(config)
+        super().__init__(config.with_effects_held)
         self.taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: []}
 
     def _complete(self, final: bool) -> NDArray[np.void]:

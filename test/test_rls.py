@@ -150,9 +150,8 @@ def test_rows_are_the_tangent_of_a_textbook_observer(heavy, fine, slope):
     np.testing.assert_allclose(
         information / np.outer(root, root), wanted / np.outer(root, root), atol=2e-3
     )
-    np.testing.assert_allclose(
-        goal / root, phi.T @ (e / s) / root, atol=0.01 * np.abs(e / s**0.5).max()
-    )
+    # in standard deviations
+    np.testing.assert_allclose(goal / root, phi.T @ (e / s) / root, atol=0.02)
 
 
 def in_order(state):
@@ -197,8 +196,7 @@ def test_constant_forgetting_is_the_textbook_formula(heavy, noisy):
 
 def test_surprise_adds_variance_to_what_would_show(heavy, noisy):
     """A diagonal share of the prior, as there is room to it; the estimate and the rest stay."""
-    task = rls.problem(heavy)
-    n, checked = len(task.scale), 0
+    task, checked = rls.problem(heavy), 0
     state, _ = rls.fold(task, rls.init(task), noisy[:1500])
     surge = [heavy.model.names.index(name) for name in ("X_udot", "X_u", "X_uu")]
     for k in range(1500, 1600):

@@ -105,7 +105,9 @@ class Effect:
 
     ``place`` is where it enters: the *input* (between the demanded and the acting wrench), the
     *motion* (between the motion through the water and what is measured) or the *wrench*.
-    ``manoeuvre`` is the run that shows it and tells it from its neighbours.
+    ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
+    effect that does nearly the same and that every vehicle has: this one is looked for only in a
+    model that has some of that.
     """
 
     name: str
@@ -115,6 +117,7 @@ class Effect:
     manoeuvre: str
     parameters: tuple[EffectParameter, ...] = ()
     coefficients: tuple[str, ...] = ()
+    beyond: str = ""
     body: Callable[..., Any] | None = None
     wrench: Callable[..., None] | None = None
     water: Callable[..., Array] | None = None

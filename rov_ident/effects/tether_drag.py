@@ -30,6 +30,7 @@ EFFECT = Effect(
     name="tether_drag",
     place="wrench",
     summary="The tether drags at its point of attachment.",
+    beyond="quadratic_damping",
     manoeuvre="turns on the spot, and runs at two speeds along each axis",
     source="Feng, Allen (2004), Evaluation of the effects of the communication cable on the "
     "dynamics of an underwater flight vehicle, Ocean Engineering 31",

@@ -1,0 +1,372 @@
+"""Offline fits of an archive: least squares, instrumental variables, maximum likelihood.
+
+All channels together, or channel by channel: then the other components of the motion are as
+measured, a channel whose open-loop simulation is good already is left alone, and one that the
+motion does not show is refused, with the reason (Zhao et al. 2018).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident import least_squares, maximum_likelihood
+from rov_ident.archive import Archive
+from rov_ident.coefficients import Coefficient
+from rov_ident.config import Config
+from rov_ident.effects import Acting, compiled
+from rov_ident.errors import UserError
+from rov_ident.estimate import Estimate, Prior, physical, prior_of
+from rov_ident.fit import IDENTIFIABLE, Fit
+from rov_ident.messages import Array
+from rov_ident.model import Model
+from rov_ident.records import HORIZON, VELOCITIES, over_ground, predicted
+
+KINDS = ("ls", "iv", "ml")
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+CHANNELS: dict[str, tuple[str, ...]] = {
+    **{name: (name,) for name in AXES},
+    "lateral": ("sway", "yaw"),
+    "longitudinal": ("heave", "pitch"),
+}
+"""What can be fitted by itself: single axes, and those that one pair of actuators moves."""
+
+_GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
+_NOISY = 1.5  # or relative to the noise of what it is compared with
+_NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
+_POINTS = 1500  # of a curve in a picture
+
+Samples = NDArray[np.void]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a fit is made.
+
+    ``stages``: channels, fitted one group after the other; none: all together. ``prior``: whether
+    what the configuration says of the coefficients counts as one more measurement. ``weighted``:
+    least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
+    errors of the wrench.
+    """
+
+    stages: tuple[tuple[str, ...], ...] = ()
+    prior: bool = True
+    weighted: bool = True
+    process: bool = True
+
+
+@dataclass(frozen=True)
+class _Stage:
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    identifiable: NDArray[np.bool_]
+    more: dict[str, Any]
+
+
+def fit_batch(
+    archive: Archive,
+    config: Config,
+    kind: str,
+    settings: Settings | None = None,
+    say: Say | None = None,
+) -> Fit:
+    """Fit an archive.
+
+    Raises
+    ------
+    UserError
+        If there is no such estimator, a channel has no coefficient to estimate, or the configured
+        model cannot be simulated.
+    """
+    if kind not in KINDS:
+        raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
+    settings = settings or Settings()
+    tell = say or (lambda what: None)
+    tell("open loop, as configured")
+    before = open_loop_rmse(archive, config)
+    notes = list(archive.notes)
+    prior = prior_of(config)
+    values, covariance = prior.mean.copy(), np.diag(prior.std**2)
+    identifiable = np.zeros(len(values), dtype=bool)
+    now, parts = config, []
+    for stage in settings.stages or (AXES,):
+        found = _stage(archive, now, kind, stage, settings, notes, tell)
+        if found is None:
+            continue
+        at = np.array([prior.names.index(name) for name in found.names])
+        values[at], identifiable[at] = found.values, found.identifiable
+        covariance[np.ix_(at, at)] = found.covariance
+        now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
+        parts.append({"channels": list(stage), **found.more})
+    tell("open loop, fitted")
+    after = open_loop_rmse(archive, now)
+    motion = archive.each(_range)
+    low, high = np.min([m[0] for m in motion], axis=0), np.max([m[1] for m in motion], axis=0)
+    more: dict[str, Any] = {
+        "open_loop_before": {"horizon_s": HORIZON, "rmse": _numbers(before)},
+        "range": {n: [a, b] for n, a, b in zip(VELOCITIES, low.tolist(), high.tolist())},
+    }
+    more |= parts[0] if len(parts) == 1 and not settings.stages else {"stages": parts}
+    more.pop("channels", None)
+    return Fit(
+        kind,
+        prior.names,
+        prior.units,
+        values,
+        covariance,
+        tuple(bool(i) for i in identifiable),
+        now.model,
+        archive.samples,
+        archive.duration,
+        after,
+        {
+            "version": version("rov_ident"),
+            "vehicle": config.name,
+            "bags": [{"file": b.path.name, "sha256": b.sha256} for b in archive.bags],
+        },
+        tuple(notes),
+        more,
+    )
+
+
+def _stage(
+    archive: Archive,
+    config: Config,
+    kind: str,
+    channels: Sequence[str],
+    settings: Settings,
+    notes: list[str],
+    say: Say,
+) -> _Stage | None:
+    """Fit some channels; None, and a note, where there is nothing to do."""
+    free = np.array([axis in channels for axis in AXES])
+    name = ", ".join(channels)
+    names = tuple(n for n in config.estimate if _of_channels(_coefficient(config, n), free))
+    if not names:
+        raise UserError(f"no coefficient of {name} is among those to estimate (key `estimate`)")
+    config = replace(config, estimate=names)
+    prior = prior_of(config)
+    if settings.stages:
+        good = _is_good(archive, config, free)
+        if good:
+            notes.append(f"{name}: left alone, {good}")
+            return None
+        say(f"{name}: excitation")
+        known, reason = _excited(archive, config, prior, free)
+        if not known.any():
+            notes.append(f"{name}: not fitted, {reason}")
+            return None
+        if not known.all():
+            held = [n for n, k in zip(names, known, strict=True) if not k]
+            notes.append(f"{name}: {', '.join(held)} held, {reason}")
+            names = tuple(n for n, k in zip(names, known, strict=True) if k)
+            config = replace(config, estimate=names)
+            prior = prior_of(config)
+    precision = 1.0 if settings.prior else _NO_PRIOR
+
+    def progress(what: str) -> None:
+        say(f"{name}: {what}" if settings.stages else what)
+
+    solution = least_squares.solve(
+        archive.each,
+        config,
+        free,
+        instrumental=kind == "iv",
+        weighted=settings.weighted,
+        precision=precision,
+        progress=progress,
+    )
+    base = least_squares.base_parameters(names, solution.information, prior.std)
+    more: dict[str, Any] = {"base_parameters": _described(base)}
+    found, covariance = solution.values, solution.covariance
+    if kind == "ml":
+        start = _valued(config, names, found)
+        if np.linalg.eigvalsh(start.mass_matrix)[0] <= 0.0:
+            start = config.dynamics
+        likelihood = maximum_likelihood.maximise(
+            archive.each,
+            config,
+            start,
+            free,
+            precision / prior.std**2,
+            settings.process,
+            progress,
+        )
+        found, covariance = likelihood.values, likelihood.covariance
+        bound = np.sqrt(np.diag(likelihood.bound))
+        more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
+        more["noise"] = _noise(likelihood, free)
+        more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
+        if not likelihood.converged:
+            notes.append(f"{name}: the iteration did not settle: give a better configuration")
+    removed = 1.0 - np.diag(covariance) / prior.std**2
+    estimate = Estimate(names, found, covariance, 0.0)
+    values = physical(config.dynamics, prior, estimate)
+    for n, raw, held in zip(names, found.tolist(), values.tolist(), strict=True):
+        if abs(raw - held) > 2.0 * estimate.std[names.index(n)]:
+            notes.append(
+                f"{n}: the data ask for {raw:.4g}, which no passive hull has; {held:.4g} is kept"
+            )
+    if base.unidentified and not settings.stages:
+        notes.append(
+            "the motion does not tell apart or does not show: " + ", ".join(base.unidentified)
+        )
+    return _Stage(names, values, covariance, removed > IDENTIFIABLE, more)
+
+
+def _coefficient(config: Config, name: str) -> Coefficient:
+    return config.model.coefficients[config.model.names.index(name)]
+
+
+def _of_channels(c: Coefficient, free: NDArray[np.bool_]) -> bool:
+    """Whether a coefficient acts on free axes only (an added mass on both that it couples)."""
+    return bool(free[c.row] and (not c.is_added_mass or free[c.column]))
+
+
+def _valued(config: Config, names: Sequence[str], values: Array) -> Model:
+    return config.dynamics.with_values(dict(zip(names, values.tolist(), strict=True)))
+
+
+def _is_good(archive: Archive, config: Config, free: NDArray[np.bool_]) -> str:
+    """Why a channel needs no fit, in words, or nothing."""
+    rmse = open_loop_rmse(archive, config, free)[free]
+    size, noise = (np.sqrt(np.mean(np.square(x), axis=0)) for x in zip(*archive.each(_size)))
+    share = rmse / np.maximum(size[free], 1e-9)
+    if np.all((share < _GOOD) | (rmse < _NOISY * noise[free])):
+        worst = 100.0 * float(np.max(share))
+        return f"its open-loop error is at most {worst:.1f} % of the motion, or noise"
+    return ""
+
+
+def _excited(
+    archive: Archive, config: Config, prior: Prior, free: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], str]:
+    """Which coefficients (n,) the motion shows, and why not the others."""
+    information = predicted_information(archive, config, free)
+    covariance = maximum_likelihood.inverse_of(information + np.diag(prior.std**-2.0))
+    std = np.sqrt(np.diag(covariance))
+    known = std**2 < (1.0 - IDENTIFIABLE) * prior.std**2
+    size = np.sqrt(np.mean(np.square([s[0] for s in archive.each(_size)]), axis=0))[free]
+    moved = ", ".join(
+        f"{axis} moves {s:.2g} {'m/s' if AXES.index(axis) < 3 else 'rad/s'}"
+        for axis, s in zip(np.array(AXES)[free], size, strict=True)
+    )
+    return known, (
+        "the motion does not show it: it would be known to "
+        + ", ".join(
+            f"{n} +-{s:.2g} {u}"
+            for n, s, u, k in zip(prior.names, std, prior.units, known, strict=True)
+            if not k
+        )
+        + f" ({moved} rms); drive it harder, in both directions"
+    )
+
+
+def predicted_information(
+    archive: Archive, config: Config, free: NDArray[np.bool_] | None = None
+) -> Array:
+    """Information (n, n) about the coefficients to estimate that the bags' motion holds, at the
+    configured values and noise."""
+    estimated = prior_of(config).estimated
+    noise = maximum_likelihood.assumed(config, maximum_likelihood.LIKELY)
+    parts = archive.each(maximum_likelihood.one_pass, config.dynamics, estimated, noise, free)
+    return maximum_likelihood.total(parts).information
+
+
+# ------------------------------------------------------------------ open loop
+
+
+def open_loop_rmse(
+    archive: Archive, config: Config, free: NDArray[np.bool_] | None = None
+) -> Array:
+    """RMSE (6,) of the open-loop simulation in windows of HORIZON seconds over all bags."""
+    parts = archive.each(_squares, config.dynamics, compiled(config.effects), free)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rmse: Array = np.sqrt(sum(p[0] for p in parts) / sum(p[1] for p in parts))
+    return rmse
+
+
+def _squares(
+    samples: Samples, model: Model, effects: Acting, free: NDArray[np.bool_] | None
+) -> tuple[Array, int]:
+    measured = samples["measured"]
+    with np.errstate(invalid="ignore"):
+        error = predicted(model, samples, HORIZON, free, effects) - over_ground(samples)
+    return np.sum(error[measured] ** 2, axis=0), int(measured.sum())
+
+
+def _range(samples: Samples) -> tuple[Array, Array]:
+    """Where the motion is for all but a thousandth of the time, either side."""
+    low, high = np.quantile(samples["nu"], [0.001, 0.999], axis=0)
+    return low, high
+
+
+def _size(samples: Samples) -> tuple[Array, Array]:
+    """Root mean square (6,) of the motion, and of the noise of its measurement."""
+    noise = np.sqrt(np.mean(samples["odometry_variance"], axis=0))
+    if np.isfinite(samples["gyro"]).any():
+        noise[3:] = np.sqrt(np.mean(samples["gyro_variance"]))
+    return np.sqrt(np.mean(samples["nu"] ** 2, axis=0)), noise
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Measured and simulated velocities (k, 6) of a bag, thinned for a picture."""
+
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
+    """One for each bag: the open-loop simulation in windows of HORIZON, before and after."""
+    found: list[Curves] = archive.each(
+        _curves, before.dynamics, after.dynamics, compiled(before.effects)
+    )
+    return found
+
+
+def _curves(samples: Samples, before: Model, after: Model, effects: Acting) -> Curves:
+    keep = slice(None, None, max(1, len(samples) // _POINTS))
+    return Curves(
+        samples["t"][keep],
+        over_ground(samples)[keep],
+        *(predicted(m, samples, HORIZON, None, effects)[keep] for m in (before, after)),
+    )
+
+
+# ------------------------------------------------------------------ words and numbers
+
+
+def _numbers(values: Array) -> dict[str, float | None]:
+    return {
+        n: v if np.isfinite(v) else None for n, v in zip(VELOCITIES, values.tolist(), strict=True)
+    }
+
+
+def _described(base: least_squares.BaseParameters) -> dict[str, Any]:
+    return {
+        "identifiable": [str(c) for c in base.combinations],
+        "unidentified": list(base.unidentified),
+        "not_excited": list(base.unexcited),
+        "condition": base.condition if np.isfinite(base.condition) else None,
+        "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
+    }
+
+
+def _noise(found: maximum_likelihood.Likelihood, free: NDArray[np.bool_]) -> dict[str, Any]:
+    n = found.noise
+    axes = [a for a, f in zip(VELOCITIES, free, strict=True) if f]
+    factor = np.sqrt(n.measurement[free])
+    floor = np.sqrt(n.floor[free] / n.correlation_time)
+    return {
+        "measurement_factor": dict(zip(axes, factor.tolist(), strict=True)),
+        "wrench_floor": dict(zip(axes, floor.tolist(), strict=True)),
+        "wrench_relative": n.relative,
+    }

@@ -1,0 +1,166 @@
+"""Thrust, drag and added mass of the surge channel, from step-up and coast-down (Zhao et al. 2018).
+
+    (m - X_udot) u_dot = k1 n + k2 |n| n + X_u u + X_uu |u| u
+
+Every term is a force: multiply ``m - X_udot``, k1, k2, X_u and X_uu by one number, and the motion
+is the same. Speeds alone tell the *ratios* to the inertia; one force or mass from elsewhere sets
+the scale: a bollard pull, or the added mass (a spheroid's, say).
+
+Fitted by output error: u is simulated from the shaft speed n, run by run, each from an estimated
+starting speed, and compared with the measured one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rov_ident.errors import UserError
+from rov_ident.jit import kernel
+from rov_ident.model import Array
+
+_NAMES = ("k1", "k2", "X_u", "X_uu")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: shaft speed n (N,) held from each ``t`` (N,) [s] on, measured surge speed u (N,)."""
+
+    t: Array
+    n: Array
+    u: Array
+
+
+@dataclass(frozen=True)
+class Surge:
+    """``values`` and ``std`` by name: k1 [N s], k2 [N s2] per shaft speed in 1/s or its unit, X_u
+    [N s/m], X_uu [N s2/m2], X_udot [kg]. ``rmse`` [m/s] of the simulated speed."""
+
+    values: dict[str, float]
+    std: dict[str, float]
+    rmse: float
+
+
+def fit_surge(
+    runs: Sequence[Run],
+    mass: float,
+    *,
+    added_mass: float | None = None,
+    bollard: tuple[float, float] | None = None,
+) -> Surge:
+    """Fit step-up and coast-down runs.
+
+    ``added_mass``: X_udot [kg], not positive; or ``bollard``: a shaft speed and the thrust [N] at
+    rest there. One of the two.
+
+    Raises
+    ------
+    UserError
+        If the scale is not given, or the runs lack thrust, coasting, or speed.
+    """
+    if (added_mass is None) == (bollard is None):
+        raise UserError(
+            "speeds do not tell forces: give either the added mass X_udot or one bollard pull"
+        )
+    if added_mass is not None and added_mass > 0.0:
+        raise UserError(f"added_mass is {added_mass:g}: X_udot is negative (SNAME signs)")
+    if not runs:
+        raise UserError("no run was given")
+    _check(runs)
+    speed = max(float(np.abs(r.u).max()) for r in runs)
+    shaft = max(float(np.abs(r.n).max()) for r in runs)
+    rise = max(1.0, max(float(r.t[-1] - r.t[0]) for r in runs) / 10.0)
+    size = np.array(
+        [speed / rise / shaft, speed / rise / shaft**2, 1.0 / rise, 1.0 / (rise * speed)]
+    )
+
+    def errors(x: Array) -> Array:
+        return np.concatenate(
+            [r.u - _simulated(x[:4] * size, x[4 + k], r.t, r.n) for k, r in enumerate(runs)]
+        )
+
+    start = np.concatenate([[0.5, 0.5, -0.5, -0.5], [float(np.median(r.u[:5])) for r in runs]])
+    found = least_squares(errors, start, x_scale="jac")
+    ratio = found.x[:4] * size
+    left = errors(found.x)
+    # residuals of one run are alike from point to point: allow for it by their own correlation
+    inflation = _inflation([left[a:b] for a, b in _spans(runs)])
+    variance = float(left @ left) / max(len(left) - len(found.x), 1) * inflation
+    covariance = np.linalg.pinv(found.jac.T @ found.jac)[:4, :4] * variance
+    covariance = covariance * np.outer(size, size)
+    if added_mass is not None:
+        inertia, slope = mass - added_mass, np.zeros(4)
+    else:
+        assert bollard is not None
+        n, thrust = bollard
+        terms = np.array([n, abs(n) * n, 0.0, 0.0])
+        if not float(terms @ ratio) * thrust > 0.0:
+            raise UserError("the bollard pull and the runs disagree about the sign of the thrust")
+        inertia = thrust / float(terms @ ratio)
+        slope = -inertia * terms / float(terms @ ratio)
+        if inertia <= mass:
+            raise UserError(
+                f"with {thrust:g} N at rest the runs make mass and added mass {inertia:.3g} kg, "
+                f"less than the mass of {mass:g} kg: check the bollard pull"
+            )
+    values = dict(zip(_NAMES, (inertia * ratio).tolist(), strict=True))
+    jacobian = inertia * np.eye(4) + np.outer(ratio, slope)
+    std = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+    spread = dict(zip(_NAMES, std.tolist(), strict=True))
+    values["X_udot"] = mass - inertia
+    spread["X_udot"] = float(np.sqrt(slope @ covariance @ slope))
+    return Surge(values, spread, float(np.sqrt(np.mean(left**2))))
+
+
+def _check(runs: Sequence[Run]) -> None:
+    for i, r in enumerate(runs):
+        if not (len(r.t) == len(r.n) == len(r.u)) or len(r.t) < 10:
+            raise UserError(f"run {i + 1}: t, n and u must have one length, 10 points at least")
+        if not (np.isfinite(r.t).all() and np.isfinite(r.n).all() and np.isfinite(r.u).all()):
+            raise UserError(f"run {i + 1}: holds values that are not finite")
+        if np.any(np.diff(r.t) <= 0.0):
+            raise UserError(f"run {i + 1}: times must increase")
+    shaft = np.concatenate([r.n for r in runs])
+    speed = np.concatenate([r.u for r in runs])
+    if not np.any(shaft != 0.0):
+        raise UserError("the shaft never turns: add a step-up run")
+    top = float(np.abs(speed).max())
+    if not np.any((shaft == 0.0) & (np.abs(speed) > 0.3 * top)):
+        raise UserError("no run coasts (n = 0 at speed): drag and thrust cannot be told apart")
+    if len(np.unique(np.round(np.abs(shaft[shaft != 0.0]) / np.abs(shaft).max(), 1))) < 2:
+        raise UserError("the shaft turns at one speed only: k1 and k2 cannot be told apart")
+
+
+def _spans(runs: Sequence[Run]) -> list[tuple[int, int]]:
+    ends = np.cumsum([len(r.t) for r in runs]).tolist()
+    return list(zip([0, *ends[:-1]], ends, strict=True))
+
+
+def _inflation(residuals: Sequence[Array]) -> float:
+    """By how much means of the residuals scatter more than white noise would let them."""
+    top, bottom = 0.0, 0.0
+    for e in residuals:
+        top += float(e[1:] @ e[:-1])
+        bottom += float(e @ e)
+    rho = min(max(top / max(bottom, 1e-300), 0.0), 0.99)
+    return (1.0 + rho) / (1.0 - rho)
+
+
+@kernel
+def _simulated(ratio, start, t, n):
+    """u (N,) from its value ``start`` at t[0], steps of 20 ms at most."""
+    u = np.empty(len(t))
+    u[0] = start
+    for k in range(len(t) - 1):
+        x, span = u[k], t[k + 1] - t[k]
+        steps = max(1, int(np.ceil(span / 0.02)))
+        dt = span / steps
+        push = ratio[0] * n[k] + ratio[1] * abs(n[k]) * n[k]
+        for _ in range(steps):
+            a = push + ratio[2] * x + ratio[3] * abs(x) * x
+            y = x + 0.5 * dt * a
+            x += dt * (push + ratio[2] * y + ratio[3] * abs(y) * y)
+            x = min(max(x, -50.0), 50.0)
+        u[k + 1] = x
+    return u
