@@ -448,7 +448,7 @@ def _fit(options: argparse.Namespace) -> None:
         "value", "std", "unit", "configured", "identifiable",
     )  # fmt: skip
     for row in zip(fit.names, fit.values, fit.std, fit.units, fit.identifiable):
-        before = config.model.theta[config.model.names.index(row[0])]
+        before = config.value(row[0])
         yes = "yes" if row[4] else "no: the prior decides"
         table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
     OUT.print(table)

@@ -318,6 +318,18 @@ class Config:
         """The model with the effects on the rigid body: that of simulation and estimation."""
         return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
 
+    def value(self, name: str) -> float:
+        """Of a coefficient, or of a parameter of an effect such as thruster_lag.time_constant."""
+        effect, _, own = name.partition(".")
+        if own:
+            return self.effects[effect][own]
+        return float(self.model.theta[self.model.names.index(name)])
+
+    @property
+    def with_effects_held(self) -> "Config":
+        """The same, with the parameters of effects as they are: samples need not follow them."""
+        return dataclasses.replace(self, estimate_effects=())
+
     def with_values(self, values: Mapping[str, float]) -> "Config":
         """The same with other values of coefficients, and of parameters of its effects by names
         such as thruster_lag.time_constant.

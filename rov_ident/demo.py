@@ -95,7 +95,7 @@ def _table(config: Config, truth: dict[str, float], seen: dict[str, list[Report]
                 continue
             colour = ("green", "yellow", "red", "dim")[state.levels[i]]
             cells.append(f"[{colour}]{state.values[i]:.4g} ± {1.96 * state.std[i]:.2g}[/]")
-        start = config.model.theta[config.model.names.index(name)]
+        start = config.value(name)
         unit = config.model.coefficients[config.model.names.index(name)].unit
         table.add_row(name, f"{truth[name]:.4g}", f"{start:.4g}", *cells, unit)
     return table

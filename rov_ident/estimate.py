@@ -45,8 +45,8 @@ class Estimate:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
-def prior_of(config: Config) -> Prior:
-    """The prior that a configuration states.
+def prior_of(config: Config, effects: bool = False) -> Prior:
+    """The prior that a configuration states, of its coefficients or of all that it estimates.
 
     The standard deviation of a coefficient is relative to its value, but not less than a share of
     what such a term would weigh at working speed: a published zero means "not known", not "exactly
@@ -64,17 +64,18 @@ def prior_of(config: Config) -> Prior:
         ]
     )
     chosen = [model.coefficients[i] for i in index]
-    effects = [parameter(*key) for key in config.estimate_effects]
-    k, none = len(effects), np.full(len(chosen), np.inf)
+    keys = config.estimate_effects if effects else ()
+    more = [parameter(*key) for key in keys]
+    k, none = len(more), np.full(len(chosen), np.inf)
     return Prior(
-        (*config.estimate, *(".".join(key) for key in config.estimate_effects)),
-        (*(c.unit for c in chosen), *(p.unit for p in effects)),
+        (*config.estimate, *(".".join(key) for key in keys)),
+        (*(c.unit for c in chosen), *(p.unit for p in more)),
         np.array([*index, *range(len(model.theta), len(model.theta) + k)], dtype=np.int64),
-        theta_of(config)[[*index, *range(len(model.theta), len(model.theta) + len(effects))]],
-        np.concatenate([std, [p.typical for p in effects]]),
+        np.concatenate([model.theta[index], [config.effects[name][own] for name, own in keys]]),
+        np.concatenate([std, [p.typical for p in more]]),
         np.array([c.is_diagonal for c in chosen] + [False] * k, dtype=bool),
-        np.concatenate([-none, [p.lower for p in effects]]),
-        np.concatenate([none, [p.upper for p in effects]]),
+        np.concatenate([-none, [p.lower for p in more]]),
+        np.concatenate([none, [p.upper for p in more]]),
     )
 
 

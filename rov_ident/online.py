@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rov_ident import rls, ukf
 from rov_ident.config import Config
+from rov_ident.effects import EFFECTS
 from rov_ident.estimate import Estimate, physical, prior_of
 from rov_ident.messages import Array, Message
 from rov_ident.samples import Sampler
@@ -78,7 +79,7 @@ class OnlineEstimator:
     def __init__(self, config: Config, kind: Kind) -> None:
         self.config = config
         self.kind = kind
-        self.prior = prior_of(config)
+        self.prior = prior_of(config, effects=True)
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
@@ -158,7 +159,13 @@ class OnlineEstimator:
         self._watch(float(samples["dt"].sum()))
         if self.config.estimate_effects and abs(self._last_t - self._centred) >= CENTRING_TIME:
             self._centred = self._last_t
-            self.sampler.recentre(self.config.with_values(self.report().effects))
+            # The rigid body is the estimator's own, and what acts on it all but linear.
+            found = {
+                name: value
+                for name, value in self.report().effects.items()
+                if EFFECTS[name.partition(".")[0]].body is None
+            }
+            self.sampler.recentre(self.config.with_values(found))
         if self.watcher is not None and self.sampler.demands is not None:
             window = self.watcher.take(samples, self.sampler.demands)
             if window is not None:

@@ -55,7 +55,7 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
     bag = Bag(Path(path))
     topics = select_topics(bag, vars(config.topics))
     total = sum(bag.topics[name].message_count for name in topics.values() if name)
-    sampler = Sampler(config)
+    sampler = Sampler(config.with_effects_held)
     parts: list[NDArray[np.void]] = []
     undecodable: Counter[str] = Counter()
     for done, (role, message) in enumerate(read_messages(bag, topics)):

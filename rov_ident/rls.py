@@ -166,7 +166,7 @@ class State(NamedTuple):
 
 def problem(config: Config) -> Problem:
     """The constants of the estimation that a configuration asks for."""
-    model, prior = config.dynamics, prior_of(config)
+    model, prior = config.dynamics, prior_of(config, effects=True)
     settings = np.zeros(1, dtype=_SETTINGS)
     settings["corner"] = config.residual_corner
     settings["gate"] = config.rls.gate

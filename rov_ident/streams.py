@@ -112,7 +112,7 @@ class _Recorder(Sampler):
     """Refuses and converts as the estimators do, but keeps the messages instead of merging them."""
 
     def __init__(self, config: Config) -> None:
-        super().__init__(config)
+        super().__init__(config.with_effects_held)
         self.taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: []}
 
     def _complete(self, final: bool) -> NDArray[np.void]:

@@ -131,7 +131,7 @@ class State(NamedTuple):
 
 def problem(config: Config) -> Problem:
     """The constants of the estimation that a configuration asks for."""
-    model, prior, u = config.dynamics, prior_of(config), config.ukf
+    model, prior, u = config.dynamics, prior_of(config, effects=True), config.ukf
     n = len(prior.names)
     reach = u.alpha**2 * (6 + n + u.kappa)  # size of the state + lambda, van der Merwe (2004)
     settings = np.zeros(1, dtype=_SETTINGS)

@@ -10,9 +10,11 @@ import pytest
 from rov_ident import sensors
 from rov_ident.bags import Bag, BagWriter
 from rov_ident.cdr import ODOMETRY_TYPE
+from rov_ident.config import from_parameters, to_parameters
 from rov_ident.errors import UserError
 from rov_ident.fit import fit_online, write_text
 from rov_ident.frames import gravity_direction
+from rov_ident.online import OnlineEstimator
 from rov_ident.recording import write_messages
 from rov_ident.records import VELOCITIES, predicted, read_record, score
 
@@ -217,3 +219,24 @@ def test_a_file_in_the_way_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError, match=r"result\.json cannot be written"):
         write_text(tmp_path / "file" / "result.json", "text")
+
+
+def test_parameters_of_effects_are_fitted_too(heavy, tmp_path):
+    """As a node would: the sampler follows what is known by then."""
+    true = from_parameters(
+        {**to_parameters(heavy), "effects": {"thruster_lag": {"time_constant": 0.13}}}
+    )
+    config = from_parameters(
+        {**to_parameters(heavy), "effects": {"thruster_lag": {"time_constant": 0.1}}}
+    )
+    run = sensors.dive(true, "steps", 60.0)
+    write_messages(tmp_path / "dive.mcap", run.messages)
+    record = read_record(tmp_path / "dive.mcap", config)
+    result = fit_online([record], config, "rls")
+    online = OnlineEstimator(config, "rls")
+    for _, role, message in run.messages:
+        online.push(role, message)
+    online.flush()
+    listed = json.loads(result.to_json())["coefficients"]["thruster_lag.time_constant"]
+    assert listed["unit"] == "s"
+    assert listed["value"] == online.report().values[-1] == pytest.approx(0.13, abs=0.005)
