@@ -133,6 +133,7 @@ class Coefficient:
         return (self.row, min(self.left, self.right), max(self.left, self.right))
 
 
+@cache
 def parse(name: str) -> Coefficient:
     """The coefficient called ``name``.
 

@@ -216,6 +216,7 @@ def _columns(task: Task, evidence: Evidence, h: Hypothesis, motion: Motion) -> A
             amplitude = next(k for k in plain if k[0] == key[0])
             arm = parameter(key).typical
             there = Hypothesis(h.config, h.values, {key: arm})
+            vars(there).update(model=h.model, equations=h.equations)  # the same, and slow to make
             column = evidence.columns(there, motion, [amplitude])[:, :, 0]
             found[key] = (column - found[amplitude]) / arm
     return np.stack([found[key] for key in extra], axis=2)
