@@ -218,10 +218,11 @@ class Rls:
         "variable", "how old data lose weight", choices=("variable", "constant")
     )
     forgetting_factor: float = option(
-        1.0, "weight kept per sample by constant forgetting", lower=POSITIVE, upper=1.0, live=True
-    )
-    filter_corner: float = option(
-        3.0, "corner of the filter on every channel of the regression", "rad/s", lower=POSITIVE
+        1.0,
+        "weight kept per 0.1 s by constant forgetting, in directions that move",
+        lower=POSITIVE,
+        upper=1.0,
+        live=True,
     )
     gate: float = option(
         5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
@@ -243,13 +244,6 @@ class Ukf:
         "normalised innovation squared, over 2 s, from which the vehicle is taken to have changed "
         "and its coefficients are learnt anew; 1 is expected, higher where the model is rough",
         lower=1.0,
-    )
-    process_std: Vector = option(
-        (0.003, 0.003, 0.003, 0.003, 0.003, 0.003),
-        "density of the acceleration that the model does not explain, besides the noise of the "
-        "wrench: surge sway heave, roll pitch yaw",
-        "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
-        lower=0.0,
     )
     random_walk: float = option(
         0.005, "drift of a coefficient relative to its value", "1/sqrt(h)", lower=0.0
@@ -287,6 +281,16 @@ class Config:
     odometry: OdometrySensor = OdometrySensor()
     imu: ImuSensor = ImuSensor()
     wrench: WrenchNoise = WrenchNoise()
+    process_std: Vector = option(
+        (0.0005,) * 6,
+        "least density of the acceleration that the model does not explain, besides the noise of "
+        "the wrench (more is found from the innovations): surge sway heave, roll pitch yaw",
+        "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
+        lower=0.0,
+    )
+    residual_corner: float = option(
+        3.0, "corner of the filter on the published wrench residual", "rad/s", lower=POSITIVE
+    )
     rls: Rls = Rls()
     ukf: Ukf = Ukf()
     qos: Qos = Qos()

@@ -133,12 +133,12 @@ def problem(config: Config) -> Problem:
     """The constants of the estimation that a configuration asks for."""
     model, prior = config.dynamics, prior_of(config)
     settings = np.zeros(1, dtype=_SETTINGS)
-    settings["corner"] = config.rls.filter_corner
+    settings["corner"] = config.residual_corner
     settings["period"] = 0.1
     settings["gate"] = config.rls.gate
     settings["forgetting_factor"] = config.rls.forgetting_factor
     settings["variable"] = config.rls.forgetting == "variable"
-    settings["lag"] = 6.0 / config.rls.filter_corner
+    settings["lag"] = 6.0 / config.residual_corner
     settings["floor"] = 1e-3 * authority(model)
     return Problem(
         settings,

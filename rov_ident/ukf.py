@@ -45,7 +45,8 @@ from rov_ident.model import (
     in_motion,
     symmetric_product,
 )
-from rov_ident.rls import INFO, first_order, is_finite
+from rov_ident.residual import filtered_residual
+from rov_ident.rls import INFO, is_finite
 from rov_ident.samples import SAMPLE
 
 Array = NDArray[np.float64]
@@ -126,10 +127,10 @@ def problem(config: Config) -> Problem:
     settings["centre"] = u.beta - u.alpha**2
     settings["gate"] = u.gate
     settings["changed"] = u.change_threshold
-    settings["process"] = np.square(u.process_std)
+    settings["process"] = np.square(config.process_std)
     settings["wrench"] = config.wrench.relative_std**2 * config.wrench.correlation_time
     settings["wrench_floor"] = np.square(config.wrench.floor_std) * config.wrench.correlation_time
-    settings["corner"] = config.rls.filter_corner
+    settings["corner"] = config.residual_corner
     # Two fifths of the prior's width: straight where the coefficient is likely, bent close to zero.
     scale = np.where(prior.negative, 0.4 * prior.std, prior.std)
     # A coefficient configured as zero starts within reach of its scale: at exactly zero the
@@ -725,31 +726,14 @@ def _absorb(x, work, first):
 @inlined
 def _residual(task, state, work, sample, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
-    x, y, u, last = state.residual[0], state.residual[1], state.residual[2], state.residual[3]
-    w, dt = task.settings[0].corner, sample.dt
     s, theta = work.scratch[0], work.mean
     nu, mass, h = s.mean_nu, s.mean_mass, s.mean_h
     _coefficients(task, state.x[6:], theta)
     for i in range(6):
-        nu[i, 0] = sample.nu[i]
         for j in range(6):
             mass[i, j, 0] = task.rigid_body[i, j]
     add_added_mass(task.structure, theta, mass)
-    generalized_force(1, task.structure, mass, theta, nu, h, s.mean_extended)
-    a, b0, b1 = first_order(w, dt)
-    for i in range(6):
-        p, force = 0.0, h[i, 0]
-        for j in range(6):
-            p += mass[i, j, 0] * sample.nu[j]
-        for j in range(3):
-            force -= task.restoring[i, j] * sample.down[j]
-        now = w * p - force
-        if out.reason == RESTARTED:
-            x[i], y[i] = w * p, 0.0
-        else:
-            before = x[i] - w * last[i]
-            x[i] = a * x[i] + b0 * u[i] + b1 * now + (1.0 - a) * sample.wrench[i]
-            x[i] += 0.5 * dt * (b1 - b0) * sample.wrench_slope[i]
-            y[i] = a * y[i] + b0 * before + b1 * (x[i] - w * p)
-            out.residual[i] = y[i]
-        u[i], last[i] = now, p
+    filtered_residual(
+        task.structure, theta, mass, task.restoring, task.settings[0].corner, state.residual,
+        sample, out.reason == RESTARTED, nu, h, s.mean_extended, out.residual,
+    )  # fmt: skip

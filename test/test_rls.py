@@ -115,7 +115,7 @@ def test_equals_batch_least_squares_on_independently_filtered_rows(heavy, exact,
     if slope:  # any wrench within the interval, as long as both sides use it alike
         rows["wrench_slope"] = np.random.default_rng(1).standard_normal((len(rows), 6))
         rows["wrench_slope"] *= [20.0, 20.0, 20.0, 2.0, 2.0, 2.0]
-    phi, y = textbook.regression(config.model, rows, config.rls.filter_corner)
+    phi, y = textbook.regression(config.model, rows, config.residual_corner)
     phi = phi[:, :, prior.estimated]
 
     task = rls.problem(config)

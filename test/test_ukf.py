@@ -224,7 +224,7 @@ def test_no_samples(heavy):
 def test_truth_without_noise(heavy):
     rows = textbook.rows_of(*driven(heavy, 90.0, 11), None, gyro=False)
     rows["odometry_variance"] = 1e-8
-    config = with_section(wrong_prior(heavy, spread=0.3), "ukf", process_std=(1e-5,) * 6)
+    config = dataclasses.replace(wrong_prior(heavy, spread=0.3), process_std=(1e-5,) * 6)
     config = with_section(config, "wrench", relative_std=1e-5)
     estimate, _, _ = result(with_section(config, "ukf", gate=1e6), rows)
     error = np.abs(estimate.values / heavy.model.theta - 1.0)

@@ -1,0 +1,92 @@
+"""What moves the vehicle besides the model, as process noise: one definition for both estimators.
+
+Two parts. The noise of the thruster wrench is configured (``wrench``). What the model lacks is not
+known beforehand: per axis, the density of an unexplained acceleration is found from the innovations
+(Mehra 1972; Myers and Tapley 1976). A wrong structure then widens the intervals instead of being
+learnt as a coefficient.
+
+It *starts high* and comes down: what an estimator learns with too little process noise weighs too
+much for ever, and later data cannot make up for it. And it looks at innovations *added up over a
+second*: what they have in common is process noise, while a single innovation is all but the sensor's.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.excitation import authority
+from rov_ident.jit import inlined
+
+FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
+ROOM = 1.2  # the power of summed innovations from which noise is added; 1 is expected
+SUM_TIME = 1.0  # s; over which innovations are added up
+FIRST_TIME, TIME = (
+    1.0,
+    20.0,
+)  # s; in which the density doubles with twice the power: at first, later
+STEADY = 4.0  # a squared sum counts for at most this often its variance
+
+PROCESS = np.dtype(
+    [
+        ("first", "f8", (6,)),  # variance density of the unexplained acceleration to begin with
+        ("floor", "f8", (6,)),  # and its least
+        ("wrench", "f8"),  # relative variance of the wrench times its correlation time
+        ("wrench_floor", "f8", (6,)),  # variance density of the wrench at zero wrench
+    ],
+    align=True,
+)
+"""What does not change: see :func:`process`."""
+
+ADAPTATION = np.dtype(
+    [
+        ("density", "f8"),  # of the unexplained acceleration, (m/s2)^2/Hz or (rad/s2)^2/Hz
+        ("acting", "f8"),  # the same with the noise of the wrench: set by the estimator
+        ("summed", "f8"),  # normalised innovations added up with fading memory
+        ("expected", "f8"),  # variance of that
+        ("since", "f8"),  # s since this velocity was measured: counted by the estimator
+        ("seen", "f8"),  # s of innovations so far
+    ],
+    align=True,
+)
+"""What is known of one axis."""
+
+
+def process(config: Config) -> NDArray[np.void]:
+    """The constants (1,) of PROCESS that a configuration asks for."""
+    model, wrench = config.dynamics, config.wrench
+    out = np.zeros(1, dtype=PROCESS)
+    # the acceleration of a force that lasts a second has this density
+    out["first"] = np.square(FIRST_FORCE * authority(model) / np.diag(model.mass_matrix))
+    out["floor"] = np.square(config.process_std)
+    out["wrench"] = wrench.relative_std**2 * wrench.correlation_time
+    out["wrench_floor"] = np.square(wrench.floor_std) * wrench.correlation_time
+    return out
+
+
+def first_adaptation(constants: NDArray[np.void]) -> NDArray[np.void]:
+    """(6,) of ADAPTATION, before any innovation."""
+    out = np.zeros(6, dtype=ADAPTATION)
+    out["density"] = np.maximum(constants["first"][0], constants["floor"][0])
+    return out
+
+
+@inlined
+def interrupt(adaptation):
+    """After a gap: the sum of innovations begins anew, the density stays."""
+    adaptation.summed = 0.0
+    adaptation.expected = 0.0
+    adaptation.since = 0.0
+
+
+@inlined
+def adapt(adaptation, floor, innovation):
+    """Take in one innovation, given in its standard deviations; ``floor`` of the density."""
+    a = adaptation
+    keep = np.exp(-a.since / SUM_TIME)
+    a.seen += a.since
+    a.summed = keep * a.summed + innovation
+    a.expected = keep * keep * a.expected + 1.0
+    excess = min(a.summed * a.summed / a.expected, STEADY) - ROOM
+    blend = min(a.since / min(FIRST_TIME + 0.25 * a.seen, TIME), 0.1)
+    a.density = max(a.density + blend * excess * a.acting, floor)
+    a.since = 0.0
