@@ -7,7 +7,7 @@ learnt as a coefficient.
 
 It *starts high* and comes down: what an estimator learns with too little process noise weighs too
 much for ever, and later data cannot make up for it. And it looks at innovations *added up over a
-second*: what they have in common is process noise, while a single innovation is all but the sensor's.
+second*: what they have in common is process noise, while each alone is nearly all the sensor's.
 """
 
 import numpy as np

@@ -1,31 +1,41 @@
-"""Recursive least squares over the filtered 6-DOF regressor, as ``init``, ``step`` and ``fold``.
+"""Recursive least squares over the sensitivities of a model-based velocity observer.
 
-The wrench is linear in the coefficients, ``tau = d/dt(P theta) + H theta + known``
-(:func:`rov_ident.model.columns`). Every channel, the measured wrench included, goes through one
-low-pass filter F, so that no acceleration is measured and no phase difference biases the fit::
+The recursive prediction-error method (Ljung and Soderstrom 1983, sec. 3.7) as ``init``, ``step`` and
+``fold``. A Kalman filter of the six velocities predicts each measured one with the present
+coefficients; how the prediction would change with the coefficients, ``phi = d nu / d theta``,
+follows from the same recursion, one column a coefficient::
 
-    F(s) = (w / (s + w))^2,   y = F[tau - known],   Phi = s F[P] + F[H],   y = Phi theta + noise
+    nu_dot = M^-1 (tau - h(nu)) + noise
+    S_dot  = (d nu_dot / d nu) S - M^-1 Y(nu, nu_dot)      Y: regressor, tau = known + Y theta
 
-The derivative is exact: ``s w/(s + w) P = w (P - x)`` where x is the filtered P. Started with
-``x(0) = P(0)`` there is no transient, so that a gap in the data costs nothing but itself.
+and a measurement corrects nu and S alike. Every innovation e with variance s is then a row of least
+squares for the deviation x from the values that the observer works with::
 
-The information is kept as a triangular root R of ``R'R = sum of Phi' Phi / sigma^2`` (Householder;
-it keeps half the digits that the covariance form loses), in coefficients scaled by their prior
-standard deviation about their prior value: the prior is the unit matrix.
+    e / sqrt(s) = phi / sqrt(s) x + white noise
 
-*Columns* count where the motion they multiply is well above its noise, *rows* where the thrusters
-drive their axis. Where the residual is larger than the wrench, the motion has other causes (a
-tether, waves, the wash of another axis) which are correlated with it, and least squares would turn
-that into coefficients.
+It is *recursive least squares* still, on the rows of a linearised prediction error. Equation error
+(filtered accelerations and products of measured velocities) needs no observer, but the noise of the
+velocities enters its moments by way of the Munk terms, biases the products and cannot be whitened
+axis by axis: six times the Cramer-Rao bound instead of one and a half (docs/accuracy.md).
+
+The information is kept as a triangular root R of ``R'R = sum of phi' phi / s`` (Householder; it
+keeps half the digits that the covariance form loses), in coefficients scaled by their prior standard
+deviation about their prior value: the prior is the unit matrix.
+
+*Coefficients whose motion is not well above its noise* are not learnt, or it would be from the noise;
+but their uncertainty is that of the others, too. With their columns behind the others', R holds the
+distribution of the others *given* them, and that alone takes new rows: the Schmidt-Kalman filter in
+square-root information form.
 
 *Forgetting* touches only directions that the present motion excites (subspace-of-information
-forgetting, Lai and Bernstein 2024): unexcited ones keep their information, so nothing winds up.
-What is forgotten leaves the root while the new rows come in, as rows of negative sign (hyperbolic
-Householder); no direction loses more than ``1 - factor`` of its information, so that is as safe.
+forgetting, Lai and Bernstein 2024): unexcited ones keep their information, so nothing winds up. By
+default it waits for evidence: while the innovations of an axis are larger than they should be, what
+its row sees gains variance as on a random walk, up to the prior's. To multiply the information by a
+fixed factor instead takes the longer the better something was known.
 
-*Standard deviations* do not assume white residuals: the covariance of the accumulated score
-``sum of Phi' e / sigma^2``, with its correlation in time, stands between two inverse informations
-(the sandwich of Newey and West 1987, with an exponential lag window).
+*Standard deviations* do not assume white innovations: the covariance of the accumulated score
+``sum of phi' e / s``, with its correlation in time, stands between two inverse informations (the
+sandwich of Newey and West 1987, with an exponential lag window).
 """
 
 from typing import NamedTuple
@@ -33,60 +43,72 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, prior_of
-from rov_ident.excitation import authority
 from rov_ident.jit import inlined, inner, kernel, reordered
-from rov_ident.model import Structure, columns, coriolis_of, in_motion
+from rov_ident.model import (
+    Structure,
+    add_added_mass,
+    columns,
+    generalized_force,
+    in_motion,
+)
+from rov_ident.process_noise import ADAPTATION, adapt, first_adaptation, interrupt, process
+from rov_ident.residual import filtered_residual
 from rov_ident.samples import SAMPLE
 
 Array = NDArray[np.float64]
 
-USED, RESTARTED, WAITING, GATED, NOT_FINITE = range(5)
+USED, RESTARTED, WAITING, GATED, NOT_FINITE, UNPREDICTABLE = range(6)
 REASONS = (
     "used",
     "restarted after a gap",
-    "between updates",
+    "not measured",
     "outlier",
     "not finite",
+    "no model moves so",
 )
 
-REFUSALS = (GATED, NOT_FINITE)
+REFUSALS = (GATED, NOT_FINITE, UNPREDICTABLE)
 
 INFO = np.dtype(
     [
         ("t", "f8"),
         ("reason", "i8"),  # index into REASONS
         ("residual", "f8", (6,)),  # N, N m: filtered wrench, measured minus model
-        ("ratio", "f8", (6,)),  # squared residual over its predicted variance
+        ("ratio", "f8", (6,)),  # squared innovation over its predicted variance
         ("forgetting", "f8"),
         ("condition", "f8"),  # as of condition(), before the sample; NaN: not looked at
     ],
     align=True,
 )
 
+_MAX_STEP = 0.05  # s; of one step of the observer
+_PERIOD = 0.1  # s; the observer takes over the present coefficients this often
+_LIGHTEST = 0.2  # of the rigid body's own inertia: the observer is never lighter
+_FASTEST = 50.0  # m/s, rad/s; the observer of a sane model never gets there
 _WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
 _PATIENCE = 1.5  # lesser outliers in short order from which the vehicle has changed
 _PATIENCE_TIME = 3.0  # s; over which that is counted
-_STEADY = 4.0  # a squared residual counts for at most this often its variance: a change of the
-# vehicle is noticed by the surprise long before it passes for noise
-_SETTLED = 100  # updates after which the residual's variance is known roughly
+_STEADY = 4.0  # a squared innovation counts for at most this often its variance in the noise
+_NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
-_SURPRISING = 2.0  # its value from which old data are forgotten; 1 is expected
-_FORGETTING_TIME = 2.0  # s; memory while surprised
-_DRIVE_TIME = 20.0  # s; memory of how strongly an axis is driven
-_NOISE_TIME = 60.0  # s; memory of the residual's variance
+_SURPRISING = 3.0  # its value from which the vehicle has changed; 1 is expected
+_RELEARNING_TIME = 20.0  # s; in which what a row sees then becomes as uncertain as at first
+_SMALLEST_FACTOR = 0.1  # of the information in a direction is kept in any one update
+_PEAK_TIME = 5.0  # s; over which a peak of a velocity is remembered
+_MOVING = 4.0  # that peak's square over the noise variance from which the component moves
+_LAG = 4.0  # s; of the window over the score's correlation
 _EXCITED = 0.01  # a row with less information than this, relative to the prior, excites nothing
+_SHIFT = 1e-6  # m/s, rad/s; of a velocity, for the Jacobian
 
 _SETTINGS = np.dtype(
     [
-        ("corner", "f8"),
-        ("period", "f8"),
+        ("corner", "f8"),  # rad/s, of the published residual
         ("gate", "f8"),
         ("forgetting_factor", "f8"),
         ("variable", "?"),
-        ("lag", "f8"),  # s, of the window over the residual's correlation
-        ("floor", "f8", (6,)),  # smallest residual standard deviation
     ],
     align=True,
 )
@@ -95,12 +117,11 @@ _SCALARS = np.dtype(
     [
         ("t", "f8"),
         ("since_update", "f8"),
-        ("variance", "f8", (6,)),  # of the filtered residual
-        ("wrench", "f8", (6,)),  # filtered once
-        ("drive", "f8", (6,)),  # its mean square of late
-        ("surprise", "f8"),  # normalised innovation squared, averaged: 1 when all is well
+        ("noise", "f8", (6,)),  # variance of a measurement over the declared one
+        ("surprise", "f8", (6,)),  # normalised innovations squared, averaged: 1 when all is well
+        ("peak", "f8", (6,)),  # squared velocities, their peaks of late
         ("refused", "f8"),  # outliers of late
-        ("updates", "i8"),
+        ("free", "i8"),  # so many of the first columns take rows
         ("started", "?"),
     ],
     align=True,
@@ -111,8 +132,9 @@ class Problem(NamedTuple):
     """What does not change from sample to sample."""
 
     settings: NDArray[np.void]
+    process: NDArray[np.void]  # (1,) of PROCESS
     structure: Structure
-    estimated: NDArray[np.int64]  # indices into theta
+    estimated: NDArray[np.int64]  # (n,) indices into theta
     theta: Array  # (m,) values of all coefficients: the prior of the estimated, the held others
     scale: Array  # (n,) prior standard deviations
     rigid_body: Array  # (6, 6)
@@ -120,12 +142,18 @@ class Problem(NamedTuple):
 
 
 class State(NamedTuple):
-    """All that the next step needs."""
+    """All that the next step needs. Columns of coefficients are in the order of ``order``."""
 
+    order: NDArray[np.int64]  # (n,): indices into Problem.estimated
     root: Array  # (n, n + 1): [R | z], R upper triangular, of the scaled deviation from the prior
     score: Array  # (n, n): covariance of the accumulated score, the prior's included
     lagged: Array  # (n,): recent scores under the lag window
-    filters: Array  # (4, 6, n + 1): stage 1, stage 2, last input, last momentum; last column: known
+    deviation: Array  # (n,): the scaled deviation that the observer works with
+    nu: Array  # (6,): velocities
+    p: Array  # (6, 6): their covariance, the coefficients taken as known
+    sensitivity: Array  # (6, n): d nu / d deviation
+    adaptation: NDArray[np.void]  # (6,) of ADAPTATION: of the process noise
+    residual: Array  # (4, 6): filters of the published residual
     scalars: NDArray[np.void]  # (1,)
 
 
@@ -134,14 +162,12 @@ def problem(config: Config) -> Problem:
     model, prior = config.dynamics, prior_of(config)
     settings = np.zeros(1, dtype=_SETTINGS)
     settings["corner"] = config.residual_corner
-    settings["period"] = 0.1
     settings["gate"] = config.rls.gate
     settings["forgetting_factor"] = config.rls.forgetting_factor
     settings["variable"] = config.rls.forgetting == "variable"
-    settings["lag"] = 6.0 / config.residual_corner
-    settings["floor"] = 1e-3 * authority(model)
     return Problem(
         settings,
+        process(config),
         model.structure,
         prior.estimated,
         model.theta,
@@ -152,16 +178,23 @@ def problem(config: Config) -> Problem:
 
 
 def init(task: Problem) -> State:
-    """Nothing learnt: the prior."""
+    """Nothing learnt: the prior; the velocity is taken from the first measurement."""
     n = len(task.scale)
     scalars = np.zeros(1, dtype=_SCALARS)
     scalars["surprise"] = 1.0
-    scalars["variance"] = (30.0 * task.settings["floor"]) ** 2
+    scalars["noise"] = 1.0
+    scalars["free"] = n
     return State(
+        np.arange(n),
         np.hstack([np.eye(n), np.zeros((n, 1))]),
         np.eye(n),
         np.zeros(n),
-        np.zeros((4, 6, n + 1)),
+        np.zeros(n),
+        np.zeros(6),
+        np.zeros((6, 6)),
+        np.zeros((6, n)),
+        first_adaptation(task.process),
+        np.zeros((4, 6)),
         scalars,
     )
 
@@ -182,28 +215,26 @@ def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, 
 
 def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
-    n = len(task.scale)
-    r = state.root[:, :n]
-    deviation = np.linalg.solve(r, state.root[:, n])
-    inverse = np.linalg.solve(r, np.eye(n))
+    n, place = len(task.scale), np.argsort(state.order)
+    inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
     information = inverse @ inverse.T
-    covariance = information @ state.score @ information
-    covariance = 0.5 * (covariance + covariance.T)
     # From a short record the sandwich is itself uncertain, and mostly too thin: never thinner than
-    # the inverse information, whose rows count once for the filter's memory.
-    widen = np.sqrt(np.maximum(np.diag(information) / np.diag(covariance), 1.0)) * task.scale
+    # the inverse information.
+    sandwich = np.sum((information @ state.score) * information, axis=1)
+    widen = np.sqrt(np.maximum(sandwich / np.diag(information), 1.0))
+    covariance = (information * np.outer(widen, widen))[np.ix_(place, place)]
     return Estimate(
         prior.names,
-        task.theta[task.estimated] + task.scale * deviation,
-        covariance * np.outer(widen, widen),
+        task.theta[task.estimated] + task.scale * (inverse @ state.root[:, n])[place],
+        covariance * np.outer(task.scale, task.scale),
         float(state.scalars["t"][0]),
     )
 
 
 def variance(task: Problem, state: State) -> Array:
     """Diagonal (n,) of the inverse information, in squared units: what excitation is judged by."""
-    variances: Array = task.scale**2 * (inverse_of(state.root) ** 2).sum(axis=1)
-    return variances
+    variances: Array = (inverse_of(state.root) ** 2).sum(axis=1)[np.argsort(state.order)]
+    return task.scale**2 * variances
 
 
 def condition(task: Problem, state: State) -> float:
@@ -218,66 +249,98 @@ def condition(task: Problem, state: State) -> float:
 
 # ------------------------------------------------------------------ kernels
 #
-# Matrices that are worked on have zeros in further columns, up to a multiple of _LANES, and in two
+# Matrices that are worked on have zeros in further columns, up to a multiple of _WIDTH, and in two
 # further rows: loops along a row then leave no remainder, and may take three rows at a time.
 
-_LANES = 32
+_WIDTH = 32
+_POINTS = 8  # a velocity and its displacements along six axes, side by side; one is spare
+
+_SCRATCH = np.dtype(
+    [
+        ("nu", "f8", (6, _POINTS)),
+        ("mass", "f8", (6, 6, _POINTS)),
+        ("h", "f8", (6, _POINTS)),
+        ("extended", "f8", (EXTENDED_SIZE, _POINTS)),
+        ("one_nu", "f8", (6, 1)),
+        ("one_mass", "f8", (6, 6, 1)),
+        ("one_h", "f8", (6, 1)),
+        ("one_extended", "f8", (EXTENDED_SIZE, 1)),
+        ("inverse", "f8", (6, 6)),  # of the mass matrix
+        ("force", "f8", (6,)),  # wrench less restoring in mid-interval
+        ("slope", "f8", (6,)),
+        ("rate", "f8", (6,)),
+        ("middle", "f8", (6,)),
+        ("jacobian", "f8", (6, 6)),  # d nu_dot / d nu
+        ("transition", "f8", (6, 6)),
+        ("into", "f8", (6, 6)),  # from a wrench in the interval to the velocity at its end
+        ("noise", "f8", (6, 6)),  # variance density of the acceleration
+        ("product", "f8", (6, 6)),
+        ("z", "f8", (6,)),  # nu as measured
+        ("r", "f8", (6,)),  # its variance
+    ],
+    align=True,
+)
 
 
 class Work(NamedTuple):
     """Scratch for all samples of a fold."""
 
-    momentum: Array  # (6, m): per unit of each coefficient
-    force: Array  # (6, m)
-    known: Array  # (6,): momentum of the rigid body
-    now: Array  # (2, 6, n + 1): force - corner * momentum, and momentum; the last column: known
-    before: Array  # (6 (n + 1),)
+    theta: Array  # (m, _POINTS): of the observer
+    one_theta: Array  # (m, 1)
+    estimated: NDArray[np.int64]  # (n,): indices into theta, in the order of the columns
+    scale: Array  # (n,)
     moves: NDArray[np.bool_]  # (m,)
-    deviation: Array  # (n,): the present solution
+    moving: NDArray[np.uint8]  # (6,)
+    momentum: Array  # (6, m): per unit of each coefficient
+    of_rate: Array  # (6, m)
+    of_motion: Array  # (6, m)
+    change: Array  # (n,)
     gradient: Array  # (n,)
-    noise: Array  # (6,)
-    goals: Array  # (6,)
-    errors: Array  # (6,)
     line: Array  # (columns,)
+    sensitivity: Array  # (6, columns)
+    drive: Array  # (6, columns)
     root: Array  # (n + 2, columns): [R | z]
     inverse: Array  # (n + 2, columns): R^-1
     score: Array  # (n + 2, columns)
+    spare: Array  # (n + 2, columns)
     rows: Array  # (12, columns): what comes in, and what is forgotten
-    taken: Array  # (6, columns): what came in
     basis: Array  # (6, columns): orthonormal directions to forget in
-    lost: Array  # (3, 6, columns): V', W', D' of _forget
-    product: Array  # (6, 6)
+    lost: Array  # (2, 6, columns): W', D' of _forget
+    scratch: NDArray[np.void]  # (1,): in one record, whose parts the compiler knows apart
 
 
 @inner
 def _work(task, state):
     n, m = len(task.scale), len(task.theta)
-    columns = _LANES * ((n + 2) // _LANES + 1)
+    columns = _WIDTH * ((n + 2) // _WIDTH + 1)
     work = Work(
-        np.empty((6, m)),
-        np.empty((6, m)),
-        np.empty(6),
-        np.empty((2, 6, n + 1)),
-        np.empty(6 * (n + 1)),
+        np.empty((m, _POINTS)),
+        np.empty((m, 1)),
+        np.empty(n, dtype=np.int64),
+        np.empty(n),
         np.empty(m, dtype=np.bool_),
+        np.empty(6, dtype=np.uint8),
+        np.empty((6, m)),
+        np.empty((6, m)),
+        np.empty((6, m)),
         np.empty(n),
         np.empty(n),
-        np.empty(6),
-        np.empty(6),
-        np.empty(6),
         np.empty(columns),
+        np.zeros((6, columns)),
+        np.zeros((6, columns)),
+        np.zeros((n + 2, columns)),
         np.zeros((n + 2, columns)),
         np.zeros((n + 2, columns)),
         np.zeros((n + 2, columns)),
         np.zeros((12, columns)),
         np.zeros((6, columns)),
-        np.zeros((6, columns)),
-        np.zeros((3, 6, columns)),
-        np.empty((6, 6)),
+        np.zeros((2, 6, columns)),
+        np.empty(1, dtype=_SCRATCH),
     )
     _copy(state.root, work.root)
     _copy(state.score, work.score)
-    _solve(state.root, work.deviation)
+    _copy(state.sensitivity, work.sensitivity)
+    _name_columns(task, state, work)
     return work
 
 
@@ -289,19 +352,27 @@ def _copy(a, b):
             b[i, j] = a[i, j]
 
 
+@inner
+def _name_columns(task, state, work):
+    for a in range(len(state.order)):
+        work.estimated[a] = task.estimated[state.order[a]]
+        work.scale[a] = task.scale[state.order[a]]
+
+
 @kernel
 def _fold(task, state, samples, info):
     work = _work(task, state)
+    _take_over(task, state, work)
     for k in range(len(samples)):
         _step(task, state, work, samples[k], info[k])
     _copy(work.root, state.root)
     _copy(work.score, state.score)
+    _copy(work.sensitivity, state.sensitivity)
 
 
 @inlined
 def _step(task, state, work, sample, info):
     s, c = task.settings[0], state.scalars[0]
-    n, w, dt = len(task.scale), s.corner, sample.dt
     info.t = sample.t
     info.forgetting = 1.0
     info.condition = np.nan
@@ -311,168 +382,409 @@ def _step(task, state, work, sample, info):
     if not is_finite(sample):
         info.reason = NOT_FINITE
         return
-
-    _regress(task, work, sample)
-    now = work.now
-    x, y, u, last = state.filters[0], state.filters[1], state.filters[2], state.filters[3]
     c.t = sample.t
-    if sample.restart or not c.started or not dt > 0.0:
-        c.started = True
-        for i in range(6):
-            for j in range(n + 1):
-                x[i, j] = -w * now[1, i, j]
-                y[i, j] = 0.0
-                u[i, j] = now[0, i, j]
-                last[i, j] = now[1, i, j]
-        c.since_update = 0.0
-        for j in range(n):
-            state.lagged[j] = 0.0
+    info.reason = USED
+    if sample.restart or not c.started or not sample.dt > 0.0:
         info.reason = RESTARTED
-        return
+        _restart(state, work, sample)
+    else:
+        c.since_update += sample.dt
+        if _predict(task, state, work, sample):
+            _judge_motion(task, state, work, sample)
+            _update(task, state, work, sample, info)
+        else:
+            info.reason = UNPREDICTABLE
+            c.started = False
+            return
+        if c.since_update >= _PERIOD - 1e-6:
+            _learn(task, state, work, info)
+    x = work.scratch[0]
+    filtered_residual(
+        task.structure, work.one_theta, x.one_mass, task.restoring, s.corner, state.residual, sample,
+        info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended, info.residual,
+    )  # fmt: skip
 
-    a, b0, b1 = first_order(w, dt)
-    _filter(state.filters, work, w, a, b0, b1)
+
+@inlined
+def _restart(state, work, sample):
+    """The velocity from the sample; what the coefficients have to do with it is not known."""
+    c = state.scalars[0]
+    c.started = True
+    c.since_update = 0.0
     for i in range(6):
-        # the wrench goes in a line from sample to sample, but jumps there
-        wrench = (1.0 - a) * sample.wrench[i] + 0.5 * dt * (b1 - b0) * sample.wrench_slope[i]
-        x[i, n] += wrench
-        y[i, n] += b1 * wrench
-        c.wrench[i] = a * c.wrench[i] + (1.0 - a) * sample.wrench[i]
-        c.drive[i] += min(dt / _DRIVE_TIME, 1.0) * (c.wrench[i] ** 2 - c.drive[i])
-    c.since_update += dt
+        for k in range(work.sensitivity.shape[1]):
+            work.sensitivity[i, k] = 0.0
+        for j in range(6):
+            state.p[i, j] = 0.0
+        state.p[i, i] = min(sample.odometry_variance[i], 1.0)
+        state.nu[i] = sample.nu[i]
+        c.peak[i] = 0.0
+        interrupt(state.adaptation[i])
+    for a in range(len(state.lagged)):
+        state.lagged[a] = 0.0
 
-    _residuals(y, work.deviation, info.residual)
-    if c.since_update < s.period - 1e-6:
+
+# ---------------------------------------------------------------- observer
+
+
+@inner
+def _take_over(task, state, work):
+    """The model that the observer works with."""
+    s = work.scratch[0]
+    for j in range(len(task.theta)):
+        work.one_theta[j, 0] = task.theta[j]
+    for a in range(len(work.estimated)):
+        work.one_theta[work.estimated[a], 0] += work.scale[a] * state.deviation[a]
+    for j in range(len(task.theta)):
+        for k in range(_POINTS):
+            work.theta[j, k] = work.one_theta[j, 0]
+    for i in range(6):
+        for j in range(6):
+            s.one_mass[i, j, 0] = task.rigid_body[i, j]
+    add_added_mass(task.structure, work.one_theta, s.one_mass)
+    for i in range(6):
+        least = _LIGHTEST * task.rigid_body[i, i]
+        s.one_mass[i, i, 0] = max(s.one_mass[i, i, 0], least)
+    for i in range(6):
+        for j in range(6):
+            s.product[i, j] = s.one_mass[i, j, 0]
+            s.inverse[i, j] = 1.0 if i == j else 0.0
+            for k in range(_POINTS):
+                s.mass[i, j, k] = s.one_mass[i, j, 0]
+    # Gauss and Jordan; positive definite, or made so
+    for c in range(6):
+        f = 1.0 / max(s.product[c, c], _LIGHTEST * task.rigid_body[c, c])
+        for j in range(6):
+            s.product[c, j] *= f
+            s.inverse[c, j] *= f
+        for i in range(6):
+            f = s.product[i, c] if i != c else 0.0
+            for j in range(6):
+                s.product[i, j] -= f * s.product[c, j]
+                s.inverse[i, j] -= f * s.inverse[c, j]
+
+
+@reordered
+def _predict(task, state, work, sample):
+    """Velocities, covariance, sensitivities to the sample's time; False if out of all reason."""
+    s, nu, p, sensitivity = work.scratch[0], state.nu, state.p, work.sensitivity
+    noise, inverse, constants = s.noise, s.inverse, task.process[0]
+    for i in range(6):
+        s.force[i], s.slope[i] = sample.wrench[i], sample.wrench_slope[i]
+        for j in range(3):
+            middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
+            s.force[i] += task.restoring[i, j] * middle
+            s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
+        s.middle[i] = constants.wrench * sample.wrench[i] ** 2 + constants.wrench_floor[i]
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            for a in range(6):
+                total += inverse[i, a] * inverse[j, a] * s.middle[a]
+            noise[i, j] = total
+            noise[j, i] = total
+        state.adaptation[i].since += sample.dt
+        noise[i, i] += state.adaptation[i].density
+        state.adaptation[i].acting = noise[i, i]
+    steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
+    dt = sample.dt / steps
+    for step in range(steps):
+        _linearise(task, work, nu, (step + 0.5) * dt - 0.5 * sample.dt, dt)
+        # the regressor, in the middle of the step
+        columns(task.structure, s.rate, work.of_rate, work.of_motion)
+        columns(task.structure, s.middle, work.momentum, work.of_motion)
+        for i in range(6):
+            for a in range(len(work.scale)):
+                e = work.estimated[a]
+                work.drive[i, a] = -work.scale[a] * (work.of_rate[i, e] + work.of_motion[i, e])
+        _advance(s.transition, sensitivity, s.into, work.drive, work.rows)
+        for i in range(6):
+            nu[i] += dt * s.rate[i]
+        for i in range(6):
+            for j in range(6):
+                total = 0.0
+                for a in range(6):
+                    total += s.transition[i, a] * p[a, j]
+                s.product[i, j] = total
+        for i in range(6):
+            for j in range(i + 1):
+                total = dt * noise[i, j]
+                for a in range(6):
+                    total += s.product[i, a] * s.transition[j, a]
+                p[i, j] = total
+                p[j, i] = total
+    fastest = 0.0
+    for i in range(6):
+        fastest += nu[i] * nu[i]
+    return fastest < _FASTEST**2  # not so with NaN
+
+
+@reordered
+def _advance(transition, x, into, drive, out):
+    """x (6, columns) = transition x + into drive; the first six rows of out are work space."""
+    columns = x.shape[1]
+    for i in range(6):
+        a, b, c, d, e, f = (
+            transition[i, 0], transition[i, 1], transition[i, 2],
+            transition[i, 3], transition[i, 4], transition[i, 5],
+        )  # fmt: skip
+        g, h, k, l, m, n = (
+            into[i, 0], into[i, 1], into[i, 2], into[i, 3], into[i, 4], into[i, 5],
+        )  # fmt: skip
+        for j in range(columns):
+            out[i, j] = (
+                a * x[0, j] + b * x[1, j] + c * x[2, j]
+                + d * x[3, j] + e * x[4, j] + f * x[5, j]
+                + g * drive[0, j] + h * drive[1, j] + k * drive[2, j]
+                + l * drive[3, j] + m * drive[4, j] + n * drive[5, j]
+            )  # fmt: skip
+    for i in range(6):
+        for j in range(columns):
+            x[i, j] = out[i, j]
+
+
+@inlined
+def _linearise(task, work, nu, late, dt):
+    """A step of the midpoint rule from nu, ``late`` seconds after mid-interval in its middle.
+
+    s.rate is nu_dot there; s.transition is ``d nu(end) / d nu``, s.into ``d nu(end) / d wrench``,
+    both to second order in dt.
+    """
+    s = work.scratch[0]
+    for i in range(6):
+        s.one_nu[i, 0] = nu[i]
+    generalized_force(
+        1, task.structure, s.one_mass, work.one_theta, s.one_nu, s.one_h, s.one_extended
+    )
+    for i in range(6):
+        total = 0.0
+        for j in range(6):
+            # the force of mid-step serves for the start of it, too: to second order
+            total += s.inverse[i, j] * (s.force[j] + late * s.slope[j] - s.one_h[j, 0])
+        s.middle[i] = nu[i] + 0.5 * dt * total
+    for i in range(6):
+        for k in range(_POINTS):
+            s.nu[i, k] = s.middle[i] + (_SHIFT if k == i + 1 else 0.0)
+    generalized_force(_POINTS, task.structure, s.mass, work.theta, s.nu, s.h, s.extended)
+    for i in range(6):
+        total = 0.0
+        for j in range(6):
+            total += s.inverse[i, j] * (s.force[j] + late * s.slope[j] - s.h[j, 0])
+        s.rate[i] = total
+        for k in range(6):
+            total = 0.0
+            for j in range(6):
+                total -= s.inverse[i, j] * (s.h[j, 1 + k] - s.h[j, 0])
+            s.jacobian[i, k] = total / _SHIFT
+    for i in range(6):
+        for j in range(6):
+            unit = 1.0 if i == j else 0.0
+            square, into = 0.0, 0.0
+            for a in range(6):
+                square += s.jacobian[i, a] * s.jacobian[a, j]
+                into += s.jacobian[i, a] * s.inverse[a, j]
+            s.transition[i, j] = unit + dt * (s.jacobian[i, j] + 0.5 * dt * square)
+            s.into[i, j] = dt * (s.inverse[i, j] + 0.5 * dt * into)
+
+
+@inlined
+def _judge_motion(task, state, work, sample):
+    """Columns of coefficients first whose velocities are well above the noise of their sensor."""
+    c = state.scalars[0]
+    decay = np.exp(-sample.dt / _PEAK_TIME)
+    for i in range(6):
+        r = sample.odometry_variance[i]
+        if i >= 3 and np.isfinite(sample.gyro[i - 3]):
+            r = sample.gyro_variance
+        c.peak[i] = max(c.peak[i] * decay, state.nu[i] ** 2)
+        work.moving[i] = 1 if c.peak[i] > _MOVING * r else 0
+    in_motion(task.structure, work.moving, work.moves)
+    free, sorted_already = 0, True
+    for a in range(len(work.estimated)):
+        if work.moves[work.estimated[a]]:
+            sorted_already = sorted_already and free == a
+            free += 1
+    c.free = free
+    if not sorted_already:
+        _sort(task, state, work)
+
+
+@inner
+def _sort(task, state, work):
+    """Columns of what moves first, all parts of the state alike."""
+    n = len(state.order)
+    place, at = np.empty(n, dtype=np.int64), 0
+    for moves in (True, False):
+        for a in range(n):
+            if work.moves[work.estimated[a]] == moves:
+                place[at] = a
+                at += 1
+    order, lagged, deviation = state.order.copy(), state.lagged.copy(), state.deviation.copy()
+    _copy(work.score, work.spare)
+    for a in range(n):
+        state.order[a] = order[place[a]]
+        state.lagged[a] = lagged[place[a]]
+        state.deviation[a] = deviation[place[a]]
+        for b in range(n):
+            work.score[a, b] = work.spare[place[a], place[b]]
+    _copy(work.sensitivity, work.drive)
+    for a in range(n):
+        for i in range(6):
+            work.sensitivity[i, a] = work.drive[i, place[a]]
+    _name_columns(task, state, work)
+    # a root of the permuted information: the old one's rows, stacked below nothing
+    _copy(work.root, work.spare)
+    for a in range(n):
+        for b in range(n + 1):
+            work.root[a, b] = 0.0
+    for first in range(0, n, 3):
+        for i in range(3):
+            a = first + i
+            for b in range(n):
+                work.rows[i, b] = work.spare[a, place[b]] if a < n else 0.0
+            work.rows[i, n] = work.spare[a, n] if a < n else 0.0
+        _stack(work.root, work.rows, n, 3, 0, work.line)
+
+
+# ---------------------------------------------------------------- update
+
+
+@inlined
+def _update(task, state, work, sample, info):
+    """Linear and angular velocity, one component after another; their rows into the root."""
+    s, c, scratch = task.settings[0], state.scalars[0], work.scratch[0]
+    nu, p, sensitivity, rows = state.nu, state.p, work.sensitivity, work.rows
+    z, r, n = scratch.z, scratch.r, len(task.scale)
+    count, gated, wild = 0, False, False
+    for i in range(6):
+        z[i], r[i] = sample.odometry[i], sample.odometry_variance[i]
+        if i >= 3 and np.isfinite(sample.gyro[i - 3]):
+            z[i], r[i] = sample.gyro[i - 3], sample.gyro_variance
+        if not np.isfinite(z[i]) or not np.isfinite(r[i]):
+            z[i] = np.nan
+            continue
+        for k in range(rows.shape[1]):
+            rows[count, k] = sensitivity[i, k]
+        count += 1
+    if count == 0:
         info.reason = WAITING
         return
-    in_motion(task.structure, sample.moving, work.moves)
-    _update(task, state, work, y, info)
+    # what an innovation owes to coefficients still to be learnt is no surprise
+    _whiten(work.root, rows, n, count, scratch.product)
+    count = 0
+    for i in range(6):
+        if np.isnan(z[i]):
+            continue
+        declared, since = r[i], state.adaptation[i].since
+        r[i] *= max(c.noise[i], 1.0)
+        e = z[i] - nu[i] + rows[count, n]
+        for a in range(n):
+            e += sensitivity[i, a] * state.deviation[a]
+        spread = p[i, i] + r[i] + scratch.product[0, count]
+        count += 1
+        info.ratio[i] = e * e / spread
+        gated = gated or info.ratio[i] > s.gate**2
+        wild = wild or info.ratio[i] > _WILD**2
+        blend = min(since / _SURPRISE_TIME, 1.0)
+        c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
+        seen = (min(info.ratio[i], _STEADY) - 1.0) * spread + r[i]
+        c.noise[i] += min(since / _NOISE_TIME, 0.1) * (seen / declared - c.noise[i])
+        adapt(state.adaptation[i], task.process[0].floor[i], e / np.sqrt(spread))
+    c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
+    if wild or (gated and c.refused < _PATIENCE):
+        c.refused += 1.0
+        # It may have been the wrench: the observer would be wrong for long.
+        c.started = False
+        info.reason = GATED
+        return
+    _absorb(state, work, n)
+    _stack(work.root, rows, c.free, 6, 0, work.line)
+
+
+@reordered
+def _whiten(root, rows, n, count, squares):
+    """rows (count, columns) -> [w | -w z], w = phi R^-1; squares[0] (count,) of w: phi P phi'."""
+    columns = root.shape[1]
+    for i in range(count):
+        total = 0.0
+        rows[i, n] = 0.0
+        for a in range(n):
+            f = rows[i, a] / root[a, a]
+            total += f * f
+            for k in range(columns):
+                rows[i, k] -= f * root[a, k]
+        squares[0, i] = total
+
+
+@reordered
+def _absorb(state, work, n):
+    """Take in the measured velocities, one after the other; their rows (6, columns) of the root."""
+    s, nu, p = work.scratch[0], state.nu, state.p
+    sensitivity, rows = work.sensitivity, work.rows
+    columns, q = rows.shape[1], 0
+    for i in range(6):
+        if s.z[i] != s.z[i]:
+            continue
+        total = p[i, i] + s.r[i]
+        weight, e = 1.0 / np.sqrt(total), s.z[i] - nu[i]
+        goal = e
+        for a in range(n):
+            goal += sensitivity[i, a] * state.deviation[a]
+        for k in range(columns):
+            rows[q, k] = weight * sensitivity[i, k]
+        rows[q, n] = weight * goal
+        for a in range(6):
+            s.middle[a] = p[a, i]
+        for a in range(6):
+            gain = s.middle[a] / total
+            nu[a] += gain * e
+            for k in range(columns):
+                sensitivity[a, k] -= gain / weight * rows[q, k]
+            sensitivity[a, n] = 0.0
+            for b in range(6):
+                p[a, b] -= gain * s.middle[b]
+        q += 1
+    for i in range(q, 6):
+        for k in range(columns):
+            rows[i, k] = 0.0
+
+
+@inlined
+def _learn(task, state, work, info):
+    """The observer takes over what the rows since the last time have taught."""
+    s, c, n = task.settings[0], state.scalars[0], len(state.order)
+    _invert(work.root, work.inverse)
+    info.condition = _norm(work.root, n, work.line) * _norm(work.inverse, n, work.line)
+    _add_up(state, work, np.exp(-c.since_update / _LAG))
+    _take_over(task, state, work)
+    surprised = False
+    for i in range(6):
+        surprised = surprised or c.surprise[i] > _SURPRISING
+    if surprised if s.variable else s.forgetting_factor < 1.0:
+        info.forgetting = _forget(task, state, work, c.since_update / _RELEARNING_TIME)
     c.since_update = 0.0
 
 
 @reordered
-def _regress(task, work, sample):
-    """work.now: the unfiltered rows, in units of the prior about the prior."""
-    momentum, force, now, p, nu = work.momentum, work.force, work.now, work.known, sample.nu
-    n, w = len(task.scale), task.settings[0].corner
-    columns(task.structure, nu, momentum, force)
+def _add_up(state, work, decay):
+    """The change of the solution, and the score ``g = R'R change`` that did it."""
+    n, root, change, gradient = len(state.order), work.root, work.change, work.gradient
+    _solve(root, change)
+    for a in range(n):
+        change[a], state.deviation[a] = change[a] - state.deviation[a], change[a]
+        gradient[a] = 0.0
     for i in range(6):
-        p[i] = 0.0
-        for j in range(6):
-            p[i] += task.rigid_body[i, j] * nu[j]
-    h = coriolis_of(
-        (p[0], p[1], p[2], p[3], p[4], p[5]), (nu[0], nu[1], nu[2], nu[3], nu[4], nu[5])
-    )
-    for i in range(6):
-        known_momentum, known_force = p[i], h[i]
-        for j in range(3):
-            known_force -= task.restoring[i, j] * sample.down[j]
-        for j in range(len(task.theta)):
-            known_momentum += momentum[i, j] * task.theta[j]
-            known_force += force[i, j] * task.theta[j]
-        for j in range(n):
-            e = task.estimated[j]
-            now[1, i, j] = momentum[i, e] * task.scale[j]
-            now[0, i, j] = force[i, e] * task.scale[j] - w * now[1, i, j]
-        now[1, i, n] = -known_momentum
-        now[0, i, n] = w * known_momentum - known_force
-
-
-@reordered
-def _filter(filters, work, corner, a, b0, b1):
-    """Two sections in series, and the derivative; all channels as one long line."""
-    x, y, u = filters[0].reshape(-1), filters[1].reshape(-1), filters[2].reshape(-1)
-    last, before = filters[3].reshape(-1), work.before
-    force, momentum = work.now[0].reshape(-1), work.now[1].reshape(-1)
-    for j in range(len(x)):
-        before[j] = corner * last[j] + x[j]
-    for j in range(len(x)):
-        x[j] = a * x[j] + b0 * u[j] + b1 * force[j]
-    for j in range(len(x)):
-        y[j] = a * y[j] + b0 * before[j] + b1 * (corner * momentum[j] + x[j])
-    for j in range(len(x)):
-        u[j] = force[j]
-    for j in range(len(x)):
-        last[j] = momentum[j]
-
-
-@inlined
-def _update(task, state, work, y, info):
-    """Take the filtered rows y (6, n + 1) into the estimate."""
-    s, c, lagged = task.settings[0], state.scalars[0], state.lagged
-    rows, goals, noise, deviation = work.rows, work.goals, work.noise, work.deviation
-    n = len(deviation)
-    _invert(work.root, work.inverse)
-    info.condition = _norm(work.root, n, work.line) * _norm(work.inverse, n, work.line)
-    # Rows closer than the filter's memory repeat each other: they count as one.
-    repeats = max(1.0, 2.0 / (s.corner * c.since_update))
-    surprise, driven, gated, wild = 0.0, 0, False, False
-    for i in range(6):
-        for j in range(n):
-            rows[i, j] = y[i, j]
-        rows[i, n] = 0.0
-        predicted = c.variance[i] + _spread(work.inverse, rows[i], n, work.line)
-        # what of the squared residual is noise, and not a coefficient still to be learnt
-        noise[i] = info.residual[i] ** 2 * c.variance[i] / predicted
-        if c.drive[i] <= c.variance[i]:
-            continue
-        driven += 1
-        info.ratio[i] = info.residual[i] ** 2 / predicted
-        surprise += min(info.ratio[i], s.gate**2)
-        gated = gated or info.ratio[i] > s.gate**2
-        wild = wild or info.ratio[i] > _WILD**2
-    if driven > 0:
-        blend = min(c.since_update / _SURPRISE_TIME, 1.0)
-        c.surprise += blend * (surprise / driven - c.surprise)
-    c.refused *= np.exp(-c.since_update / _PATIENCE_TIME)
-    if wild or (gated and c.refused < _PATIENCE):
-        c.refused += 1.0
-        # The outlier would ring on in the filters; beginning anew costs nothing but their memory.
-        c.started = False
-        info.reason = GATED
-        return
-    info.reason = USED
-    c.updates += 1
-
-    if s.variable:
-        if c.surprise > _SURPRISING:
-            info.forgetting = np.exp(-c.since_update / _FORGETTING_TIME)
-    else:
-        info.forgetting = s.forgetting_factor
-    for i in range(6):
-        used = 1.0 / np.sqrt(c.variance[i] * repeats) if c.drive[i] > c.variance[i] else 0.0
-        # What those coefficients are to explain that take part: the residual and their own share.
-        goal = info.residual[i] * used
-        for j in range(n):
-            # A coefficient whose motion is not above its noise stays out: least squares would
-            # learn from the noise.
-            rows[i, j] *= used if work.moves[task.estimated[j]] else 0.0
-            goal += rows[i, j] * deviation[j]
-        goals[i] = goal
-    if info.forgetting < 1.0:
-        _forget(work, n, info.forgetting)
-    for i in range(6):
-        rows[i, n] = goals[i]
-    _copy(rows, work.taken)
-    _stack(work.root, rows, n, 12 if info.forgetting < 1.0 else 6, work.line)
-
-    _solve(work.root, deviation)
-    gradient = work.gradient
-    for j in range(n):
-        gradient[j] = 0.0
-    blend = max(c.since_update / _NOISE_TIME, 1.0 / (20.0 + c.updates))
-    if c.surprise > _SURPRISING:
-        blend *= 0.2
-    _residuals(work.taken, deviation, work.errors)
-    for i in range(6):
-        e = work.errors[i]
-        for j in range(n):
-            gradient[j] += work.taken[i, j] * e
-        e2 = e * e * c.variance[i] * repeats if c.drive[i] > c.variance[i] else noise[i]
-        if c.updates > _SETTLED:
-            e2 = min(e2, _STEADY * c.variance[i])
-        c.variance[i] = max(c.variance[i] + blend * (e2 - c.variance[i]), s.floor[i] ** 2)
-    decay = np.exp(-c.since_update / s.lag)
+        total = 0.0
+        for a in range(n):
+            total += work.sensitivity[i, a] * change[a]
+        state.nu[i] += total
+    for a in range(n):
+        moved = 0.0
+        for b in range(a, n):
+            moved += root[a, b] * change[b]
+        for b in range(a, n):
+            gradient[b] += root[a, b] * moved
+    lagged = state.lagged
     for a in range(n):
         lagged[a] *= decay
     for a in range(n):
@@ -480,17 +792,6 @@ def _update(task, state, work, y, info):
             work.score[a, b] += gradient[a] * (gradient[b] + lagged[b]) + lagged[a] * gradient[b]
     for a in range(n):
         lagged[a] += gradient[a]
-
-
-@kernel
-def first_order(corner, dt):
-    """a, b0, b1 of ``x = a x + b0 u_before + b1 u_now``.
-
-    The exact response of corner / (s + corner) to an input that is linear between samples.
-    """
-    a = np.exp(-corner * dt)
-    b1 = 1.0 - (1.0 - a) / (corner * dt)
-    return a, (1.0 - a) - b1, b1
 
 
 @kernel
@@ -518,22 +819,11 @@ def _solve(root, x):
         x[a] = total / root[a, a]
 
 
-@reordered
-def _residuals(rows, x, out):
-    """out (6,): what rows (6, n + 1) = [phi | y] leave unexplained, y - phi x."""
-    n = len(x)
-    for i in range(6):
-        total = 0.0
-        for j in range(n):
-            total += rows[i, j] * x[j]
-        out[i] = rows[i, n] - total
-
-
 @kernel
 def inverse_of(root):
     """R^-1 (n, n) of the root (n, n + 1) = [R | z]."""
     n = len(root)
-    columns = _LANES * ((n + 2) // _LANES + 1)
+    columns = _WIDTH * ((n + 2) // _WIDTH + 1)
     padded, inverse = np.zeros((n + 2, columns)), np.zeros((n + 2, columns))
     _copy(root, padded)
     _invert(padded, inverse)
@@ -573,26 +863,20 @@ def _norm(matrix, n, line):
 
 
 @reordered
-def _spread(inverse, phi, n, line):
-    """phi' (R'R)^-1 phi: variance of the prediction, in units of that of the noise."""
-    _combine(phi, inverse, n, line)
-    total = 0.0
-    for k in range(len(line)):
-        total += line[k] * line[k]
-    return total
+def _stack(root, rows, free, count, leaving, dot):
+    """Householder: make [root; rows] upper triangular again in its first ``free`` columns.
 
-
-@reordered
-def _stack(root, rows, n, count, dot):
-    """Householder: make [root; rows] upper triangular again; the first ``count`` rows are used up.
-
-    The first six rows come in, further ones leave: with J their signs, Q' J Q = J.
+    The first ``count`` rows come in, the ``leaving`` ones from the seventh on leave: with J their
+    signs, Q' J Q = J (hyperbolic Householder). Both numbers are multiples of three. What the rows
+    say about the other columns is left over.
     """
     columns = root.shape[1]
-    for j in range(n):
+    for j in range(free):
         below = 0.0
         for i in range(count):
-            below += rows[i, j] ** 2 if i < 6 else -(rows[i, j] ** 2)
+            below += rows[i, j] ** 2
+        for i in range(6, 6 + leaving):
+            below -= rows[i, j] ** 2
         if below == 0.0:
             continue
         pivot = root[j, j]
@@ -602,15 +886,23 @@ def _stack(root, rows, n, count, dot):
         for k in range(columns):
             dot[k] = head * root[j, k]
         for i in range(0, count, 3):
-            sign = 1.0 if i < 6 else -1.0
-            f, g, h = sign * rows[i, j], sign * rows[i + 1, j], sign * rows[i + 2, j]
+            f, g, h = rows[i, j], rows[i + 1, j], rows[i + 2, j]
             for k in range(columns):
                 dot[k] += f * rows[i, k] + g * rows[i + 1, k] + h * rows[i + 2, k]
+        for i in range(6, 6 + leaving, 3):
+            f, g, h = rows[i, j], rows[i + 1, j], rows[i + 2, j]
+            for k in range(columns):
+                dot[k] -= f * rows[i, k] + g * rows[i + 1, k] + h * rows[i + 2, k]
         head *= beta
         for k in range(columns):
             root[j, k] -= head * dot[k]
         root[j, j] = alpha
         for i in range(count):
+            f = beta * rows[i, j]
+            for k in range(columns):
+                rows[i, k] -= f * dot[k]
+            rows[i, j] = 0.0
+        for i in range(6, 6 + leaving):
             f = beta * rows[i, j]
             for k in range(columns):
                 rows[i, k] -= f * dot[k]
@@ -621,32 +913,38 @@ def _stack(root, rows, n, count, dot):
 
 
 @reordered
-def _forget(work, n, factor):
-    """Leave ``factor`` of the information in the subspace that the rows excite, and only there.
+def _forget(task, state, work, share):
+    """Forget in the directions that the sensitivities see, and only there; the smallest factor.
 
-    With A = R'R, u = R phi' and Q an orthonormal basis of the u of all excited rows::
+    With A = R'R, u = R phi' and q_i an orthonormal basis of the u of all excited rows::
 
-        A_new = R' (I - (1 - factor) Q Q') R = A - V V',     V = sqrt(1 - factor) R' Q
+        A_new = R' (I - sum (1 - f_i) q_i q_i') R = A - V V',     V_i = sqrt(1 - f_i) R' q_i
 
-    V' becomes the last six rows. The estimate stays; the score's covariance S goes with the
-    information: with ``T = A_new A^-1 = I - V W'``, ``W = sqrt(1 - factor) R^-1 Q``::
+    f_i is the configured factor. Or, while row i is surprised, the one that gives the direction
+    w = R^-1 q_i the variance that a random walk would, ``f = 1 / (1 + added / |w|^2)``, up to the
+    prior's. V' leaves the root. The estimate stays; the score's covariance S goes with the
+    information: with ``T = A_new A^-1 = I - V W'``, ``W_i = sqrt(1 - f_i) R^-1 q_i``::
 
         T S T' = S - V D' - D V',     D = S W - V (W' S W) / 2
     """
+    s, c, n = task.settings[0], state.scalars[0], len(state.order)
     root, score, rows, basis = work.root, work.score, work.rows, work.basis
-    v, w, d, product = work.lost[0], work.lost[1], work.lost[2], work.product
-    columns, count, share = root.shape[1], 0, np.sqrt(1.0 - factor)
+    w, d, product = work.lost[0], work.lost[1], work.scratch[0].product
+    columns, count, smallest = root.shape[1], 0, 1.0
     for i in range(6):
+        if s.variable and not c.surprise[i] > _SURPRISING:
+            continue
+        total = state.p[i, i] + work.scratch[0].r[i]
         size, left = 0.0, 0.0
         for k in range(columns):
-            size += rows[i, k] ** 2
-            w[count, k] = rows[i, k]
-        if size < _EXCITED:
+            w[count, k] = work.sensitivity[i, k] if k < c.free else 0.0
+            size += w[count, k] ** 2 / total
+        if not size > _EXCITED:  # NaN, too
             continue
         for a in range(n):
             total = 0.0
             for k in range(columns):
-                total += root[a, k] * rows[i, k]
+                total += root[a, k] * w[count, k]
             basis[count, a] = total
             left += total * total
         whole = left
@@ -671,36 +969,66 @@ def _forget(work, n, factor):
             for k in range(columns):
                 w[count, k] *= f
             count += 1
-    for b in range(6):
-        f = share if b < count else 0.0
+    for b in range(count):
+        factor = s.forgetting_factor
+        if s.variable:
+            factor = max(_factor(work, w[b], share), _SMALLEST_FACTOR)
+        smallest = min(smallest, factor)
+        f = np.sqrt(1.0 - factor)
         for k in range(columns):
             basis[b, k] *= f
         for k in range(columns):
             w[b, k] *= f
-        _combine(basis[b], root, n, rows[6 + b])
-        _combine(w[b], score, n, d[b])
-        for k in range(columns):
-            v[b, k] = rows[6 + b, k]
-        v[b, n] = 0.0
     for b in range(6):
-        for c in range(6):
+        v = rows[6 + b]
+        if b >= count:
+            for k in range(columns):
+                v[k] = 0.0
+                d[b, k] = 0.0
+            continue
+        _combine(basis[b], root, n, v)
+        _combine(w[b], score, n, d[b])
+    for b in range(count):
+        for e in range(count):
             total = 0.0
             for k in range(columns):
-                total += w[c, k] * d[b, k]
-            product[b, c] = 0.5 * total
-    for b in range(6):
-        for c in range(6):
-            f = product[b, c]
-            for k in range(columns):
-                d[b, k] -= f * v[c, k]
-    for b in range(0, 6, 3):
+                total += w[e, k] * d[b, k]
+            product[b, e] = 0.5 * total
+    for b in range(count):
+        for e in range(count):
+            f = product[b, e]
+            for k in range(n):
+                d[b, k] -= f * rows[6 + e, k]
+    for b in range(0, count, 3):
         for a in range(n):
-            f, g, h = v[b, a], v[b + 1, a], v[b + 2, a]
+            f, g, h = rows[6 + b, a], rows[7 + b, a], rows[8 + b, a]
             x, y, z = d[b, a], d[b + 1, a], d[b + 2, a]
-            for k in range(columns):
+            for k in range(n):
                 forth = f * d[b, k] + g * d[b + 1, k] + h * d[b + 2, k]
-                back = x * v[b, k] + y * v[b + 1, k] + z * v[b + 2, k]
+                back = x * rows[6 + b, k] + y * rows[7 + b, k] + z * rows[8 + b, k]
                 score[a, k] -= forth + back
+    # V' x goes with V', so that the solution stays
+    _stack(root, rows, n, 0, 6, work.line)
+    return smallest
+
+
+@reordered
+def _factor(work, w, share):
+    """Of the information in direction w (columns,): see :func:`_forget`."""
+    inverse, line, n = work.inverse, work.line, len(work.scale)
+    size, present = 0.0, 0.0
+    for k in range(n):
+        size += w[k] * w[k]
+    # variance along w: |R^-T w|^2 / |w|^2
+    for k in range(len(line)):
+        line[k] = 0.0
+    for a in range(n):
+        for k in range(len(line)):
+            line[k] += w[a] * inverse[a, k]
+    for k in range(len(line)):
+        present += line[k] * line[k]
+    added = share * max(1.0 - present / size, 0.0)
+    return 1.0 / (1.0 + added / size)
 
 
 @reordered
