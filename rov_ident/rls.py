@@ -99,6 +99,7 @@ _RELEARNING_TIME = 20.0  # s; in which what a row sees then becomes as uncertain
 _SMALLEST_FACTOR = 0.1  # of the information in a direction is kept in any one update
 _PEAK_TIME = 5.0  # s; over which a peak of a velocity is remembered
 _MOVING = 4.0  # that peak's square over the noise variance from which the component moves
+_NOISE_PEAK = 16.0  # variances; no square of a noise is larger in a minute
 _LAG = 4.0  # s; of the window over the score's correlation
 _EXCITED = 0.01  # a row with less information than this, relative to the prior, excites nothing
 _SHIFT = 1e-6  # m/s, rad/s; of a velocity, for the Jacobian
@@ -389,8 +390,8 @@ def _step(task, state, work, sample, info):
         _restart(state, work, sample)
     else:
         c.since_update += sample.dt
+        _judge_motion(task, state, work, sample)
         if _predict(task, state, work, sample):
-            _judge_motion(task, state, work, sample)
             _update(task, state, work, sample, info)
         else:
             info.reason = UNPREDICTABLE
@@ -469,6 +470,7 @@ def _predict(task, state, work, sample):
     """Velocities, covariance, sensitivities to the sample's time; False if out of all reason."""
     s, nu, p, sensitivity = work.scratch[0], state.nu, state.p, work.sensitivity
     noise, inverse, constants = s.noise, s.inverse, task.process[0]
+    n, free = len(work.scale), state.scalars[0].free
     for i in range(6):
         s.force[i], s.slope[i] = sample.wrench[i], sample.wrench_slope[i]
         for j in range(3):
@@ -492,11 +494,11 @@ def _predict(task, state, work, sample):
         _linearise(task, work, nu, (step + 0.5) * dt - 0.5 * sample.dt, dt)
         # the regressor, in the middle of the step
         columns(task.structure, s.rate, work.of_rate, work.of_motion)
-        columns(task.structure, s.middle, work.momentum, work.of_motion)
-        for i in range(6):
-            for a in range(len(work.scale)):
-                e = work.estimated[a]
-                work.drive[i, a] = -work.scale[a] * (work.of_rate[i, e] + work.of_motion[i, e])
+        if free < n:
+            _drive(work, task.structure, s.middle, free, n)
+            for i in range(6):
+                s.middle[i] *= work.moving[i]  # or products with mere noise would be learnt from
+        _drive(work, task.structure, s.middle, 0, free)
         _advance(s.transition, sensitivity, s.into, work.drive, work.rows)
         for i in range(6):
             nu[i] += dt * s.rate[i]
@@ -517,6 +519,16 @@ def _predict(task, state, work, sample):
     for i in range(6):
         fastest += nu[i] * nu[i]
     return fastest < _FASTEST**2  # not so with NaN
+
+
+@inlined
+def _drive(work, structure, nu, first, end):
+    """work.drive of these columns: wrench that a unit more of each coefficient adds to the motion."""
+    columns(structure, nu, work.momentum, work.of_motion)
+    for i in range(6):
+        for a in range(first, end):
+            e = work.estimated[a]
+            work.drive[i, a] = -work.scale[a] * (work.of_rate[i, e] + work.of_motion[i, e])
 
 
 @reordered
@@ -596,8 +608,10 @@ def _judge_motion(task, state, work, sample):
         r = sample.odometry_variance[i]
         if i >= 3 and np.isfinite(sample.gyro[i - 3]):
             r = sample.gyro_variance
-        c.peak[i] = max(c.peak[i] * decay, state.nu[i] ** 2)
-        work.moving[i] = 1 if c.peak[i] > _MOVING * r else 0
+        # less what the observer's own noise reaches now and then
+        surely = state.nu[i] ** 2 - _NOISE_PEAK * state.p[i, i]
+        c.peak[i] = max(c.peak[i] * decay, surely)
+        work.moving[i] = 1 if c.peak[i] > _MOVING * max(c.noise[i], 1.0) * r else 0
     in_motion(task.structure, work.moving, work.moves)
     free, sorted_already = 0, True
     for a in range(len(work.estimated)):
