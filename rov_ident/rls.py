@@ -92,7 +92,7 @@ _WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
 _PATIENCE = 1.5  # lesser outliers in short order from which the vehicle has changed
 _PATIENCE_TIME = 3.0  # s; over which that is counted
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in the noise
-_NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged
+_NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged; less at first
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 3.0  # its value from which the vehicle has changed; 1 is expected
 _RELEARNING_TIME = 20.0  # s; in which what a row sees then becomes as uncertain as at first
@@ -702,7 +702,8 @@ def _update(task, state, work, sample, info):
         blend = min(since / _SURPRISE_TIME, 1.0)
         c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
         seen = (min(info.ratio[i], _STEADY) - 1.0) * spread + r[i]
-        c.noise[i] += min(since / _NOISE_TIME, 0.1) * (seen / declared - c.noise[i])
+        averaging = min(1.0 + 0.25 * state.adaptation[i].seen, _NOISE_TIME)
+        c.noise[i] += min(since / averaging, 0.1) * (seen / declared - c.noise[i])
         adapt(state.adaptation[i], task.process[0].floor[i], e / np.sqrt(spread))
     c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
     if wild or (gated and c.refused < _PATIENCE):

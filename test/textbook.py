@@ -8,8 +8,6 @@ import dataclasses
 import itertools
 
 import numpy as np
-from scipy.signal import cont2discrete
-
 from rov_ident import sensors
 from rov_ident.frames import quaternion_to_matrix
 from rov_ident.model import skew
@@ -151,76 +149,56 @@ def runge_kutta(f, t, x, dt):
     return x + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d)
 
 
-# ------------------------------------------------------------------ filtered regression
+# ------------------------------------------------------------------ observer
 
 
-def filtered(inputs, jumps, corner, dt):
-    """Two sections w/(s + w) in series, of ``d/dt(jumps) + inputs``; all (N, ...), dt uniform.
+def innovations(config, theta, rows, adapted, gains=None):
+    """Innovations (k,), their variances (k,) and gains of an extended Kalman filter of nu.
 
-    As one state-space system for each section, discretised by scipy for an input that is linear
-    between samples; the derivative is integrated by parts: s w/(s + w) = w - w^2/(s + w).
+    Linear velocities and gyro are taken one after the other where they are measured; ``adapted``
+    holds, for each row, the density (6,) of the process noise and the factor (6,) on the variances.
+    Given ``gains``, the covariance is not needed, and these are used.
     """
-    w = corner
-    system = (np.array([[-w]]), np.array([[w]]), np.array([[1.0]]), np.array([[0.0]]))
-    a, b, c, d = (m[0, 0] for m in cont2discrete(system, dt, method="foh")[:4])
+    model, wrench = config.model, config.wrench
+    nu, p = rows[0]["nu"].copy(), np.diag(rows[0]["odometry_variance"])
+    inverse = np.linalg.inv(model.with_theta(theta).mass_matrix)
+    e, s, used = [], [], []
+    for row, (density, factor) in zip(rows[1:], adapted[1:], strict=True):
+        dt = row["dt"]
 
-    def section(u, state):
-        # scipy's form has its state at the sample without direct term: y = c x + d u
-        out, x = np.empty_like(u), (state - d * u[0]) / c
-        for k in range(len(u)):
-            out[k] = c * x + d * u[k]
-            x = a * x + b * u[k]
-        return out
+        def rate(t, nu, row=row, dt=dt):
+            tau = row["wrench"] + (t - 0.5 * dt) * row["wrench_slope"]
+            down = row["down"] + (t - dt) * row["down_slope"]
+            return acceleration(model.body, model.coefficients, theta, nu, tau, down)
 
-    # the first section begins with its memory of the momentum full: no transient
-    first = section(inputs - w * jumps, -w * jumps[0]) + w * jumps
-    return section(first, np.zeros_like(first[0]))
-
-
-def regression(model, rows, corner):
-    """Rows Phi (N, 6, m) and y (N, 6) of ``y = Phi theta`` for samples with uniform dt."""
-    m, dt = len(model.theta), rows["dt"][1]
-    phi = np.empty((len(rows), 6, m))
-    none = model.with_theta(np.zeros(m))
-    known_force, known_momentum = np.empty((2, len(rows), 6))
-    zero = np.zeros(6)
-    for k, row in enumerate(rows):
-        nu = row["nu"]
-        known_momentum[k] = model.body.mass_matrix @ nu
-        known_force[k] = none.wrench(nu, zero, row["down"])
-    for j in range(m):
-        unit = model.with_theta(np.eye(m)[j])
-        added = unit.mass_matrix - model.body.mass_matrix
-        force = np.array([unit.wrench(r["nu"], zero, r["down"]) for r in rows]) - known_force
-        phi[:, :, j] = filtered(force, rows["nu"] @ added.T, corner, dt)
-    y = -filtered(known_force, known_momentum, corner, dt)
-    # the wrench: a line of its own in every interval, so begin and end differ
-    begin = rows["wrench"] - 0.5 * dt * rows["wrench_slope"]
-    end = rows["wrench"] + 0.5 * dt * rows["wrench_slope"]
-    system = (np.array([[-corner]]), np.array([[corner]]), np.array([[1.0]]), np.array([[0.0]]))
-    stage = np.zeros((len(rows), 6))
-    for k in range(1, len(rows)):
-        stage[k] = _line(system, stage[k - 1], begin[k], end[k], dt)
-    total = np.zeros((len(rows), 6))
-    for k in range(1, len(rows)):
-        total[k] = _line(system, total[k - 1], stage[k - 1], stage[k], dt)
-    return phi, y + total
-
-
-def _line(system, x, begin, end, dt):
-    """The section's state after an input that goes in a line from begin to end."""
-    w = system[1][0, 0]
-    slope = (end - begin) / dt
-    # particular solution begin + slope (t - 1/w), and the rest decays
-    return begin + slope * (dt - 1.0 / w) + (x - begin + slope / w) * np.exp(-w * dt)
-
-
-def least_squares(phi, y, weights, mean, std):
-    """Coefficients (n,) and R'R (n, n) in prior units; phi (k, 6, n), y (k, 6), weights (k, 6)."""
-    root = np.sqrt(weights)
-    a = np.vstack([np.eye(len(mean)), (phi * root[:, :, None]).reshape(-1, len(mean)) * std])
-    b = np.concatenate([np.zeros(len(mean)), ((y - phi @ mean) * root).ravel()])
-    return mean + std * np.linalg.lstsq(a, b, rcond=None)[0], a.T @ a
+        start = nu
+        nu = runge_kutta(rate, 0.0, start, dt)
+        if gains is None:
+            transition = np.empty((6, 6))
+            for i in range(6):
+                shift = 1e-6 * np.eye(6)[i]
+                there, back = (runge_kutta(rate, 0.0, start + f * shift, dt) for f in (1, -1))
+                transition[:, i] = (there - back) / 2e-6
+            strength = (wrench.relative_std * row["wrench"]) ** 2 + np.square(wrench.floor_std)
+            strength *= wrench.correlation_time
+            noise = inverse @ np.diag(strength) @ inverse.T + np.diag(density)
+            p = transition @ p @ transition.T + dt * noise
+        for i in range(6):
+            z = row["odometry"][i] if i < 3 else row["gyro"][i - 3]
+            if np.isnan(z):
+                continue
+            if gains is None:
+                r = row["odometry_variance"][i] if i < 3 else row["gyro_variance"]
+                total = p[i, i] + r * max(factor[i], 1.0)
+                gain = p[:, i] / total
+                p = p - np.outer(gain, p[i])
+            else:
+                total, gain = 1.0, gains[len(e)]
+            e.append(z - nu[i])
+            s.append(total)
+            used.append(gain)
+            nu = nu + gain * e[-1]
+    return np.array(e), np.array(s), used
 
 
 # ------------------------------------------------------------------ projection
