@@ -27,11 +27,12 @@ but their uncertainty is that of the others, too. With their columns behind the 
 distribution of the others *given* them, and that alone takes new rows: the Schmidt-Kalman filter in
 square-root information form.
 
-*Forgetting* touches only directions that the present motion excites (subspace-of-information
-forgetting, Lai and Bernstein 2024): unexcited ones keep their information, so nothing winds up. By
-default it waits for evidence: while the innovations of an axis are larger than they should be, what
-its row sees gains variance as on a random walk, up to the prior's. To multiply the information by a
-fixed factor instead takes the longer the better something was known.
+*Forgetting* waits for evidence. While the innovations of an axis are larger than they should be, the
+coefficients that would show there gain variance as on a random walk, up to the prior's (to multiply
+the information by a factor instead takes the longer the better something was known). Constant
+forgetting, where it is asked for, touches only directions that the present motion excites
+(subspace-of-information forgetting, Lai and Bernstein 2024). Either way unexcited directions keep
+their information, so nothing winds up.
 
 *Standard deviations* do not assume white innovations: the covariance of the accumulated score
 ``sum of phi' e / s``, with its correlation in time, stands between two inverse informations (the
@@ -54,7 +55,7 @@ from rov_ident.model import (
     generalized_force,
     in_motion,
 )
-from rov_ident.process_noise import ADAPTATION, adapt, first_adaptation, interrupt, process
+from rov_ident.process_noise import adapt, first_adaptation, interrupt, process
 from rov_ident.residual import filtered_residual
 from rov_ident.samples import SAMPLE
 
@@ -95,8 +96,7 @@ _STEADY = 4.0  # a squared innovation counts for at most this often its variance
 _NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged; less at first
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 3.0  # its value from which the vehicle has changed; 1 is expected
-_RELEARNING_TIME = 20.0  # s; in which what a row sees then becomes as uncertain as at first
-_SMALLEST_FACTOR = 0.1  # of the information in a direction is kept in any one update
+_RELEARNING_TIME = 20.0  # s; in which the suspects then become as uncertain as at first
 _PEAK_TIME = 5.0  # s; over which a peak of a velocity is remembered
 _MOVING = 4.0  # that peak's square over the noise variance from which the component moves
 _NOISE_PEAK = 16.0  # variances; no square of a noise is larger in a minute
@@ -301,7 +301,7 @@ class Work(NamedTuple):
     sensitivity: Array  # (6, columns)
     drive: Array  # (6, columns)
     root: Array  # (n + 2, columns): [R | z]
-    inverse: Array  # (n + 2, columns): R^-1
+    inverse: Array  # (n + 2, columns): R^-1 as of the last time that the observer was told
     score: Array  # (n + 2, columns)
     spare: Array  # (n + 2, columns)
     rows: Array  # (12, columns): what comes in, and what is forgotten
@@ -772,11 +772,13 @@ def _learn(task, state, work, info):
     info.condition = _norm(work.root, n, work.line) * _norm(work.inverse, n, work.line)
     _add_up(state, work, np.exp(-c.since_update / _LAG))
     _take_over(task, state, work)
-    surprised = False
-    for i in range(6):
-        surprised = surprised or c.surprise[i] > _SURPRISING
-    if surprised if s.variable else s.forgetting_factor < 1.0:
-        info.forgetting = _forget(task, state, work, c.since_update / _RELEARNING_TIME)
+    if not s.variable and s.forgetting_factor < 1.0:
+        info.forgetting = s.forgetting_factor
+        _forget(task, state, work, s.forgetting_factor)
+    elif s.variable and _suspect(state, work):
+        share = min(c.since_update / _RELEARNING_TIME, 1.0)
+        info.forgetting = 1.0 - share
+        _loosen(state, work, share)
     c.since_update = 0.0
 
 
@@ -927,28 +929,129 @@ def _stack(root, rows, free, count, leaving, dot):
 # ---------------------------------------------------------------- forgetting
 
 
+@inlined
+def _suspect(state, work):
+    """work.moves (n,): of which columns a surprised axis would show a change; whether of any."""
+    c, any_of_them = state.scalars[0], False
+    for a in range(len(state.order)):
+        work.moves[a] = False
+        for i in range(6):
+            if a < c.free and c.surprise[i] > _SURPRISING:
+                shown = work.sensitivity[i, a] ** 2
+                work.moves[a] |= shown > state.p[i, i] + work.scratch[0].r[i]
+        any_of_them |= work.moves[a]
+    return any_of_them
+
+
 @reordered
-def _forget(task, state, work, share):
-    """Forget in the directions that the sensitivities see, and only there; the smallest factor.
+def _loosen(state, work, share):
+    """The vehicle has changed: P <- P + W, the estimate stays.
 
-    With A = R'R, u = R phi' and q_i an orthonormal basis of the u of all excited rows::
+    W is diagonal, a share of the prior for each suspect as it has room to it: what it would gain on
+    a random walk. With X = R^-1, P = X X', and [X W^1/2] is made triangular from the right
+    (Householder, row by row from the last), which is the inverse of the new root. The score's
+    covariance becomes that of a sandwich which has gained W, too.
+    """
+    n, root, x, extra, score = len(state.order), work.root, work.inverse, work.spare, work.score
+    columns = root.shape[1]
+    # C = P S P + W, by way of X (X' S X) X'
+    _multiply(score, x, n, extra)
+    _multiply_transposed(x, extra, n, score)
+    _multiply(x, score, n, extra)
+    _multiply_by_transposed(extra, x, n, score)
+    for a in range(n):
+        present = 0.0
+        for k in range(columns):
+            extra[a, k] = 0.0
+            present += x[a, k] ** 2
+        if work.moves[a]:
+            extra[a, a] = np.sqrt(share * max(1.0 - present, 0.0))
+            score[a, a] += extra[a, a] ** 2
+    for a in range(n - 1, -1, -1):
+        beside = 0.0
+        for k in range(columns):
+            beside += extra[a, k] ** 2
+        if beside == 0.0:
+            continue
+        pivot = x[a, a]
+        alpha = -np.sqrt(pivot * pivot + beside) if pivot > 0.0 else np.sqrt(pivot * pivot + beside)
+        head = pivot - alpha
+        beta = 2.0 / (head * head + beside)
+        for i in range(a):
+            dot = head * x[i, a]
+            for k in range(columns):
+                dot += extra[a, k] * extra[i, k]
+            dot *= beta
+            x[i, a] -= dot * head
+            for k in range(columns):
+                extra[i, k] -= dot * extra[a, k]
+        x[a, a] = alpha
+    _invert(x, root)
+    # S = R' (R C R') R
+    _multiply_by_transposed(score, root, n, extra)
+    _multiply(root, extra, n, score)
+    _multiply(score, root, n, extra)
+    _multiply_transposed(root, extra, n, score)
+    for a in range(n):
+        total = 0.0
+        for b in range(a, n):
+            total += root[a, b] * state.deviation[b]
+        root[a, n] = total
 
-        A_new = R' (I - sum (1 - f_i) q_i q_i') R = A - V V',     V_i = sqrt(1 - f_i) R' q_i
 
-    f_i is the configured factor. Or, while row i is surprised, the one that gives the direction
-    w = R^-1 q_i the variance that a random walk would, ``f = 1 / (1 + added / |w|^2)``, up to the
-    prior's. V' leaves the root. The estimate stays; the score's covariance S goes with the
-    information: with ``T = A_new A^-1 = I - V W'``, ``W_i = sqrt(1 - f_i) R^-1 q_i``::
+@reordered
+def _multiply(a, b, n, out):
+    """out = a b; only n x n of each."""
+    for i in range(n):
+        for k in range(n):
+            out[i, k] = 0.0
+        for j in range(n):
+            f = a[i, j]
+            for k in range(n):
+                out[i, k] += f * b[j, k]
+
+
+@reordered
+def _multiply_transposed(a, b, n, out):
+    """out = a' b."""
+    for i in range(n):
+        for k in range(n):
+            out[i, k] = 0.0
+        for j in range(n):
+            f = a[j, i]
+            for k in range(n):
+                out[i, k] += f * b[j, k]
+
+
+@reordered
+def _multiply_by_transposed(a, b, n, out):
+    """out = a b'."""
+    for i in range(n):
+        for k in range(n):
+            total = 0.0
+            for j in range(n):
+                total += a[i, j] * b[k, j]
+            out[i, k] = total
+
+
+@reordered
+def _forget(task, state, work, factor):
+    """Leave ``factor`` of the information in what the sensitivities see, and only there.
+
+    With A = R'R, u = R phi' and Q an orthonormal basis of the u of all excited rows::
+
+        A_new = R' (I - (1 - factor) Q Q') R = A - V V',     V = sqrt(1 - factor) R' Q
+
+    V' leaves the root. The estimate stays; the score's covariance S goes with the information: with
+    ``T = A_new A^-1 = I - V W'``, ``W = sqrt(1 - factor) R^-1 Q``::
 
         T S T' = S - V D' - D V',     D = S W - V (W' S W) / 2
     """
-    s, c, n = task.settings[0], state.scalars[0], len(state.order)
+    c, n = state.scalars[0], len(state.order)
     root, score, rows, basis = work.root, work.score, work.rows, work.basis
     w, d, product = work.lost[0], work.lost[1], work.scratch[0].product
-    columns, count, smallest = root.shape[1], 0, 1.0
+    columns, count, share = root.shape[1], 0, np.sqrt(1.0 - factor)
     for i in range(6):
-        if s.variable and not c.surprise[i] > _SURPRISING:
-            continue
         total = state.p[i, i] + work.scratch[0].r[i]
         size, left = 0.0, 0.0
         for k in range(columns):
@@ -984,66 +1087,38 @@ def _forget(task, state, work, share):
             for k in range(columns):
                 w[count, k] *= f
             count += 1
-    for b in range(count):
-        factor = s.forgetting_factor
-        if s.variable:
-            factor = max(_factor(work, w[b], share), _SMALLEST_FACTOR)
-        smallest = min(smallest, factor)
-        f = np.sqrt(1.0 - factor)
+    for b in range(6):
+        f = share if b < count else 0.0
         for k in range(columns):
             basis[b, k] *= f
         for k in range(columns):
             w[b, k] *= f
-    for b in range(6):
-        v = rows[6 + b]
-        if b >= count:
-            for k in range(columns):
-                v[k] = 0.0
-                d[b, k] = 0.0
-            continue
-        _combine(basis[b], root, n, v)
+        _combine(basis[b], root, n, rows[6 + b])  # with its part of z, so that the solution stays
         _combine(w[b], score, n, d[b])
-    for b in range(count):
-        for e in range(count):
+        for k in range(columns):
+            basis[b, k] = rows[6 + b, k]
+        basis[b, n] = 0.0
+    v = basis
+    for b in range(6):
+        for e in range(6):
             total = 0.0
             for k in range(columns):
                 total += w[e, k] * d[b, k]
             product[b, e] = 0.5 * total
-    for b in range(count):
-        for e in range(count):
+    for b in range(6):
+        for e in range(6):
             f = product[b, e]
-            for k in range(n):
-                d[b, k] -= f * rows[6 + e, k]
-    for b in range(0, count, 3):
+            for k in range(columns):
+                d[b, k] -= f * v[e, k]
+    for b in range(0, 6, 3):
         for a in range(n):
-            f, g, h = rows[6 + b, a], rows[7 + b, a], rows[8 + b, a]
+            f, g, h = v[b, a], v[b + 1, a], v[b + 2, a]
             x, y, z = d[b, a], d[b + 1, a], d[b + 2, a]
-            for k in range(n):
+            for k in range(columns):
                 forth = f * d[b, k] + g * d[b + 1, k] + h * d[b + 2, k]
-                back = x * rows[6 + b, k] + y * rows[7 + b, k] + z * rows[8 + b, k]
+                back = x * v[b, k] + y * v[b + 1, k] + z * v[b + 2, k]
                 score[a, k] -= forth + back
-    # V' x goes with V', so that the solution stays
     _stack(root, rows, n, 0, 6, work.line)
-    return smallest
-
-
-@reordered
-def _factor(work, w, share):
-    """Of the information in direction w (columns,): see :func:`_forget`."""
-    inverse, line, n = work.inverse, work.line, len(work.scale)
-    size, present = 0.0, 0.0
-    for k in range(n):
-        size += w[k] * w[k]
-    # variance along w: |R^-T w|^2 / |w|^2
-    for k in range(len(line)):
-        line[k] = 0.0
-    for a in range(n):
-        for k in range(len(line)):
-            line[k] += w[a] * inverse[a, k]
-    for k in range(len(line)):
-        present += line[k] * line[k]
-    added = share * max(1.0 - present / size, 0.0)
-    return 1.0 / (1.0 + added / size)
 
 
 @reordered

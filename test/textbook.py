@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 
 import numpy as np
+
 from rov_ident import sensors
 from rov_ident.frames import quaternion_to_matrix
 from rov_ident.model import skew
