@@ -1,7 +1,7 @@
 """Recursive least squares over the sensitivities of a model-based velocity observer.
 
-The recursive prediction-error method (Ljung and Soderstrom 1983, sec. 3.7) as ``init``, ``step`` and
-``fold``. A Kalman filter of the six velocities predicts each measured one with the present
+The recursive prediction-error method (Ljung and Soderstrom 1983, sec. 3.7) as ``init``, ``step``
+and ``fold``. A Kalman filter of the six velocities predicts each measured one with the present
 coefficients; how the prediction would change with the coefficients, ``phi = d nu / d theta``,
 follows from the same recursion, one column a coefficient::
 
@@ -19,18 +19,18 @@ velocities enters its moments by way of the Munk terms, biases the products and 
 axis by axis: six times the Cramer-Rao bound instead of one and a half (docs/accuracy.md).
 
 The information is kept as a triangular root R of ``R'R = sum of phi' phi / s`` (Householder; it
-keeps half the digits that the covariance form loses), in coefficients scaled by their prior standard
-deviation about their prior value: the prior is the unit matrix.
+keeps half the digits that the covariance form loses), in coefficients scaled by their prior
+standard deviation about their prior value: the prior is the unit matrix.
 
-*Coefficients whose motion is not well above its noise* are not learnt, or it would be from the noise;
-but their uncertainty is that of the others, too. With their columns behind the others', R holds the
-distribution of the others *given* them, and that alone takes new rows: the Schmidt-Kalman filter in
-square-root information form.
+*Coefficients whose motion is not well above its noise* are not learnt, or it would be from the
+noise; but their uncertainty is that of the others, too. With their columns behind the others', R
+holds the distribution of the others *given* them, and that alone takes new rows (consider
+parameters, Bierman 1977, ch. VIII). Nor do the others learn from products with such motion.
 
-*Forgetting* waits for evidence. While the innovations of an axis are larger than they should be, the
-coefficients that would show there gain variance as on a random walk, up to the prior's (to multiply
-the information by a factor instead takes the longer the better something was known). Constant
-forgetting, where it is asked for, touches only directions that the present motion excites
+*Forgetting* waits for evidence. While the innovations of an axis are larger than they should be,
+the coefficients that would show there gain variance as on a random walk, up to the prior's (to
+multiply the information by a factor instead takes the longer the better something was known).
+Constant forgetting, where it is asked for, touches only directions that the present motion excites
 (subspace-of-information forgetting, Lai and Bernstein 2024). Either way unexcited directions keep
 their information, so nothing winds up.
 
@@ -88,6 +88,8 @@ INFO = np.dtype(
 _MAX_STEP = 0.05  # s; of one step of the observer
 _PERIOD = 0.1  # s; the observer takes over the present coefficients this often
 _LIGHTEST = 0.2  # of the rigid body's own inertia: the observer is never lighter
+_REACH = 10.0  # prior standard deviations; the observer's coefficients are never further off
+_NOISIEST = 100.0  # times the declared variance; a measurement is never taken for worse
 _FASTEST = 50.0  # m/s, rad/s; the observer of a sane model never gets there
 _WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
 _PATIENCE = 1.5  # lesser outliers in short order from which the vehicle has changed
@@ -138,6 +140,7 @@ class Problem(NamedTuple):
     estimated: NDArray[np.int64]  # (n,) indices into theta
     theta: Array  # (m,) values of all coefficients: the prior of the estimated, the held others
     scale: Array  # (n,) prior standard deviations
+    highest: Array  # (n,) scaled deviation that the observer's coefficients do not exceed
     rigid_body: Array  # (6, 6)
     restoring: Array  # (6, 3)
 
@@ -149,7 +152,8 @@ class State(NamedTuple):
     root: Array  # (n, n + 1): [R | z], R upper triangular, of the scaled deviation from the prior
     score: Array  # (n, n): covariance of the accumulated score, the prior's included
     lagged: Array  # (n,): recent scores under the lag window
-    deviation: Array  # (n,): the scaled deviation that the observer works with
+    solution: Array  # (n,): of R x = z when the observer was told last
+    deviation: Array  # (n,): what the observer took over of it, within reason
     nu: Array  # (6,): velocities
     p: Array  # (6, 6): their covariance, the coefficients taken as known
     sensitivity: Array  # (6, n): d nu / d deviation
@@ -173,6 +177,7 @@ def problem(config: Config) -> Problem:
         prior.estimated,
         model.theta,
         prior.std,
+        np.where(prior.negative, np.minimum(-prior.mean / prior.std, _REACH), _REACH),
         model.body.mass_matrix,
         model.body.restoring,
     )
@@ -189,6 +194,7 @@ def init(task: Problem) -> State:
         np.arange(n),
         np.hstack([np.eye(n), np.zeros((n, 1))]),
         np.eye(n),
+        np.zeros(n),
         np.zeros(n),
         np.zeros(n),
         np.zeros(6),
@@ -394,15 +400,19 @@ def _step(task, state, work, sample, info):
         if _predict(task, state, work, sample):
             _update(task, state, work, sample, info)
         else:
+            # A model that runs away; a new start, from what was known before any data, shows better.
             info.reason = UNPREDICTABLE
             c.started = False
+            for a in range(len(state.deviation)):
+                state.deviation[a] = 0.0
+            _take_over(task, state, work)
             return
         if c.since_update >= _PERIOD - 1e-6:
             _learn(task, state, work, info)
     x = work.scratch[0]
     filtered_residual(
-        task.structure, work.one_theta, x.one_mass, task.restoring, s.corner, state.residual, sample,
-        info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended, info.residual,
+        task.structure, work.one_theta, x.one_mass, task.restoring, s.corner, state.residual,
+        sample, info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended, info.residual,
     )  # fmt: skip
 
 
@@ -523,7 +533,7 @@ def _predict(task, state, work, sample):
 
 @inlined
 def _drive(work, structure, nu, first, end):
-    """work.drive of these columns: wrench that a unit more of each coefficient adds to the motion."""
+    """work.drive of these columns: the wrench that a unit more of each coefficient adds."""
     columns(structure, nu, work.momentum, work.of_motion)
     for i in range(6):
         for a in range(first, end):
@@ -634,11 +644,13 @@ def _sort(task, state, work):
                 place[at] = a
                 at += 1
     order, lagged, deviation = state.order.copy(), state.lagged.copy(), state.deviation.copy()
+    solution = state.solution.copy()
     _copy(work.score, work.spare)
     for a in range(n):
         state.order[a] = order[place[a]]
         state.lagged[a] = lagged[place[a]]
         state.deviation[a] = deviation[place[a]]
+        state.solution[a] = solution[place[a]]
         for b in range(n):
             work.score[a, b] = work.spare[place[a], place[b]]
     _copy(work.sensitivity, work.drive)
@@ -704,6 +716,7 @@ def _update(task, state, work, sample, info):
         seen = (min(info.ratio[i], _STEADY) - 1.0) * spread + r[i]
         averaging = min(1.0 + 0.25 * state.adaptation[i].seen, _NOISE_TIME)
         c.noise[i] += min(since / averaging, 0.1) * (seen / declared - c.noise[i])
+        c.noise[i] = min(c.noise[i], _NOISIEST)
         adapt(state.adaptation[i], task.process[0].floor[i], e / np.sqrt(spread))
     c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
     if wild or (gated and c.refused < _PATIENCE):
@@ -770,7 +783,7 @@ def _learn(task, state, work, info):
     s, c, n = task.settings[0], state.scalars[0], len(state.order)
     _invert(work.root, work.inverse)
     info.condition = _norm(work.root, n, work.line) * _norm(work.inverse, n, work.line)
-    _add_up(state, work, np.exp(-c.since_update / _LAG))
+    _add_up(task, state, work, np.exp(-c.since_update / _LAG))
     _take_over(task, state, work)
     if not s.variable and s.forgetting_factor < 1.0:
         info.forgetting = s.forgetting_factor
@@ -783,17 +796,24 @@ def _learn(task, state, work, info):
 
 
 @reordered
-def _add_up(state, work, decay):
-    """The change of the solution, and the score ``g = R'R change`` that did it."""
+def _add_up(task, state, work, decay):
+    """The change of the solution, the observer's with it, and the score ``g = R'R change``."""
     n, root, change, gradient = len(state.order), work.root, work.change, work.gradient
-    _solve(root, change)
+    _solve(root, gradient)
+    for i in range(6):
+        total = 0.0
+        for a in range(n):
+            total -= work.sensitivity[i, a] * state.deviation[a]
+        state.nu[i] += total
     for a in range(n):
-        change[a], state.deviation[a] = change[a] - state.deviation[a], change[a]
+        change[a], state.solution[a] = gradient[a] - state.solution[a], gradient[a]
+        highest = task.highest[state.order[a]]
+        state.deviation[a] = min(max(gradient[a], -_REACH), highest)
         gradient[a] = 0.0
     for i in range(6):
         total = 0.0
         for a in range(n):
-            total += work.sensitivity[i, a] * change[a]
+            total += work.sensitivity[i, a] * state.deviation[a]
         state.nu[i] += total
     for a in range(n):
         moved = 0.0
@@ -995,7 +1015,7 @@ def _loosen(state, work, share):
     for a in range(n):
         total = 0.0
         for b in range(a, n):
-            total += root[a, b] * state.deviation[b]
+            total += root[a, b] * state.solution[b]
         root[a, n] = total
 
 

@@ -156,7 +156,7 @@ def test_what_the_nodes_publish(hydrodynamics, heavy, short_dive):
     from rov_ident.nodes.conversions import to_diagnostics
 
     online = OnlineEstimator(heavy, "rls")
-    for _, role, incoming in short_dive:
+    for _, role, incoming in short_dive[: len(short_dive) // 4]:  # of them, two converge later
         online.push(role, incoming)
     report = online.report()
     converged = [level == Level.OK for level in report.levels]

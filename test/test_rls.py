@@ -197,8 +197,7 @@ def test_constant_forgetting_is_the_textbook_formula(heavy, noisy):
 
 def test_surprise_adds_variance_to_what_would_show(heavy, noisy):
     """A diagonal share of the prior, as there is room to it; the estimate and the rest stay."""
-    task = rls.problem(heavy)
-    n, checked = len(task.scale), 0
+    task, checked = rls.problem(heavy), 0
     state, _ = rls.fold(task, rls.init(task), noisy[:1500])
     surge = [heavy.model.names.index(name) for name in ("X_udot", "X_u", "X_uu")]
     for k in range(1500, 1600):
