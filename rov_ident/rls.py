@@ -95,6 +95,7 @@ _WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
 _PATIENCE = 1.5  # lesser outliers in short order from which the vehicle has changed
 _PATIENCE_TIME = 3.0  # s; over which that is counted
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in the noise
+_STEADY_MEAN = 0.92  # what that is in the mean, of a normal distribution
 _NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged; less at first
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 3.0  # its value from which the vehicle has changed; 1 is expected
@@ -400,7 +401,7 @@ def _step(task, state, work, sample, info):
         if _predict(task, state, work, sample):
             _update(task, state, work, sample, info)
         else:
-            # A model that runs away; a new start, from what was known before any data, shows better.
+            # The model runs away; better begin again with what was known before any data.
             info.reason = UNPREDICTABLE
             c.started = False
             for a in range(len(state.deviation)):
@@ -701,7 +702,7 @@ def _update(task, state, work, sample, info):
     for i in range(6):
         if np.isnan(z[i]):
             continue
-        declared, since = r[i], state.adaptation[i].since
+        since = state.adaptation[i].since
         r[i] *= max(c.noise[i], 1.0)
         e = z[i] - nu[i] + rows[count, n]
         for a in range(n):
@@ -713,10 +714,11 @@ def _update(task, state, work, sample, info):
         wild = wild or info.ratio[i] > _WILD**2
         blend = min(since / _SURPRISE_TIME, 1.0)
         c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
-        seen = (min(info.ratio[i], _STEADY) - 1.0) * spread + r[i]
+        # as far as it is the noise, and not the prediction, that an innovation shows
         averaging = min(1.0 + 0.25 * state.adaptation[i].seen, _NOISE_TIME)
-        c.noise[i] += min(since / averaging, 0.1) * (seen / declared - c.noise[i])
-        c.noise[i] = min(c.noise[i], _NOISIEST)
+        excess = (min(info.ratio[i], _STEADY) - _STEADY_MEAN) * r[i] / spread
+        c.noise[i] *= 1.0 + min(since / averaging, 0.1) * excess
+        c.noise[i] = min(max(c.noise[i], 0.5), _NOISIEST)
         adapt(state.adaptation[i], task.process[0].floor[i], e / np.sqrt(spread))
     c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
     if wild or (gated and c.refused < _PATIENCE):
@@ -974,11 +976,11 @@ def _loosen(state, work, share):
     """
     n, root, x, extra, score = len(state.order), work.root, work.inverse, work.spare, work.score
     columns = root.shape[1]
-    # C = P S P + W, by way of X (X' S X) X'
-    _multiply(score, x, n, extra)
-    _multiply_transposed(x, extra, n, score)
-    _multiply(x, score, n, extra)
-    _multiply_by_transposed(extra, x, n, score)
+    # score: P S P
+    _transpose(x, n, extra)
+    _multiply(x, extra, n, root)
+    _multiply(root, score, n, extra)
+    _multiply(extra, root, n, score)
     for a in range(n):
         present = 0.0
         for k in range(columns):
@@ -1007,11 +1009,11 @@ def _loosen(state, work, share):
                 extra[i, k] -= dot * extra[a, k]
         x[a, a] = alpha
     _invert(x, root)
-    # S = R' (R C R') R
-    _multiply_by_transposed(score, root, n, extra)
-    _multiply(root, extra, n, score)
-    _multiply(score, root, n, extra)
-    _multiply_transposed(root, extra, n, score)
+    # score: R'R (P S P + W) R'R
+    _transpose(root, n, x)
+    _multiply(x, root, n, extra)
+    _multiply(extra, score, n, x)
+    _multiply(x, extra, n, score)
     for a in range(n):
         total = 0.0
         for b in range(a, n):
@@ -1021,7 +1023,7 @@ def _loosen(state, work, share):
 
 @reordered
 def _multiply(a, b, n, out):
-    """out = a b; only n x n of each."""
+    """out = a b, (n, n) each."""
     for i in range(n):
         for k in range(n):
             out[i, k] = 0.0
@@ -1031,27 +1033,12 @@ def _multiply(a, b, n, out):
                 out[i, k] += f * b[j, k]
 
 
-@reordered
-def _multiply_transposed(a, b, n, out):
-    """out = a' b."""
+@inner
+def _transpose(a, n, out):
+    """out = a'."""
     for i in range(n):
         for k in range(n):
-            out[i, k] = 0.0
-        for j in range(n):
-            f = a[j, i]
-            for k in range(n):
-                out[i, k] += f * b[j, k]
-
-
-@reordered
-def _multiply_by_transposed(a, b, n, out):
-    """out = a b'."""
-    for i in range(n):
-        for k in range(n):
-            total = 0.0
-            for j in range(n):
-                total += a[i, j] * b[k, j]
-            out[i, k] = total
+            out[i, k] = a[k, i]
 
 
 @reordered
