@@ -163,7 +163,7 @@ def runge_kutta(rate: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: flo
 
 
 class FilterpyUkf:
-    """filterpy's filter on the textbook model, with the same noise and parametrisation as ours."""
+    """filterpy's filter on the textbook model, with the same noise as ours."""
 
     def __init__(self, config: Config, task: ukf.Problem, state: ukf.State) -> None:
         self.config, self.task, self.model = config, task, TextbookModel(config.model)
@@ -173,9 +173,7 @@ class FilterpyUkf:
         self.filter.x, self.filter.P = state.x.copy(), state.p.copy()
 
     def theta(self, xi: np.ndarray) -> np.ndarray:
-        t = self.task
-        bent = -0.5 * t.scale * (xi + np.sqrt(xi * xi + 4.0))
-        return np.where(t.negative, bent, t.scale * xi)
+        return np.asarray(self.task.scale * xi)
 
     def moved(self, x: np.ndarray, dt: float, force: np.ndarray) -> np.ndarray:
         model = self.model
@@ -192,8 +190,6 @@ class FilterpyUkf:
         noise = (self.model.inverse * strength) @ self.model.inverse.T
         f.Q = np.zeros_like(f.P)
         f.Q[:6, :6] = (c.wrench.correlation_time * noise + np.diag(process)) * dt
-        room = np.maximum(1.0 - np.diag(f.P)[6:] / t.prior_variance, 0.0)
-        f.Q[6:, 6:] = np.diag(t.walk * dt * room)
         f.predict(dt=dt, force=row["wrench"] + t.restoring @ row["down"])
         f.update(row["odometry"], R=np.diag(row["odometry_variance"]))
 
@@ -210,7 +206,7 @@ def ukf_step() -> Iterator[Row]:
     begun, _ = ukf.fold(task, ukf.init(task), rows[:50])
     state, peer = begun, FilterpyUkf(config, task, begun)
     for row in rows[50:100]:
-        peer.step(row, state.process)
+        peer.step(row, state.adaptation["density"])
         state, _ = ukf.step(task, state, np.array([row]))
     scale = np.sqrt(np.diag(peer.filter.P))
     apart = float(np.abs((state.x - peer.filter.x) / np.maximum(scale, np.abs(state.x))).max())
@@ -219,7 +215,7 @@ def ukf_step() -> Iterator[Row]:
         60,
         (lambda: ukf.fold(task, begun, rows[50:250]), 200),
         (lambda: [ukf.step(task, begun, rows[50:51]) for _ in range(50)], 50),
-        (lambda: [peer.step(rows[100], begun.process) for _ in range(3)], 3),
+        (lambda: [peer.step(rows[100], begun.adaptation["density"]) for _ in range(3)], 3),
     )
     yield faster("UKF step, 6 + 24 states, RK4", ours, theirs, 250.0, "filterpy")
     yield faster("same, one call from Python a sample", live, theirs, 100.0, "filterpy")

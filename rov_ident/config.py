@@ -246,7 +246,10 @@ class Ukf:
         lower=1.0,
     )
     random_walk: float = option(
-        0.005, "drift of a coefficient relative to its value", "1/sqrt(h)", lower=0.0
+        0.0,
+        "drift of a coefficient relative to its value, without any evidence of a change",
+        "1/sqrt(h)",
+        lower=0.0,
     )
 
 

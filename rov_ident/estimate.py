@@ -70,6 +70,20 @@ def prior_of(config: Config) -> Prior:
     )
 
 
+def calibrated(covariance: Array, score: Array) -> Array:
+    """The covariance (n, n) with its standard deviations widened to those of the sandwich.
+
+    ``score`` (n, n) is the covariance of the accumulated score, the prior's included, with its
+    correlation in time: for white innovations the inverse of ``covariance``, and nothing changes.
+    The sandwich is ``covariance @ score @ covariance``; from a short record it is itself uncertain,
+    and mostly too thin, so that nothing is narrowed.
+    """
+    sandwich = np.sum((covariance @ score) * covariance, axis=1)
+    widen = np.sqrt(np.maximum(sandwich / np.diag(covariance), 1.0))
+    wide: Array = covariance * np.outer(widen, widen)
+    return wide
+
+
 def typical(model: Model) -> Array:
     """(m,) the size at which each term alone would take its axis's whole working wrench."""
     wrench, inertia = authority(model), np.diag(model.body.mass_matrix)

@@ -25,6 +25,7 @@ FIRST_TIME, TIME = (
     20.0,
 )  # s; in which the density doubles with twice the power: at first, later
 STEADY = 4.0  # a squared sum counts for at most this often its variance
+LARGEST = 3.0  # standard deviations that a single innovation counts for: outliers are no motion
 
 PROCESS = np.dtype(
     [
@@ -84,7 +85,7 @@ def adapt(adaptation, floor, innovation):
     a = adaptation
     keep = np.exp(-a.since / SUM_TIME)
     a.seen += a.since
-    a.summed = keep * a.summed + innovation
+    a.summed = keep * a.summed + min(max(innovation, -LARGEST), LARGEST)
     a.expected = keep * keep * a.expected + 1.0
     excess = min(a.summed * a.summed / a.expected, STEADY) - ROOM
     blend = min(a.since / min(FIRST_TIME + 0.25 * a.seen, TIME), 0.1)

@@ -1,9 +1,10 @@
 """Unscented Kalman filter over body velocities and coefficients: ``init``, ``step``, ``fold``.
 
-State ``x = [nu (6), xi (n)]``. The coefficients are a random walk; those that physics keeps
-negative are ``theta = -s (xi + sqrt(xi^2 + 4)) / 2``: negative for every xi, smooth, and linear
-where the coefficient is well above its scale s, so that intervals stay those of a normal
-distribution. The others are ``theta = s xi``.
+State ``x = [nu (6), xi (n)]`` with ``theta = scale xi``, the scale being the prior's standard
+deviation. Linear: under any bent parametrisation, one that keeps signs for instance, early
+information is reinterpreted whenever xi moves (N_r ended at fifteen times the Cramer-Rao bound).
+Signs are for what leaves the filter (:func:`rov_ident.estimate.physical`); inside, a sigma point's
+mass matrix is kept positive definite by raising the pivots of its factorisation.
 
 Prediction: scaled sigma points (van der Merwe; as in filterpy) through one or more Runge-Kutta
 steps of the equations of motion, LANES points side by side. The coefficients do not move and the
@@ -21,12 +22,13 @@ Coefficients whose motion is not well above its noise are *considered*, not esti
 1966): they stay what they are, their uncertainty is carried along. At rest a filter would else
 learn from the difference between its assumed and the true noise.
 
-The random walk fades out as a variance nears its prior: without excitation nothing grows beyond it.
+Coefficients walk only on evidence: while the innovations are larger than they should be, variances
+grow, up to the prior's and no further. (``ukf.random_walk`` lets them walk all the time.)
 
-What the model leaves unexplained is found from the innovations: per axis, the density of the
-process noise follows the difference between their square and its prediction (Mehra 1972; Myers and
-Tapley 1976), down to the configured floor. A wrong structure then widens the intervals instead of
-being learnt as a coefficient.
+What the model leaves unexplained is found from the innovations (``process_noise``), and *standard
+deviations* do not assume those white: the covariance of their summed influence on the coefficients,
+with its correlation in time, stands between two covariances of the filter (the sandwich of Newey
+and West 1987, with an exponential lag window).
 """
 
 from typing import NamedTuple
@@ -36,7 +38,7 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
-from rov_ident.estimate import Estimate, Prior, prior_of
+from rov_ident.estimate import Estimate, Prior, calibrated, prior_of
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
     Structure,
@@ -45,6 +47,7 @@ from rov_ident.model import (
     in_motion,
     symmetric_product,
 )
+from rov_ident.process_noise import adapt, first_adaptation, interrupt, process
 from rov_ident.residual import filtered_residual
 from rov_ident.rls import INFO, is_finite
 from rov_ident.samples import SAMPLE
@@ -65,9 +68,9 @@ REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 
 LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
 _MAX_STEP = 0.05  # s; of one Runge-Kutta step
-_LOWEST = -2.0  # of xi where theta stays negative: below, it has too little slope to come back
-_ADAPTATION_TIME = 20.0  # s; over which the process noise follows the innovations
-_STEADY = 4.0  # a squared innovation counts for at most this often its variance in that
+_LIGHTEST = 0.2  # of the rigid body's own inertia: no sigma point is lighter
+_PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
+_LAG = 4.0  # s; of the window over the correlation of that influence
 _LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
 _RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
@@ -80,10 +83,18 @@ _SETTINGS = np.dtype(
         ("centre", "f8"),  # beta - alpha^2
         ("gate", "f8"),
         ("changed", "f8"),  # surprise from which the vehicle is taken to have changed
-        ("process", "f8", (6,)),  # variance density of the acceleration
-        ("wrench", "f8"),  # relative variance of the wrench times its correlation time
-        ("wrench_floor", "f8", (6,)),
         ("corner", "f8"),  # rad/s, of the published residual
+    ],
+    align=True,
+)
+
+_SCALARS = np.dtype(
+    [
+        ("t", "f8"),
+        ("surprise", "f8"),  # normalised innovations squared, averaged: 1 when all is well
+        ("refused", "f8"),  # s of nothing but outliers
+        ("since", "f8"),  # s since the coefficients walked
+        ("started", "?"),
     ],
     align=True,
 )
@@ -93,16 +104,16 @@ class Problem(NamedTuple):
     """What does not change from sample to sample."""
 
     settings: NDArray[np.void]
+    process: NDArray[np.void]  # (1,) of PROCESS
     structure: Structure
     estimated: NDArray[np.int64]  # (n,) indices into theta
     theta: Array  # (m,) held values of the coefficients that are not estimated
-    scale: Array  # (n,) s of the parametrisation
-    negative: NDArray[np.bool_]  # (n,)
+    scale: Array  # (n,) prior standard deviations
     start: Array  # (n,) xi of the prior
-    prior_variance: Array  # (n,) of xi
-    walk: Array  # (n,) variance density of the random walk
+    walk: Array  # (n,) variance density of the random walk of xi, 1/s
     rigid_body: Array  # (6, 6)
     restoring: Array  # (6, 3)
+    lightest: Array  # (6,) least pivots of a mass matrix
 
 
 class State(NamedTuple):
@@ -111,9 +122,11 @@ class State(NamedTuple):
     x: Array  # (6 + n,)
     p: Array  # (6 + n, 6 + n)
     residual: Array  # (4, 6): stage 1, stage 2, last input, last momentum of the published residual
-    process: Array  # (6,): variance density of the acceleration, adapted
-    since: Array  # (6,): s since each velocity was measured
-    scalars: Array  # (4,): t, 1 once nu is known, surprise, s of nothing but outliers
+    adaptation: NDArray[np.void]  # (6,) of ADAPTATION: of the process noise
+    score: Array  # (n, n): covariance of the summed influence of the innovations, and of the prior
+    lagged: Array  # (n,): that influence of late, under the lag window
+    before: Array  # (n,): xi when it was last summed
+    scalars: NDArray[np.void]  # (1,)
 
 
 def problem(config: Config) -> Problem:
@@ -127,46 +140,37 @@ def problem(config: Config) -> Problem:
     settings["centre"] = u.beta - u.alpha**2
     settings["gate"] = u.gate
     settings["changed"] = u.change_threshold
-    settings["process"] = np.square(config.process_std)
-    settings["wrench"] = config.wrench.relative_std**2 * config.wrench.correlation_time
-    settings["wrench_floor"] = np.square(config.wrench.floor_std) * config.wrench.correlation_time
     settings["corner"] = config.residual_corner
-    # Two fifths of the prior's width: straight where the coefficient is likely, bent close to zero.
-    scale = np.where(prior.negative, 0.4 * prior.std, prior.std)
-    # A coefficient configured as zero starts within reach of its scale: at exactly zero the
-    # parametrisation has no slope.
-    size = np.where(prior.negative, np.maximum(-prior.mean, scale), prior.mean)
-    start = np.where(
-        prior.negative, size / scale - scale / np.where(size == 0, 1, size), size / scale
-    )
-    slope = np.where(prior.negative, 0.5 * (1.0 + start / np.sqrt(start**2 + 4.0)), 1.0)
-    deviation = prior.std / (slope * scale)
-    walk = (u.random_walk * np.abs(size) / (slope * scale)) ** 2 / 3600.0
     return Problem(
         settings,
+        process(config),
         model.structure,
         prior.estimated,
         model.theta,
-        scale,
-        prior.negative,
-        start,
-        deviation**2,
-        walk,
+        prior.std,
+        prior.mean / prior.std,
+        (u.random_walk * prior.mean / prior.std) ** 2 / 3600.0,
         model.body.mass_matrix,
         model.body.restoring,
+        # so that no hull with positive added mass is touched
+        _LIGHTEST * np.diag(np.linalg.cholesky(model.body.mass_matrix)) ** 2,
     )
 
 
 def init(task: Problem) -> State:
     """Nothing learnt: the prior; the velocity is taken from the first measurement."""
-    p = np.diag(np.concatenate([np.full(6, 1.0), task.prior_variance]))
+    n = len(task.scale)
+    scalars = np.zeros(1, dtype=_SCALARS)
+    scalars["surprise"] = 1.0
     return State(
         np.concatenate([np.zeros(6), task.start]),
-        p,
+        np.eye(6 + n),
         np.zeros((4, 6)),
-        task.settings["process"][0].copy(),
-        np.zeros(6),
-        np.array([0.0, 0.0, 1.0, 0.0]),
+        first_adaptation(task.process),
+        np.eye(n),
+        np.zeros(n),
+        task.start.copy(),
+        scalars,
     )
 
 
@@ -185,39 +189,24 @@ def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, 
 
 
 def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
-    """Coefficients and covariance (n, n) in their own units, to first order about the mean."""
-    xi = state.x[6:]
-    slope = _slope(task, xi)
+    """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
     return Estimate(
         prior.names,
-        coefficients(task, xi),
-        state.p[6:, 6:] * np.outer(slope, slope),
-        float(state.scalars[0]),
+        task.scale * state.x[6:],
+        calibrated(state.p[6:, 6:], state.score) * np.outer(task.scale, task.scale),
+        float(state.scalars["t"][0]),
     )
 
 
 def variance(task: Problem, state: State) -> Array:
-    """Variances (n,), in squared units: what excitation is judged by."""
-    variances: Array = np.diag(state.p)[6:] * _slope(task, state.x[6:]) ** 2
+    """Variances (n,) of the filter, in squared units: what excitation is judged by."""
+    variances: Array = np.diag(state.p)[6:] * task.scale**2
     return variances
 
 
 def condition(task: Problem, state: State) -> float:
     """Condition number of the information's root as :func:`rov_ident.rls.condition` has it."""
-    std = np.sqrt(task.prior_variance)
-    return float(np.sqrt(np.linalg.cond(state.p[6:, 6:] / np.outer(std, std), 1)))
-
-
-def coefficients(task: Problem, xi: Array) -> Array:
-    """theta (n,) of the estimated coefficients from xi (n,)."""
-    theta = task.theta.copy().reshape(-1, 1)
-    _coefficients(task, np.asarray(xi, dtype=float), theta)
-    return theta[task.estimated, 0]
-
-
-def _slope(task: Problem, xi: Array) -> Array:
-    bent = -0.5 * (1.0 + xi / np.sqrt(xi**2 + 4.0))
-    return task.scale * np.where(task.negative, bent, 1.0)
+    return float(np.sqrt(np.linalg.cond(state.p[6:, 6:], 1)))
 
 
 # ------------------------------------------------------------------ kernels
@@ -261,6 +250,7 @@ class Work(NamedTuple):
     moved: Array  # (2, 6, columns): nu of the points on the + and - side of each column
     cross: Array  # (3, columns)
     gain: Array  # (3, columns)
+    block: Array  # (3, n, columns): for the covariance of the coefficients alone
     free: Array  # (columns,): 1 where a state is estimated, 0 where it is only considered
     moves: NDArray[np.bool_]  # (m,)
     theta: Array  # (m, LANES)
@@ -279,6 +269,7 @@ def _work(task, state):
         np.empty((2, 6, columns)),
         np.zeros((3, columns)),
         np.zeros((3, columns)),
+        np.zeros((3, size - 6, columns)),
         np.zeros(columns),
         np.empty(m, dtype=np.bool_),
         np.empty((m, LANES)),
@@ -325,9 +316,9 @@ def _step(task, state, work, sample, out):
     if not is_finite(sample):
         out.reason = NOT_FINITE
         return
-    state.scalars[0] = sample.t
+    state.scalars[0].t = sample.t
     out.reason = USED
-    if sample.restart or state.scalars[1] == 0.0 or not sample.dt > 0.0:
+    if sample.restart or not state.scalars[0].started or not sample.dt > 0.0:
         _restart(state, work.p, sample)
         out.reason = RESTARTED
     else:
@@ -335,12 +326,13 @@ def _step(task, state, work, sample, out):
         _move(task, state.x, work, sample)
         if not _collect(task, state, work, sample):
             out.reason = UNPREDICTABLE
-            state.scalars[1] = 0.0
+            state.scalars[0].started = False
             return
         in_motion(task.structure, sample.moving, work.moves)
         for i in range(len(state.x)):
             work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
         _update(task, state, work, sample, out)
+        _look_back(task, state, work, sample.dt)
     _residual(task, state, work, sample, out)
 
 
@@ -354,9 +346,9 @@ def _restart(state, p, sample):
         state.x[i] = sample.nu[i]
         variance = sample.odometry_variance[i]
         p[i, i] = variance if variance < 1.0 else 1.0
-    state.scalars[1] = 1.0
-    state.scalars[2] = 1.0
-    state.scalars[3] = 0.0
+        interrupt(state.adaptation[i])
+    c = state.scalars[0]
+    c.started, c.surprise, c.refused = True, 1.0, 0.0
 
 
 # ---------------------------------------------------------------- prediction
@@ -372,7 +364,7 @@ def _take_root(task, work, out):
         out.reason = REPAIRED
         for i in range(size):
             if attempt == 0:  # a little of the prior
-                p[i, i] += 1e-9 * (task.prior_variance[i - 6] if i >= 6 else 1.0)
+                p[i, i] += 1e-9
             else:
                 for j in range(i):
                     p[i, j] = 0.0
@@ -440,20 +432,6 @@ def _move(task, x, work, sample):
             s.centre_inverse[j, i] = s.inverse[i, j, LANES - 1]
 
 
-@inlined
-def _negative(scale, xi):
-    """The coefficient that is negative for every xi."""
-    return -0.5 * scale * (xi + np.sqrt(xi * xi + 4.0))
-
-
-@kernel
-def _coefficients(task, xi, theta):
-    """Set the estimated ones of theta (m, 1) from xi (n,)."""
-    for j in range(len(xi)):
-        e, scale = task.estimated[j], task.scale[j]
-        theta[e, 0] = _negative(scale, xi[j]) if task.negative[j] else scale * xi[j]
-
-
 @reordered
 def _spread(task, x, work, first, spread):
     """Sigma points x + spread * column: their velocities, coefficients, mass matrices."""
@@ -465,19 +443,18 @@ def _spread(task, x, work, first, spread):
     for j in range(len(task.scale)):
         root = work.root[6 + j, first : first + LANES]
         e, scale, mean = task.estimated[j], task.scale[j], x[6 + j]
-        if task.negative[j]:
-            for k in range(LANES):
-                theta[e, k] = _negative(scale, mean + spread * root[k])
-        else:
-            for k in range(LANES):
-                theta[e, k] = scale * (mean + spread * root[k])
+        for k in range(LANES):
+            theta[e, k] = scale * (mean + spread * root[k])
+    for i in range(6):
+        for k in range(LANES):
+            s.mass[i, i, k] = task.rigid_body[i, i]
     for c in range(len(structure.mass_row)):
         i, j = structure.mass_row[c], structure.mass_column[c]
         for k in range(LANES):
             s.mass[i, j, k] = task.rigid_body[i, j]
             s.mass[j, i, k] = task.rigid_body[i, j]
     add_added_mass(structure, theta, s.mass)
-    _invert(s.mass, s.inverse)
+    _invert(s.mass, task.lightest, s.inverse)
 
 
 _NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta step
@@ -517,7 +494,7 @@ def _collect(task, state, work, sample):
 
     False where the model takes a point out of all reason.
     """
-    s, c = work.scratch[0], task.settings[0]
+    s, c, q = work.scratch[0], task.settings[0], task.process[0]
     x, p, root, plus, minus = state.x, work.p, work.root, work.moved[0], work.moved[1]
     size, columns = p.shape
     speed = 0.0
@@ -529,7 +506,7 @@ def _collect(task, state, work, sample):
             minus[i, k] -= s.centre[i]
             total += plus[i, k] + minus[i, k]
         s.shift[i] = c.weight * total
-        s.strength[i] = c.wrench * sample.wrench[i] ** 2 + c.wrench_floor[i]
+        s.strength[i] = q.wrench * sample.wrench[i] ** 2 + q.wrench_floor[i]
     if not speed < 2 * columns * _FASTEST**2:  # NaN too
         return False
     for i in range(6):
@@ -538,9 +515,10 @@ def _collect(task, state, work, sample):
             total = 0.0
             for k in range(columns):
                 total += plus[i, k] * plus[j, k] + minus[i, k] * minus[j, k]
-            noise = state.process[i] if i == j else 0.0
+            noise = state.adaptation[i].density if i == j else 0.0
             for a in range(6):
                 noise += s.centre_inverse[i, a] * s.centre_inverse[j, a] * s.strength[a]
+            state.adaptation[i].acting = noise  # the last one stays: of the axis itself
             total = c.weight * total + c.centre * s.shift[i] * s.shift[j] + noise * sample.dt
             p[i, j] = total
             p[j, i] = total
@@ -556,13 +534,6 @@ def _collect(task, state, work, sample):
                 w += plus[i + 2, k] * root[j, k]
             p[i, j], p[i + 1, j], p[i + 2, j] = u, v, w
             p[j, i], p[j, i + 1], p[j, i + 2] = u, v, w
-    for j in range(6, size):
-        room = 1.0 - p[j, j] / task.prior_variance[j - 6]
-        if room > 0.0:
-            walk = task.walk[j - 6]
-            if state.scalars[2] > c.changed:
-                walk = max(walk, task.prior_variance[j - 6] / _RELEARNING_TIME)
-            p[j, j] += walk * sample.dt * room
     return True
 
 
@@ -610,33 +581,57 @@ def _transposed(a):
 
 
 @inlined
-def _inverse(a):
-    """Of a symmetric 3 x 3 matrix, by its cofactors."""
-    xx, xy, xz = a[0]
-    yy, yz, zz = a[1][1], a[1][2], a[2][2]
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    g = 1.0 / (xx * a + xy * b + xz * c)
-    return (g * a, g * b, g * c), (g * b, g * d, g * e), (g * c, g * e, g * f)
+def _inverse(a, least):
+    """Of a symmetric 3 x 3 matrix, its pivots raised to ``least``; what that adds to its diagonal.
+
+    ``A + E = L D L'`` with L's entries l, m (first column) and n.
+    """
+    d = a[0][0] if a[0][0] > least[0] else least[0]
+    l, m, x = a[0][1] / d, a[0][2] / d, 1.0 / d
+    pivot = a[1][1] - l * a[0][1]
+    e = pivot if pivot > least[1] else least[1]
+    rest = a[1][2] - l * a[0][2]
+    n, y = rest / e, 1.0 / e
+    last = a[2][2] - m * a[0][2] - n * rest
+    f = last if last > least[2] else least[2]
+    z, k = 1.0 / f, l * n - m
+    ny, nz = -l * y - k * n * z, -n * z
+    return (
+        ((x + l * l * y + k * k * z, ny, k * z), (ny, y + n * n * z, nz), (k * z, nz, z)),
+        (d - a[0][0], e - pivot, f - last),
+    )
 
 
 @inlined
-def _invert(m, inverse):
+def _invert(m, lightest, inverse):
     """Lower half of the inverses (6, 6, LANES) of symmetric m (6, 6, LANES) = [[A, B'], [B, D]].
 
     In 3 x 3 blocks, with V = A^-1 B', the Schur complement S = D - B V and U = V S^-1::
 
         m^-1 = [[A^-1 + U V', -U], [-U', S^-1]]
+
+    The pivots of A and S are those of m. Where one is less than ``lightest`` (6,), m has no inertia
+    left in some direction, as the outer points of a wide prior may have: m gets so much more on its
+    diagonal that it has (as in Gill, Murray and Wright 1981, sec. 4.4.2.2).
     """
     none = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    first = lightest[0], lightest[1], lightest[2]
+    last = lightest[3], lightest[4], lightest[5]
     for k in range(LANES):
-        a, b = _inverse(_block(m, 0, 0, k)), _block(m, 3, 0, k)
+        b = _block(m, 3, 0, k)
+        a, more = _inverse(_block(m, 0, 0, k), first)
         v = _plus(none, 1.0, a, b)
-        s = _inverse(_plus(_block(m, 3, 3, k), -1.0, b, _transposed(v)))
+        s, yet_more = _inverse(_plus(_block(m, 3, 3, k), -1.0, b, _transposed(v)), last)
         u = _plus(none, 1.0, v, s)
         _put(inverse, 0, 0, k, 1.0, _plus(a, 1.0, u, v))
         _put(inverse, 3, 0, k, -1.0, _transposed(u))
         _put(inverse, 3, 3, k, 1.0, s)
+        m[0, 0, k], m[1, 1, k], m[2, 2, k] = (
+            m[0, 0, k] + more[0], m[1, 1, k] + more[1], m[2, 2, k] + more[2],
+        )  # fmt: skip
+        m[3, 3, k], m[4, 4, k], m[5, 5, k] = (
+            m[3, 3, k] + yet_more[0], m[4, 4, k] + yet_more[1], m[5, 5, k] + yet_more[2],
+        )  # fmt: skip
 
 
 # ---------------------------------------------------------------- update
@@ -645,7 +640,7 @@ def _invert(m, inverse):
 @inlined
 def _update(task, state, work, sample, out):
     """Linear and angular velocity, each behind its own gate."""
-    s, scratch = task.settings[0], work.scratch[0]
+    s, c, scratch = task.settings[0], state.scalars[0], work.scratch[0]
     x, p, z, r = state.x, work.p, scratch.z, scratch.r
     for i in range(6):
         z[i], r[i] = sample.odometry[i], sample.odometry_variance[i]
@@ -655,38 +650,31 @@ def _update(task, state, work, sample, out):
             z[i] = np.nan
     surprise, count = 0.0, 0
     for i in range(6):
-        state.since[i] += sample.dt
+        state.adaptation[i].since += sample.dt
     for first in (0, 3):
         if not np.isfinite(z[first] + z[first + 1] + z[first + 2]):
             continue
         worst = 0.0
         for i in range(first, first + 3):
-            total = p[i, i] + r[i]
-            out.ratio[i] = (z[i] - x[i]) ** 2 / total
+            innovation = (z[i] - x[i]) / np.sqrt(p[i, i] + r[i])
+            out.ratio[i] = innovation**2
             worst = max(worst, out.ratio[i])
             surprise += min(out.ratio[i], s.gate**2)
             count += 1
-            excess = (min(out.ratio[i], _STEADY) - 1.0) * total
-            blend = min(state.since[i] / _ADAPTATION_TIME, 0.1)
-            density = state.process[i] + blend * excess / state.since[i]
-            state.process[i] = max(density, s.process[i])
-            state.since[i] = 0.0
+            adapt(state.adaptation[i], task.process[0].floor[i], innovation)
         if worst > s.gate**2:
             out.reason = GATED
             continue
-        state.scalars[3] = 0.0
+        c.refused = 0.0
         _absorb(x, work, first)
     if out.reason == GATED:
-        state.scalars[3] += sample.dt
-        if state.scalars[3] > _LOST:
+        c.refused += sample.dt
+        if c.refused > _LOST:
             _restart(state, p, sample)
             return
     if count > 0:
         blend = min(sample.dt / _SURPRISE_TIME, 1.0)
-        state.scalars[2] += blend * (surprise / count - state.scalars[2])
-    for j in range(len(task.scale)):
-        if task.negative[j] and x[6 + j] < _LOWEST:
-            x[6 + j] = _LOWEST
+        c.surprise += blend * (surprise / count - c.surprise)
 
 
 @reordered
@@ -720,6 +708,113 @@ def _absorb(x, work, first):
             p[i, k] -= f * w[0, k] + g * w[1, k] + h * w[2, k]
 
 
+# ---------------------------------------------------------------- looking back
+
+
+@inlined
+def _look_back(task, state, work, dt):
+    """Every _PERIOD: what the innovations did to the coefficients, and the random walk of these."""
+    c = state.scalars[0]
+    c.since += dt
+    if c.since < _PERIOD:
+        return
+    _sum_up(state, work, np.exp(-c.since / _LAG))
+    _walk(task, state, work, c.surprise > task.settings[0].changed, c.since)
+    c.since = 0.0
+
+
+@reordered
+def _sum_up(state, work, decay):
+    """With ``change = P g``, g is what innovations have added to the information's right side."""
+    n, p = len(state.before), work.p
+    matrix, upper, root = work.block[0], work.block[1], work.block[2]
+    for j in range(n):
+        for k in range(n):
+            matrix[j, k] = p[6 + j, 6 + k]
+    if not _cholesky(matrix, upper, root):
+        return
+    g, lagged, score = work.gain[0], state.lagged, state.score
+    for j in range(n):
+        g[j] = state.x[6 + j] - state.before[j]
+        state.before[j] = state.x[6 + j]
+    _solve(root, n, g)
+    for j in range(n):
+        lagged[j] *= decay
+    for j in range(n):
+        for k in range(n):
+            score[j, k] += g[j] * (g[k] + lagged[k]) + lagged[j] * g[k]
+    for j in range(n):
+        lagged[j] += g[j]
+
+
+@reordered
+def _walk(task, state, work, changed, elapsed):
+    """Variances grow by G, less and less up to the prior's; the sandwich P S P grows alike.
+
+    Hence with ``W = P_new^-1 G``, ``S_new = (1 - W) S (1 - W)' + W P_new^-1``.
+    """
+    n, p = len(state.before), work.p
+    matrix, upper, root = work.block[0], work.block[1], work.block[2]
+    grown, most = work.cross[0], 0.0
+    for j in range(n):
+        walk = task.walk[j]
+        if changed:
+            walk = max(walk, 1.0 / _RELEARNING_TIME)
+        grown[j] = elapsed * walk * max(1.0 - p[6 + j, 6 + j], 0.0)
+        most = max(most, grown[j])
+    if most == 0.0:
+        return
+    for j in range(n):
+        p[6 + j, 6 + j] += grown[j]
+        for k in range(n):
+            matrix[j, k] = p[6 + j, 6 + k]
+    if not _cholesky(matrix, upper, root):
+        return
+    inverse, score, lagged = upper, state.score, state.lagged
+    for j in range(n):
+        row = inverse[j]
+        for k in range(n):
+            row[k] = 1.0 if j == k else 0.0
+        _solve(root, n, row)
+    # T = 1 - W, then T S into matrix, then T S T' + W P_new^-1
+    for j in range(n):
+        for k in range(n):
+            root[j, k] = (1.0 if j == k else 0.0) - inverse[j, k] * grown[k]
+    for j in range(n):
+        for k in range(n):
+            matrix[j, k] = 0.0
+        for a in range(n):
+            f = root[j, a]
+            for k in range(n):
+                matrix[j, k] += f * score[a, k]
+    for j in range(n):
+        for k in range(n):
+            total = 0.0
+            for a in range(n):
+                total += matrix[j, a] * root[k, a] + inverse[j, a] * grown[a] * inverse[a, k]
+            score[j, k] = total
+    for j in range(n):
+        total = 0.0
+        for k in range(n):
+            total += root[j, k] * lagged[k]
+        grown[j] = total
+    for j in range(n):
+        lagged[j] = grown[j]
+
+
+@inner
+def _solve(root, n, x):
+    """x (n,) of L L' x = x, in place; L the lower root."""
+    for j in range(n):
+        for k in range(j):
+            x[j] -= root[j, k] * x[k]
+        x[j] /= root[j, j]
+    for j in range(n - 1, -1, -1):
+        for k in range(j + 1, n):
+            x[j] -= root[k, j] * x[k]
+        x[j] /= root[j, j]
+
+
 # ---------------------------------------------------------------- residual
 
 
@@ -728,7 +823,8 @@ def _residual(task, state, work, sample, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     s, theta = work.scratch[0], work.mean
     nu, mass, h = s.mean_nu, s.mean_mass, s.mean_h
-    _coefficients(task, state.x[6:], theta)
+    for j in range(len(task.scale)):
+        theta[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
     for i in range(6):
         for j in range(6):
             mass[i, j, 0] = task.rigid_body[i, j]

@@ -120,9 +120,23 @@ def held_at_rest(model, rows):
 # ------------------------------------------------------------------ the equations of motion
 
 
-def acceleration(body, coefficients, theta, nu, tau, down):
+def ballast(mass, rigid_body, least=0.2):
+    """Diagonal (6, 6) that raises the pivots of a mass matrix to a share of the rigid body's.
+
+    As in a modified Cholesky factorisation: pivot by pivot, each after the ones before it.
+    """
+    mass, body, added = mass.copy(), rigid_body.copy(), np.zeros((6, 6))
+    for i in range(6):
+        added[i, i] = max(least * body[i, i] - mass[i, i], 0.0)
+        mass[i, i] += added[i, i]
+        for m in (mass, body):
+            m[i + 1 :, i + 1 :] -= np.outer(m[i + 1 :, i], m[i, i + 1 :]) / m[i, i]
+    return added
+
+
+def acceleration(body, coefficients, theta, nu, tau, down, ballast=0.0):
     """nu_dot (6,) by the book: M, C(nu) from M (Fossen 2021, eq. 3.46), d term by term, g."""
-    mass = body.mass_matrix
+    mass = body.mass_matrix + ballast
     d = np.zeros(6)
     for c, value in zip(coefficients, theta, strict=True):
         if c.is_added_mass:
