@@ -180,7 +180,9 @@ class Bag:
         yield from pending
 
 
-def select_topics(bag: Bag, overrides: Mapping[str, str] | None = None) -> dict[str, str | None]:
+def select_topics(
+    bag: Bag, overrides: Mapping[str, str] | None = None, roles: Iterable[str] = tuple(ROLE_TYPES)
+) -> dict[str, str | None]:
     """Which topic plays which role: `odom`, `imu`, `wrench`; `imu` may be None.
 
     An override (if not empty) wins; else the topic called `odom`, `imu/data` or `thruster_wrench`
@@ -192,7 +194,7 @@ def select_topics(bag: Bag, overrides: Mapping[str, str] | None = None) -> dict[
     overrides = overrides or {}
     if unknown := set(overrides) - set(ROLE_TYPES):
         raise UserError(f"{min(unknown)} is not an input: use one of {', '.join(ROLE_TYPES)}.")
-    return {role: _select_topic(bag, role, overrides.get(role, "")) for role in ROLE_TYPES}
+    return {role: _select_topic(bag, role, overrides.get(role, "")) for role in roles}
 
 
 def read_messages(

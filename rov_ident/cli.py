@@ -167,9 +167,41 @@ def _parser() -> argparse.ArgumentParser:
     model.add_argument("--out", required=True, type=Path, metavar="CONFIG")
     model.set_defaults(run=_import_model)
 
+    _add_nomoto(commands)
+
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
     return parser
+
+
+def _add_nomoto(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    nomoto = commands.add_parser("nomoto", help="K and T of Nomoto's steering model from zigzags")
+    nomoto.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE",
+        help="CSV (t_s, heading_rad or heading_deg, rudder_rad or rudder_deg) or bag",
+    )  # fmt: skip
+    nomoto.add_argument("--order", type=int, choices=(1, 2), default=1)
+    nomoto.add_argument("--nonlinear", action="store_true", help="with Norrbin's cubic term")
+    nomoto.add_argument(
+        "--interpolate", choices=("none", "spline", "spiral"), default="none",
+        help="densify sparse headings before the fit (default none)",
+    )  # fmt: skip
+    nomoto.add_argument(
+        "--step", type=_positive, metavar="S",
+        help="of the densified heading (default: that of the rows, or a fifth of the heading's)",
+    )  # fmt: skip
+    nomoto.add_argument(
+        "--method", choices=("oe", "fd", "iv", "rls"), default="oe",
+        help="output error (default), forward differences, instruments, recursive",
+    )  # fmt: skip
+    nomoto.add_argument(
+        "--rudder", choices=("auto", "held", "linear"), default="auto",
+        help="how the rudder goes between its samples (auto: whichever fits better)",
+    )  # fmt: skip
+    nomoto.add_argument("--validate", type=Path, metavar="FILE", help="predict this run as well")
+    nomoto.add_argument("--json", type=Path, help="write the result here")
+    nomoto.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    nomoto.set_defaults(run=_nomoto)
 
 
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
@@ -470,6 +502,36 @@ def _import_model(options: argparse.Namespace) -> None:
     for note in notes:
         ERR.print(f"note: {note}", markup=False, soft_wrap=True)
     ERR.print(f"written: {options.out}", markup=False, soft_wrap=True)
+
+
+def _nomoto(options: argparse.Namespace) -> None:
+    from rov_ident import nomoto, zigzag
+    from rov_ident.fit import write_text
+
+    _check_outputs([options.json, options.report], [*options.files, options.validate])
+    runs = [zigzag.read(path) for path in options.files]
+    judge = zigzag.read(options.validate) if options.validate else None
+    model = nomoto.fit(
+        runs, options.order, options.nonlinear, options.method, options.interpolate, options.step,
+        {"held": True, "linear": False}.get(options.rudder),
+    )  # fmt: skip
+    validation = nomoto.predict(model, judge)[1] if judge else None
+    if options.json:
+        write_text(options.json, nomoto.to_json(model, validation))
+    table = _table(
+        f"Nomoto's model of order {model.order}, by {model.method}", "value", "std", "unit"
+    )
+    for name, (value, std, unit) in model.parameters().items():
+        table.add_row(name, f"{value:.5g}", f"{std:.2g}", unit)
+    OUT.print(table)
+    OUT.print(f"heading RMSE {model.rmse:.4g} rad ({math.degrees(model.rmse):.3g} deg)")
+    if judge and validation is not None:
+        OUT.print(
+            f"on {judge.name} {validation:.4g} rad ({math.degrees(validation):.3g} deg)",
+            markup=False,
+        )
+    for note in model.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
 
 
 def _coefficients(options: argparse.Namespace) -> None:

@@ -1,0 +1,597 @@
+"""Nomoto's steering model from zigzag tests: heading psi as the response to the rudder delta.
+
+First and second order (Nomoto 1957), with Norrbin's cubic term (Norrbin 1963)::
+
+    T r' + r + n3 r^3 = K (delta - delta_0)
+    T1 T2 r'' + (T1 + T2) r' + r + n3 r^3 = K (delta - delta_0) + K T3 delta',    psi' = r
+
+K has the sign of the data: with SNAME axes a rudder of positive angle that turns the vehicle to
+port (Prestero's N_uudr < 0) gives K < 0. ``delta_0`` is the rudder angle that keeps the course.
+Inside, the model is written so that it stays regular for a vehicle without course stability (T
+infinite or negative)::
+
+    x1' = -a1 x1 + x2 + b1 (delta - delta_0)        first order: x1' = -a0 x1 - c x1^3 + b0 (...)
+    x2' = -a0 x1 - c x1^3 + b0 (delta - delta_0)    r = x1
+
+Four estimators: output error (`oe`: the simulated heading is fitted, first state estimated; white
+heading noise does not bias it), forward differences (`fd`: the equation itself, least squares, as
+in the literature on sparse zigzags), the same with instruments (`iv`) and recursive (`rls`).
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+
+from rov_ident import densify
+from rov_ident.errors import UserError
+from rov_ident.jit import kernel
+from rov_ident.messages import Array
+from rov_ident.zigzag import Zigzag
+
+METHODS = ("oe", "fd", "iv", "rls")
+STEP = 0.05  # s, largest of the integration
+_MIN_SAMPLES = 20
+
+
+@dataclass(frozen=True)
+class Nomoto:
+    """A fitted model: ``theta`` in the order of ``names``, its covariance, and how it was got.
+
+    names: order 1 ``a0 b0 [c] delta_0``, order 2 ``a0 a1 b0 b1 [c] delta_0``; see the head of the
+    module. ``held``: whether the rudder is taken as held between its samples, else as linear.
+    """
+
+    order: int
+    nonlinear: bool
+    method: str
+    theta: Array
+    covariance: Array
+    held: bool
+    unit: str
+    rmse: float
+    notes: tuple[str, ...] = ()
+    histories: Array | None = None  # (k, len(names)) of the recursive estimator
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return _names(self.order, self.nonlinear)
+
+    def parameters(self) -> dict[str, tuple[float, float, str]]:
+        """K, T (and T1 T2 T3, n3, delta_0): value, standard deviation, unit.
+
+        Standard deviations by linear propagation. T1 and T2 are left out where they are complex.
+        """
+        rate = "1/s" if self.unit == "rad" else "rad/(s N m)"
+        values: dict[str, tuple[float, float, str]] = {}
+        for name, (function, unit) in self._functions(rate).items():
+            value = function(self.theta)
+            if not np.isfinite(value):
+                continue
+            gradient = _gradient(function, self.theta)
+            std = float(np.sqrt(max(gradient @ self.covariance @ gradient, 0.0)))
+            values[name] = (float(value), std, unit)
+        return values
+
+    def _functions(self, rate: str) -> dict[str, tuple[Callable[[Array], float], str]]:
+        n = self.names
+        b0, off = n.index("b0"), n.index("delta_0")
+        found: dict[str, tuple[Callable[[Array], float], str]] = {
+            "K": (lambda x: x[b0] / x[0], rate)
+        }
+        if self.order == 1:
+            found["T"] = (lambda x: 1.0 / x[0], "s")
+        else:
+            found["T"] = (lambda x: x[1] / x[0] - x[3] / x[b0], "s")
+            found["T1"] = (lambda x: _root(x[0], x[1], 1.0), "s")
+            found["T2"] = (lambda x: _root(x[0], x[1], -1.0), "s")
+            found["T3"] = (lambda x: x[3] / x[b0], "s")
+            found["T1T2"] = (lambda x: 1.0 / x[0], "s2")
+            found["T1_plus_T2"] = (lambda x: x[1] / x[0], "s")
+        if self.nonlinear:
+            c = n.index("c")
+            found["n3"] = (lambda x: x[c] / x[0], "s2/rad2")
+        found["delta_0"] = (lambda x: x[off], self.unit)
+        return found
+
+
+def _root(a0: float, a1: float, sign: float) -> float:
+    """T1 (sign +) or T2 (-) with T1 T2 = 1/a0 and T1 + T2 = a1/a0; NaN where they are complex."""
+    square = (a1 / a0) ** 2 - 4.0 / a0
+    return float(0.5 * (a1 / a0 + sign * np.sqrt(square))) if square >= 0.0 else float("nan")
+
+
+def _gradient(function: Callable[[Array], float], x: Array) -> Array:
+    out = np.zeros(len(x))
+    for i in range(len(x)):
+        d = np.zeros(len(x))
+        d[i] = 1e-6 * max(abs(x[i]), 1e-3)
+        out[i] = (function(x + d) - function(x - d)) / (2.0 * d[i])
+    return out
+
+
+def _names(order: int, nonlinear: bool) -> tuple[str, ...]:
+    linear = ("a0", "b0") if order == 1 else ("a0", "a1", "b0", "b1")
+    return (*linear, *(("c",) if nonlinear else ()), "delta_0")
+
+
+def to_json(model: Nomoto, validation: float | None = None) -> str:
+    """The result as JSON; ``validation`` is the heading RMSE [rad] on another run."""
+    values = {
+        name: {"value": value, "std": std, "unit": unit}
+        for name, (value, std, unit) in model.parameters().items()
+    }
+    document: dict[str, object] = {
+        "order": model.order,
+        **values,
+        "heading_rmse_rad": model.rmse,
+        "nonlinear": model.nonlinear,
+        "method": model.method,
+        "notes": list(model.notes),
+    }
+    if validation is not None:
+        document["validation"] = {"heading_rmse_rad": validation}
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+# ------------------------------------------------------------------ simulation
+
+
+@kernel
+def _respond(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max_step, out):  # type: ignore[no-untyped-def]
+    """Classical Runge-Kutta; out (n,) the heading, from first = [psi, x1, x2]."""
+    psi, x1, x2 = first[0], first[1], first[2]
+    n = len(t)
+    out[0] = psi
+    for i in range(n - 1):
+        span = t[i + 1] - t[i]
+        steps = max(1, int(np.ceil(span / max_step - 1e-9)))
+        h = span / steps
+        slope = 0.0 if held else (rudder[i + 1] - rudder[i]) / span
+        for s in range(steps):
+            p1 = p2 = p3 = 0.0
+            k0 = k1 = k2 = 0.0
+            for stage in range(4):
+                ahead = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
+                y1, y2 = x1 + ahead * k1, x2 + ahead * k2
+                d = rudder[i] + slope * (s * h + ahead) - bias
+                k0 = y1
+                if order == 1:
+                    k1 = -a0 * y1 - c * y1 * y1 * y1 + b0 * d
+                    k2 = 0.0
+                else:
+                    k1 = -a1 * y1 + y2 + b1 * d
+                    k2 = -a0 * y1 - c * y1 * y1 * y1 + b0 * d
+                weight = h / 6.0 if stage == 0 or stage == 3 else h / 3.0
+                p1 += weight * k0
+                p2 += weight * k1
+                p3 += weight * k2
+            psi += p1
+            x1 += p2
+            x2 += p3
+        if not abs(x1) < 1e3:
+            out[i + 1 :] = 1e6
+            return
+        out[i + 1] = psi
+
+
+def respond(
+    order: int, nonlinear: bool, theta: Array, run: Zigzag, first: Array, held: bool
+) -> Array:
+    """The simulated heading (n,) [rad] of a run from its first state [psi, x1, x2]."""
+    x = dict(zip(_names(order, nonlinear), theta))
+    out = np.empty(len(run.t))
+    _respond(
+        order, x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0),
+        x["delta_0"], run.t, run.rudder, held, first, STEP, out,
+    )  # fmt: skip
+    return out
+
+
+def predict(model: Nomoto, run: Zigzag) -> tuple[Array, float]:
+    """The heading (n,) that the model predicts for a run, its first state fitted; and the RMSE.
+
+    Raises
+    ------
+    UserError
+        If the run has another kind of input than those of the fit.
+    """
+    if run.unit != model.unit:
+        raise UserError(
+            f"{run.name} has an input in {run.unit}, but the model was fitted to one in "
+            f"{model.unit}: validate on a run of the same kind"
+        )
+    first = _first_state(model.order, model.nonlinear, model.theta, run, model.held)
+    heading = respond(model.order, model.nonlinear, model.theta, run, first, model.held)
+    return heading, _rmse(run.heading - heading)
+
+
+def _rmse(error: Array) -> float:
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+def _states(order: int) -> int:
+    return order + 1
+
+
+def _first_state(order: int, nonlinear: bool, theta: Array, run: Zigzag, held: bool) -> Array:
+    """The first state that fits the heading best: Gauss-Newton, exact for the linear models."""
+    known = run.known
+    first = np.zeros(3)
+    first[0] = run.heading[known][0]
+    for _ in range(12 if nonlinear else 2):
+        base = respond(order, nonlinear, theta, run, first, held)
+        columns = [np.ones(len(run.t))]
+        for i in range(1, _states(order)):
+            moved = first.copy()
+            moved[i] += 1e-5
+            columns.append((respond(order, nonlinear, theta, run, moved, held) - base) / 1e-5)
+        step = np.linalg.lstsq(
+            np.column_stack(columns)[known], (run.heading - base)[known], rcond=None
+        )[0]
+        if not np.isfinite(step).all():
+            break
+        first[: len(step)] += step
+        if np.abs(step).max() < 1e-9:
+            break
+    return first
+
+
+# ------------------------------------------------------------------ fitting
+
+
+def fit(
+    runs: Sequence[Zigzag],
+    order: int = 1,
+    nonlinear: bool = False,
+    method: str = "oe",
+    interpolate: str = "none",
+    step: float | None = None,
+    held: bool | None = None,
+    scale: float = 1.0,
+) -> Nomoto:
+    """One model for all runs.
+
+    ``interpolate`` densifies sparse headings first (:func:`dense`), to ``step`` [s]. ``held`` says
+    how the rudder goes between its samples; None: whichever fits the heading better.
+
+    Raises
+    ------
+    UserError
+        For runs too short, at rest, of different kinds, or with which the fit does not converge.
+    """
+    if order not in (1, 2):
+        raise UserError(f"the order is 1 or 2, not {order}")
+    if method not in METHODS:
+        raise UserError(f"there is no method '{method}': choose one of {', '.join(METHODS)}")
+    if not runs:
+        raise UserError("no run is given: name at least one file")
+    for run in runs:
+        check(run, order, nonlinear)
+        if run.unit != runs[0].unit:
+            raise UserError(
+                f"{run.name} has an input in {run.unit}, but {runs[0].name} in {runs[0].unit}: fit "
+                "runs of one kind together"
+            )
+    used = [dense(run, interpolate, step, scale) for run in runs] if interpolate != "none" else runs
+    choices = (False, True) if held is None else (held,)
+    models = [_output_error(used, order, nonlinear, choice) for choice in choices]
+    model = min(models, key=lambda m: m.rmse)
+    if method != "oe":
+        model = _equation_error(used, model, method)
+    measured = np.concatenate([run.heading - predict(model, run)[0] for run in runs])
+    notes = list(model.notes)
+    if model.theta[0] <= 0.0:
+        notes.append(
+            "T is not positive: the vehicle has no course stability in this model; K and T then "
+            "describe the slope of an unstable balance"
+        )
+    elif order == 2 and "T1" not in model.parameters():
+        notes.append("T1 and T2 are complex: only T1T2 and T1_plus_T2 are given")
+    return dataclasses.replace(model, rmse=_rmse(measured), notes=tuple(notes))
+
+
+def check(run: Zigzag, order: int = 1, nonlinear: bool = False) -> None:
+    """Whether a run can tell anything about the model.
+
+    Raises
+    ------
+    UserError
+        Too few headings, or a rudder or heading that never moves.
+    """
+    known = run.heading[run.known]
+    if len(known) < _MIN_SAMPLES:
+        raise UserError(
+            f"{run.name} has {len(known)} headings, but a fit of order {order} needs at least "
+            f"{_MIN_SAMPLES}: give a longer run"
+        )
+    for name, values in (("rudder", run.rudder), ("heading", known)):
+        if np.ptp(values) < 1e-6:
+            raise UserError(
+                f"{run.name}: the {name} is constant, so nothing can be identified: give a zigzag"
+            )
+
+
+def dense(run: Zigzag, method: str, step: float | None = None, scale: float = 1.0) -> Zigzag:
+    """The run with a heading at every row, or where all rows have one, at every ``step`` [s].
+
+    The default step is a fifth of the heading's. The rudder keeps what is known of it: rows
+    between headings as they are, else straight lines.
+    """
+    known = run.known
+    t = run.t
+    if step is not None or known.all():
+        step = step or run.step / 5.0
+        t = t[0] + step * np.arange(int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1)
+    inside = (t >= run.t[known][0] - 1e-9) & (t <= run.t[known][-1] + 1e-9)
+    t = t[inside]
+    heading = densify.densify(run.t[known], run.heading[known], t, method, scale)
+    return Zigzag(run.name, t, heading, np.interp(t, run.t, run.rudder), run.unit)
+
+
+def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool, held: bool) -> Nomoto:
+    """Least squares on the simulated headings over theta and every run's first state."""
+    start, firsts = _linear_start(runs, order, held)
+    if nonlinear:
+        start = np.insert(start, len(start) - 1, 0.0)
+    n = len(start)
+    states = _states(order)
+    known = [run.known for run in runs]
+    speed = max(float(np.std(np.gradient(r.heading[k], r.t[k]))) for r, k in zip(runs, known))
+    names = _names(order, nonlinear)
+    # Scales: of the offset the rudder's spread, of the cubic term one that equals a0 at r_rms.
+    scale = np.abs(start)
+    spread = max(float(np.std(run.rudder)) for run in runs)
+    scale[names.index("delta_0")] = 0.1 * spread
+    if nonlinear:
+        scale[names.index("c")] = abs(start[0]) / speed**2
+    scale = np.maximum(scale, 1e-9)
+    scales = np.concatenate([scale, np.tile([0.1, *[speed] * order], len(runs))])
+
+    def residual(x: Array) -> Array:
+        theta = x[:n] * scale
+        parts = []
+        for i, run in enumerate(runs):
+            first = np.zeros(3)
+            at = n + states * i
+            first[:states] = (x * scales)[at : at + states]
+            parts.append(
+                (respond(order, nonlinear, theta, run, first, held) - run.heading)[known[i]]
+            )
+        return np.concatenate(parts)
+
+    x0 = np.concatenate([start, *(first[:states] for first in firsts)]) / scales
+    result = least_squares(
+        residual, x0, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200 * len(x0)
+    )
+    lengths = [int(k.sum()) for k in known]
+    covariance = _robust_covariance(result.jac, result.fun, lengths) * np.outer(scales, scales)
+    return Nomoto(
+        order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], held, runs[0].unit,
+        _rmse(result.fun),
+    )  # fmt: skip
+
+
+def _linear_start(runs: Sequence[Zigzag], order: int, held: bool) -> tuple[Array, list[Array]]:
+    """Start of the search: over a grid of time constants all else of the linear model is linear."""
+    states = _states(order)
+    total = sum(int(run.known.sum()) for run in runs)
+    longest = max(run.t[-1] - run.t[0] for run in runs)
+    shortest = min(float(np.median(np.diff(run.t))) for run in runs)
+    grid = np.geomspace(max(shortest, 1e-3 * longest), 3.0 * longest, 25)
+    pairs = (
+        [(1.0 / T, 0.0) for T in grid]
+        if order == 1
+        else [(1.0 / (T * S), (T + S) / (T * S)) for T in grid[::2] for S in grid[::2] if S < T]
+    )
+    target = np.concatenate([run.heading[run.known] for run in runs])
+    best, cost = None, np.inf
+    for a0, a1 in pairs:
+        columns = np.zeros((total, order + 1 + states * len(runs)))
+        row = 0
+        for i, run in enumerate(runs):
+            rows = slice(row, row + int(run.known.sum()))
+            row = rows.stop
+            ones = dataclasses.replace(run, rudder=np.ones(len(run.t)))
+            units = [(1.0, 0.0, run, 0), (1.0, 0.0, ones, order)]
+            units += [(0.0, 1.0, run, 1)] if order == 2 else []
+            for b0, b1, driven, column in units:
+                theta = np.array([a0, b0, 0.0] if order == 1 else [a0, a1, b0, b1, 0.0])
+                columns[rows, column] = respond(order, False, theta, driven, np.zeros(3), held)[
+                    run.known
+                ]
+            theta = np.array([a0, 0.0, 0.0] if order == 1 else [a0, a1, 0.0, 0.0, 0.0])
+            for j in range(states):
+                first = np.eye(3)[j]
+                column = order + 1 + states * i + j
+                columns[rows, column] = respond(order, False, theta, run, first, held)[run.known]
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        solution = np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
+        error = float(np.sum((columns @ solution - target) ** 2))
+        if error < cost:
+            best, cost = (a0, a1, solution), error
+    if best is None or not abs(best[2][0]) > 0.0:
+        raise UserError(
+            f"the heading of {runs[0].name} does not follow the rudder: check the columns, and "
+            "that the run is a zigzag"
+        )
+    a0, a1, x = best
+    theta = [a0, x[0], -x[1] / x[0]] if order == 1 else [a0, a1, x[0], x[1], -x[2] / x[0]]
+    firsts = []
+    for i in range(len(runs)):
+        first = np.zeros(3)
+        first[:states] = x[order + 1 + states * i : order + 1 + states * (i + 1)]
+        firsts.append(first)
+    return np.array(theta), firsts
+
+
+def _robust_covariance(jac: Array, error: Array, lengths: Sequence[int]) -> Array:
+    """Covariance (n, n) of a least-squares solution whose residuals are coloured.
+
+    The sandwich ``(J'J)^-1 S (J'J)^-1`` with the long-run covariance S of the scores ``J e``, from
+    a Bartlett window over scores prewhitened by a first-order autoregression (Andrews and Monahan
+    1992), run by run: plain least squares takes a slow residual for many independent ones.
+    """
+    n = jac.shape[1]
+    scores = jac * error[:, None]
+    s = np.zeros((n, n))
+    at = 0
+    for length in lengths:
+        part = scores[at : at + length]
+        at += length
+        if length < 4:
+            s += part.T @ part
+            continue
+        e = error[at - length : at]
+        own = float(np.clip(e[1:] @ e[:-1] / max(e @ e, 1e-300), 0.0, 0.97))
+        white = part[1:] - own * part[:-1]
+        rho = np.clip(np.sum(white[1:] * white[:-1]) / max(np.sum(white**2), 1e-300), -0.9, 0.97)
+        # Andrews (1991), eq. 6.2: the bandwidth for an AR(1) of that correlation.
+        alpha = 4.0 * rho**2 / ((1.0 - rho) ** 2 * (1.0 + rho) ** 2)
+        lags = int(min(1.1447 * (alpha * length) ** (1.0 / 3.0), 0.25 * length))
+        long_run = white.T @ white
+        for lag in range(1, lags + 1):
+            gamma = white[lag:].T @ white[:-lag]
+            long_run += (1.0 - lag / (lags + 1.0)) * (gamma + gamma.T)
+        s += long_run / (1.0 - own) ** 2
+    inverse = np.linalg.pinv(jac.T @ jac, rcond=1e-15)
+    return inverse @ s @ inverse * len(error) / max(len(error) - n, 1)
+
+
+# ------------------------------------------------------------------ equation error
+
+
+def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomoto:
+    """The equation in forward differences: least squares, instruments, or recursive.
+
+    First order, h the step, D the forward difference over h::
+
+        D^2 psi / h^2 = b0 (delta - delta_0) - a0 D psi / h - c (D psi / h)^3
+
+    all at t; second order one difference more. ``b0 delta_0`` is the constant column.
+    """
+    order, nonlinear = model.order, model.nonlinear
+    even = [_evenly(run) for run in runs]
+    parts = [_rows(run.t, run.heading, run.rudder, order, nonlinear) for run in even]
+    y = np.concatenate([p[0] for p in parts])
+    x = np.vstack([p[1] for p in parts])
+    if len(y) < 4 * x.shape[1]:
+        raise UserError(f"{len(y)} equations for {x.shape[1]} unknowns: give a longer run")
+    solution = np.linalg.lstsq(x, y, rcond=None)[0]
+    z, history = x, None
+    if method == "iv":
+        # The instruments are the regressors of a simulated heading, which noise has not touched.
+        for _ in range(30):
+            theta = _from_solution(solution, order, nonlinear)
+            blocks = []
+            for run in even:
+                first = _first_state(order, nonlinear, theta, run, model.held)
+                heading = respond(order, nonlinear, theta, run, first, model.held)
+                blocks.append(_rows(run.t, heading, run.rudder, order, nonlinear)[1])
+            z = np.vstack(blocks)
+            if not np.abs(z).max() < 1e5:
+                raise UserError(
+                    "the instruments diverge: the noise is too strong for `iv`; use `oe`"
+                )
+            new = np.linalg.solve(z.T @ x, z.T @ y)
+            moved = np.abs(new - solution).max() / np.abs(new).max()
+            solution = new
+            if moved < 1e-8:
+                break
+    elif method == "rls":
+        history = recursive(y, x)
+        solution = history[-1]
+    error = y - x @ solution
+    # The sandwich of instruments: (Z'X)^-1 S (X'Z)^-1.
+    inverse = np.linalg.pinv(z.T @ x)
+    core = _robust_covariance(z, error, [len(p[0]) for p in parts])
+    square = z.T @ z
+    covariance = inverse @ square @ core @ square @ inverse.T
+    theta = _from_solution(solution, order, nonlinear)
+    jacobian = np.array(
+        [
+            _gradient(lambda s, i=i: _from_solution(s, order, nonlinear)[i], solution)
+            for i in range(len(theta))
+        ]
+    )
+    histories = (
+        None
+        if history is None
+        else np.array([_from_solution(row, order, nonlinear) for row in history])
+    )
+    return dataclasses.replace(
+        model, method=method, theta=theta, covariance=jacobian @ covariance @ jacobian.T,
+        histories=histories,
+    )  # fmt: skip
+
+
+def _evenly(run: Zigzag) -> Zigzag:
+    """The headings on an even grid of their median step: differences need one."""
+    known = run.known
+    t, step = run.t[known], run.step
+    if np.abs(np.diff(t) - step).max() < 0.01 * step:
+        rudder = np.interp(t, run.t, run.rudder)
+        return Zigzag(run.name, t, run.heading[known], rudder, run.unit)
+    even = t[0] + step * np.arange(int((t[-1] - t[0]) / step + 1e-6) + 1)
+    heading = CubicSpline(t, run.heading[known])(even)
+    return Zigzag(run.name, even, heading, np.interp(even, run.t, run.rudder), run.unit)
+
+
+def _rows(
+    t: Array, heading: Array, rudder: Array, order: int, nonlinear: bool
+) -> tuple[Array, Array]:
+    """Left side (k,) and regressors (k, n) of the equation in forward differences."""
+    h = float(np.median(np.diff(t)))
+    rate = np.diff(heading) / h
+    k = len(rate) - order
+    left = np.diff(rate, order) / h**order
+    columns = [-rate[:k], rudder[:k]]
+    if order == 2:
+        columns = [-rate[:k], -np.diff(rate)[:k] / h, rudder[:k], np.diff(rudder)[:k] / h]
+    if nonlinear:
+        columns.append(-(rate[:k] ** 3))
+    return left, np.column_stack([*columns, -np.ones(k)])
+
+
+def _from_solution(solution: Array, order: int, nonlinear: bool) -> Array:
+    """theta from the solution, whose last entry is b0 delta_0."""
+    theta = solution.copy()
+    theta[-1] = solution[-1] / theta[_names(order, nonlinear).index("b0")]
+    return theta
+
+
+def recursive(y: Array, x: Array, lowest: float = 0.95, memory: float = 0.99) -> Array:
+    """Recursive least squares with a dynamic forgetting factor: solutions (k, n) after each row.
+
+    The factor falls from 1 towards ``lowest`` as the prediction error grows beyond its usual size
+    (Park and Jun 1992: ``lowest + (1 - lowest) 2^-(e/sigma)^2``, here from one and a half sigma
+    on), sigma by exponential averaging with ``memory``. What is forgotten is taken from the
+    direction just excited only, so that the covariance stays bounded where nothing moves.
+    """
+    n = x.shape[1]
+    size = np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-300)
+    p = np.eye(n) * 1e6 * max(float(np.mean(y**2)), 1e-12)
+    theta = np.zeros(n)
+    out = np.empty((len(y), n))
+    variance = float(np.mean(y**2)) + 1e-300
+    for i in range(len(y)):
+        row = x[i] / size
+        error = y[i] - row @ theta
+        excess = max(abs(error) / np.sqrt(variance) - 1.5, 0.0)
+        factor = lowest + (1.0 - lowest) * 2.0 ** -(excess**2)
+        pr = p @ row
+        power = float(row @ pr)
+        if power > 1e-12:
+            # Directional forgetting (Kulhavy 1987).
+            beta = factor - (1.0 - factor) / power
+            gain = pr / (1.0 + power)
+            theta = theta + gain * error
+            if abs(beta) > 1e-12:
+                p = p - np.outer(pr, pr) / (1.0 / beta + power)
+        variance = memory * variance + (1.0 - memory) * min(error**2, 9.0 * variance)
+        out[i] = theta / size
+    return out

@@ -1,0 +1,152 @@
+"""Records of steering: heading and rudder over time, from a CSV file or a bag."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident.errors import UserError
+from rov_ident.frames import FrameDefaults, quaternion_to_euler, to_core
+from rov_ident.messages import Array, Odometry, Wrench
+from rov_ident.tables import CsvTable, read_csv
+
+_RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
+_STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
+_FAINT = 1.0  # deg; a zigzag whose angles all stay below it is one in radians
+
+
+@dataclass(frozen=True)
+class Zigzag:
+    """A run: t (n,) [s] increasing, heading (n,) [rad] unwrapped, NaN where not known, rudder (n,)
+    [rad]; ``unit`` is that of the rudder (`rad`, or `N m` for a yaw moment in its stead)."""
+
+    name: str
+    t: Array
+    heading: Array
+    rudder: Array
+    unit: str = "rad"
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which rows have a heading."""
+        return np.isfinite(self.heading)
+
+    @property
+    def step(self) -> float:
+        """Median time between two headings [s]."""
+        return float(np.median(np.diff(self.t[self.known])))
+
+
+def read(path: Path) -> Zigzag:
+    """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read, lacks a column or topic, or is in other units than it says.
+    """
+    return from_bag(path) if path.is_dir() or path.suffix == ".mcap" else from_csv(path)
+
+
+def from_csv(path: Path) -> Zigzag:
+    """Columns `t_s`, `heading_rad|deg` (empty where not measured) and `rudder_rad|deg`."""
+    table = read_csv(path)
+    if "t_s" not in table.cells:
+        raise UserError(
+            f"{path} has no column t_s, the time in seconds: it has {', '.join(table.cells)}"
+        )
+    t = table.numbers("t_s")
+    if (bad := np.flatnonzero(np.diff(t) <= 0.0)).size:
+        raise UserError(
+            f"{path}, line {table.lines[bad[0] + 1]}: t_s goes from {t[bad[0]]:g} to "
+            f"{t[bad[0] + 1]:g}, but time must increase: sort the rows"
+        )
+    rudder = _angle(table, "rudder", blank=False)
+    heading = _angle(table, "heading", blank=True)
+    known = np.isfinite(heading)
+    heading[known] = np.unwrap(heading[known])
+    return Zigzag(path.name, t, heading, rudder)
+
+
+def _angle(table: CsvTable, name: str, blank: bool) -> Array:
+    """The column `name_rad` or `name_deg` in radians, its unit held against its values."""
+    found = [f"{name}_{unit}" for unit in ("rad", "deg") if f"{name}_{unit}" in table.cells]
+    if not found:
+        hint = f"say its unit by renaming it {name}_rad or {name}_deg" if name in table.cells else (
+            f"it has {', '.join(table.cells)}"
+        )  # fmt: skip
+        raise UserError(f"{table.path} has no column {name}_rad or {name}_deg: {hint}")
+    values = table.numbers(found[0], blank)
+    moved = values[np.isfinite(values)]
+    if len(moved) == 0:
+        raise UserError(f"{table.path}: the column {found[0]} is empty: fill it in")
+    if len(found) == 2:
+        other = np.radians(table.numbers(found[1], blank))
+        if not np.nanmax(np.abs(other - values), initial=0.0) < 0.01 + 1e-3 * np.nanmax(
+            np.abs(values)
+        ):
+            raise UserError(f"{table.path}: {found[0]} and {found[1]} disagree: remove one of them")
+    if found[0].endswith("_rad"):
+        step = np.abs(np.diff(moved)).max(initial=0.0)
+        turned = name == "heading" and 20.0 < step < 359.0 and np.ptp(moved) > 20.0
+        if turned or (name == "rudder" and np.abs(moved).max() > _STEEPEST):
+            raise UserError(
+                f"{table.path}: {found[0]} reaches {np.abs(moved).max():g}, which looks like "
+                f"degrees: rename the column {name}_deg if it is"
+            )
+        return values
+    if 0.0 < np.ptp(moved) < _FAINT:
+        raise UserError(
+            f"{table.path}: {found[0]} varies by {np.ptp(moved):.3g} only, which looks like "
+            f"radians: rename the column {name}_rad if it is"
+        )
+    return np.radians(values)
+
+
+def from_bag(path: Path) -> Zigzag:
+    """Heading of the odometry; the rudder from a std_msgs/Float64 (or 32) topic [rad] whose name
+    ends in `rudder`, stamped as recorded, or without one the yaw moment of the thruster wrench."""
+    bag = Bag(path)
+    steered = [
+        name
+        for name, topic in bag.topics.items()
+        if topic.type_name in _RUDDER_TYPES and name.endswith("rudder") and topic.message_count
+    ]
+    if len(steered) > 1:
+        raise UserError(f"{path} has several rudders, {', '.join(steered)}: keep one")
+    roles = select_topics(bag, roles=("odom",) if steered else ("odom", "wrench"))
+    defaults = FrameDefaults()
+    times: dict[str, list[float]] = {"odom": [], "wrench": []}
+    values: dict[str, list[float]] = {"odom": [], "wrench": []}
+    for role, message in read_messages(bag, roles):
+        if isinstance(message, Odometry | Wrench):
+            core = to_core(message, defaults)
+            if isinstance(core, Odometry):
+                value = float(np.asarray(quaternion_to_euler(core.orientation))[..., 2])
+            else:
+                value = float(core.torque[2])
+            if np.isfinite(value):
+                times[role].append(1e-9 * core.stamp)
+                values[role].append(value)
+    at, steering = np.array(times["wrench"]), np.array(values["wrench"])
+    if steered:
+        raw = list(bag.iter_raw(steered))
+        kind = _RUDDER_TYPES[bag.topics[steered[0]].type_name]
+        at = 1e-9 * np.array([m.log_time for m in raw], dtype=float)
+        steering = np.array(
+            [np.frombuffer(m.data, ("<" if m.data[1] else ">") + kind, 1, 4)[0] for m in raw],
+            dtype=float,
+        )
+    t, first = np.unique(np.array(times["odom"]), return_index=True)
+    at, once = np.unique(at, return_index=True)
+    if len(t) < 2 or len(at) < 1:
+        raise UserError(f"{path} has too few messages of heading or rudder: record a longer run")
+    heading = np.unwrap(np.array(values["odom"])[first])
+    # Heading and input on the instants of either, so that a step of the input keeps its time.
+    both = np.unique(np.concatenate([t, at[(at > t[0]) & (at < t[-1])]]))
+    index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)
+    known = np.full(len(both), np.nan)
+    known[np.searchsorted(both, t)] = heading
+    return Zigzag(path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m")
