@@ -19,7 +19,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from rov_ident import config as configuration
-from rov_ident.coefficients import catalogue
+from rov_ident.coefficients import catalogue, fin_catalogue
 from rov_ident.errors import UserError
 
 if TYPE_CHECKING:
@@ -193,10 +193,6 @@ def _add_nomoto(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     nomoto.add_argument(
         "--method", choices=("oe", "fd", "iv", "rls"), default="oe",
         help="output error (default), forward differences, instruments, recursive",
-    )  # fmt: skip
-    nomoto.add_argument(
-        "--rudder", choices=("auto", "held", "linear"), default="auto",
-        help="how the rudder goes between its samples (auto: whichever fits better)",
     )  # fmt: skip
     nomoto.add_argument("--validate", type=Path, metavar="FILE", help="predict this run as well")
     nomoto.add_argument("--json", type=Path, help="write the result here")
@@ -513,8 +509,7 @@ def _nomoto(options: argparse.Namespace) -> None:
     judge = zigzag.read(options.validate) if options.validate else None
     model = nomoto.fit(
         runs, options.order, options.nonlinear, options.method, options.interpolate, options.step,
-        {"held": True, "linear": False}.get(options.rudder),
-    )  # fmt: skip
+        )  # fmt: skip
     validation = nomoto.predict(model, judge)[1] if judge else None
     if options.json:
         write_text(options.json, nomoto.to_json(model, validation))
@@ -535,8 +530,10 @@ def _nomoto(options: argparse.Namespace) -> None:
 
 
 def _coefficients(options: argparse.Namespace) -> None:
-    for c in catalogue():
-        OUT.print(f"{c.name:<10} {c.unit:<18} {c.meaning}", markup=False)
+    entries = [(c.name, c.unit, c.meaning) for c in catalogue()]
+    entries += [(c.name, c.unit, c.meaning) for c in fin_catalogue()]
+    for name, unit, meaning in entries:
+        OUT.print(f"{name:<10} {unit:<18} {meaning}", markup=False)
 
 
 def _table(title: str, *columns: str) -> Table:

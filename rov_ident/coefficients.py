@@ -14,15 +14,21 @@ name           term on the hydrodynamic side of the axis    example
 ``A_b_neg``    ``min(b, 0)``, added to ``A_b b``; only      ``Z_w_neg``
                where b is the axis's own velocity
 ``A_bb_neg``   ``|b| min(b, 0)``, added to ``A_bb |b| b``   ``Z_ww_neg``
+``A_uudr``     fin ``u^2 dr``; with ``ds``, ``da`` alike;   ``N_uudr``, ``X_uudsds``
+               ``A_uudrdr``: ``u^2 |dr| dr``, or plain
+               square where even; ``A_udr``, ``A_dr``:
+               behind a propeller, where not u^2 decides
 =============  ==========================================  ============================
 
 A *term* is the product of two entries of the extended velocity ``[1, nu, |nu|, min(nu, 0)]``, so
 that every velocity coefficient is a row and two indices: simulator, regressor and Kalman filter
-loop over one table, and a new name in the grammar needs no new equation.
+loop over one table, and a new name in the grammar needs no new equation. Fin angles are an input,
+not a state: their coefficients (:class:`FinCoefficient`) make a wrench outside of that table.
 """
 
 import re
 from dataclasses import dataclass
+from functools import cache
 
 from rov_ident.errors import UserError
 
@@ -45,6 +51,35 @@ _GRAMMAR = re.compile(
     r"(?P<axis>[XYZKMN])_(?P<first>[uvwpqr])"
     r"(?:(?P<dot>dot)|_abs_(?P<abs>[uvwpqr])|(?P<second>[uvwpqr])?(?P<neg>_neg)?)"
 )
+
+FINS = "sra"
+"""Equivalent cross-tail angles: stern plane, rudder, aileron (:mod:`rov_ident.fins`)."""
+
+_FIN_GRAMMAR = re.compile(
+    r"(?P<axis>[XYZKMN])_(?P<speed>u{0,2})d(?P<fin>[sra])(?P<square>d(?P=fin))?"
+)
+_FIN_EVEN = {"X": "sra", "Z": "ra", "M": "ra"}  # by the same symmetries as EVEN
+_FIN_NAMES = {"s": "stern plane", "r": "rudder", "a": "aileron"}
+
+
+@dataclass(frozen=True)
+class FinCoefficient:
+    """A force per fin angle: ``u^power delta``, with ``square`` ``u^power |delta| delta``, or
+    ``u^power delta^2`` where it is ``even``. ``row`` is the axis (0..5), ``fin`` one of FINS."""
+
+    name: str
+    row: int
+    power: int
+    fin: str
+    square: bool
+    even: bool
+    unit: str
+    meaning: str
+
+    def factor(self, u: float, delta: float) -> float:
+        """What the coefficient multiplies, at surge speed u [m/s] and angle delta [rad]."""
+        angle = delta if not self.square else delta * (delta if self.even else abs(delta))
+        return u**self.power * angle
 
 
 @dataclass(frozen=True)
@@ -151,6 +186,41 @@ def parse(name: str) -> Coefficient:
     meaning = f"{'linear damping' if left == ONE else 'quadratic term'}: {axis} = {name} {formula}"
     order = [first] if left == ONE else [first, second]
     return Coefficient(name, row, first, left, right, _unit(force, order), meaning)
+
+
+@cache
+def parse_fin(name: str) -> FinCoefficient | None:
+    """The fin coefficient called ``name``; None for any other name."""
+    match = _FIN_GRAMMAR.fullmatch(name)
+    if match is None:
+        return None
+    axis, fin, power = match["axis"], match["fin"], len(match["speed"])
+    row, square = AXES.index(axis), match["square"] is not None
+    even = square and fin in _FIN_EVEN.get(axis, "")
+    speed = ("", "u ", "u^2 ")[power]
+    angle = f"d{fin}" if not square else f"d{fin}^2" if even else f"|d{fin}| d{fin}"
+    force = "N" if row < 3 else "N m"
+    radians = "rad2" if square else "rad"
+    unit = (
+        f"{force}/{radians}",
+        f"{force} s/(m {radians})",
+        f"{force} s2/(m2 {radians})",
+    )[power]
+    side = "force" if row < 3 else "moment"
+    meaning = f"fin ({_FIN_NAMES[fin]}): {side} {axis} = {name} {speed}{angle}"
+    return FinCoefficient(name, row, power, fin, square, even, unit, meaning)
+
+
+def fin_catalogue() -> list[FinCoefficient]:
+    """Every fin coefficient of the grammar."""
+    names = [
+        f"{axis}_{speed}d{fin}{square}"
+        for speed in ("uu", "u", "")
+        for axis in AXES
+        for fin in FINS
+        for square in ("", f"d{fin}")
+    ]
+    return [c for name in names if (c := parse_fin(name))]
 
 
 def _unit(force: str, velocities: list[int]) -> str:

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from rov_ident.coefficients import catalogue, parse
+from rov_ident.coefficients import catalogue, parse, parse_fin
 from rov_ident.effects import EFFECTS, rigid_body
 from rov_ident.errors import UserError
 from rov_ident.frames import FrameDefaults, to_core
@@ -551,6 +551,8 @@ def _model(vehicle: Vehicle, coefficients: Mapping[str, float], gravity: float) 
     if not coefficients:
         raise UserError("coefficients is empty: give at least one, such as X_udot or X_u")
     for name in coefficients:
+        if parse_fin(name) is not None:
+            continue
         try:
             parse(name)
         except UserError as error:
@@ -619,6 +621,7 @@ def to_parameters(config: Config) -> dict[str, Any]:
         "inertia": inertia.tolist(),
     }
     coefficients = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
+    coefficients |= config.model.fins
     settings = _changed(config)
     if config.estimate == config.model.names:
         del settings["estimate"]

@@ -81,7 +81,8 @@ class Hypothesis:
             change = EFFECTS[name].body
             if change is not None:
                 body = change(body, **parameters)
-        return Model(body, tuple(found), np.array([values[c.name] for c in found]))
+        theta = np.array([values[c.name] for c in found])
+        return Model(body, tuple(found), theta, self.config.model.fins)
 
     @cached_property
     def equations(self) -> Equations:

@@ -21,7 +21,7 @@ ones.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +35,7 @@ from rov_ident.coefficients import (
     PLAIN,
     Coefficient,
     parse,
+    parse_fin,
 )
 from rov_ident.errors import UserError
 from rov_ident.jit import inlined, kernel
@@ -95,11 +96,14 @@ class Model:
     """A rigid body and its hydrodynamic coefficients: all that the equations of motion need.
 
     ``coefficients`` are in the order of the parameter vector ``theta`` (added mass first).
+    ``fins`` are coefficients of fin angles: these are an input, so that what they make is part of
+    the wrench on the vehicle (:meth:`fin_wrench`) and the estimators do not see them.
     """
 
     body: RigidBody
     coefficients: tuple[Coefficient, ...]
     theta: Array
+    fins: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -127,7 +131,7 @@ class Model:
         """
         if np.shape(theta) != self.theta.shape:
             raise UserError(f"theta needs shape {self.theta.shape}, not {np.shape(theta)}")
-        return Model(self.body, self.coefficients, _vector(theta))
+        return replace(self, theta=_vector(theta))
 
     def with_values(self, values: Mapping[str, float]) -> "Model":
         """The same structure with some coefficients replaced by name.
@@ -145,6 +149,15 @@ class Model:
                 )
             theta[self.names.index(name)] = value
         return self.with_theta(theta)
+
+    def fin_wrench(self, u: float, angles: Mapping[str, float]) -> Array:
+        """The wrench (6,) of the fins at surge speed u [m/s]; ``angles`` [rad] by letter."""
+        wrench = np.zeros(6)
+        for name, value in self.fins.items():
+            c = parse_fin(name)
+            if c is not None:
+                wrench[c.row] += value * c.factor(u, angles.get(c.fin, 0.0))
+        return wrench
 
     @property
     def mass_matrix(self) -> Array:
@@ -213,7 +226,11 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
         For a name outside the grammar, a term given twice, or values that no passive hull has.
     """
     by_place: dict[tuple[int, ...], Coefficient] = {}
+    fins: dict[str, float] = {}
     for name, value in values.items():
+        if parse_fin(name) is not None and np.isfinite(value):
+            fins[name] = float(value)
+            continue
         coefficient = parse(name)
         if not np.isfinite(value):
             raise UserError(f"coefficients.{name} is {value}, but must be a finite number")
@@ -234,7 +251,7 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
             )
     coefficients = sorted(by_place.values(), key=lambda c: not c.is_added_mass)
     theta = np.array([float(values[c.name]) for c in coefficients])
-    model = Model(body, tuple(coefficients), theta)
+    model = Model(body, tuple(coefficients), theta, fins)
     if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0:
         raise UserError(
             "the mass matrix (rigid body plus added mass) is not positive definite: "

@@ -35,6 +35,7 @@ from rov_ident.zigzag import Zigzag
 
 METHODS = ("oe", "fd", "iv", "rls")
 STEP = 0.05  # s, largest of the integration
+MOST_JUMPS = 200  # of a rudder, beyond which their instants are not estimated
 _MIN_SAMPLES = 20
 
 
@@ -43,7 +44,7 @@ class Nomoto:
     """A fitted model: ``theta`` in the order of ``names``, its covariance, and how it was got.
 
     names: order 1 ``a0 b0 [c] delta_0``, order 2 ``a0 a1 b0 b1 [c] delta_0``; see the head of the
-    module. ``held``: whether the rudder is taken as held between its samples, else as linear.
+    module.
     """
 
     order: int
@@ -51,7 +52,6 @@ class Nomoto:
     method: str
     theta: Array
     covariance: Array
-    held: bool
     unit: str
     rmse: float
     notes: tuple[str, ...] = ()
@@ -180,20 +180,42 @@ def _respond(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max_step, o
 
 
 def respond(
-    order: int, nonlinear: bool, theta: Array, run: Zigzag, first: Array, held: bool
+    order: int,
+    nonlinear: bool,
+    theta: Array,
+    run: Zigzag,
+    first: Array,
+    shares: Array | None = None,
 ) -> Array:
-    """The simulated heading (n,) [rad] of a run from its first state [psi, x1, x2]."""
+    """The simulated heading (n,) [rad] of a run from its first state [psi, x1, x2].
+
+    The rudder is linear between the rows, or where the run says so, held. ``shares`` (j,) from 0
+    to 1 says when within its step each of ``run.reversals`` came about.
+    """
     x = dict(zip(_names(order, nonlinear), theta))
-    out = np.empty(len(run.t))
+    t, rudder, held = run.t, run.rudder, run.held
+    rows = None
+    if shares is not None:
+        after = run.reversals + 1
+        instants = t[after - 1] + np.clip(shares, 0.0, 1.0) * (t[after] - t[after - 1])
+        instants = np.clip(instants, t[after - 1] + 1e-9, t[after] - 1e-9)
+        rudder = np.insert(rudder, after, rudder[after])
+        t = np.insert(t, after, instants)
+        rows = np.delete(np.arange(len(t)), after + np.arange(len(after)))
+        held = True
+    out = np.empty(len(t))
     _respond(
         order, x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0),
-        x["delta_0"], run.t, run.rudder, held, first, STEP, out,
+        x["delta_0"], t, rudder, held, first, STEP, out,
     )  # fmt: skip
-    return out
+    return out if rows is None else out[rows]
 
 
-def predict(model: Nomoto, run: Zigzag) -> tuple[Array, float]:
+def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[Array, float]:
     """The heading (n,) that the model predicts for a run, its first state fitted; and the RMSE.
+
+    ``rudder`` is the same run with more rows, if there is one. As in the fit, a rudder that jumps
+    has the instants of its jumps fitted, each within its step.
 
     Raises
     ------
@@ -205,8 +227,18 @@ def predict(model: Nomoto, run: Zigzag) -> tuple[Array, float]:
             f"{run.name} has an input in {run.unit}, but the model was fitted to one in "
             f"{model.unit}: validate on a run of the same kind"
         )
-    first = _first_state(model.order, model.nonlinear, model.theta, run, model.held)
-    heading = respond(model.order, model.nonlinear, model.theta, run, first, model.held)
+    fine = run
+    if rudder is not None and rudder is not run:
+        both = np.union1d(rudder.t, run.t)
+        heading = np.full(len(both), np.nan)
+        heading[np.searchsorted(both, run.t)] = run.heading
+        fine = dataclasses.replace(
+            run, t=both, heading=heading, rudder=np.interp(both, rudder.t, rudder.rudder)
+        )
+    first, shares = _first_state(model.order, model.nonlinear, model.theta, fine)
+    heading = respond(model.order, model.nonlinear, model.theta, fine, first, shares)
+    if fine is not run:
+        heading = heading[np.searchsorted(fine.t, run.t)]
     return heading, _rmse(run.heading - heading)
 
 
@@ -218,27 +250,41 @@ def _states(order: int) -> int:
     return order + 1
 
 
-def _first_state(order: int, nonlinear: bool, theta: Array, run: Zigzag, held: bool) -> Array:
-    """The first state that fits the heading best: Gauss-Newton, exact for the linear models."""
-    known = run.known
-    first = np.zeros(3)
-    first[0] = run.heading[known][0]
-    for _ in range(12 if nonlinear else 2):
-        base = respond(order, nonlinear, theta, run, first, held)
-        columns = [np.ones(len(run.t))]
-        for i in range(1, _states(order)):
-            moved = first.copy()
-            moved[i] += 1e-5
-            columns.append((respond(order, nonlinear, theta, run, moved, held) - base) / 1e-5)
-        step = np.linalg.lstsq(
-            np.column_stack(columns)[known], (run.heading - base)[known], rcond=None
-        )[0]
+def _jumps(run: Zigzag) -> int:
+    """How many instants of jumps are to be estimated: none where the record has them."""
+    count = len(run.reversals)
+    return 0 if run.held or count > MOST_JUMPS else count
+
+
+def _first_state(
+    order: int, nonlinear: bool, theta: Array, run: Zigzag
+) -> tuple[Array, Array | None]:
+    """First state and shares (see :func:`respond`) that fit the heading best: Gauss-Newton."""
+    known, jumps, states = run.known, _jumps(run), _states(order)
+    x = np.concatenate([[run.heading[known][0]], np.zeros(order), np.full(jumps, 0.5)])
+
+    def simulated(x: Array) -> Array:
+        first = np.zeros(3)
+        first[:states] = x[:states]
+        return respond(order, nonlinear, theta, run, first, x[states:] if jumps else None)[known]
+
+    for _ in range(12 if nonlinear or jumps else 2):
+        base = simulated(x)
+        columns = [np.ones(len(base))]
+        for i in range(1, len(x)):
+            moved = x.copy()
+            moved[i] += 1e-5 if moved[i] < 0.5 else -1e-5
+            columns.append((simulated(moved) - base) / (moved[i] - x[i]))
+        step = np.linalg.lstsq(np.column_stack(columns), run.heading[known] - base, rcond=None)[0]
         if not np.isfinite(step).all():
             break
-        first[: len(step)] += step
+        x = x + step
+        x[states:] = np.clip(x[states:], 0.0, 1.0)
         if np.abs(step).max() < 1e-9:
             break
-    return first
+    first = np.zeros(3)
+    first[:states] = x[:states]
+    return first, x[states:] if jumps else None
 
 
 # ------------------------------------------------------------------ fitting
@@ -251,13 +297,12 @@ def fit(
     method: str = "oe",
     interpolate: str = "none",
     step: float | None = None,
-    held: bool | None = None,
     scale: float = 1.0,
 ) -> Nomoto:
     """One model for all runs.
 
-    ``interpolate`` densifies sparse headings first (:func:`dense`), to ``step`` [s]. ``held`` says
-    how the rudder goes between its samples; None: whichever fits the heading better.
+    ``interpolate`` densifies sparse headings first (:func:`dense`), to ``step`` [s], in a plane
+    of ``scale`` [s/rad] where the spiral needs one.
 
     Raises
     ------
@@ -278,12 +323,12 @@ def fit(
                 "runs of one kind together"
             )
     used = [dense(run, interpolate, step, scale) for run in runs] if interpolate != "none" else runs
-    choices = (False, True) if held is None else (held,)
-    models = [_output_error(used, order, nonlinear, choice) for choice in choices]
-    model = min(models, key=lambda m: m.rmse)
+    model = _output_error(used, order, nonlinear)
     if method != "oe":
         model = _equation_error(used, model, method)
-    measured = np.concatenate([run.heading - predict(model, run)[0] for run in runs])
+    measured = np.concatenate(
+        [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
+    )
     notes = list(model.notes)
     if model.theta[0] <= 0.0:
         notes.append(
@@ -330,53 +375,74 @@ def dense(run: Zigzag, method: str, step: float | None = None, scale: float = 1.
     inside = (t >= run.t[known][0] - 1e-9) & (t <= run.t[known][-1] + 1e-9)
     t = t[inside]
     heading = densify.densify(run.t[known], run.heading[known], t, method, scale)
-    return Zigzag(run.name, t, heading, np.interp(t, run.t, run.rudder), run.unit)
+    return dataclasses.replace(
+        run, t=t, heading=heading, rudder=np.interp(t, run.t, run.rudder), held=False
+    )
 
 
-def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool, held: bool) -> Nomoto:
-    """Least squares on the simulated headings over theta and every run's first state."""
-    start, firsts = _linear_start(runs, order, held)
+def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
+    """Least squares on the simulated headings over theta, every run's first state, and the instants
+    of jumps that fall between two rows (:attr:`Zigzag.reversals`)."""
+    start, firsts = _linear_start(runs, order)
     if nonlinear:
         start = np.insert(start, len(start) - 1, 0.0)
-    n = len(start)
-    states = _states(order)
+    n, states = len(start), _states(order)
     known = [run.known for run in runs]
     speed = max(float(np.std(np.gradient(r.heading[k], r.t[k]))) for r, k in zip(runs, known))
     names = _names(order, nonlinear)
     # Scales: of the offset the rudder's spread, of the cubic term one that equals a0 at r_rms.
     scale = np.abs(start)
-    spread = max(float(np.std(run.rudder)) for run in runs)
-    scale[names.index("delta_0")] = 0.1 * spread
+    scale[names.index("delta_0")] = 0.1 * max(float(np.std(run.rudder)) for run in runs)
     if nonlinear:
         scale[names.index("c")] = abs(start[0]) / speed**2
     scale = np.maximum(scale, 1e-9)
-    scales = np.concatenate([scale, np.tile([0.1, *[speed] * order], len(runs))])
+    jumps = [_jumps(run) for run in runs]
+    scales, x0 = [scale], [start / scale]
+    lower, upper = [np.full(n, -np.inf)], [np.full(n, np.inf)]
+    for first, count in zip(firsts, jumps):
+        size = np.array([0.1, *[speed] * order])
+        scales += [size, np.ones(count)]
+        x0 += [first[:states] / size, np.full(count, 0.5)]
+        lower += [np.full(states, -np.inf), np.zeros(count)]
+        upper += [np.full(states, np.inf), np.ones(count)]
+    sizes = np.concatenate(scales)
 
     def residual(x: Array) -> Array:
-        theta = x[:n] * scale
-        parts = []
-        for i, run in enumerate(runs):
+        x = x * sizes
+        parts, at = [], n
+        for run, seen, count in zip(runs, known, jumps):
             first = np.zeros(3)
-            at = n + states * i
-            first[:states] = (x * scales)[at : at + states]
-            parts.append(
-                (respond(order, nonlinear, theta, run, first, held) - run.heading)[known[i]]
-            )
+            first[:states] = x[at : at + states]
+            shares = x[at + states : at + states + count] if count else None
+            at += states + count
+            parts.append((respond(order, nonlinear, x[:n], run, first, shares) - run.heading)[seen])
         return np.concatenate(parts)
 
-    x0 = np.concatenate([start, *(first[:states] for first in firsts)]) / scales
+    bounded = any(jumps)
     result = least_squares(
-        residual, x0, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200 * len(x0)
+        residual,
+        np.concatenate(x0),
+        bounds=(np.concatenate(lower), np.concatenate(upper)),
+        method="trf" if bounded else "lm",
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-12,
+        max_nfev=100 if bounded else 200 * len(sizes),
     )
+    if not result.cost < 1e10:
+        raise UserError("the fit does not converge: try --order 1 without --nonlinear")
+    free = result.active_mask == 0  # a jump's instant on its bound is no free parameter
     lengths = [int(k.sum()) for k in known]
-    covariance = _robust_covariance(result.jac, result.fun, lengths) * np.outer(scales, scales)
+    covariance = np.zeros((len(sizes), len(sizes)))
+    covariance[np.ix_(free, free)] = _robust_covariance(result.jac[:, free], result.fun, lengths)
+    covariance *= np.outer(sizes, sizes)
     return Nomoto(
-        order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], held, runs[0].unit,
+        order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], runs[0].unit,
         _rmse(result.fun),
     )  # fmt: skip
 
 
-def _linear_start(runs: Sequence[Zigzag], order: int, held: bool) -> tuple[Array, list[Array]]:
+def _linear_start(runs: Sequence[Zigzag], order: int) -> tuple[Array, list[Array]]:
     """Start of the search: over a grid of time constants all else of the linear model is linear."""
     states = _states(order)
     total = sum(int(run.known.sum()) for run in runs)
@@ -401,14 +467,12 @@ def _linear_start(runs: Sequence[Zigzag], order: int, held: bool) -> tuple[Array
             units += [(0.0, 1.0, run, 1)] if order == 2 else []
             for b0, b1, driven, column in units:
                 theta = np.array([a0, b0, 0.0] if order == 1 else [a0, a1, b0, b1, 0.0])
-                columns[rows, column] = respond(order, False, theta, driven, np.zeros(3), held)[
-                    run.known
-                ]
+                columns[rows, column] = respond(order, False, theta, driven, np.zeros(3))[run.known]
             theta = np.array([a0, 0.0, 0.0] if order == 1 else [a0, a1, 0.0, 0.0, 0.0])
             for j in range(states):
                 first = np.eye(3)[j]
                 column = order + 1 + states * i + j
-                columns[rows, column] = respond(order, False, theta, run, first, held)[run.known]
+                columns[rows, column] = respond(order, False, theta, run, first)[run.known]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         solution = np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
         error = float(np.sum((columns @ solution - target) ** 2))
@@ -449,7 +513,8 @@ def _robust_covariance(jac: Array, error: Array, lengths: Sequence[int]) -> Arra
         e = error[at - length : at]
         own = float(np.clip(e[1:] @ e[:-1] / max(e @ e, 1e-300), 0.0, 0.97))
         white = part[1:] - own * part[:-1]
-        rho = np.clip(np.sum(white[1:] * white[:-1]) / max(np.sum(white**2), 1e-300), -0.9, 0.97)
+        power = max(float(np.sum(white**2)), 1e-300)
+        rho = float(np.clip(np.sum(white[1:] * white[:-1]) / power, -0.9, 0.97))
         # Andrews (1991), eq. 6.2: the bandwidth for an AR(1) of that correlation.
         alpha = 4.0 * rho**2 / ((1.0 - rho) ** 2 * (1.0 + rho) ** 2)
         lags = int(min(1.1447 * (alpha * length) ** (1.0 / 3.0), 0.25 * length))
@@ -489,8 +554,8 @@ def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomot
             theta = _from_solution(solution, order, nonlinear)
             blocks = []
             for run in even:
-                first = _first_state(order, nonlinear, theta, run, model.held)
-                heading = respond(order, nonlinear, theta, run, first, model.held)
+                first, shares = _first_state(order, nonlinear, theta, run)
+                heading = respond(order, nonlinear, theta, run, first, shares)
                 blocks.append(_rows(run.t, heading, run.rudder, order, nonlinear)[1])
             z = np.vstack(blocks)
             if not np.abs(z).max() < 1e5:
@@ -560,7 +625,8 @@ def _rows(
 def _from_solution(solution: Array, order: int, nonlinear: bool) -> Array:
     """theta from the solution, whose last entry is b0 delta_0."""
     theta = solution.copy()
-    theta[-1] = solution[-1] / theta[_names(order, nonlinear).index("b0")]
+    with np.errstate(divide="ignore", invalid="ignore"):  # b0 is zero before the rudder moves
+        theta[-1] = solution[-1] / theta[_names(order, nonlinear).index("b0")]
     return theta
 
 

@@ -20,13 +20,15 @@ _FAINT = 1.0  # deg; a zigzag whose angles all stay below it is one in radians
 @dataclass(frozen=True)
 class Zigzag:
     """A run: t (n,) [s] increasing, heading (n,) [rad] unwrapped, NaN where not known, rudder (n,)
-    [rad]; ``unit`` is that of the rudder (`rad`, or `N m` for a yaw moment in its stead)."""
+    [rad]; ``unit`` is that of the rudder (`rad`, or `N m` for a yaw moment in its stead).
+    ``held``: the rudder is known to stay as it is from one row to the next."""
 
     name: str
     t: Array
     heading: Array
     rudder: Array
     unit: str = "rad"
+    held: bool = False
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -37,6 +39,15 @@ class Zigzag:
     def step(self) -> float:
         """Median time between two headings [s]."""
         return float(np.median(np.diff(self.t[self.known])))
+
+    @property
+    def reversals(self) -> NDArray[np.intp]:
+        """Rows after which a rudder that otherwise stands still has jumped: the two steps beside
+        are level. When it jumped within the step is not in the record."""
+        level = np.abs(np.diff(self.rudder)) < 1e-3 * np.ptp(self.rudder)
+        jumps = np.flatnonzero(~level)
+        inside = jumps[(jumps > 0) & (jumps < len(level) - 1)]
+        return inside[level[inside - 1] & level[inside + 1]]
 
 
 def read(path: Path) -> Zigzag:
@@ -149,4 +160,6 @@ def from_bag(path: Path) -> Zigzag:
     index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)
     known = np.full(len(both), np.nan)
     known[np.searchsorted(both, t)] = heading
-    return Zigzag(path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m")
+    return Zigzag(
+        path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m", True
+    )
