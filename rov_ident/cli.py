@@ -168,6 +168,7 @@ def _parser() -> argparse.ArgumentParser:
     model.set_defaults(run=_import_model)
 
     _add_nomoto(commands)
+    _add_forces(commands)
 
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
@@ -198,6 +199,40 @@ def _add_nomoto(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     nomoto.add_argument("--json", type=Path, help="write the result here")
     nomoto.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
     nomoto.set_defaults(run=_nomoto)
+
+
+def _add_forces(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    forces = commands.add_parser(
+        "forces", help="coefficients from CFD, towing-tank, rotating-arm or PMM tables"
+    )
+    forces.add_argument("table", type=Path, metavar="TABLE.csv")
+    forces.add_argument(
+        "--map", nargs="+", action="extend", default=[], metavar="NAME=HEADING",
+        help='headings that are called otherwise (beta_deg="beta(deg)"), or a YAML file',
+    )  # fmt: skip
+    forces.add_argument(
+        "--nondimensional", metavar="rho=,L=[,T=]",
+        help="forces are over rho/2 U^2 L^2 (with T: L T), moments over L times that",
+    )  # fmt: skip
+    forces.add_argument(
+        "--drift", choices=("auto", "starboard", "port"), default="auto",
+        help="positive beta is a drift to starboard, v = U sin(beta), or to port (default: as a "
+        "hull resists its motion)",
+    )  # fmt: skip
+    forces.add_argument(
+        "--config", type=Path,
+        help="the vehicle: the Coriolis forces of its added mass are not counted twice",
+    )  # fmt: skip
+    forces.add_argument(
+        "--hull", metavar="cylinder:L=,R=",
+        help="with --config: added mass of a cylinder or spheroid of length L, radius R [m], rho",
+    )  # fmt: skip
+    forces.add_argument("--json", type=Path, help="write the result here")
+    forces.add_argument(
+        "--out", type=Path, metavar="CONFIG", help="write the vehicle with the fitted values"
+    )
+    forces.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    forces.set_defaults(run=_forces)
 
 
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
@@ -526,6 +561,44 @@ def _nomoto(options: argparse.Namespace) -> None:
             markup=False,
         )
     for note in model.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
+
+
+def _forces(options: argparse.Namespace) -> None:
+    from rov_ident import force_tables
+    from rov_ident.added_mass import parse_hull
+    from rov_ident.fit import write_text
+    from rov_ident.importer import parse_columns
+
+    _check_outputs([options.json, options.out, options.report], [options.table, options.config])
+    if not options.config and (options.out or options.hull):
+        raise UserError("--out and --hull need --config: the vehicle's mass, inertia and buoyancy")
+    config = configuration.load(options.config) if options.config else None
+    hull = parse_hull(options.hull) if options.hull else {}
+    scale = options.nondimensional
+    table = force_tables.read_table(
+        options.table,
+        parse_columns(options.map),
+        force_tables.parse_nondimensional(scale) if scale else None,
+        options.drift,
+    )
+    if config:
+        config = force_tables.with_hull(config, hull)
+    fits = force_tables.fit(table, config.model if config else None)
+    notes = (*table.notes, *force_tables.remarks(fits, config is not None))
+    new = force_tables.configured(config, fits) if config and options.out else None
+    if options.json:
+        write_text(options.json, force_tables.to_json(fits, notes))
+    if new:
+        configuration.dump(
+            new, options.out, f"Coefficients from {options.table.name} by rov-ident forces."
+        )
+    for axis, f in fits.items():
+        table_ = _table(f"{axis}: {f.why}; R2 {f.r2:.4f}", "value", "std", "unit")
+        for name, value, std in zip(f.terms, f.values, f.std):
+            table_.add_row(name, f"{value:.5g}", f"{std:.2g}", force_tables.unit(name))
+        OUT.print(table_)
+    for note in notes:
         ERR.print(note, markup=False, soft_wrap=True)
 
 

@@ -20,6 +20,7 @@ in the literature on sparse zigzags), the same with instruments (`iv`) and recur
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -73,7 +74,7 @@ class Nomoto:
             if not np.isfinite(value):
                 continue
             gradient = _gradient(function, self.theta)
-            std = float(np.sqrt(max(gradient @ self.covariance @ gradient, 0.0)))
+            std = math.sqrt(max(float(gradient @ self.covariance @ gradient), 0.0))
             values[name] = (float(value), std, unit)
         return values
 
@@ -511,10 +512,10 @@ def _robust_covariance(jac: Array, error: Array, lengths: Sequence[int]) -> Arra
             s += part.T @ part
             continue
         e = error[at - length : at]
-        own = float(np.clip(e[1:] @ e[:-1] / max(e @ e, 1e-300), 0.0, 0.97))
+        own = float(np.clip(float(e[1:] @ e[:-1]) / (float(e @ e) + 1e-300), 0.0, 0.97))
         white = part[1:] - own * part[:-1]
-        power = max(float(np.sum(white**2)), 1e-300)
-        rho = float(np.clip(np.sum(white[1:] * white[:-1]) / power, -0.9, 0.97))
+        power = float(np.sum(white**2)) + 1e-300
+        rho = float(np.clip(float(np.sum(white[1:] * white[:-1])) / power, -0.9, 0.97))
         # Andrews (1991), eq. 6.2: the bandwidth for an AR(1) of that correlation.
         alpha = 4.0 * rho**2 / ((1.0 - rho) ** 2 * (1.0 + rho) ** 2)
         lags = int(min(1.1447 * (alpha * length) ** (1.0 / 3.0), 0.25 * length))
@@ -577,12 +578,9 @@ def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomot
     square = z.T @ z
     covariance = inverse @ square @ core @ square @ inverse.T
     theta = _from_solution(solution, order, nonlinear)
-    jacobian = np.array(
-        [
-            _gradient(lambda s, i=i: _from_solution(s, order, nonlinear)[i], solution)
-            for i in range(len(theta))
-        ]
-    )
+    jacobian = np.eye(len(theta))  # of the last alone, delta_0 = (b0 delta_0) / b0
+    b0 = _names(order, nonlinear).index("b0")
+    jacobian[-1, -1], jacobian[-1, b0] = 1.0 / theta[b0], -theta[-1] / theta[b0]
     histories = (
         None
         if history is None
