@@ -548,6 +548,11 @@ def _nomoto(options: argparse.Namespace) -> None:
     validation = nomoto.predict(model, judge)[1] if judge else None
     if options.json:
         write_text(options.json, nomoto.to_json(model, validation))
+    if options.report:
+        from rov_ident import table_reports
+
+        others = nomoto.others(model, runs, options.interpolate, options.step)
+        write_text(options.report, table_reports.steering(model, runs, judge, others))
     table = _table(
         f"Nomoto's model of order {model.order}, by {model.method}", "value", "std", "unit"
     )
@@ -589,15 +594,20 @@ def _forces(options: argparse.Namespace) -> None:
     new = force_tables.configured(config, fits) if config and options.out else None
     if options.json:
         write_text(options.json, force_tables.to_json(fits, notes))
+    if options.report:
+        from rov_ident import table_reports
+
+        write_text(options.report, table_reports.forces(table.name, fits, notes))
     if new:
         configuration.dump(
             new, options.out, f"Coefficients from {options.table.name} by rov-ident forces."
         )
     for axis, f in fits.items():
-        table_ = _table(f"{axis}: {f.why}; R2 {f.r2:.4f}", "value", "std", "unit")
+        table_ = _table(f"{axis}: R2 {f.r2:.4f}", "value", "std", "unit")
         for name, value, std in zip(f.terms, f.values, f.std):
             table_.add_row(name, f"{value:.5g}", f"{std:.2g}", force_tables.unit(name))
         OUT.print(table_)
+        OUT.print(f"{axis}: {f.why}\n", markup=False)
     for note in notes:
         ERR.print(note, markup=False, soft_wrap=True)
 

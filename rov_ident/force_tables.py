@@ -4,8 +4,9 @@ Every row is a state (velocities, fin angles) and the forces and moments on the 
 each axis the terms of the grammar that the table excites are candidates. Structures are grown term
 by term and refined by exchange; each is judged by leave-one-out cross-validation, exactly and at
 once from the projection ``h`` of least squares, ``e_i / (1 - h_i)``. Chosen is the smallest whose
-squared error exceeds that of the best by less than one standard error of the difference, row by row
-paired: where several do equally well, the simplest is believed.
+squared error exceeds that of the best by less than two standard errors of the difference, row by
+row paired: where several do equally well, the simplest is believed. (A term that acts on a few rows
+alone makes that standard error large by itself; a term that is clearly seen there is kept.)
 
 Intervals allow for noise that grows with the force: heteroscedastic covariance HC3 (MacKinnon and
 White 1985), Student's distribution.
@@ -44,7 +45,9 @@ _ALIKE = 0.995  # cosine between two columns from which a table cannot tell them
 _CONDITION = 100.0  # of a structure's scaled columns, beyond which its values mean nothing apart
 _FEWEST = 6  # conditions
 _ROWS_PER_TERM = 3
-_WORTH = 1.0  # standard errors
+_SHOWN = 20  # candidates, beside the chosen
+_WORTH = 2.0  # standard errors
+_DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 
 
 @dataclass(frozen=True)
@@ -127,9 +130,10 @@ def read_table(
     """A CSV of states and forces; ``columns`` maps our names to its headings.
 
     States: `u v w p q r` (m/s, rad/s), or `U_mps` with `alpha_deg|rad`, `beta_deg|rad`, and a
-    turning radius `R_m` (r = U / R; empty: straight on). Fins: `rudder_deg`, `stern_deg`, `aileron_deg` (or
-    `delta_r_deg` ...; or `_rad`), the fins of an X tail `ul ur ll lr` or a cross tail `upper lower
-    port starboard`. Forces: `X Y Z K M N`; with ``nondimensional`` (rho, L, maybe T) also `X'` ...
+    turning radius `R_m` (r = U / R; empty: straight on). Fins: `rudder_deg`, `stern_deg`,
+    `aileron_deg` (or `delta_r_deg` ...; or `_rad`), the fins of an X tail `ul ur ll lr` or a cross
+    tail `upper lower port starboard`. Forces: `X Y Z K M N`; with ``nondimensional`` also
+    `X'` ...
 
     ``drift`` says what a positive beta (and alpha) means: `starboard` v = U sin(beta) (Fossen),
     `port` v = -U sin(beta) (SNAME, towing tanks), `auto`: as a hull resists its motion.
@@ -446,9 +450,10 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     scale = size[list(chosen)]
     fitted = x @ values
     spread = float(np.sum((force - force.mean()) ** 2))
+    shown = sorted(path, key=lambda s: _rms(errors[s]))[:_SHOWN]
     candidates = tuple(
         Candidate(tuple(names[i] for i in s), _rms(errors[s]))
-        for s in sorted(path, key=lambda s: _rms(errors[s]))[:20]
+        for s in sorted({*shown, chosen}, key=lambda s: _rms(errors[s]))
     )
     return AxisFit(
         axis,
@@ -547,12 +552,14 @@ def _smallest(
     best: tuple[int, ...],
     names: Sequence[str],
 ) -> tuple[tuple[int, ...], str]:
-    """The smallest structure not worse than the best by more than a standard error, and why."""
+    """The smallest structure not worse than the best by more than chance, and why."""
     n = len(errors[best])
     fit: dict[tuple[int, ...], float] = {}
     for subset in path:
         excess = errors[subset] ** 2 - errors[best] ** 2
-        doubt = float(np.std(excess)) / math.sqrt(n)
+        left_out = max(len(best) - len(subset), 1)
+        of_term = _DOUBT * left_out * float(np.mean(errors[best] ** 2)) / n
+        doubt = min(float(np.std(excess)) / math.sqrt(n), of_term)
         if float(np.mean(excess)) <= _WORTH * doubt + 1e-18:
             fit[subset] = float(np.mean(errors[subset] ** 2))
     chosen = min(fit, key=lambda s: (len(s), fit[s]))
@@ -560,10 +567,10 @@ def _smallest(
     if chosen != best:
         words += (
             f"; {' '.join(names[i] for i in best)} has {_rms(errors[best]):.4g}, not better by "
-            "more than one standard error, and has more terms"
+            "more than two standard errors, and has more terms"
         )
     else:
-        words += ", the least of all tried; no smaller structure comes within one standard error"
+        words += ", the least of all tried; no smaller structure comes within two standard errors"
     smaller = [s for s in path if len(s) < len(chosen)]
     if smaller:
         nearest = min(smaller, key=lambda s: _rms(errors[s]))
@@ -576,10 +583,10 @@ def _smallest(
 
 def _solve(x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Values, HC3 covariance, half-widths of the 95 % intervals."""
-    values: Array = np.linalg.lstsq(x, y, rcond=None)[0]
+    values = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=np.float64)
     left = _left_out(x, y)
     inverse = np.linalg.pinv(x.T @ x)
-    covariance: Array = inverse @ (x.T * left**2) @ x @ inverse
+    covariance = inverse @ (x.T * left**2) @ x @ inverse
     freedom = max(len(y) - x.shape[1], 1)
     return values, covariance, float(stats.t.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
 

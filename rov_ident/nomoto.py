@@ -341,6 +341,21 @@ def fit(
     return dataclasses.replace(model, rmse=_rmse(measured), notes=tuple(notes))
 
 
+def others(
+    model: Nomoto, runs: Sequence[Zigzag], interpolate: str = "none", step: float | None = None
+) -> dict[str, Nomoto]:
+    """The same model by every other method that succeeds, by name."""
+    found = {}
+    for method in METHODS:
+        if method == model.method:
+            continue
+        try:
+            found[method] = fit(runs, model.order, model.nonlinear, method, interpolate, step)
+        except (UserError, np.linalg.LinAlgError):
+            continue
+    return found
+
+
 def check(run: Zigzag, order: int = 1, nonlinear: bool = False) -> None:
     """Whether a run can tell anything about the model.
 
@@ -485,13 +500,13 @@ def _linear_start(runs: Sequence[Zigzag], order: int) -> tuple[Array, list[Array
             "that the run is a zigzag"
         )
     a0, a1, x = best
-    theta = [a0, x[0], -x[1] / x[0]] if order == 1 else [a0, a1, x[0], x[1], -x[2] / x[0]]
+    start = [a0, x[0], -x[1] / x[0]] if order == 1 else [a0, a1, x[0], x[1], -x[2] / x[0]]
     firsts = []
     for i in range(len(runs)):
         first = np.zeros(3)
         first[:states] = x[order + 1 + states * i : order + 1 + states * (i + 1)]
         firsts.append(first)
-    return np.array(theta), firsts
+    return np.array(start), firsts
 
 
 def _robust_covariance(jac: Array, error: Array, lengths: Sequence[int]) -> Array:
@@ -553,7 +568,7 @@ def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomot
         # The instruments are the regressors of a simulated heading, which noise has not touched.
         for _ in range(30):
             theta = _from_solution(solution, order, nonlinear)
-            blocks = []
+            blocks: list[Array] = []
             for run in even:
                 first, shares = _first_state(order, nonlinear, theta, run)
                 heading = respond(order, nonlinear, theta, run, first, shares)

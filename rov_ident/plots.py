@@ -166,6 +166,61 @@ def draw_curves(
         ax.set_xlim(x[0], x[-1])
 
 
+def steering(
+    t: Array,
+    heading: Array,
+    rudder: Array,
+    simulated: Mapping[str, Array],
+    title: str,
+    units: tuple[str, str] = ("deg", "deg"),
+) -> Figure:
+    """Heading (k,) measured and simulated above, their difference and the rudder below."""
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    upper, middle, lower = figure.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.0, 1.0))
+    known = np.isfinite(heading)
+    upper.plot(t[known], heading[known], color=INK, lw=3.2, alpha=0.35, label=MEASURED)
+    for colour, (label, y) in zip(COLOURS, simulated.items()):
+        upper.plot(t, y, color=colour, lw=1.3, label=label)
+        middle.plot(t[known], (y - heading)[known], color=colour, lw=1.1)
+    lower.plot(t, rudder, color=INK, lw=1.0)
+    upper.set_title(title, loc="left", fontsize=9)
+    upper.set_ylabel(f"heading [{units[0]}]")
+    middle.set_ylabel(f"error [{units[0]}]")
+    lower.set(ylabel=f"input [{units[1]}]", xlabel="time [s]")
+    upper.legend(loc="upper right", ncols=1 + len(simulated))
+    upper.margins(y=0.18)
+    return figure
+
+
+def parity(measured: Array, fitted: Array, title: str, unit: str) -> Figure:
+    """Fitted over measured values (k,), the line of equality behind."""
+    figure = Figure(figsize=(4.6, 3.4), layout="constrained")
+    ax = figure.subplots()
+    ends = [float(min(measured.min(), fitted.min())), float(max(measured.max(), fitted.max()))]
+    ax.plot(ends, ends, color=INK, lw=1.0, alpha=0.5)
+    ax.plot(measured, fitted, color=COLOURS[0], marker="o", ms=3.5, lw=0.0, alpha=0.7)
+    ax.set(xlabel=f"measured [{unit}]", ylabel=f"fitted [{unit}]")
+    ax.set_title(title, loc="left", fontsize=9)
+    return figure
+
+
+def structures(sizes: Array, errors: Array, chosen: int, title: str, unit: str) -> Figure:
+    """The cross-validated error of every structure tried over its number of terms."""
+    figure = Figure(figsize=(4.6, 3.4), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(sizes, errors, color=COLOURS[0], marker="o", ms=4.0, lw=0.0, alpha=0.5, label="tried")
+    ax.plot(
+        sizes[chosen], errors[chosen], color=COLOURS[1], marker="o", ms=9.0, lw=0.0,
+        fillstyle="none", mew=2.0, label="chosen",
+    )  # fmt: skip
+    ax.set_yscale("log")
+    ax.set(xlabel="terms", ylabel=f"cross-validated error [{unit}]")
+    ax.set_xticks(np.unique(sizes))
+    ax.set_title(title, loc="left", fontsize=9)
+    ax.legend()
+    return figure
+
+
 def bars(groups: Sequence[str], models: Mapping[str, Array], title: str, y_label: str) -> Figure:
     """One panel: a bar for each of MODELS in every group; values (groups,)."""
     figure, ax = panel(title, "", y_label)

@@ -1,0 +1,128 @@
+"""The pages of `nomoto` and `forces`: what was fitted, how well, and why this structure."""
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+
+import numpy as np
+
+from rov_ident import force_tables, nomoto, plots, report
+from rov_ident.force_tables import AxisFit
+from rov_ident.messages import Array
+from rov_ident.nomoto import Nomoto
+from rov_ident.zigzag import Zigzag
+
+_EQUATIONS = {
+    (1, False): "T r' + r = K (delta - delta_0)",
+    (1, True): "T r' + r + n3 r^3 = K (delta - delta_0)",
+    (2, False): "T1 T2 r'' + (T1 + T2) r' + r = K (delta - delta_0) + K T3 delta'",
+    (2, True): "T1 T2 r'' + (T1 + T2) r' + r + n3 r^3 = K (delta - delta_0) + K T3 delta'",
+}
+_METHODS = {
+    "oe": "output error: the simulated heading fitted to the measured one",
+    "fd": "least squares on forward differences",
+    "iv": "forward differences with instruments from the simulated heading",
+    "rls": "recursive least squares on forward differences, with dynamic forgetting",
+}
+
+
+def steering(
+    model: Nomoto,
+    runs: Sequence[Zigzag],
+    judge: Zigzag | None,
+    others: Mapping[str, Nomoto] | None = None,
+) -> str:
+    """The page of a Nomoto fit; ``others`` are fits by other methods, for comparison."""
+    sections = [
+        report.paragraph(f"{_EQUATIONS[model.order, model.nonlinear]}, r = d(heading)/dt"),
+        report.paragraph(f"Fitted by {_METHODS[model.method]}."),
+        report.heading("Parameters"),
+        _parameters(model),
+    ]
+    sections += [report.bullets(model.notes)] if model.notes else []
+    if others:
+        rows = []
+        for name, other in {model.method: model, **others}.items():
+            values = other.parameters()
+            cells = [
+                f"{values[k][0]:.4g} ± {1.96 * values[k][1]:.2g}" if k in values else ""
+                for k in ("K", "T")
+            ]
+            rows.append([_METHODS[name], *cells, f"{np.degrees(other.rmse):.3g}"])
+        head = ["", f"K [{model.parameters()['K'][2]}]", "T [s]", "heading RMSE [deg]"]
+        sections += [report.heading("By other estimators"), report.table(head, rows)]
+        sections.append(
+            report.paragraph("± is half of the 95 % interval, coloured noise allowed for.")
+        )
+    sections.append(report.heading("Simulation against the record"))
+    for i, run in enumerate(runs):
+        sections.append(_run(model, run, "fitted", f"run{i}-"))
+    if judge is not None:
+        sections.append(report.heading("On a run not used for the fit"))
+        sections.append(_run(model, judge, "predicted", "judge-"))
+    lead = f"heading RMSE {np.degrees(model.rmse):.3g} deg on what was fitted"
+    if judge is not None:
+        lead += f", {np.degrees(nomoto.predict(model, judge)[1]):.3g} deg on {judge.name}"
+    names = ", ".join(run.name for run in runs)
+    return report.page(f"Nomoto's model from {names}", lead, sections, _footer())
+
+
+def _parameters(model: Nomoto) -> str:
+    rows = []
+    for name, (value, std, unit) in model.parameters().items():
+        ends = (f"{value + side * std:.5g}" for side in (-1.96, 1.96))
+        rows.append([name, f"{value:.5g}", f"{std:.2g}", *ends, unit])
+    return report.table(["", "value", "std", "95 % from", "to", "unit"], rows, text=[5])
+
+
+def _run(model: Nomoto, run: Zigzag, word: str, name: str) -> str:
+    simulated, rmse = nomoto.predict(model, run)
+    angle = run.unit == "rad"
+    figure = plots.steering(
+        run.t,
+        np.degrees(run.heading),
+        np.degrees(run.rudder) if angle else run.rudder,
+        {word: np.degrees(simulated)},
+        f"{run.name}: RMSE {np.degrees(rmse):.3g} deg",
+        ("deg", "deg" if angle else run.unit),
+    )
+    caption = "Open loop from a fitted first state: only the input is given along the way."
+    return report.figure(plots.to_svg(figure, name), caption)
+
+
+def forces(
+    name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = (), origin: str = ""
+) -> str:
+    """The page of a force table."""
+    sections = [report.bullets(notes)] if notes else []
+    for axis, f in fits.items():
+        unit = "N" if axis in "XYZ" else "N m"
+        rows = [
+            [n, f"{v:.5g}", f"{s:.2g}", f"{v - h:.5g}", f"{v + h:.5g}", force_tables.unit(n)]
+            for n, v, s, h in zip(f.terms, f.values, f.std, f.half)
+        ]
+        tried = [[" ".join(c.terms), f"{c.cv_rmse:.4g}"] for c in f.candidates[:8]]
+        sizes: Array = np.array([len(c.terms) for c in f.candidates], dtype=np.float64)
+        errors: Array = np.array([c.cv_rmse for c in f.candidates], dtype=np.float64)
+        chosen = [set(c.terms) for c in f.candidates].index(set(f.terms))
+        sections += [
+            report.heading(f"{axis}: R2 {f.r2:.4f}, residual {f.rmse:.3g} {unit}"),
+            report.table(["", "value", "std", "95 % from", "to", "unit"], rows, text=[5]),
+            report.paragraph(f"Chosen because: {f.why}."),
+            report.panels(
+                [
+                    plots.to_svg(plots.parity(f.measured, f.fitted, axis, unit), f"fit-{axis}-"),
+                    plots.to_svg(
+                        plots.structures(sizes, errors, chosen, "structures tried", unit),
+                        f"tried-{axis}-",
+                    ),
+                ],
+                "Left: every row of the table. Right: the best structures that were tried.",
+            ),
+            report.table(["structure", f"cross-validated error [{unit}]"], tried),
+        ]
+    lead = ", ".join(f"{axis}: {' '.join(f.terms)}" for axis, f in fits.items())
+    return report.page(f"Coefficients from {name}", lead, sections, _footer(origin))
+
+
+def _footer(origin: str = "") -> str:
+    return f"rov_ident {version('rov_ident')}. {origin}".strip()

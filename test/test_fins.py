@@ -1,0 +1,145 @@
+"""Fins: names, the wrench by the fins' normals, tails, and the vehicle under its fins."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rov_ident import autopilot, config
+from rov_ident.coefficients import catalogue, fin_catalogue, parse_fin
+from rov_ident.errors import UserError
+from rov_ident.fins import CROSS, TAILS, X, tail
+
+ROOT = Path(__file__).resolve().parents[1]
+REMUS = ROOT / "config" / "remus100.yaml"
+
+
+@pytest.fixture(scope="module")
+def remus():
+    return config.load(REMUS).model
+
+
+def test_names_say_what_they_multiply():
+    assert parse_fin("N_uudr").factor(2.0, -0.1) == pytest.approx(-0.4)
+    assert parse_fin("X_uudsds").factor(2.0, -0.1) == pytest.approx(0.04)
+    assert parse_fin("N_uudrdr").factor(2.0, -0.1) == pytest.approx(-0.04)  # |dr| dr
+    assert parse_fin("Y_udr").factor(2.0, 0.1) == pytest.approx(0.2)
+    assert parse_fin("Y_dr").factor(2.0, 0.1) == pytest.approx(0.1)
+    assert parse_fin("N_uudr").unit == "N m s2/(m2 rad)"
+
+
+def test_fin_names_and_others_are_told_apart():
+    assert all(parse_fin(c.name) is None for c in catalogue())
+    names = [c.name for c in fin_catalogue()]
+    assert len(set(names)) == len(names) == 3 * 6 * 3 * 2
+    for name in ("N_uudx", "N_uuudr", "N_uudrds", "N_vdr", "uudr"):
+        assert parse_fin(name) is None
+
+
+@pytest.mark.parametrize("name", TAILS)
+def test_pure_equivalents_act_on_their_axes_alone(name):
+    """By the normals of the fins: a pure stern-plane angle gives no yaw, roll or side force."""
+    this = tail(name)
+    tail_x, radius = -0.7, 0.1
+    for i, (own, signs) in enumerate(
+        [((2, 4), (-1, -1)), ((1, 5), (1, -1)), ((3,), (1,))]  # Prestero's signs; roll to starboard
+    ):
+        wrench = this.wrench(this.to_fins(np.eye(3)[i]), tail_x, radius)
+        others = [k for k in range(6) if k not in own]
+        np.testing.assert_allclose(wrench[others], 0.0, atol=1e-15)
+        assert (np.sign(wrench[list(own)]) == signs).all()
+
+
+@pytest.mark.parametrize("this", [CROSS, X])
+def test_there_and_back(this):
+    angles = np.random.default_rng(1).normal(size=(5, 3))
+    np.testing.assert_allclose(this.to_equivalent(this.to_fins(angles)), angles, atol=1e-14)
+
+
+def test_x_tail_mixes_over_the_root_of_two():
+    root = np.sqrt(0.5)
+    np.testing.assert_allclose(X.to_fins([1.0, 0.0, 0.0]), root * np.array([-1, 1, -1, 1]))
+    np.testing.assert_allclose(X.to_fins([0.0, 1.0, 0.0]), root * np.array([-1, -1, 1, 1]))
+
+
+def test_both_tails_push_alike_for_the_same_equivalents():
+    for angles in np.eye(3):
+        wrenches = [t.wrench(t.to_fins(angles), -0.7, 0.1) for t in (CROSS, X)]
+        np.testing.assert_allclose(wrenches[0], wrenches[1], atol=1e-15)
+
+
+def test_unknown_tail_is_named():
+    with pytest.raises(UserError, match="no tail 'y'"):
+        tail("y")
+
+
+def test_fin_wrench(remus):
+    wrench = remus.fin_wrench(2.0, {"r": 0.1})
+    np.testing.assert_allclose(wrench, [0, 9.64 * 0.4, 0, 0, 0, -6.15 * 0.4])
+    np.testing.assert_array_equal(remus.fin_wrench(2.0, {}), np.zeros(6))
+
+
+def test_fins_do_not_change_what_estimators_see(remus):
+    assert "N_uudr" in remus.fins and "N_uudr" not in remus.names
+    assert len(remus.theta) == len(remus.names)
+    assert remus.with_theta(2.0 * remus.theta).fins == remus.fins
+
+
+def test_configuration_keeps_its_fins(tmp_path):
+    loaded = config.load(REMUS)
+    config.dump(loaded, tmp_path / "again.yaml")
+    assert config.load(tmp_path / "again.yaml").model.fins == loaded.model.fins
+
+
+def test_misspelt_fin_is_refused(tmp_path):
+    text = REMUS.read_text().replace("N_uudr", "N_uudx")
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(UserError, match=r"coefficients\.N_uudx"):
+        config.load(tmp_path / "c.yaml")
+
+
+# ------------------------------------------------------------------ under its fins
+
+
+def test_fixed_rudder_turns_to_the_side_of_its_sign(remus):
+    for angle in (0.1, -0.1):
+        run = autopilot.steer(remus, autopilot.Turn(angle), 40.0, 1.5)
+        assert np.sign(run.nu[-1, 5]) == np.sign(angle) * np.sign(remus.fins["N_uudr"])
+        # steady: the speed still falls, but the circle no longer changes
+        curvature = run.nu[:, 5] / run.nu[:, 0]
+        assert abs(curvature[-1] - curvature[-500]) < 0.01 * abs(curvature[-1])
+
+
+def test_dive_reaches_its_depth(remus):
+    run = autopilot.steer(remus, autopilot.Depth(5.0, np.sign(remus.fins["M_uuds"])), 80.0, 1.5)
+    assert abs(run.position[-1, 2] - 5.0) < 0.3
+    assert np.abs(run.angles[:, 1]).max() < np.radians(40.0)
+    np.testing.assert_allclose(run.position[:, 1], 0.0, atol=1e-6)
+
+
+def test_heading_change_arrives(remus):
+    run = autopilot.steer(remus, autopilot.Heading(1.0, np.sign(remus.fins["N_uudr"])), 40.0, 1.5)
+    assert abs(run.angles[-1, 2] - 1.0) < 0.02
+
+
+def test_servo_is_no_faster_than_its_rate(remus):
+    servo = autopilot.Servo(rate=0.2, limit=0.15)
+    run = autopilot.zigzag(remus, 0.3, duration=20.0, servo=servo)
+    assert np.abs(np.diff(run.fins["r"])).max() <= 0.2 * 0.02 + 1e-12
+    assert np.abs(run.fins["r"]).max() == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("rudder, switch", [(10.0, 10.0), (20.0, 20.0), (15.0, 5.0)])
+def test_zigzag_turns_back_at_the_switching_heading(remus, rudder, switch):
+    run = autopilot.zigzag(remus, np.radians(rudder), np.radians(switch), duration=60.0)
+    heading, side = run.angles[:, 2], np.sign(np.diff(run.fins["r"]))
+    turning = np.flatnonzero(np.diff(side[side != 0.0]) != 0.0)
+    assert len(turning) >= 3
+    peaks = np.abs(heading[1:-1][np.diff(np.sign(np.diff(heading))) != 0.0])
+    assert (peaks[1:] > np.radians(switch)).all()  # overshoot, never short of it
+
+
+def test_vehicle_without_fins_is_refused():
+    model = config.load(ROOT / "config" / "bluerov2_heavy.yaml").model
+    with pytest.raises(UserError, match="no fin coefficients: add N_uudr"):
+        autopilot.steer(model, autopilot.Turn(0.1), 1.0, 1.0)

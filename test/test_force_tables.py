@@ -1,0 +1,364 @@
+"""Force tables: structures found again, values within intervals, tables as people write them."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from rov_ident import autopilot, config, force_tables
+from rov_ident.added_mass import cylinder, parse_hull, spheroid
+from rov_ident.cli import main
+from rov_ident.coefficients import AXES
+from rov_ident.errors import UserError
+from rov_ident.fins import X
+
+ROOT = Path(__file__).resolve().parents[1]
+REMUS = str(ROOT / "config" / "remus100.yaml")
+DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))  # others': not here
+CAPTIVE = DATA / "kvlcc2-model" / "captive.csv"
+
+
+def design():
+    """States nu (n, 6) and fins: speeds x (alpha, beta, turning circles, fin angles)."""
+    rows = []
+    for speed in (0.5, 1.0, 1.5, 2.0):
+        for angle in np.radians([-12, -8, -4, 0, 4, 8, 12]):
+            rows.append((speed, angle, 0, 0, 0, 0, 0))
+            rows.append((speed, 0, angle, 0, 0, 0, 0))
+        for radius in (5, 10, 20, -5, -10, -20):
+            rate = speed / radius
+            rows += [(speed, 0, b, 0, rate, 0, 0) for b in np.radians([-6, 0, 6])]
+            rows += [(speed, a, 0, rate, 0, 0, 0) for a in np.radians([-6, 0, 6])]
+        for fin in np.radians([-20, -10, 10, 20]):
+            rows += [(speed, 0, 0, 0, 0, fin, 0), (speed, 0, 0, 0, 0, 0, fin)]
+    speed, alpha, beta, q, r, rudder, stern = np.array(rows).T
+    nu = np.zeros((len(speed), 6))
+    nu[:, 0] = speed * np.cos(alpha) * np.cos(beta)
+    nu[:, 1] = speed * np.sin(beta)
+    nu[:, 2] = speed * np.sin(alpha) * np.cos(beta)
+    nu[:, 4], nu[:, 5] = q, r
+    return nu, {"r": rudder, "s": stern}
+
+
+TERMS = {
+    "X": "X_uu X_vv X_ww X_qq X_rr X_vr X_wq X_uudrdr X_uudsds",
+    "Y": "Y_uv Y_vv Y_ur Y_rr Y_uudr Y_v Y_r",
+    "Z": "Z_uw Z_ww Z_uq Z_qq Z_uuds Z_w Z_q Z_uu",
+    "M": "M_uw M_ww M_uq M_qq M_uuds M_w M_q M_uu",
+    "N": "N_uv N_vv N_ur N_rr N_uudr N_v N_r",
+}
+
+
+def drawn(rng, axis, nu, fins, noise):
+    """A structure with values, each of its terms between 30 and 100 % of the largest; its force."""
+    names = TERMS[axis].split()
+    chosen = [names[0], *rng.choice(names[1:], rng.integers(2, len(names)), replace=False)]
+    values, force = {}, np.zeros(len(nu))
+    for name in map(str, chosen):
+        column = force_tables.column(name, nu, fins)
+        values[name] = -rng.uniform(3.0, 10.0) / np.abs(column).max()
+        force += values[name] * column
+    force = force + noise * np.abs(force) * rng.standard_normal(len(nu))
+    return values, force + 0.2 * noise * np.std(force) * rng.standard_normal(len(nu))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_drawn_structures_are_found_again(noise):
+    rng = np.random.default_rng(5)
+    nu, fins = design()
+    right, inside = [], []
+    for _ in range(12):
+        for axis in TERMS:
+            truth, force = drawn(rng, axis, nu, fins, noise)
+            fit = force_tables.fit_axis(axis, nu, fins, force)
+            right.append(set(fit.terms) == set(truth))
+            if right[-1]:
+                error = fit.values - [truth[name] for name in fit.terms]
+                inside += (np.abs(error) <= fit.half).tolist()
+    assert np.mean(right) >= 0.9
+    assert 0.9 <= np.mean(inside) <= 0.98
+
+
+def test_cross_validation_is_leaving_rows_out():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(15, 3)), rng.normal(size=15)
+    direct = []
+    for i in range(15):
+        rest = np.arange(15) != i
+        direct.append(y[i] - x[i] @ np.linalg.lstsq(x[rest], y[rest], rcond=None)[0])
+    np.testing.assert_allclose(force_tables._left_out(x, y), direct, atol=1e-12)
+
+
+# ------------------------------------------------------------------ tables as files
+
+
+def write(path, columns):
+    names = list(columns)
+    rows = zip(*columns.values())
+    lines = [",".join(names), *(",".join(f"{x:.10g}" for x in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def steady_forces(model, nu, fins):
+    """What a tank measures: damping and fins less the Coriolis force of the added mass."""
+    forces = []
+    for state, r, s in zip(nu, fins["r"], fins["s"]):
+        moving = model.wrench(state, np.zeros(6), np.array([0.0, 0.0, 1.0]))
+        rigid = model.body.mass_matrix @ state
+        of_body = np.concatenate(
+            [
+                np.cross(state[3:], rigid[:3]),
+                np.cross(state[3:], rigid[3:]) + np.cross(state[:3], rigid[:3]),
+            ]
+        )
+        force = of_body + model.restoring_force(np.array([0.0, 0.0, 1.0])) - moving
+        forces.append(force + model.fin_wrench(state[0], {"r": r, "s": s}))
+    return np.array(forces)
+
+
+@pytest.fixture(scope="module")
+def remus_table(tmp_path_factory):
+    """The REMUS 100 as a table of forces, with 1 % noise, angles in degrees."""
+    model = config.load(REMUS).model
+    nu, fins = design()
+    rng = np.random.default_rng(2)
+    forces = steady_forces(model, nu, fins)
+    forces += 0.01 * np.abs(forces) * rng.standard_normal(forces.shape)
+    forces += 0.002 * np.std(forces, axis=0) * rng.standard_normal(forces.shape)
+    columns = dict(zip("uvwqr", nu[:, [0, 1, 2, 4, 5]].T))
+    columns |= {"rudder_deg": np.degrees(fins["r"]), "stern_deg": np.degrees(fins["s"])}
+    columns |= {axis: forces[:, AXES.index(axis)] for axis in "XYZMN"}
+    return write(tmp_path_factory.mktemp("table") / "remus.csv", columns)
+
+
+def test_remus_from_its_table_into_a_configuration(remus_table, tmp_path):
+    out, result = tmp_path / "new.yaml", tmp_path / "f.json"
+    arguments = ["forces", str(remus_table), "--config", REMUS]
+    assert main([*arguments, "--json", str(result), "--out", str(out)]) == 0
+    axes = json.loads(result.read_text())["axes"]
+    truth = config.load(REMUS).model
+    known = dict(zip(truth.names, truth.theta)) | truth.fins
+    for axis, name in (("X", "X_uu"), ("Y", "Y_uudr"), ("N", "N_uudr"), ("M", "M_uuds"),
+                       ("N", "N_uv"), ("N", "N_ur"), ("Y", "Y_uv"), ("M", "M_uw")):  # fmt: skip
+        term = axes[axis]["terms"][name]
+        assert abs(term["value"] - known[name]) < 4.0 * term["std"], name
+        assert {"value", "std", "unit", "lower", "upper"} <= set(term)
+    for axis in axes.values():
+        assert axis["cv_rmse"] > 0.0 and axis["candidates"][0].keys() == {"terms", "cv_rmse"}
+        assert axis["cv_rmse"] >= axis["candidates"][0]["cv_rmse"]
+    # the vehicle made from the table turns and dives as the one the table was made from
+    made = config.load(out).model
+    np.testing.assert_allclose(made.added_mass, truth.added_mass)
+    law = autopilot.Both((autopilot.Turn(0.1), autopilot.Depth(3.0, -1.0)))
+    runs = [autopilot.steer(model, law, 40.0, 1.5) for model in (truth, made)]
+    assert abs(runs[0].angles[-1, 2]) > 2.0 and abs(runs[0].position[-1, 2] - 3.0) < 0.5
+    np.testing.assert_allclose(runs[1].angles[:, 2], runs[0].angles[:, 2], atol=0.1)
+    np.testing.assert_allclose(runs[1].position, runs[0].position, atol=1.0)
+
+
+def test_coriolis_of_the_added_mass_is_not_counted_twice(remus_table):
+    table = force_tables.read_table(remus_table)
+    truth = config.load(REMUS).model
+    known = dict(zip(truth.names, truth.theta))
+    munk = known["Y_vdot"] - known["X_udot"]
+    whole = dict(zip(*_terms(force_tables.fit(table)["N"])))
+    own = dict(zip(*_terms(force_tables.fit(table, truth)["N"])))
+    assert whole["N_uv"] - own["N_uv"] == pytest.approx(munk, rel=0.02)
+
+
+def _terms(fit):
+    return fit.terms, fit.values
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_flow_angles_of_either_sign(tmp_path, side):
+    """A hull resists sway: the table says by itself whether beta is a drift to starboard."""
+    speed, beta = (
+        a.ravel() for a in np.meshgrid([0.5, 1.0, 1.5], np.radians(np.arange(-12, 13, 3)))
+    )
+    u, v = speed * np.cos(beta), side * speed * np.sin(beta)
+    y = -30.0 * u * v - 100.0 * v * np.abs(v)
+    y += 0.01 * np.random.default_rng(0).normal(size=len(y))
+    path = write(tmp_path / "t.csv", {"U_mps": speed, "beta_deg": np.degrees(beta), "Y": y})
+    fit = force_tables.fit(force_tables.read_table(path))["Y"]
+    found = dict(zip(fit.terms, fit.values))
+    assert found["Y_uv"] == pytest.approx(-30.0, rel=0.02)
+    assert found["Y_vv"] == pytest.approx(-100.0, rel=0.05)
+    other = force_tables.read_table(path, drift="port")
+    np.testing.assert_allclose(other.nu[:, 1], -speed * np.sin(beta), atol=1e-9)
+
+
+def test_radius_x_tail_and_comments(tmp_path):
+    speed = np.tile([0.5, 1.0, 1.5, 2.0], 6)
+    radius = np.repeat([np.inf, 5.0, 10.0, -5.0, -10.0, 20.0], 4)
+    stern = 0.1 * np.sin(np.arange(24.0))
+    single = X.to_fins(np.column_stack([stern, np.zeros(24), np.zeros(24)]))
+    lines = ["# rotating arm", "U_mps,R_m,ul_rad,ur_rad,ll_rad,lr_rad,M,N"]
+    for i in range(24):
+        m = -6.0 * speed[i] ** 2 * stern[i] + 1e-3 * np.cos(7.0 * i)
+        n = -4.0 * speed[i] ** 2 / radius[i] + 1e-3 * np.sin(5.0 * i)
+        where = "" if np.isinf(radius[i]) else f"{radius[i]}"
+        cells = [f"{speed[i]}", where, *(f"{a:.12f}" for a in single[i]), f"{m}", f"{n}"]
+        lines.append(",".join(cells))
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(lines))
+    table = force_tables.read_table(path)
+    np.testing.assert_allclose(table.nu[:, 5], speed / radius)
+    np.testing.assert_allclose(table.fins["s"], stern, atol=1e-9)
+    fits = force_tables.fit(table)
+    assert fits["M"].terms == ("M_uuds",) and fits["N"].terms == ("N_ur",)
+    assert fits["N"].values[0] == pytest.approx(-4.0, rel=1e-2)
+
+
+def test_nondimensional_forces_and_mapped_headings(tmp_path):
+    speed, beta = (a.ravel() for a in np.meshgrid([0.6, 1.0, 1.4], np.arange(-20.0, 21.0, 5.0)))
+    v = -speed * np.sin(np.radians(beta))  # drift to port
+    u = speed * np.cos(np.radians(beta))
+    y, n = -50.0 * u * v, -80.0 * u * v
+    area = 0.5 * 1000.0 * speed**2 * 7.0 * 0.4
+    columns = {"Speed(m/s)": speed, "beta(deg)": beta, "Y'": y / area, "N'": n / (7.0 * area)}
+    path = write(tmp_path / "t.csv", columns)
+    result = tmp_path / "f.json"
+    arguments = ["forces", str(path), "--map", "U_mps=Speed(m/s)", "beta_deg=beta(deg)"]
+    arguments += ["--nondimensional", "rho=1000,L=7,T=0.4", "--json", str(result)]
+    assert main(arguments) == 0
+    axes = json.loads(result.read_text())["axes"]
+    assert axes["Y"]["terms"]["Y_uv"]["value"] == pytest.approx(-50.0, rel=1e-6)
+    assert axes["N"]["terms"]["N_uv"]["value"] == pytest.approx(-80.0, rel=1e-6)
+    assert axes["N"]["terms"]["N_uv"]["unit"] == "N m s2/m2"
+
+
+@pytest.mark.skipif(not CAPTIVE.exists(), reason="the measured captive runs are not here")
+def test_measured_captive_runs(tmp_path):
+    """KVLCC2: a hull resists sway, its rudder pushes to starboard and turns to port."""
+    result = tmp_path / "f.json"
+    arguments = ["forces", str(CAPTIVE), "--map", "U_mps=Speed(m/s)", "beta_deg=beta(deg)"]
+    arguments += ["rudder_deg=delta(deg)", "--nondimensional", "rho=1000,L=7"]
+    assert main([*arguments, "--json", str(result)]) == 0
+    axes = json.loads(result.read_text())["axes"]
+    assert axes["X"]["r2"] > 0.9 and axes["Y"]["r2"] > 0.99 and axes["N"]["r2"] > 0.99
+    assert axes["Y"]["terms"]["Y_uv"]["value"] < 0.0 and axes["N"]["terms"]["N_uv"]["value"] < 0.0
+    fin = {a: next(v["value"] for k, v in axes[a]["terms"].items() if "dr" in k) for a in "YN"}
+    assert fin["Y"] > 0.0 and fin["N"] < 0.0
+
+
+# ------------------------------------------------------------------ what is refused
+
+
+def table(**changes):
+    u = np.array([0.5, 0.8, 1.0, 1.3, 1.6, 2.0, 2.3, 2.6])
+    columns = {"u": u, "X": -3.0 * u**2 + 0.01 * np.cos(9.0 * u)}
+    columns |= changes
+    return {name: values for name, values in columns.items() if values is not None}
+
+
+ANGLES = np.array([-10.0, -5.0, 0.0, 5.0, 10.0, -5.0, 5.0, 10.0])
+REFUSED = {
+    "no velocity": (table(u=None, rps=ANGLES), "has no velocities: name u v w p q r, or U_mps"),
+    "no force": (table(X=None), "has no forces: name X Y Z K M N"),
+    "primes": (table(X=None, **{"X'": ANGLES}), "give --nondimensional rho=...,L=..."),
+    "constant force": (table(Y=0.0 * ANGLES + 1.0), "the column Y is constant, 1: remove it"),
+    "one condition": (table(u=0.0 * ANGLES + 1.0), "every row is the same condition"),
+    "angle without unit": (table(rudder=ANGLES), "is the column `rudder` in degrees or radians"),
+    "degrees as radians": (table(rudder_rad=ANGLES), "reaches 10, which looks like degrees"),
+    "radians as degrees": (table(rudder_deg=ANGLES / 57.3), "which looks like radians"),
+    "both units": (table(rudder_deg=ANGLES, rudder_rad=ANGLES / 57.3), "remove one of them"),
+    "unknown angle": (table(flap_deg=ANGLES), "the angle `flap_deg` is not known here"),
+    "drift without speed": (table(u=None, beta_deg=ANGLES), "no speed: add U_mps"),
+    "two speeds": (table(U_mps=np.abs(ANGLES)), "has U_mps and u: keep one way"),
+    "half a tail": (table(ul_deg=ANGLES), "lacks the fin ll_deg of the x tail"),
+    "not a number": (table(X=np.where(ANGLES == 0.0, np.nan, ANGLES)), "`nan` is not a number"),
+    "too few": ({k: v[:4] for k, v in table().items()}, "4 different conditions are too few"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_tables_are_refused_in_a_sentence(case, tmp_path, capsys):
+    columns, sentence = REFUSED[case]
+    path = write(tmp_path / "t.csv", columns)
+    result = tmp_path / "f.json"
+    assert main(["forces", str(path), "--json", str(result)]) == 2
+    captured = capsys.readouterr()
+    assert sentence in captured.err.replace("\n", " ") and captured.err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["--map", "beta_deg=drift"], "has no column `drift` for beta_deg"),
+        (["--nondimensional", "rho=1000"], "lacks L"),
+        (["--nondimensional", "rho=1000,L=-1"], "all positive"),
+        (["--out", "c.yaml"], "need --config"),
+        (["--config", REMUS, "--hull", "cube:L=1,R=1"], "give cylinder:L=LENGTH"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, sentence, tmp_path, capsys):
+    path = write(tmp_path / "t.csv", table())
+    assert main(["forces", str(path), *arguments]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_a_driving_hull_is_not_written(tmp_path, capsys):
+    """Damping of the wrong sign makes no vehicle, and no file."""
+    path = write(tmp_path / "t.csv", table(X=3.0 * table()["u"] ** 2 + 0.01 * np.cos(ANGLES)))
+    out = tmp_path / "c.yaml"
+    assert main(["forces", str(path), "--config", REMUS, "--out", str(out)]) == 2
+    assert "X_uu" in capsys.readouterr().err and not out.exists()
+
+
+# ------------------------------------------------------------------ added mass
+
+
+def test_cylinder_is_strip_theory():
+    mass = np.pi * 1000.0 * 0.1**2 * 2.0
+    found = cylinder(2.0, 0.1, 1000.0)
+    assert found["X_udot"] == pytest.approx(-0.1 * mass)
+    assert found["Y_vdot"] == found["Z_wdot"] == pytest.approx(-mass)
+    # strips of the same mass: the integral of x^2 over the length
+    x = np.linspace(-1.0, 1.0, 20001)
+    strips = np.trapezoid(np.pi * 1000.0 * 0.01 * x**2, x)
+    assert found["N_rdot"] == found["M_qdot"] == pytest.approx(-strips, rel=1e-6)
+
+
+def test_spheroid_tends_to_sphere_and_needle():
+    sphere = 4.0 / 3.0 * np.pi * 1000.0 * 0.1**3
+    nearly = spheroid(0.2001, 0.1, 1000.0)
+    assert nearly["X_udot"] == pytest.approx(-0.5 * sphere, rel=2e-3)  # half the displaced mass
+    assert nearly["Y_vdot"] == pytest.approx(-0.5 * sphere, rel=2e-3)
+    assert abs(nearly["N_rdot"]) < 1e-3 * sphere * 0.1**2  # a sphere turns freely
+    long = spheroid(20.0, 0.1, 1000.0)
+    mass = 4.0 / 3.0 * np.pi * 1000.0 * 10.0 * 0.1**2
+    assert long["Y_vdot"] == pytest.approx(-mass, rel=0.01) and abs(long["X_udot"]) < 0.01 * mass
+    assert long["N_rdot"] == pytest.approx(-mass * 10.0**2 / 5.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "ratio, k1, k2, k", [(2.0, 0.209, 0.702, 0.240), (2.99, 0.122, 0.803, 0.465),
+                         (4.99, 0.059, 0.895, 0.701), (9.97, 0.021, 0.960, 0.883)]
+)  # fmt: skip
+def test_spheroid_agrees_with_lambs_integrals_and_table(ratio, k1, k2, k):
+    """Lamb (1932), art. 114: alpha and beta as integrals; p. 155: the table, to its last digit."""
+    a, b = 0.1 * ratio, 0.1
+    alpha, beta = (
+        a * b**2 * quad(lambda x, p=p: (a**2 + x) ** (p - 2.5) * (b**2 + x) ** -p, 0, np.inf)[0]
+        for p in (1, 2)
+    )
+    mass = 4.0 / 3.0 * np.pi * 1000.0 * a * b**2
+    found = spheroid(2.0 * a, b, 1000.0)
+    assert -found["X_udot"] / mass == pytest.approx(alpha / (2.0 - alpha), rel=1e-6)
+    assert -found["Y_vdot"] / mass == pytest.approx(beta / (2.0 - beta), rel=1e-6)
+    turn = mass * (a**2 + b**2) / 5.0
+    table = (-found["X_udot"] / mass, -found["Y_vdot"] / mass, -found["N_rdot"] / turn)
+    assert table == pytest.approx((k1, k2, k), abs=2.5e-3)
+
+
+def test_hull_in_words():
+    assert parse_hull("cylinder:L=2,R=0.1,rho=1000") == cylinder(2.0, 0.1, 1000.0)
+    for wrong in ("cylinder", "spheroid:L=0.1,R=0.1", "cylinder:L=2", "cylinder:L=-1,R=1"):
+        with pytest.raises(UserError):
+            parse_hull(wrong)
