@@ -552,17 +552,18 @@ def _smallest(
     best: tuple[int, ...],
     names: Sequence[str],
 ) -> tuple[tuple[int, ...], str]:
-    """The smallest structure not worse than the best by more than chance, and why."""
+    """The best structure of the smallest size at which one is not worse than the best of all by
+    more than chance, and why."""
     n = len(errors[best])
-    fit: dict[tuple[int, ...], float] = {}
+    sizes = []
     for subset in path:
         excess = errors[subset] ** 2 - errors[best] ** 2
         left_out = max(len(best) - len(subset), 1)
         of_term = _DOUBT * left_out * float(np.mean(errors[best] ** 2)) / n
         doubt = min(float(np.std(excess)) / math.sqrt(n), of_term)
         if float(np.mean(excess)) <= _WORTH * doubt + 1e-18:
-            fit[subset] = float(np.mean(errors[subset] ** 2))
-    chosen = min(fit, key=lambda s: (len(s), fit[s]))
+            sizes.append(len(subset))
+    chosen = min((s for s in path if len(s) == min(sizes)), key=lambda s: _rms(errors[s]))
     words = f"cross-validated error {_rms(errors[chosen]):.4g}"
     if chosen != best:
         words += (

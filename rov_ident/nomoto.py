@@ -643,12 +643,13 @@ def _from_solution(solution: Array, order: int, nonlinear: bool) -> Array:
     return theta
 
 
-def recursive(y: Array, x: Array, lowest: float = 0.95, memory: float = 0.99) -> Array:
+def recursive(y: Array, x: Array, lowest: float = 0.9, memory: float = 0.995) -> Array:
     """Recursive least squares with a dynamic forgetting factor: solutions (k, n) after each row.
 
     The factor falls from 1 towards ``lowest`` as the prediction error grows beyond its usual size
     (Park and Jun 1992: ``lowest + (1 - lowest) 2^-(e/sigma)^2``, here from one and a half sigma
-    on), sigma by exponential averaging with ``memory``. What is forgotten is taken from the
+    on), sigma by exponential averaging with ``memory`` of errors clipped at three sigma, its start
+    the median of the first (0.455: that of a squared normal). What is forgotten is taken from the
     direction just excited only, so that the covariance stays bounded where nothing moves.
     """
     n = x.shape[1]
@@ -656,11 +657,12 @@ def recursive(y: Array, x: Array, lowest: float = 0.95, memory: float = 0.99) ->
     p = np.eye(n) * 1e6 * max(float(np.mean(y**2)), 1e-12)
     theta = np.zeros(n)
     out = np.empty((len(y), n))
-    variance = float(np.mean(y**2)) + 1e-300
+    variance, first = float(np.mean(y**2)) + 1e-300, 10 * n
+    errors = np.zeros(first)
     for i in range(len(y)):
         row = x[i] / size
         error = y[i] - row @ theta
-        excess = max(abs(error) / np.sqrt(variance) - 1.5, 0.0)
+        excess = max(abs(error) / np.sqrt(variance) - 1.5, 0.0) if i > first else 0.0
         factor = lowest + (1.0 - lowest) * 2.0 ** -(excess**2)
         pr = p @ row
         power = float(row @ pr)
@@ -671,6 +673,11 @@ def recursive(y: Array, x: Array, lowest: float = 0.95, memory: float = 0.99) ->
             theta = theta + gain * error
             if abs(beta) > 1e-12:
                 p = p - np.outer(pr, pr) / (1.0 / beta + power)
-        variance = memory * variance + (1.0 - memory) * min(error**2, 9.0 * variance)
+        if i < first:
+            errors[i] = error
+        elif i == first:  # by then the first guesses are past
+            variance = float(np.median(errors[2 * n :] ** 2)) / 0.455 + 1e-300
+        else:
+            variance += (1.0 - memory) * (min(error**2, 9.0 * variance) - variance)
         out[i] = theta / size
     return out

@@ -213,7 +213,6 @@ def structures(sizes: Array, errors: Array, chosen: int, title: str, unit: str) 
         sizes[chosen], errors[chosen], color=COLOURS[1], marker="o", ms=9.0, lw=0.0,
         fillstyle="none", mew=2.0, label="chosen",
     )  # fmt: skip
-    ax.set_yscale("log")
     ax.set(xlabel="terms", ylabel=f"cross-validated error [{unit}]")
     ax.set_xticks(np.unique(sizes))
     ax.set_title(title, loc="left", fontsize=9)

@@ -1,0 +1,412 @@
+"""Nomoto's model: what the estimators find, at which rates, and what densifying does."""
+
+import json
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from rov_ident import autopilot, config, nomoto
+from rov_ident.bags import BagWriter
+from rov_ident.cdr import ODOMETRY_TYPE, encode
+from rov_ident.cli import main
+from rov_ident.densify import densify, spiral
+from rov_ident.errors import UserError
+from rov_ident.frames import quaternion_from_euler
+from rov_ident.messages import Odometry
+from rov_ident.zigzag import Zigzag, read
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))
+KVLCC2 = DATA / "kvlcc2-model"
+FINE = 0.01  # s
+
+
+def simulated(K, T, rate, n3=0.0, T2=0.0, T3=0.0, duration=100.0, rudder=0.26, noise=0.0, seed=0):
+    """A zigzag of the model itself, rudder and switching at FINE, its rudder linear in between.
+
+    Integrated step by step with the exact transition where it is linear.
+    """
+    n = round(duration / FINE) + 1
+    heading, delta = np.zeros(n), np.zeros(n)
+    side, last, x = 1.0, 0.0, np.zeros(2)
+    for i in range(n - 1):
+        if abs(heading[i]) >= rudder and np.sign(heading[i]) != last:
+            side, last = -side, np.sign(heading[i])
+        wanted = side * rudder if i * FINE >= 2.0 else 0.0
+        step = wanted - delta[i]
+        delta[i + 1] = delta[i] + (
+            step if rate is None else np.clip(step, -rate * FINE, rate * FINE)
+        )
+        if rate is None:  # the jump is at the instant i
+            delta[i] = delta[i + 1]
+        slope = (delta[i + 1] - delta[i]) / FINE
+
+        def motion(t, y, i=i, slope=slope):
+            d = delta[i] + slope * t
+            if T2 == 0.0:
+                return [y[1], (K * d - y[1] - n3 * y[1] ** 3) / T, 0.0]
+            rest = K * d + K * T3 * slope - y[1] - n3 * y[1] ** 3 - (T + T2) * y[2]
+            return [y[1], y[2], rest / (T * T2)]
+
+        # classical Runge-Kutta, written here a second time
+        y = np.array([heading[i], *x])
+        a = np.array(motion(0.0, y))
+        b = np.array(motion(0.5 * FINE, y + 0.5 * FINE * a))
+        c = np.array(motion(0.5 * FINE, y + 0.5 * FINE * b))
+        d = np.array(motion(FINE, y + FINE * c))
+        y = y + FINE / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+        heading[i + 1], x = y[0], y[1:]
+    t = FINE * np.arange(n)
+    noisy = heading + noise * np.random.default_rng(seed).standard_normal(n)
+    return Zigzag("simulated", t, noisy, delta)
+
+
+def every(run, step):
+    k = round(step / (run.t[1] - run.t[0]))
+    return Zigzag(run.name, run.t[::k], run.heading[::k], run.rudder[::k], run.unit)
+
+
+def blanked(run, step):
+    """Headings every ``step`` only, all of the rudder."""
+    k = round(step / (run.t[1] - run.t[0]))
+    rows = np.arange(len(run.t)) % k == 0
+    return Zigzag(run.name, run.t, np.where(rows, run.heading, np.nan), run.rudder)
+
+
+def value(model, name):
+    return model.parameters()[name][0]
+
+
+# ------------------------------------------------------------------ on data of the model
+
+
+@pytest.mark.parametrize("rate", [None, np.radians(20.0), np.radians(5.0)])
+@pytest.mark.parametrize("K, T", [(-0.92, 0.95), (0.3, 4.0)])
+def test_output_error_finds_k_and_t_at_every_rate(K, T, rate):
+    run = simulated(K, T, rate)
+    for step in (0.1, 0.2, 0.5):
+        model = nomoto.fit([every(run, step)])
+        assert value(model, "K") == pytest.approx(K, rel=0.01)
+        assert value(model, "T") == pytest.approx(T, rel=0.01)
+
+
+def test_second_order():
+    run = simulated(0.4, 5.0, 0.1, T2=1.0, T3=2.0)
+    model = nomoto.fit([every(run, 0.1)], order=2)
+    for name, truth in (("K", 0.4), ("T1", 5.0), ("T2", 1.0), ("T3", 2.0), ("T", 4.0)):
+        assert value(model, name) == pytest.approx(truth, rel=0.01), name
+
+
+def test_norrbin():
+    run = simulated(0.4, 5.0, 0.1, n3=80.0)
+    model = nomoto.fit([every(run, 0.1)], nonlinear=True)
+    for name, truth in (("K", 0.4), ("T", 5.0), ("n3", 80.0)):
+        assert value(model, name) == pytest.approx(truth, rel=0.01), name
+
+
+def test_norrbin_of_an_unstable_vehicle():
+    """T and K negative: the inner form of the model does not mind."""
+    run = simulated(-0.3, -15.0, 0.1, n3=-1500.0, rudder=0.17, duration=200.0)
+    model = nomoto.fit([every(run, 0.2)], nonlinear=True)
+    assert value(model, "T") == pytest.approx(-15.0, rel=0.02)
+    assert value(model, "K") == pytest.approx(-0.3, rel=0.02)
+    assert "no course stability" in model.notes[0]
+
+
+def test_instruments_cure_what_noise_does_to_differences():
+    run = simulated(0.3, 4.0, 0.2, noise=1e-4, seed=1)
+    dense = every(run, 0.1)
+    least, instruments = (nomoto.fit([dense], method=m) for m in ("fd", "iv"))
+    clean = nomoto.fit([every(simulated(0.3, 4.0, 0.2), 0.1)], method="fd")
+    assert abs(value(least, "T") / value(clean, "T") - 1.0) > 0.05
+    assert abs(value(instruments, "T") / value(clean, "T") - 1.0) < 0.03
+
+
+def test_recursive_follows_a_change():
+    """A vehicle whose K doubles half-way: with forgetting the last estimate is the new one."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(600, 2))
+    truth = np.where(np.arange(600)[:, None] < 300, [1.0, -2.0], [2.0, -2.0])
+    y = np.sum(x * truth, axis=1) + 0.01 * rng.normal(size=600)
+    history = nomoto.recursive(y, x)
+    np.testing.assert_allclose(history[290], [1.0, -2.0], atol=0.01)
+    np.testing.assert_allclose(history[-1], [2.0, -2.0], atol=0.02)
+    stubborn = nomoto.recursive(y, x, lowest=1.0)
+    assert abs(stubborn[-1, 0] - 2.0) > 0.2
+
+
+def test_recursive_does_not_wind_up():
+    """Without excitation the gain must not grow: the first new row is not swallowed whole."""
+    rng = np.random.default_rng(0)
+    x = np.zeros((20200, 2))
+    x[:200], x[-1] = rng.normal(size=(200, 2)), [1.0, 1.0]
+    y = x @ [1.0, -2.0] + 0.1 * rng.normal(size=len(x))
+    y[-1] = -1.0 + 0.3
+    history = nomoto.recursive(y, x)
+    assert np.abs(history[-1] - history[-2]).max() < 0.15
+
+
+def test_standard_deviations_are_honest_under_coloured_noise():
+    """Over seeds with slowly wandering heading noise the 95 % intervals hold the truth."""
+    clean = every(simulated(0.3, 4.0, 0.2, duration=150.0), 0.5)
+    rng = np.random.default_rng(3)
+    inside, naive = [], []
+    for _ in range(40):
+        wander = np.zeros(len(clean.t))
+        for i in range(1, len(wander)):
+            wander[i] = 0.9 * wander[i - 1] + 0.004 * rng.standard_normal()
+        run = Zigzag("x", clean.t, clean.heading + wander, clean.rudder)
+        model = nomoto.fit([run])
+        for name, truth in (("K", 0.3), ("T", 4.0)):
+            found, std, _ = model.parameters()[name]
+            inside.append(abs(found - truth) < 1.96 * std)
+            naive.append(abs(found - truth) / std)
+    assert np.mean(inside) >= 0.85
+    assert np.sqrt(np.mean(np.square(naive))) > 0.5  # nor far too wide
+
+
+def test_simulation_is_that_of_the_equations():
+    """The kernel beside scipy's integrator, second order with everything in it."""
+    t = np.linspace(0.0, 20.0, 201)
+    run = Zigzag("x", t, np.zeros(201), 0.3 * np.sin(0.7 * t))
+    theta = np.array([0.2, 1.2, 0.06, 0.1, 3.0, 0.02])  # a0 a1 b0 b1 c delta_0
+    first = np.array([0.1, 0.05, 0.01])
+
+    def motion(s, y):
+        d = np.interp(s, t, run.rudder) - 0.02
+        return [y[1], -1.2 * y[1] + y[2] + 0.1 * d, -0.2 * y[1] - 3.0 * y[1] ** 3 + 0.06 * d]
+
+    expected = solve_ivp(motion, (0.0, 20.0), first, t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.1)
+    found = nomoto.respond(2, True, theta, run, first)
+    np.testing.assert_allclose(found, expected.y[0], atol=1e-6)
+
+
+# ------------------------------------------------------------------ densification
+
+
+def test_spiral_joins_the_samples_and_starts_along_the_last():
+    t = np.arange(0.0, 10.0, 0.5)
+    heading = 0.3 * np.sin(t)
+    fine = np.arange(0.0, 9.5, 0.01)
+    dense = spiral(t, heading, fine)
+    np.testing.assert_allclose(dense[::50], heading[:19], atol=1e-9)
+    assert np.abs(dense - 0.3 * np.sin(fine)).max() < 0.02
+    # straight data: straight curve
+    np.testing.assert_allclose(spiral(t, 0.2 * t, fine), 0.2 * fine, atol=1e-12)
+
+
+def test_spiral_does_not_care_where_time_starts():
+    """The printed sign of rho does: half of its segments fold back."""
+    t = np.arange(0.0, 10.0, 0.5)
+    fine = np.arange(0.0, 9.5, 0.1)
+    here = spiral(t, 0.3 * np.sin(t), fine)
+    there = spiral(t + 1e4, 0.3 * np.sin(t), fine + 1e4)
+    np.testing.assert_allclose(there, here, atol=1e-7)
+
+
+def test_spiral_depends_on_the_units_of_its_plane():
+    t = np.arange(0.0, 10.0, 0.5)
+    fine = np.arange(0.0, 9.5, 0.1)
+    rad, deg = (spiral(t, 0.3 * np.sin(t), fine, s) for s in (1.0, 180.0 / np.pi))
+    assert np.abs(rad - deg).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def remus():
+    """The REMUS 100's zigzag of 15 deg at 0.02 s."""
+    model = config.load(ROOT / "config" / "remus100.yaml").model
+    return autopilot.zigzag(model, np.radians(15.0)).zigzag()
+
+
+def test_sparse_remus_densified_as_good_as_dense(remus):
+    """0.5 s headings, rudder at 0.1 s: K within 1.5 %, T within 3 % of the dense data's own fit,
+    heading within 1.1 x of the best first-order fit to the dense data."""
+    dense = every(remus, 0.1)
+    sparse = blanked(dense, 0.5)
+    best = nomoto.fit([dense])
+    for method in ("oe", "fd"):
+        own = nomoto.fit([dense], method=method)
+        model = nomoto.fit([sparse], method=method, interpolate="spline")
+        assert value(model, "K") == pytest.approx(value(own, "K"), rel=0.015)
+        assert value(model, "T") == pytest.approx(value(own, "T"), rel=0.03)
+    model = nomoto.fit([sparse], interpolate="spline")
+    assert nomoto.predict(model, dense)[1] <= 1.1 * best.rmse
+    # without densifying, differences over 0.5 s are far off
+    own, raw = nomoto.fit([dense], method="fd"), nomoto.fit([every(remus, 0.5)], method="fd")
+    assert abs(value(raw, "T") / value(own, "T") - 1.0) > 0.2
+
+
+def test_spline_is_closer_to_the_dense_data_than_the_spiral(remus):
+    dense = every(remus, 0.1)
+    error = {
+        method: np.sqrt(np.mean((densify(dense.t[::5], dense.heading[::5], dense.t, method)
+                                 - dense.heading)[:-5] ** 2))
+        for method in ("none", "spline", "spiral")
+    }  # fmt: skip
+    assert error["spline"] < error["spiral"] < error["none"]
+
+
+def test_k_is_reported_with_the_sign_of_the_data(remus):
+    """Prestero's N_uudr is negative: a positive rudder turns to port."""
+    dense = every(remus, 0.2)
+    assert value(nomoto.fit([dense]), "K") < 0.0
+    turned = Zigzag("x", dense.t, dense.heading, -dense.rudder)
+    assert value(nomoto.fit([turned]), "K") == pytest.approx(-value(nomoto.fit([dense]), "K"))
+
+
+# ------------------------------------------------------------------ measured zigzags
+
+
+@pytest.mark.skipif(not KVLCC2.is_dir(), reason="the measured zigzags are not here")
+@pytest.mark.parametrize("fitted, judged, limit", [((10, 25), 20, 2.5), ((10, 20), 25, 3.0)])
+def test_measured_zigzags_are_predicted(fitted, judged, limit):
+    runs = {a: read(KVLCC2 / f"hsva_Z_{a}_05.csv") for a in (10, 20, 25)}
+    model = nomoto.fit([runs[a] for a in fitted], nonlinear=True)
+    assert np.degrees(nomoto.predict(model, runs[judged])[1]) < limit
+
+
+# ------------------------------------------------------------------ files
+
+
+def write(path, run, heading="heading_deg", rudder="rudder_deg", extra=""):
+    factor = [180.0 / np.pi if name.endswith("_deg") else 1.0 for name in (heading, rudder)]
+    lines = ["# a zigzag", f"t_s,{heading},{rudder},other"]
+    for t, h, d in zip(run.t, run.heading, run.rudder):
+        first = "" if np.isnan(h) else f"{factor[0] * h:.9g}"
+        lines.append(f"{t:.6g},{first},{factor[1] * d:.9g},x")
+    path.write_text("\n".join(lines) + "\n" + extra)
+    return path
+
+
+@pytest.fixture(scope="module")
+def short():
+    return every(simulated(0.3, 4.0, 0.2), 0.5)
+
+
+def test_json_as_promised(short, tmp_path):
+    files = [
+        write(tmp_path / "a.csv", short),
+        write(tmp_path / "b.csv", short, "heading_rad", "rudder_rad"),
+    ]
+    result, page = tmp_path / "n.json", tmp_path / "n.html"
+    arguments = ["nomoto", str(files[0]), "--validate", str(files[1]), "--json", str(result)]
+    assert main([*arguments, "--report", str(page)]) == 0
+    document = json.loads(result.read_text())
+    assert document["order"] == 1
+    assert document["K"]["value"] == pytest.approx(0.3, rel=0.01) and document["K"]["unit"] == "1/s"
+    assert document["T"]["value"] == pytest.approx(4.0, rel=0.01) and document["T"]["unit"] == "s"
+    assert document["K"]["std"] > 0.0 and document["heading_rmse_rad"] < 0.01
+    assert document["validation"]["heading_rmse_rad"] == pytest.approx(
+        document["heading_rmse_rad"], rel=1e-3
+    )
+    text = page.read_text()
+    assert text.count("<svg") >= 2 and "http" not in text.split("</style>")[1].replace(
+        "http://www.w3.org", ""
+    )
+
+
+@pytest.mark.parametrize(
+    "options", [["--order", "2"], ["--nonlinear"], ["--interpolate", "spline"],
+                ["--interpolate", "spiral"], ["--method", "iv"], ["--method", "rls"]]
+)  # fmt: skip
+def test_options(short, tmp_path, options):
+    result = tmp_path / "n.json"
+    path = write(tmp_path / "a.csv", short)
+    assert main(["nomoto", str(path), *options, "--json", str(result)]) == 0
+    assert json.loads(result.read_text())["K"]["value"] == pytest.approx(0.3, rel=0.1)
+
+
+def test_headings_may_be_empty_between_samples(remus, tmp_path):
+    sparse = blanked(every(remus, 0.1), 0.5)
+    run = read(write(tmp_path / "a.csv", sparse))
+    np.testing.assert_allclose(run.heading, sparse.heading, atol=1e-7)
+    assert run.step == pytest.approx(0.5)
+
+
+def test_heading_across_the_wrap(short, tmp_path):
+    shifted = Zigzag("x", short.t, np.angle(np.exp(1j * (short.heading + np.pi))), short.rudder)
+    run = read(write(tmp_path / "a.csv", shifted))
+    np.testing.assert_allclose(run.heading - run.heading[0], short.heading, atol=1e-7)
+
+
+def test_bag_with_a_rudder_topic(short, tmp_path):
+    path = tmp_path / "run.mcap"
+    zeros = np.zeros(3)
+    with BagWriter(path) as writer:
+        for t, heading, rudder in zip(short.t, short.heading, short.rudder):
+            stamp = 1_000_000_000 + round(1e9 * t)
+            cdr = struct.pack("<4Bd", 0, 1, 0, 0, rudder)
+            writer.write("/rudder", "std_msgs/msg/Float64", stamp, cdr)
+            pose = quaternion_from_euler(0.0, 0.0, heading)
+            odometry = Odometry(
+                stamp, "world_ned", "base_link_frd", zeros, pose, zeros, zeros, np.zeros(6)
+            )
+            writer.write("/odom", ODOMETRY_TYPE, stamp, encode(odometry))
+    run = read(path)
+    np.testing.assert_allclose(run.heading, short.heading, atol=1e-9)
+    np.testing.assert_allclose(run.rudder, short.rudder)
+    assert run.unit == "rad" and run.held
+
+
+def test_bag_without_rudder_takes_the_yaw_moment():
+    run = read(ROOT / "bags" / "demo.mcap")
+    assert run.unit == "N m" and run.held and np.ptp(run.rudder) > 0.0
+
+
+# ------------------------------------------------------------------ what is refused
+
+
+def changed(path, old, new):
+    path.write_text(path.read_text().replace(old, new))
+
+
+BAD = {
+    "no time": (lambda p, r: changed(write(p, r), "t_s", "time"), "has no column t_s"),
+    "no heading": (lambda p, r: changed(write(p, r), "heading_deg", "course"), "heading_rad or"),
+    "no unit": (lambda p, r: changed(write(p, r), "rudder_deg", "rudder"), "say its unit"),
+    "radians called degrees": (
+        lambda p, r: changed(write(p, r, rudder="rudder_rad"), "rudder_rad", "rudder_deg"),
+        "looks like radians",
+    ),
+    "degrees called radians": (
+        lambda p, r: changed(write(p, r), "rudder_deg", "rudder_rad"), "looks like degrees"
+    ),
+    "time back": (lambda p, r: write(p, r, extra="3,0,0,x\n"), "time must increase"),
+    "no number": (lambda p, r: write(p, r, extra="101,0,hard,x\n"), "`hard` is not a number"),
+    "ragged": (lambda p, r: write(p, r, extra="101,0\n"), "2 cells under 4 headings"),
+    "too short": (
+        lambda p, r: write(p, Zigzag("x", r.t[:9], r.heading[:9], r.rudder[:9])), "looks like"
+    ),
+    "few": (
+        lambda p, r: write(p, Zigzag("x", r.t[:15], r.heading[:15] + np.arange(15), r.rudder[:15])),
+        "15 headings",
+    ),
+    "rudder at rest": (
+        lambda p, r: write(p, Zigzag("x", r.t, r.heading, 0.0 * r.rudder)), "rudder is constant"
+    ),
+    "empty": (lambda p, r: p.write_text(""), "has no rows"),
+    "binary": (lambda p, r: p.write_bytes(bytes(range(128, 256))), "is not a CSV text file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_are_refused_in_a_sentence(case, short, tmp_path, capsys):
+    make, sentence = BAD[case]
+    path = tmp_path / "a.csv"
+    make(path, short)
+    assert main(["nomoto", str(path), "--json", str(tmp_path / "n.json")]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_kinds_of_input_are_not_mixed(short, tmp_path):
+    other = Zigzag("moment", short.t, short.heading, short.rudder, "N m")
+    with pytest.raises(UserError, match="runs of one kind"):
+        nomoto.fit([short, other])
+    with pytest.raises(UserError, match="a run of the same kind"):
+        nomoto.predict(nomoto.fit([short]), other)
