@@ -194,28 +194,34 @@ def respond(
     to 1 says when within its step each of ``run.reversals`` came about.
     """
     x = dict(zip(_names(order, nonlinear), theta))
-    t, rudder, held = run.t, run.rudder, run.held
-    rows = None
+    t, rudder, rows = run.t, run.rudder, None
     if shares is not None:
+        # Two rows at every jump, the rudder before and after it.
         after = run.reversals + 1
-        instants = t[after - 1] + np.clip(shares, 0.0, 1.0) * (t[after] - t[after - 1])
-        instants = np.clip(instants, t[after - 1] + 1e-9, t[after] - 1e-9)
-        rudder = np.insert(rudder, after, rudder[after])
-        t = np.insert(t, after, instants)
-        rows = np.delete(np.arange(len(t)), after + np.arange(len(after)))
-        held = True
+        begin, end = t[after - 1], t[after]
+        instants = begin + np.clip(shares, 1e-6, 1.0 - 1e-6) * (end - begin)
+        moment = 1e-8 * (end - begin)
+        twice = np.repeat(after, 2)
+        rows = np.arange(len(t)) + np.searchsorted(twice, np.arange(len(t)), side="right")
+        t = np.insert(t, twice, np.column_stack([instants - moment, instants + moment]).ravel())
+        rudder = np.insert(
+            rudder, twice, np.column_stack([rudder[after - 1], rudder[after]]).ravel()
+        )
     out = np.empty(len(t))
     _respond(
         order, x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0),
-        x["delta_0"], t, rudder, held, first, STEP, out,
+        x["delta_0"], t, rudder, run.held, first, STEP, out,
     )  # fmt: skip
     return out if rows is None else out[rows]
 
 
-def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[Array, float]:
+def predict(
+    model: Nomoto, run: Zigzag, rudder: Zigzag | None = None, window: float | None = None
+) -> tuple[Array, float]:
     """The heading (n,) that the model predicts for a run, its first state fitted; and the RMSE.
 
-    ``rudder`` is the same run with more rows, if there is one. As in the fit, a rudder that jumps
+    ``rudder`` is the same run with more rows, if there is one; ``window`` [s] lets the first state
+    know only so much of the run, instead of all of it. As in the fit, a rudder that jumps
     has the instants of its jumps fitted, each within its step.
 
     Raises
@@ -228,17 +234,21 @@ def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[A
             f"{run.name} has an input in {run.unit}, but the model was fitted to one in "
             f"{model.unit}: validate on a run of the same kind"
         )
-    fine = run
-    if rudder is not None and rudder is not run:
+    fine = run.cornered()
+    if rudder is not None:
         both = np.union1d(rudder.t, run.t)
         heading = np.full(len(both), np.nan)
         heading[np.searchsorted(both, run.t)] = run.heading
         fine = dataclasses.replace(
             run, t=both, heading=heading, rudder=np.interp(both, rudder.t, rudder.rudder)
         )
-    first, shares = _first_state(model.order, model.nonlinear, model.theta, fine)
+    start = fine
+    if window is not None:
+        seen = np.where(fine.t <= fine.t[0] + window, fine.heading, np.nan)
+        start = dataclasses.replace(fine, heading=seen)
+    first, shares = _first_state(model.order, model.nonlinear, model.theta, start)
     heading = respond(model.order, model.nonlinear, model.theta, fine, first, shares)
-    if fine is not run:
+    if len(fine.t) > len(run.t):
         heading = heading[np.searchsorted(fine.t, run.t)]
     return heading, _rmse(run.heading - heading)
 
@@ -323,7 +333,9 @@ def fit(
                 f"{run.name} has an input in {run.unit}, but {runs[0].name} in {runs[0].unit}: fit "
                 "runs of one kind together"
             )
-    used = [dense(run, interpolate, step, scale) for run in runs] if interpolate != "none" else runs
+    used = [run.cornered() for run in runs]
+    if interpolate != "none":
+        used = [dense(run, interpolate, step, scale) for run in runs]
     model = _output_error(used, order, nonlinear)
     if method != "oe":
         model = _equation_error(used, model, method)
@@ -383,8 +395,7 @@ def dense(run: Zigzag, method: str, step: float | None = None, scale: float = 1.
     The default step is a fifth of the heading's. The rudder keeps what is known of it: rows
     between headings as they are, else straight lines.
     """
-    known = run.known
-    t = run.t
+    known, t, fine = run.known, run.t, run.cornered()
     if step is not None or known.all():
         step = step or run.step / 5.0
         t = t[0] + step * np.arange(int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1)
@@ -392,7 +403,7 @@ def dense(run: Zigzag, method: str, step: float | None = None, scale: float = 1.
     t = t[inside]
     heading = densify.densify(run.t[known], run.heading[known], t, method, scale)
     return dataclasses.replace(
-        run, t=t, heading=heading, rudder=np.interp(t, run.t, run.rudder), held=False
+        run, t=t, heading=heading, rudder=np.interp(t, fine.t, fine.rudder), held=False
     )
 
 
@@ -566,8 +577,8 @@ def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomot
     z, history = x, None
     if method == "iv":
         # The instruments are the regressors of a simulated heading, which noise has not touched.
+        theta = model.theta
         for _ in range(30):
-            theta = _from_solution(solution, order, nonlinear)
             blocks: list[Array] = []
             for run in even:
                 first, shares = _first_state(order, nonlinear, theta, run)
@@ -581,6 +592,7 @@ def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomot
             new = np.linalg.solve(z.T @ x, z.T @ y)
             moved = np.abs(new - solution).max() / np.abs(new).max()
             solution = new
+            theta = _from_solution(solution, order, nonlinear)
             if moved < 1e-8:
                 break
     elif method == "rls":

@@ -1,6 +1,6 @@
 """Records of steering: heading and rudder over time, from a CSV file or a bag."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,50 @@ class Zigzag:
         jumps = np.flatnonzero(~level)
         inside = jumps[(jumps > 0) & (jumps < len(level) - 1)]
         return inside[level[inside - 1] & level[inside + 1]]
+
+    def cornered(self) -> "Zigzag":
+        """The run with rows added where the rudder begins and ends to move.
+
+        A servo goes from one level to another at its own rate. Straight lines between samples cut
+        the corners, as if the rudder turned earlier and less; at that rate, known from within the
+        longer movements, the lines through the first and last moving sample meet the levels at the
+        corners. Added rows have no heading.
+        """
+        if self.held or len(self.t) < 4:
+            return self
+        slope = np.diff(self.rudder) / np.diff(self.t)
+        level = np.abs(np.diff(self.rudder)) < 1e-3 * np.ptp(self.rudder)
+        inner = ~level[1:-1] & ~level[:-2] & ~level[2:]
+        if not inner.any():
+            return self
+        usual = float(np.median(np.abs(slope[1:-1][inner])))
+        begin = np.flatnonzero(level[:-1] & ~level[1:]) + 1  # row where it still stands
+        added: list[tuple[float, float]] = []
+        for i in begin:
+            still = np.flatnonzero(level[i:])
+            if not len(still) or still[0] < 2:
+                continue
+            j = i + still[0]  # row where it stands again
+            own = np.abs(slope[i + 1 : j - 1])
+            rate = float(np.median(own)) if len(own) else usual
+            first = self.t[i + 1] - abs(self.rudder[i + 1] - self.rudder[i]) / rate
+            last = self.t[j - 1] + abs(self.rudder[j] - self.rudder[j - 1]) / rate
+            if self.t[i] < first < self.t[i + 1]:
+                added.append((first, self.rudder[i]))
+            if self.t[j - 1] < last < self.t[j]:
+                added.append((last, self.rudder[j]))
+        if not added:
+            return self
+        t, rudder = np.array(added).T
+        apart = np.abs(t[:, None] - self.t).min(axis=1) > 1e-6 * np.diff(self.t).min()
+        t, rudder = t[apart], rudder[apart]
+        rows = np.searchsorted(self.t, t)
+        return replace(
+            self,
+            t=np.insert(self.t, rows, t),
+            heading=np.insert(self.heading, rows, np.nan),
+            rudder=np.insert(self.rudder, rows, rudder),
+        )
 
 
 def read(path: Path) -> Zigzag:
