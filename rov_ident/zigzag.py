@@ -55,7 +55,7 @@ class Zigzag:
         A servo goes from one level to another at its own rate. Straight lines between samples cut
         the corners, as if the rudder turned earlier and less; at that rate, known from within the
         longer movements, the lines through the first and last moving sample meet the levels at the
-        corners. Added rows have no heading.
+        corners. Added rows have no heading; movements not at one rate are left as they are.
         """
         if self.held or len(self.t) < 4:
             return self
@@ -74,6 +74,8 @@ class Zigzag:
             j = i + still[0]  # row where it stands again
             own = np.abs(slope[i + 1 : j - 1])
             rate = float(np.median(own)) if len(own) else usual
+            if len(own) and np.ptp(own) > 0.1 * rate:
+                continue  # no movement at one rate
             first = self.t[i + 1] - abs(self.rudder[i + 1] - self.rudder[i]) / rate
             last = self.t[j - 1] + abs(self.rudder[j] - self.rudder[j - 1]) / rate
             if self.t[i] < first < self.t[i + 1]:
