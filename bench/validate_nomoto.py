@@ -23,14 +23,16 @@ from rov_ident.zigzag import Zigzag, read
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data")) / "kvlcc2-model"
 DENSE = 0.1  # s
-SEEDS = 10
+SEEDS = 5
 DEGREE = np.pi / 180.0
 
 
 def remus(rudder: float, switch: float) -> Zigzag:
     """A zigzag of the REMUS 100 every DENSE seconds; angles in deg."""
     model = config.load(ROOT / "config" / "remus100.yaml").model
-    return every(autopilot.zigzag(model, rudder * DEGREE, switch * DEGREE).zigzag(), DENSE)
+    return every(
+        autopilot.manoeuvre(model, "zigzag", rudder * DEGREE, switch * DEGREE).zigzag(), DENSE
+    )
 
 
 def every(run: Zigzag, step: float) -> Zigzag:

@@ -40,7 +40,8 @@ _FIN_COLUMNS = {
 }
 _FLOW = ("alpha", "beta")
 _RADIUS = ("R_m", "radius_m")
-_SLOWEST, _MOST_ROWS = 1e-6, 100_000
+_SLOWEST, _FASTEST = 1e-6, 2.0 * math.pi  # m/s, rad/s
+_MOST_ROWS = 100_000
 _ALIKE = 0.995  # cosine between two columns from which a table cannot tell them apart
 _CONDITION = 100.0  # of a structure's scaled columns, beyond which its values mean nothing apart
 _FEWEST = 6  # conditions
@@ -235,6 +236,11 @@ def _states(reader: _Reader, drift: str, notes: list[str]) -> tuple[Array, Array
     for i, name in enumerate(VELOCITIES):
         if (values := direct[name]) is not None:
             nu[:, i] = values
+            if i >= 3 and np.abs(values).max() > _FASTEST:
+                raise UserError(
+                    f"{path}: {name} reaches {np.abs(values).max():g} rad/s, which looks like "
+                    "degrees a second: convert the column to rad/s"
+                )
     if total is not None:
         if clash := [name for name in "uvw" if direct[name] is not None]:
             raise UserError(f"{path} has U_mps and {clash[0]}: keep one way to state the velocity")
