@@ -46,6 +46,7 @@ _ALIKE = 0.995  # cosine between two columns from which a table cannot tell them
 _CONDITION = 100.0  # of a structure's scaled columns, beyond which its values mean nothing apart
 _FEWEST = 6  # conditions
 _ROWS_PER_TERM = 3
+_PATIENCE = 3  # sizes without a better cross-validation until structures grow no further
 _SHOWN = 20  # candidates, beside the chosen
 _WORTH = 2.0  # standard errors
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
@@ -525,7 +526,10 @@ def _grow(x: Array, y: Array, most: int) -> list[tuple[int, ...]]:
     tried: dict[tuple[int, ...], None] = {}
     current: tuple[int, ...] = ()
     n = x.shape[1]
+    errors: list[float] = []
     for _ in range(most):
+        if len(errors) > _PATIENCE and min(errors[-_PATIENCE:]) > min(errors):
+            break
         grown = [tuple(sorted((*current, i))) for i in range(n) if i not in current]
         current = min(grown, key=cost)
         while True:
@@ -540,6 +544,7 @@ def _grow(x: Array, y: Array, most: int) -> list[tuple[int, ...]]:
                 break
             current = better
         tried[current] = None
+        errors.append(_rms(_left_out(x[:, current], y)))
         for subset in sorted({*grown, *exchanged}, key=cost)[:8]:
             tried[subset] = None
     return [s for s in tried if np.linalg.cond(x[:, s]) < _CONDITION] or [min(tried, key=len)]
