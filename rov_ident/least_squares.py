@@ -289,7 +289,7 @@ def equation_error(
             raise UserError(_NOT_TOLD)
         return np.array(np.linalg.solve(scaled[:n], root[:n, n]) / length)
     sums = np.zeros((6, n + 1, n + 1))
-    _accumulate(*arguments, pattern, count, sums)
+    _accumulate(*arguments, pattern, count, sums)  # type: ignore[call-arg]
     whole = np.einsum("k,kij->ij", weight, sums)
     a, b = whole[:-1, :-1] + np.tril(whole[:-1, :-1], -1).T, whole[-1, :-1]
     length = np.sqrt(np.diag(a))
@@ -344,7 +344,7 @@ def _householder(
     total = len(arguments[3])
     for first in range(0, total, _BLOCK):
         size = min(_BLOCK, total - first)
-        _fill(*arguments, first, block)
+        _fill(*arguments, first, block)  # type: ignore[call-arg]
         for axis in range(6):
             mine = block[axis, pattern[axis, : count[axis]], :size].T
             stacked = np.vstack([roots[axis], mine])
