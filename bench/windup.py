@@ -24,7 +24,7 @@ from rov_ident import plots, sensors
 from rov_ident.demo import shipped
 from rov_ident.estimate import prior_of
 from rov_ident.excitation import manoeuvre
-from rov_ident.jit import inlined, kernel
+from rov_ident.jit import kernel
 from rov_ident.online import ESTIMATORS
 from rov_ident.samples import SAMPLE
 
@@ -58,15 +58,15 @@ PLAIN, FORTESCUE, KULHAVY, RESETTING, BOUNDED, SIFT, EVIDENCE = range(len(RULES)
 # standard deviations of the output. g = P phi, r = phi' P phi.
 
 
-@inlined
+@kernel
 def _less(p, g, f):
-    """P - f g g'."""
+    """P - f g g', exactly symmetric: forgetting multiplies what rounding would leave."""
     for i in range(len(g)):
         for j in range(len(g)):
-            p[i, j] -= f * g[i] * g[j]
+            p[i, j] -= f * (g[i] * g[j])
 
 
-@inlined
+@kernel
 def _times(p, f):
     for i in range(len(p)):
         for j in range(len(p)):
@@ -81,10 +81,10 @@ def _step(rule, theta, p, information, phi, e, surprise):
     r = phi @ g
     if rule in (PLAIN, BOUNDED):
         forget = rule == PLAIN or np.trace(p) / FACTOR <= n  # the prior's trace
-        f = FACTOR if forget else 1.0
-        theta += g * (e / (f + r))
-        _less(p, g, 1.0 / (f + r))
-        _times(p, 1.0 / f)
+        kept = FACTOR if forget else 1.0
+        theta += g * (e / (kept + r))
+        _less(p, g, 1.0 / (kept + r))
+        _times(p, 1.0 / kept)
     elif rule == FORTESCUE:
         # the weighted sum of squared errors is held at that of 1 / (1 - FACTOR) samples
         theta += g * (e / (1.0 + r))
@@ -101,7 +101,9 @@ def _step(rule, theta, p, information, phi, e, surprise):
         theta += g * (alpha * e / (1.0 + r))
         for i in range(n):
             for j in range(n):
-                p[i, j] = p[i, j] / FACTOR - alpha * g[i] * g[j] / (1.0 + r) - delta * square[i, j]
+                p[i, j] = (
+                    p[i, j] / FACTOR - alpha * (g[i] * g[j]) / (1.0 + r) - delta * square[i, j]
+                )
             p[i, i] += beta
     elif rule == SIFT:
         seen = information @ phi
@@ -124,7 +126,7 @@ def _step(rule, theta, p, information, phi, e, surprise):
                 theta[i] += g[i] * e / (1.0 + r)
             for j in range(n):
                 if not (still_i and abs(phi[j]) <= 4.0 * SLIGHT / NOISE):
-                    p[i, j] -= g[i] * g[j] / (1.0 + r)
+                    p[i, j] -= (g[i] * g[j]) / (1.0 + r)
         if surprise > 3.0:
             for i in range(n):
                 p[i, i] += 0.001 * max(1.0 - p[i, i], 0.0)
@@ -338,8 +340,10 @@ def report(samples: int, out: Path | None) -> list[str]:
     print(
         f"\n24 coefficients, forgetting factor {FACTOR}, {samples:,} samples without excitation:\n"
     )
-    print("| rule | mean variance over the prior's, largest | largest error in the silence")
-    print("| largest after it | samples to recover |\n|" + " --- |" * 5)
+    print(
+        "| rule | mean variance over the prior's, largest | largest error in the silence"
+        " | largest after it | samples to recover |\n|" + " --- |" * 5
+    )
     every = courses(samples)
     for course in every:
         worst = np.maximum(course.errors, course.others)
@@ -351,13 +355,18 @@ def report(samples: int, out: Path | None) -> list[str]:
                 f"{trace:.2g}", f"{error:.2g}", f"{np.nanmax(worst[returned]):.2g}",
                 f"{course.to_recover:,.0f}" if np.isfinite(course.to_recover) else "never",
             ]  # fmt: skip
-        print(f"| {course.name} | {' | '.join(cells)} |")
+        print(f"| {course.name} | {' | '.join(cells)} |", flush=True)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_bytes(plots.to_png(picture(every, samples)))
     ours = every[EVIDENCE]
     if ours.spoilt or np.nanmax(ours.traces[silent]) > 1.0 or not np.isfinite(ours.to_recover):
         missed.append(f"windup: {ours.name}")
     print(f"\nThe estimators themselves, at rest for {samples:,} samples at 50 Hz:\n")
-    print("| | mean variance over the prior's: before, largest at rest | moved, in std")
-    print("| s until X_uu + 30 % is within 10 % | off at the end |\n|" + " --- |" * 5)
+    print(
+        "| | mean variance over the prior's: before, largest at rest | moved, in std"
+        " | s until X_uu + 30 % is within 10 % | off at the end |\n|" + " --- |" * 5
+    )
     for row in library(samples):
         cells = [
             f"{row['before']:.2g}, {row['trace']:.2g}", f"{row['moved']:.2f}",
@@ -367,9 +376,6 @@ def report(samples: int, out: Path | None) -> list[str]:
         met = row["definite"] and row["trace"] <= 1.0 and row["moved"] <= 1.0
         if not (met and row["to_recover"] <= SECONDS):
             missed.append(f"windup: {row['name']}: {', '.join(cells)}")
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_bytes(plots.to_png(picture(every, samples)))
     return missed
 
 
