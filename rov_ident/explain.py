@@ -387,6 +387,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
         alternatives.append((share, Alternative(rival, why)))
     if not separable:
         alternatives = [a for a in alternatives if a[1].why_not == _AS_WELL]
+    separable = separable and not any(_pinned(k, final.hypothesis.values[k]) for k in keys)
     parameters = parameters_of(final, keys)
     onset = parameters.get("onset")
     return Finding(
@@ -400,6 +401,16 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
         tuple(a for _, a in sorted(alternatives, key=lambda x: -x[0])),
         sentence(name, parameters, gain),
     )
+
+
+def _pinned(key: Key, value: float) -> bool:
+    """Whether a parameter of an effect went as far as it may: then it stands for something else.
+
+    Zero is a value like others: a thruster may fail altogether.
+    """
+    if key[0] not in EFFECTS or parameter(key).role != "amplitude":
+        return False
+    return any(b != 0.0 and abs(value - b) < 1e-3 * abs(b) for b in bounds(key)[1:])
 
 
 def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from explain import (
@@ -19,7 +20,8 @@ from explain import (
     wrong,
 )
 from hidden import EFFECTS, NESTED, Conditions, draw
-from rov_ident.explain import explain, thinned, whole
+from rov_ident.explain import _pinned, explain, thinned, whole
+from rov_ident.scores import _own
 from rov_ident.streams import gather
 
 STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
@@ -118,6 +120,31 @@ def test_what_was_left_out_is_told():
     notes = gather([messages[0], twice, twice, *messages[1:]], case.config).notes
     assert any("odom" in note and "stamp" in note for note in notes)
     assert gather(messages, case.config).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "is_pinned"),
+    [
+        (("ocean_current", "north"), -3.0, True),
+        (("ocean_current", "north"), -2.9, False),
+        (("thruster_failure", "gain_X"), 0.0, False),  # a thruster may fail altogether
+        (("thruster_gain", "gain_X"), 5.0, True),
+        (("wave", "phase"), 6.3, False),
+    ],
+)
+def test_an_effect_at_the_end_of_its_range_is_known(key, value, is_pinned):
+    assert _pinned(key, value) is is_pinned
+
+
+def test_a_noisy_axis_does_not_pass_for_a_cause():
+    """Scores of whole windows scatter more than white ones where one axis is pushed at random."""
+    rng, windows, rows = np.random.default_rng(0), 24, 60
+    first = np.arange(0, windows * rows, rows)
+    column = rng.standard_normal((windows * rows, 1))
+    push = np.repeat(rng.standard_normal(windows), rows)
+    white = rng.standard_normal(windows * rows)
+    assert _own(column, white, first) < 2.0
+    assert _own(column, white + push * column[:, 0], first) > 20.0
 
 
 def test_a_fit_takes_no_more_data_than_it_needs():
