@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check accuracy bench explain-bench bag picture clean
+.PHONY: demo test check accuracy bench validate explain-bench torture bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -30,6 +30,16 @@ accuracy: .venv/demo.stamp
 ## speed against peers, the table of docs/speed.md (ten minutes; let nothing else run)
 bench: .venv/bench.stamp
 	@$(BIN)/python bench/speed.py
+
+## offline identification: the tables of docs/offline.md, docs/nomoto.md and docs/forces.md
+validate: .venv/demo.stamp
+	$(BIN)/python bench/validate.py
+	$(BIN)/python bench/validate_nomoto.py
+	$(BIN)/python bench/validate_forces.py
+
+## what goes wrong at sea, done to both estimators
+torture: .venv/demo.stamp
+	$(BIN)/python bench/torture.py
 
 ## how often explain finds what is hidden, the tables of docs/explain-bench.md (many hours; it may be
 ## stopped and goes on where it was)

@@ -18,7 +18,7 @@ from rov_ident.coefficients import AXES
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))
 CAPTIVE = DATA / "kvlcc2-model" / "captive.csv"
-DRAWS = 40
+DRAWS = 6
 DEGREE = np.pi / 180.0
 Array = NDArray[np.float64]
 

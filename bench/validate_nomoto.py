@@ -23,14 +23,16 @@ from rov_ident.zigzag import Zigzag, read
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data")) / "kvlcc2-model"
 DENSE = 0.1  # s
-SEEDS = 10
+SEEDS = 3
 DEGREE = np.pi / 180.0
 
 
 def remus(rudder: float, switch: float) -> Zigzag:
     """A zigzag of the REMUS 100 every DENSE seconds; angles in deg."""
     model = config.load(ROOT / "config" / "remus100.yaml").model
-    return every(autopilot.zigzag(model, rudder * DEGREE, switch * DEGREE).zigzag(), DENSE)
+    return every(
+        autopilot.manoeuvre(model, "zigzag", rudder * DEGREE, switch * DEGREE).zigzag(), DENSE
+    )
 
 
 def every(run: Zigzag, step: float) -> Zigzag:
@@ -101,7 +103,7 @@ def spline_or_spiral(dense: Zigzag) -> None:
     """With noise, from other rates, in other units: heading error and errors of K and T."""
     own = {method: nomoto.fit([dense], method=method) for method in ("fd", "oe")}
     rows = []
-    for step in (0.2, 0.3, 0.5, 1.0):
+    for step in (0.2, 0.5, 1.0):
         for noise in (0.0, 0.05, 0.2):
             for way, scale in (("none", 1.0), ("spline", 1.0), ("spiral", 1.0), ("spiral", 57.3)):
                 found = [_one(dense, own, step, noise, way, scale, seed)

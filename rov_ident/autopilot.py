@@ -193,18 +193,62 @@ class Both:
         return {letter: x for law in self.laws for letter, x in law(now).items()}
 
 
-def zigzag(
+MANOEUVRES = ("zigzag", "turn", "heading", "dive")
+
+
+def manoeuvre(
     model: Model,
-    rudder: float,
+    name: str,
+    angle: float,
     switch: float | None = None,
+    depth: float = 5.0,
     duration: float = 100.0,
     speed: float = 1.5,
     servo: Servo = Servo(),
-    step: float = 0.02,
-    level: bool = True,
 ) -> Run:
-    """A zigzag of ``rudder`` [rad] at headings of ``switch`` (the same by default), depth held."""
-    kempf: Law = Kempf(rudder, rudder if switch is None else switch)
-    if level and "M_uuds" in model.fins:
-        kempf = Both((kempf, Depth(0.0, float(np.sign(model.fins["M_uuds"])))))
-    return steer(model, kempf, duration, speed, servo, step)
+    """A manoeuvre by name, the depth held where the vehicle has stern planes.
+
+    ``angle`` [rad] is the rudder's for `zigzag` (reversed at ``switch``, the same by default) and
+    `turn`, the course for `heading`; `dive` goes to ``depth`` [m].
+
+    Raises
+    ------
+    UserError
+        For an unknown name, or fins that the vehicle lacks for it.
+    """
+    yaw, pitch = (float(np.sign(model.fins.get(key, 0.0))) for key in ("N_uudr", "M_uuds"))
+    lacking = "M_uuds" if name == "dive" and not pitch else "N_uudr" if not yaw else ""
+    if lacking and not (name == "dive" and pitch):
+        raise UserError(f"the vehicle has no {lacking}: add it to coefficients for a {name}")
+    if name == "zigzag":
+        law: Law = Kempf(angle, angle if switch is None else switch)
+    elif name == "turn":
+        law = Turn(angle)
+    elif name == "heading":
+        law = Heading(angle, yaw)
+    elif name == "dive":
+        law = Depth(depth, pitch)
+    else:
+        raise UserError(f"there is no manoeuvre '{name}': choose one of {', '.join(MANOEUVRES)}")
+    if name != "dive" and pitch:
+        law = Both((law, Depth(0.0, pitch)))
+    return steer(model, law, duration, speed, servo)
+
+
+def to_csv(run: Run, step: float, heading_noise: float = 0.0, seed: int = 0) -> str:
+    """The run every ``step`` [s] as a CSV that `nomoto` reads; white heading noise [rad]."""
+    k = max(1, round(step / (run.t[1] - run.t[0])))
+    noise = heading_noise * np.random.default_rng(seed).standard_normal(len(run.t))
+    columns = {
+        "t_s": run.t,
+        "heading_deg": np.degrees(run.angles[:, 2] + noise),
+        "rudder_deg": np.degrees(run.fins["r"]),
+        "stern_deg": np.degrees(run.fins["s"]),
+        **dict(zip(("x_m", "y_m", "z_m"), run.position.T)),
+        **dict(zip(("roll_deg", "pitch_deg"), np.degrees(run.angles[:, :2].T))),
+        **dict(zip("uvwpqr", run.nu.T)),
+    }
+    rows = np.column_stack(list(columns.values()))[::k]
+    return (
+        "\n".join([",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in rows)]) + "\n"
+    )

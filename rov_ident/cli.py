@@ -232,6 +232,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_nomoto(commands)
     _add_forces(commands)
+    _add_steer(commands)
 
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
@@ -296,6 +297,28 @@ def _add_forces(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     )
     forces.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
     forces.set_defaults(run=_forces)
+
+
+def _add_steer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    steer = commands.add_parser(
+        "steer", help="simulate a vehicle under its fins: zigzag, turn, heading change, dive"
+    )
+    steer.add_argument("--config", required=True, type=Path)
+    steer.add_argument("--manoeuvre", required=True, choices=("zigzag", "turn", "heading", "dive"))
+    steer.add_argument(
+        "--angle", type=_number, default=15.0,
+        help="deg: of the rudder, or the course of heading (15)",
+    )  # fmt: skip
+    steer.add_argument("--switch", type=_positive, help="deg, of a zigzag (as the rudder)")
+    steer.add_argument("--depth", type=_positive, default=5.0, help="m, of a dive (5)")
+    steer.add_argument("--duration", type=_positive, default=100.0, help="s (100)")
+    steer.add_argument("--speed", type=_positive, default=1.5, help="m/s (1.5)")
+    steer.add_argument("--servo-rate", type=_positive, default=20.0, help="deg/s (20)")
+    steer.add_argument("--sample", type=_positive, default=0.1, help="s between rows (0.1)")
+    steer.add_argument("--noise", type=_rate, default=0.0, help="deg, of the heading (0)")
+    steer.add_argument("--seed", type=_seed, default=0, help="of the noise (0)")
+    steer.add_argument("--out", required=True, type=Path, metavar="CSV")
+    steer.set_defaults(run=_steer)
 
 
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
@@ -808,6 +831,32 @@ def _forces(options: argparse.Namespace) -> None:
         OUT.print(f"{axis}: {f.why}\n", markup=False)
     for note in notes:
         ERR.print(note, markup=False, soft_wrap=True)
+
+
+def _steer(options: argparse.Namespace) -> None:
+    from rov_ident import autopilot
+    from rov_ident.fit import write_text
+
+    _check_outputs([options.out], [options.config])
+    if not abs(options.angle) <= 180.0:
+        raise UserError(f"--angle {options.angle:g}: give degrees from -180 to 180")
+    run = autopilot.manoeuvre(
+        configuration.load(options.config).dynamics,
+        options.manoeuvre,
+        math.radians(options.angle),
+        math.radians(options.switch) if options.switch else None,
+        options.depth,
+        options.duration,
+        options.speed,
+        autopilot.Servo(rate=math.radians(options.servo_rate)),
+    )
+    noise = math.radians(options.noise)
+    write_text(options.out, autopilot.to_csv(run, options.sample, noise, options.seed))
+    heading = np.degrees(run.angles[:, 2])
+    OUT.print(
+        f"{options.manoeuvre}: heading from {heading.min():.1f} to {heading.max():.1f} deg, depth "
+        f"at the end {run.position[-1, 2]:.2f} m, speed {run.nu[-1, 0]:.2f} m/s"
+    )
 
 
 def _coefficients(options: argparse.Namespace) -> None:

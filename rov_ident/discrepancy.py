@@ -22,7 +22,7 @@ from rov_ident.evidence import Evidence, Fitted, Look
 from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
 from rov_ident.model import Array
 from rov_ident.patterns import Pattern, patterns
-from rov_ident.scores import PRICE, SURE, inflation, scores_of
+from rov_ident.scores import PRICE, SURE, inflation, own_inflation, scores_of
 from rov_ident.streams import Streams
 
 Progress = Callable[[str], None]
@@ -112,7 +112,7 @@ class Search:
                 break
             candidate, pattern = screened[0]
             longer = self.fit_pattern(final, candidate, pattern)
-            if longer is None or self.cost(final, longer) - self.cost(longer, longer) < SURE:
+            if longer is None or self.worth(final, longer, longer) < SURE:
                 break
             final = longer
             found.append(final)
@@ -136,7 +136,7 @@ class Search:
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.rss)
-        worth = [f for f in fits if self.cost(now, closest) - self.cost(f, closest) >= SURE]
+        worth = [f for f in fits if self.worth(now, f, closest) >= SURE]
         plain = [f for f in worth if self.newest(now, f) in PLAIN]
         return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
 
@@ -291,6 +291,13 @@ class Search:
             less = h.without([added[int(np.argmin(worth))]])
             fitted = self.evidence.fit(less, fitted.look)
         return None
+
+    def worth(self, now: Fitted, longer: Fitted, best: Fitted) -> float:
+        """What a longer model takes off the cost, also by the scatter of what is new in it."""
+        gain = self.cost(now, best) - self.cost(longer, best)
+        new = [k for k in longer.hypothesis.keys if k not in now.hypothesis.values]
+        own = own_inflation(longer.look, new)
+        return min(gain, (now.rss - longer.rss) / max(own, 1e-9) - PRICE * len(new))
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the price of the added parameters.

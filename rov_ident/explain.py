@@ -39,6 +39,7 @@ _MARGIN = 0.25  # s; cut off beside held-out blocks
 _CHUNK = 2.5  # s; of the bootstrap
 _CLUSTERS = 8  # windows from which their scatter tells anything
 _WORTH = 0.02  # gain from which an effect has practical weight
+_ALL = 0.98  # share of what a finding explains that counts as all of it
 _AS_WELL = "fits this bag as well"
 _ENOUGH = 600.0  # s; of data to fit
 _LIMIT = 3.0  # a simulation further off than so many standard deviations of the motion has failed
@@ -381,6 +382,8 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
             why = _AS_WELL
         else:
             why = f"fitted in its stead, it explains only {100 * share:.0f} % of this"
+            if share > _ALL:
+                why = "fitted in its stead, it needs more parameters to explain as much"
         alternatives.append((share, Alternative(rival, why)))
     if not separable:
         alternatives = [a for a in alternatives if a[1].why_not == _AS_WELL]

@@ -40,11 +40,13 @@ _FIN_COLUMNS = {
 }
 _FLOW = ("alpha", "beta")
 _RADIUS = ("R_m", "radius_m")
-_SLOWEST, _MOST_ROWS = 1e-6, 100_000
+_SLOWEST, _FASTEST = 1e-6, 2.0 * math.pi  # m/s, rad/s
+_MOST_ROWS = 100_000
 _ALIKE = 0.995  # cosine between two columns from which a table cannot tell them apart
 _CONDITION = 100.0  # of a structure's scaled columns, beyond which its values mean nothing apart
 _FEWEST = 6  # conditions
 _ROWS_PER_TERM = 3
+_PATIENCE = 3  # sizes without a better cross-validation until structures grow no further
 _SHOWN = 20  # candidates, beside the chosen
 _WORTH = 2.0  # standard errors
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
@@ -235,6 +237,11 @@ def _states(reader: _Reader, drift: str, notes: list[str]) -> tuple[Array, Array
     for i, name in enumerate(VELOCITIES):
         if (values := direct[name]) is not None:
             nu[:, i] = values
+            if i >= 3 and np.abs(values).max() > _FASTEST:
+                raise UserError(
+                    f"{path}: {name} reaches {np.abs(values).max():g} rad/s, which looks like "
+                    "degrees a second: convert the column to rad/s"
+                )
     if total is not None:
         if clash := [name for name in "uvw" if direct[name] is not None]:
             raise UserError(f"{path} has U_mps and {clash[0]}: keep one way to state the velocity")
@@ -519,7 +526,10 @@ def _grow(x: Array, y: Array, most: int) -> list[tuple[int, ...]]:
     tried: dict[tuple[int, ...], None] = {}
     current: tuple[int, ...] = ()
     n = x.shape[1]
+    errors: list[float] = []
     for _ in range(most):
+        if len(errors) > _PATIENCE and min(errors[-_PATIENCE:]) > min(errors):
+            break
         grown = [tuple(sorted((*current, i))) for i in range(n) if i not in current]
         current = min(grown, key=cost)
         while True:
@@ -534,6 +544,7 @@ def _grow(x: Array, y: Array, most: int) -> list[tuple[int, ...]]:
                 break
             current = better
         tried[current] = None
+        errors.append(_rms(_left_out(x[:, current], y)))
         for subset in sorted({*grown, *exchanged}, key=cost)[:8]:
             tried[subset] = None
     return [s for s in tried if np.linalg.cond(x[:, s]) < _CONDITION] or [min(tried, key=len)]

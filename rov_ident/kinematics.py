@@ -112,8 +112,7 @@ def blocks(
         made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
     if len(streams.imu_t) > 8:
         q = orientation_at(streams, streams.imu_t)
-        _follow(q, streams.imu_t, there.gyro - np.median(there.gyro - rate_at, axis=0))
-        r_imu = quaternion_to_matrix(q)
+        r_imu = quaternion_to_matrix(_followed(q, streams.imu_t, there.gyro, rate_at))
         origin = _at_origin(streams.imu_t, there, np.array(config.imu.position))
         shift = [change(there, key) for key in keys]
         inside = (streams.t >= streams.imu_t[0]) & (streams.t <= streams.imu_t[-1])
@@ -142,6 +141,22 @@ def blocks(
         for name, t, y, columns in made
         if len(t) > 20
     ]
+
+
+def _followed(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:
+    """Attitudes (M, 4): short term of the gyro (M, 3), long term as measured.
+
+    What the gyro reads too much tilts them all by that rate times a second, and gravity with them:
+    first taken from the odometry's ``rate`` (M, 3), then from the tilt itself, which is finer.
+    """
+    true = gyro - np.median(gyro - rate, axis=0)
+    for _ in range(2):
+        q = measured.copy()
+        _follow(q, t, true)
+        a, b = q[:, 1:], measured[:, 1:]
+        tilt = 2.0 * (q[:, :1] * b - measured[:, :1] * a - np.cross(a, b))
+        true = true + tilt.mean(axis=0) / _ATTITUDE_TIME
+    return q
 
 
 @kernel

@@ -18,7 +18,7 @@ from rov_ident.excitation import authority
 from rov_ident.jit import inlined
 
 FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
-ROOM = 1.2  # the power of summed innovations from which noise is added; 1 is expected
+ROOM = 1.5  # the power of summed innovations from which noise is added; 1 is expected
 SUM_TIME = 1.0  # s; over which innovations are added up
 FIRST_TIME, TIME = (
     1.0,

@@ -46,7 +46,11 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
+<<<<<<< HEAD
 from rov_ident.estimate import Estimate, Prior, prior_of, theta_of
+=======
+from rov_ident.estimate import Estimate, Prior, calibrated, prior_of
+>>>>>>> ukf
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
     Structure,
@@ -227,11 +231,7 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     n, place = len(task.scale), np.argsort(state.order)
     inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
     information = inverse @ inverse.T
-    # From a short record the sandwich is itself uncertain, and mostly too thin: never thinner than
-    # the inverse information.
-    sandwich = np.sum((information @ state.score) * information, axis=1)
-    widen = np.sqrt(np.maximum(sandwich / np.diag(information), 1.0))
-    covariance = (information * np.outer(widen, widen))[np.ix_(place, place)]
+    covariance = calibrated(information, state.score)[np.ix_(place, place)]
     return Estimate(
         prior.names,
         task.theta[task.estimated] + task.scale * (inverse @ state.root[:, n])[place],

@@ -663,7 +663,8 @@ def fuse(
             surprise = 0.0
             for i in range(3):
                 surprise += (v[i] - k.v[i]) ** 2
-            # a filter that refuses for long is wrong itself: its variance grows until it agrees
+            # A filter that refuses for seconds is wrong itself: its variance grows until it agrees,
+            # faster than a velocity that has run away can.
             taken = surprise <= 3.0 * s.gate**2 * total
             if taken:
                 gain, bias_gain = k.p_vv / total, k.p_vb / total
@@ -675,7 +676,7 @@ def fuse(
                 k.p_vb *= 1.0 - gain
                 k.p_vv *= 1.0 - gain
             else:
-                k.p_vv += r_linear
+                k.p_vv += 0.2 * k.p_vv + r_linear
         if taken:
             for i in range(3):
                 out.odometry[i] = v[i] - out.water[i]

@@ -24,6 +24,9 @@ Bounds = Callable[[Key], tuple[float, float, float]]
 """Null, lower and upper bound of a parameter."""
 
 
+_LEVERAGE = 0.9
+
+
 class Rows(NamedTuple):
     """Residuals (R,) with their sensitivities to the base (R, B) and to the candidates (R, C), and
     where each window begins in them."""
@@ -123,10 +126,12 @@ class Scores:
             return self.kappa
         at = [self._place[k] for k in keys]
         base, candidates, error, first = self._rows
-        left = error - candidates[:, at] @ change + base @ (self._onto[:, at] @ change)
+        new = candidates[:, at] - base @ self._onto[:, at]
+        left = error - new @ change
         gradient = np.add.reduceat(base * left[:, None], first)
         variance = float(left @ left) / max(self._linear.count - len(at) - base.shape[1], 1)
-        return min(self.kappa, max(_scatter(gradient, self._linear, self._base), variance))
+        common = max(_scatter(gradient, np.diag(self._linear.normal)[self._base]), variance)
+        return max(min(self.kappa, common), _own(new, left, first))
 
     def solve(
         self,
@@ -160,12 +165,40 @@ def inflation(linear: Linear, at: Indices) -> float:
     variance = linear.rss.sum() / max(linear.count - len(at), 1)
     if len(at) == 0 or len(linear.rss) < 4:
         return float(max(variance, 1e-9))
-    return max(_scatter(linear.gradient[:, at], linear, at), float(variance))
+    return max(_scatter(linear.gradient[:, at], np.diag(linear.normal)[at]), float(variance))
 
 
-def _scatter(gradient: Array, linear: Linear, at: Indices) -> float:
+def own_inflation(look: Look, keys: Sequence[Key]) -> float:
+    """Of these parameters of a fit alone, the others refitted along.
+
+    An axis can be noisier, and its noise slower, than most.
+    """
+    linear = look.linear
+    at = linear.index(keys)
+    rest = linear.index(k for k in linear.keys if k not in set(keys))
+    if not len(at):
+        return 0.0
+    base, new = look.columns[:, rest], look.columns[:, at]
+    size = np.sqrt(np.maximum(np.diag(linear.normal)[rest], 1e-30))
+    normal = linear.normal[np.ix_(rest, rest)] / np.outer(size, size) + 1e-9 * np.eye(len(rest))
+    onto = np.linalg.solve(normal, linear.normal[np.ix_(rest, at)] / size[:, None]) / size[:, None]
+    return _own(new - base @ onto, look.error, look.first)
+
+
+def _own(new: Array, left: Array, first: Indices) -> float:
+    """The mean over columns ``new`` (R, C) of the scatter of their windows' scores."""
+    gradient = np.add.reduceat(new * left[:, None], first)
+    normal = np.maximum(np.sum(new**2, axis=0), 1e-300)
+    if len(first) < 4:
+        return 0.0
+    # Of what a window says for itself, the fit has already taken its share away (the jackknife).
+    share = np.minimum(np.add.reduceat(new**2, first) / normal, _LEVERAGE)
+    return float(np.mean(((gradient / (1.0 - share)) ** 2).sum(axis=0) / normal))
+
+
+def _scatter(gradient: Array, normal: Array) -> float:
     """The median over parameters; those that nothing responds to do not count."""
-    w, normal = len(gradient), np.diag(linear.normal)[at]
+    w = len(gradient)
     seen = normal > 1e-12 * max(float(normal.max(initial=0.0)), 1e-300)
     own = gradient - gradient.mean(axis=0)
     ratio = (own**2).sum(axis=0)[seen] / normal[seen]

@@ -14,6 +14,7 @@ from rov_ident.tables import CsvTable, read_csv
 
 _RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
+_TURNED = 2.5 * np.pi  # a heading beyond it counts turns, or is in degrees
 _FAINT = 1.0  # deg; a zigzag whose angles all stay below it is one in radians
 
 
@@ -146,12 +147,12 @@ def _angle(table: CsvTable, name: str, blank: bool) -> Array:
         ):
             raise UserError(f"{table.path}: {found[0]} and {found[1]} disagree: remove one of them")
     if found[0].endswith("_rad"):
-        step = np.abs(np.diff(moved)).max(initial=0.0)
-        turned = name == "heading" and 20.0 < step < 359.0 and np.ptp(moved) > 20.0
-        if turned or (name == "rudder" and np.abs(moved).max() > _STEEPEST):
+        largest = float(np.abs(moved).max())
+        if largest > (_STEEPEST if name == "rudder" else _TURNED):
+            way_out = "" if name == "rudder" else ", else wrap it to +-pi"
             raise UserError(
-                f"{table.path}: {found[0]} reaches {np.abs(moved).max():g}, which looks like "
-                f"degrees: rename the column {name}_deg if it is"
+                f"{table.path}: {found[0]} reaches {largest:g}, which looks like degrees: rename "
+                f"the column {name}_deg if it is{way_out}"
             )
         return values
     if 0.0 < np.ptp(moved) < _FAINT:

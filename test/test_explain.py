@@ -1,9 +1,26 @@
 """Explain names what is hidden in a bag: a sample; `make explain-bench` is the whole."""
 
+import math
+
 import pytest
 
-from explain import RULES, TIERS, WEAK, Tier, Trial, bag, brought, explained, sure, trials, wrong
-from hidden import EFFECTS, NESTED, Conditions
+from explain import (
+    RULES,
+    TIERS,
+    WEAK,
+    Tier,
+    Trial,
+    bag,
+    brought,
+    explained,
+    streams_of,
+    sure,
+    trials,
+    wrong,
+)
+from hidden import EFFECTS, NESTED, Conditions, draw
+from rov_ident.explain import explain, thinned, whole
+from rov_ident.streams import gather
 
 STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
 PLACES = {
@@ -67,6 +84,48 @@ def test_what_has_no_name_is_described(name):
     described = {(r["axis"], r["depends_on"]) for r in line["residual"]}
     assert described & {(line["axis"], d) for d in line["depends_on"]}
     assert not sure(line)
+
+
+def test_a_tilted_attitude_is_not_taken_for_an_accelerometer_bias():
+    """A gyro that drifts tilts the attitude by which specific force is turned into the world."""
+    (found,) = found_in("imu_bias", 1)["found"]
+    for value, std, true in found["parameters"].values():
+        assert abs(value - true) < 4.0 * std
+
+
+@pytest.mark.parametrize("name", ["payload", "thruster_failure"])
+def test_onset_is_as_sure_as_it_says(name):
+    (found,) = found_in(name, 1)["found"]
+    value, std, true = found["parameters"]["onset"]
+    assert abs(value - true) < 4.0 * std
+
+
+def test_rotation_is_as_measured_where_no_moment_is_known():
+    case = draw(3, ("quadratic_damping",), STRENGTH, conditions=PLACES["a minute"])
+    streams = streams_of(case)
+    streams.demand[:, 3:] = 0.0
+    findings = explain([streams], case.config).findings
+    assert any("never holds a moment" in note for note in findings.notes)
+    for rmse in (findings.retuned, findings.extended):
+        assert math.isfinite(rmse["u"]) and all(math.isnan(rmse[c]) for c in "pqr")
+    assert not any(name[0] in "KMN" for name in findings.changed)
+
+
+def test_what_was_left_out_is_told():
+    case = draw(3, conditions=PLACES["a minute"])
+    messages = [(role, m) for _, role, m in case.messages]
+    twice = next(pair for pair in messages if pair[0] == "odom")
+    notes = gather([messages[0], twice, twice, *messages[1:]], case.config).notes
+    assert any("odom" in note and "stamp" in note for note in notes)
+    assert gather(messages, case.config).notes == ()
+
+
+def test_a_fit_takes_no_more_data_than_it_needs():
+    hour = whole(3600.0)
+    some = thinned(hour)
+    assert set(some) <= set(hour) and len(some) == pytest.approx(120, abs=2)
+    assert some[0] == hour[0] and some[-1][1] > 3500.0
+    assert thinned(hour[:100]) == hour[:100]
 
 
 # ------------------------------------------------------------------ the study itself

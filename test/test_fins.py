@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from rov_ident import autopilot, config
+from rov_ident.cli import main
 from rov_ident.coefficients import catalogue, fin_catalogue, parse_fin
 from rov_ident.errors import UserError
 from rov_ident.fins import CROSS, TAILS, X, tail
+from rov_ident.tables import read_csv
 
 ROOT = Path(__file__).resolve().parents[1]
 REMUS = ROOT / "config" / "remus100.yaml"
@@ -124,19 +126,45 @@ def test_heading_change_arrives(remus):
 
 def test_servo_is_no_faster_than_its_rate(remus):
     servo = autopilot.Servo(rate=0.2, limit=0.15)
-    run = autopilot.zigzag(remus, 0.3, duration=20.0, servo=servo)
+    run = autopilot.manoeuvre(remus, "zigzag", 0.3, duration=20.0, servo=servo)
     assert np.abs(np.diff(run.fins["r"])).max() <= 0.2 * 0.02 + 1e-12
     assert np.abs(run.fins["r"]).max() == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize("rudder, switch", [(10.0, 10.0), (20.0, 20.0), (15.0, 5.0)])
 def test_zigzag_turns_back_at_the_switching_heading(remus, rudder, switch):
-    run = autopilot.zigzag(remus, np.radians(rudder), np.radians(switch), duration=60.0)
+    run = autopilot.manoeuvre(
+        remus, "zigzag", np.radians(rudder), np.radians(switch), duration=60.0
+    )
     heading, side = run.angles[:, 2], np.sign(np.diff(run.fins["r"]))
     turning = np.flatnonzero(np.diff(side[side != 0.0]) != 0.0)
     assert len(turning) >= 3
     peaks = np.abs(heading[1:-1][np.diff(np.sign(np.diff(heading))) != 0.0])
     assert (peaks[1:] > np.radians(switch)).all()  # overshoot, never short of it
+
+
+@pytest.mark.parametrize("name", autopilot.MANOEUVRES)
+def test_manoeuvres_as_a_command(name, tmp_path):
+    out = tmp_path / "run.csv"
+    arguments = ["steer", "--config", str(REMUS), "--manoeuvre", name, "--duration", "20"]
+    assert main([*arguments, "--sample", "0.5", "--out", str(out)]) == 0
+    table = read_csv(out)
+    assert len(table.lines) == 41 and np.ptp(table.numbers("t_s")) == pytest.approx(20.0)
+    moving = {"dive": "stern_deg"}.get(name, "rudder_deg")
+    assert np.ptp(table.numbers(moving)) > 1.0
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["--manoeuvre", "dive", "--config", "bluerov2_heavy.yaml"], "has no M_uuds"),
+        (["--manoeuvre", "turn", "--config", "bluerov2_heavy.yaml"], "has no N_uudr"),
+    ],
+)
+def test_steer_without_fins_is_refused(arguments, sentence, tmp_path, capsys):
+    arguments[-1] = str(ROOT / "config" / arguments[-1])
+    assert main(["steer", *arguments, "--out", str(tmp_path / "run.csv")]) == 2
+    assert sentence in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_vehicle_without_fins_is_refused():

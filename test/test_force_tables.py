@@ -272,6 +272,7 @@ REFUSED = {
     "two speeds": (table(U_mps=np.abs(ANGLES)), "has U_mps and u: keep one way"),
     "half a tail": (table(ul_deg=ANGLES), "lacks the fin ll_deg of the x tail"),
     "not a number": (table(X=np.where(ANGLES == 0.0, np.nan, ANGLES)), "`nan` is not a number"),
+    "degrees a second": (table(r=3.0 * ANGLES), "looks like degrees a second"),
     "too few": ({k: v[:4] for k, v in table().items()}, "4 different conditions are too few"),
 }
 

@@ -230,7 +230,7 @@ def test_spiral_depends_on_the_units_of_its_plane():
 def remus():
     """The REMUS 100's zigzag of 15 deg at 0.02 s."""
     model = config.load(ROOT / "config" / "remus100.yaml").model
-    return autopilot.zigzag(model, np.radians(15.0)).zigzag()
+    return autopilot.manoeuvre(model, "zigzag", np.radians(15.0)).zigzag()
 
 
 def test_sparse_remus_densified_as_good_as_dense(remus):
@@ -384,6 +384,9 @@ BAD = {
     ),
     "degrees called radians": (
         lambda p, r: changed(write(p, r), "rudder_deg", "rudder_rad"), "looks like degrees"
+    ),
+    "heading in degrees called radians": (
+        lambda p, r: changed(write(p, r), "heading_deg", "heading_rad"), "else wrap it"
     ),
     "time back": (lambda p, r: write(p, r, extra="3,0,0,x\n"), "time must increase"),
     "no number": (lambda p, r: write(p, r, extra="101,0,hard,x\n"), "`hard` is not a number"),

@@ -183,6 +183,44 @@ def test_equals_filterpy(heavy, names, alpha, dt, kind):
     np.testing.assert_allclose(np.diag(state.p), np.diag(peer.filter.P), rtol=1e-7)
 
 
+# ------------------------------------------------------------------ mass
+
+
+def test_mass_matrices_are_made_positive_definite(heavy):
+    """Any symmetric matrix: exactly the textbook's ballast, its inverse; a hull's is left alone."""
+    rng, body = np.random.default_rng(3), heavy.model.body.mass_matrix
+    mass = rng.normal(0.0, 1.0, (ukf.LANES, 6, 6)) * np.sqrt(np.outer(np.diag(body), np.diag(body)))
+    mass = body + 0.5 * (mass + mass.transpose(0, 2, 1))
+    added = rng.normal(0.0, 1.0, (6, 6))
+    mass[0] = body + added @ added.T  # added mass as of any passive hull
+    indefinite = [np.linalg.eigvalsh(m)[0] < 0.0 for m in mass]
+    assert np.sum(indefinite) > 5 and not indefinite[0]
+    lanes = np.ascontiguousarray(mass.transpose(1, 2, 0))
+    inverse = np.zeros_like(lanes)
+    ukf._invert(lanes, ukf.problem(heavy).lightest, inverse)
+    for k, before in enumerate(mass):
+        expected = before + textbook.ballast(before, body)
+        np.testing.assert_allclose(lanes[:, :, k], expected, rtol=1e-9, atol=1e-9)
+        assert np.linalg.eigvalsh(expected)[0] > 0.0
+        wanted = np.tril(np.linalg.inv(expected))
+        np.testing.assert_allclose(np.tril(inverse[:, :, k]), wanted, rtol=1e-7, atol=1e-9)
+    assert np.array_equal(lanes[:, :, 0], mass[0])
+
+
+def test_a_prior_wide_enough_for_negative_mass(heavy, noisy):
+    """Sigma points of four times the added mass, either sign: it is learnt all the same."""
+    config = with_section(wrong_prior(heavy, spread=0.3), "prior", relative_std=1.5)
+    config = with_section(config, "ukf", alpha=1.0)
+    prior, task = prior_of(config), ukf.problem(config)
+    masses = [i for i, name in enumerate(prior.names) if name.endswith("dot")]
+    reach = prior.mean + task.settings["spread"][0] * prior.std
+    assert (reach[masses] > np.diag(heavy.model.body.mass_matrix)).any(), "no point is too light"
+    estimate, state, info = result(config, noisy)
+    assert definite(state.p) and np.isin(info["reason"], [ukf.USED, ukf.RESTARTED]).all()
+    error = np.abs(estimate.values / heavy.model.theta - 1.0)
+    assert (error[masses] < 0.02).all(), error.round(3)
+
+
 # ------------------------------------------------------------------ init, step, fold
 
 

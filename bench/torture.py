@@ -1,0 +1,372 @@
+"""What goes wrong at sea, done to both estimators.
+
+    python bench/torture.py [faults] [outliers] [garbage] [rest] [--seeds N]
+
+A fault is done to the messages of a simulated dive of three minutes; the same dive without it is
+the yardstick. Exit status 1 where a bar is missed.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from rov_ident import config as configuration
+from rov_ident.config import Config
+from rov_ident.messages import Imu, Message, Odometry, Wrench
+from rov_ident.online import ESTIMATORS, OnlineEstimator, Report
+from rov_ident.samples import IMU, ODOMETRY, WRENCH
+from rov_ident.sensors import START, dive
+
+HEAVY = Path(__file__).parents[1] / "config" / "bluerov2_heavy.yaml"
+SECOND = 1_000_000_000
+FAULT = (90.0, 100.0)  # s
+Messages = list[tuple[int, str, Message]]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table: the worst of all seeds."""
+
+    what: str
+    estimator: str
+    value: float
+    unit: str
+    bar: float
+
+    @property
+    def met(self) -> bool:
+        return self.value <= self.bar
+
+
+@cache
+def dived(seed: int) -> Messages:
+    """Three minutes of a vehicle that the configuration knows."""
+    return dive(configuration.load(HEAVY), "steps", 180.0, seed=seed).messages
+
+
+@cache
+def started(seed: int) -> Config:
+    """The configuration with every coefficient off by up to 30 %."""
+    config = configuration.load(HEAVY)
+    rng = np.random.default_rng(seed + 1000)
+    off = config.model.theta * (1.0 + rng.uniform(-0.3, 0.3, len(config.model.theta)))
+    return config.with_model(config.model.with_theta(off))
+
+
+def at(message: Message) -> float:
+    """Seconds since the first instant of the dive."""
+    return (message.stamp - START) / SECOND
+
+
+def during(message: Message, begin: float = FAULT[0], end: float = FAULT[1]) -> bool:
+    return begin <= at(message) < end
+
+
+@dataclass
+class Run:
+    """The reports of one second each, by the time of the input."""
+
+    final: Report
+    times: list[float]
+    used: list[int]  # samples so far
+
+    def recovery(self, since: float, rate: float) -> float:
+        """Seconds from ``since`` until samples are used at half their usual rate again."""
+        for t, before, after in zip(self.times, self.used, self.used[1:], strict=False):
+            if t >= since and after - before > 0.5 * rate:
+                return t - since
+        return math.inf
+
+
+def run(config: Config, kind: str, messages: Messages) -> Run:
+    """All messages in the order of their arrival."""
+    online = OnlineEstimator(config, kind)  # type: ignore[arg-type]
+    refusals = ESTIMATORS[kind].REFUSALS
+    times, used, count, begin = [], [], 0, messages[0][0]
+    for arrival, role, message in messages:
+        reasons = online.push(role, message)["reason"]
+        count += int(np.count_nonzero(~np.isin(reasons, refusals)))
+        if arrival - begin >= SECOND * len(times):
+            times.append((arrival - begin) / SECOND)
+            used.append(count)
+            report = online.report()
+            assert all(np.isfinite(x).all() for x in (report.values, report.std))
+            scaled = report.covariance / np.outer(report.std, report.std)
+            assert np.linalg.eigvalsh(scaled)[0] > 0.0, f"covariance at {times[-1]} s"
+    online.flush()
+    return Run(online.report(), times, used)
+
+
+def shift(a: Run, b: Run) -> float:
+    """The largest change of a coefficient, in standard deviations of the undisturbed run."""
+    return float(np.max(np.abs(a.final.values - b.final.values) / b.final.std))
+
+
+# ------------------------------------------------------------------ faults in time
+
+
+def imu_gone(messages: Messages) -> Messages:
+    return [m for m in messages if not (m[1] == IMU and during(m[2]))]
+
+
+def odometry_at_1_hz(messages: Messages) -> Messages:
+    kept, last = [], -math.inf
+    for entry in messages:
+        if entry[1] == ODOMETRY and during(entry[2]):
+            if at(entry[2]) - last < 1.0:
+                continue
+            last = at(entry[2])
+        kept.append(entry)
+    return kept
+
+
+def wrench_late(messages: Messages) -> Messages:
+    late = [
+        (arrival + 3 * SECOND // 10 if role == WRENCH and during(m) else arrival, role, m)
+        for arrival, role, m in messages
+    ]
+    return sorted(late, key=lambda entry: entry[0])
+
+
+def frozen(messages: Messages) -> Messages:
+    """A velocity sensor that has lost the ground and repeats its last value."""
+    out, last = [], None
+    for arrival, role, m in messages:
+        if isinstance(m, Odometry):
+            if during(m) and last is not None:
+                m = m._replace(linear=last)
+            else:
+                last = m.linear
+        out.append((arrival, role, m))
+    return out
+
+
+def zeroed(messages: Messages) -> Messages:
+    return [
+        (a, role, m._replace(linear=np.zeros(3)) if isinstance(m, Odometry) and during(m) else m)
+        for a, role, m in messages
+    ]
+
+
+def wrench_gone(messages: Messages) -> Messages:
+    return [m for m in messages if not (m[1] == WRENCH and during(m[2], 90.0, 95.0))]
+
+
+def clock(jump: int) -> Callable[[Messages], Messages]:
+    def jumped(messages: Messages) -> Messages:
+        return [
+            (a, role, m._replace(stamp=m.stamp + jump * SECOND) if at(m) >= FAULT[0] else m)
+            for a, role, m in messages
+        ]
+
+    return jumped
+
+
+def loop(messages: Messages) -> Messages:
+    """A bag that starts over after its first half."""
+    half = [m for m in messages if at(m[2]) < FAULT[0]]
+    lag = half[-1][0] - messages[0][0] + SECOND // 100
+    return half + [(a + lag, role, m) for a, role, m in messages]
+
+
+FAULTS: dict[str, Callable[[Messages], Messages]] = {
+    "IMU gone for 10 s": imu_gone,
+    "odometry at 1 Hz for 10 s": odometry_at_1_hz,
+    "wrench 300 ms late for 10 s": wrench_late,
+    "velocity frozen for 10 s": frozen,
+    "velocity zero for 10 s": zeroed,
+    "wrench gone for 5 s": wrench_gone,
+    "clock an hour ahead": clock(3600),
+    "clock an hour back": clock(-3600),
+    "bag starts over": loop,
+}
+
+
+def faults(seeds: int) -> Iterator[Row]:
+    for what, fault in FAULTS.items():
+        for kind in ESTIMATORS:
+            moved, slowest = 0.0, 0.0
+            for seed in range(seeds):
+                config, messages = started(seed), dived(seed)
+                done = run(config, kind, fault(messages))
+                moved = max(moved, shift(done, undisturbed(seed, kind)))
+                slowest = max(slowest, done.recovery(FAULT[1], 50.0))
+            yield Row(f"{what}: moved", kind, moved, "sigma", 1.0)
+            yield Row(f"{what}: used again after", kind, slowest, "s", 10.0)
+
+
+@cache
+def undisturbed(seed: int, kind: str) -> Run:
+    return run(started(seed), kind, dived(seed))
+
+
+# ------------------------------------------------------------------ outliers
+
+CHANNELS = {
+    ODOMETRY: (("linear", "uvw", 2.0), ("angular", "pqr", 2.0)),
+    IMU: (("angular_velocity", "xyz", 2.0), ("linear_acceleration", "xyz", 20.0)),
+    WRENCH: (("force", "XYZ", 200.0), ("torque", "KMN", 40.0)),
+}
+
+
+def outliers(seeds: int) -> Iterator[Row]:
+    """Five per cent of one channel's numbers replaced by something up to ``size``."""
+    for role, fields in CHANNELS.items():
+        for field, letters, size in fields:
+            for index, letter in enumerate(letters):
+                for kind in ESTIMATORS:
+                    moved = max(
+                        shift(
+                            run(started(seed), kind, spoilt(seed, role, field, index, size)),
+                            undisturbed(seed, kind),
+                        )
+                        for seed in range(seeds)
+                    )
+                    yield Row(f"5 % outliers, {role} {field} {letter}", kind, moved, "sigma", 1.0)
+
+
+def spoilt(seed: int, role: str, field: str, index: int, size: float) -> Messages:
+    rng = np.random.default_rng([seed, index, len(field)])
+    out = []
+    for arrival, name, m in dived(seed):
+        if name == role and rng.random() < 0.05:
+            values = getattr(m, field).copy()
+            values[index] = rng.uniform(-size, size)
+            m = m._replace(**{field: values})
+        out.append((arrival, name, m))
+    return out
+
+
+# ------------------------------------------------------------------ garbage
+
+WILD = (math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 0.0, -0.0, 1e30)
+STAMPS = (0, -1, 1, -(2**62), 2**62, 10**18)
+
+
+def garbage(seeds: int, count: int = 1_000_000) -> Iterator[Row]:
+    """A million wild messages between good ones: nothing raises, nothing bad is published."""
+    for kind in ESTIMATORS:
+        bad = 0
+        rng = np.random.default_rng(1)
+        online = OnlineEstimator(started(0), kind)  # type: ignore[arg-type]
+        good = dived(0)
+        for k in range(count):
+            _, role, m = good[k % len(good)]
+            online.push(role, wild(m, rng))
+            if k % 1000 == 0:
+                report = online.report()
+                bad += not all(
+                    np.isfinite(x).all()
+                    for x in (report.values, report.std, report.lower, report.upper)
+                )
+        for _, role, m in good:
+            online.push(role, m)
+        bad += not np.isfinite(online.report().values).all()
+        yield Row(f"{count} wild messages: reports that are not finite", kind, bad, "", 0)
+    yield from ()
+
+
+def wild(message: Message, rng: np.random.Generator) -> Message:
+    """A message with one to three of its parts made wild."""
+    for _ in range(rng.integers(1, 4)):
+        name = message._fields[rng.integers(len(message._fields))]
+        value = getattr(message, name)
+        if isinstance(value, np.ndarray):
+            value = value.copy()
+            value[rng.integers(len(value))] = WILD[rng.integers(len(WILD))]
+            if rng.random() < 0.1:
+                value[:] = 0.0
+        elif isinstance(value, int):
+            value = STAMPS[rng.integers(len(STAMPS))] if rng.random() < 0.3 else value - SECOND
+        else:
+            value = ("", "map", "base_link_ned", "x" * 300, "\0")[rng.integers(5)]
+        message = message._replace(**{name: value})
+    return message
+
+
+# ------------------------------------------------------------------ no excitation
+
+
+def rest(seeds: int, count: int = 10_000_000) -> Iterator[Row]:
+    """Ten million samples at rest after a minute of learning, then a minute more of it."""
+    for kind, module in ESTIMATORS.items():
+        config = started(0)
+        online = OnlineEstimator(config, kind)  # type: ignore[arg-type]
+        for _, role, m in dived(0):
+            if at(m) < 60.0:
+                online.push(role, m)
+        before = online.report()
+        rng = np.random.default_rng(2)
+        samples = np.concatenate(list(_resting(config, rng)))
+        task, state = module.problem(config), online.state
+        for _ in range(count // len(samples)):
+            state, _ = module.fold(task, state, samples)
+        after = module.estimate(task, state)
+        moved = np.max(np.abs(after.values - before.values) / before.std)
+        grown = np.max(after.std / before.std)
+        smallest = np.linalg.eigvalsh(after.covariance)[0]
+        yield Row(f"{count} samples at rest: moved", kind, float(moved), "sigma", 1.0)
+        yield Row("  standard deviation grown by", kind, float(grown), "x", 1.5)
+        yield Row("  covariance not positive definite", kind, float(smallest <= 0.0), "", 0.0)
+
+
+def _resting(config: Config, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    from rov_ident.samples import Sampler
+
+    sampler = Sampler(config)
+    for _, role, m in dived(0):
+        if at(m) > 40.0:
+            break
+        yield sampler.push(role, still(m, rng))
+    yield sampler.flush()
+
+
+def still(m: Message, rng: np.random.Generator) -> Message:
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    if isinstance(m, Odometry):
+        linear, angular = 0.008 * rng.standard_normal(3), 0.004 * rng.standard_normal(3)
+        return m._replace(position=np.zeros(3), orientation=level, linear=linear, angular=angular)
+    if isinstance(m, Imu):
+        gravity = np.array([0.0, 0.0, -9.81])
+        return m._replace(
+            angular_velocity=0.003 * rng.standard_normal(3),
+            linear_acceleration=gravity + 0.03 * rng.standard_normal(3),
+        )
+    assert isinstance(m, Wrench)
+    return m._replace(force=np.zeros(3), torque=np.zeros(3))
+
+
+STUDIES = {"faults": faults, "outliers": outliers, "garbage": garbage, "rest": rest}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], metavar="STUDY")
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    table = Table("what", "estimator", "value", "bar", "met")
+    missed = 0
+    for name in options.studies or STUDIES:
+        for row in STUDIES[name](options.seeds):
+            missed += not row.met
+            table.add_row(
+                row.what, row.estimator, f"{row.value:.3g} {row.unit}",
+                f"<= {row.bar:g}", "yes" if row.met else "NO",
+            )  # fmt: skip
+            print(f"{row.what}: {row.estimator} {row.value:.3g} {row.unit}", file=sys.stderr)
+    Console(width=120).print(table)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

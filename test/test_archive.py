@@ -1,0 +1,163 @@
+"""Many bags as one fit: in one process, in several, on Dask; and bags that cannot be read."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rov_ident import archive, sensors
+from rov_ident.batch import fit_batch
+from rov_ident.errors import UserError
+from rov_ident.hindsight import hindsight
+from rov_ident.recording import write_messages
+
+
+@pytest.fixture(scope="module")
+def off(heavy):
+    factor = np.random.default_rng(3).uniform(0.75, 1.25, len(heavy.model.theta))
+    return heavy.with_model(heavy.model.with_theta(heavy.model.theta * factor))
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory, heavy):
+    """Three bags, and between them one that is none."""
+    folder = tmp_path_factory.mktemp("archive")
+    found = []
+    for seed in range(3):
+        found.append(folder / f"{seed}.mcap")
+        write_messages(found[-1], sensors.dive(heavy, duration=20.0, seed=seed).messages)
+    broken = folder / "broken.mcap"
+    broken.write_bytes(b"not a bag")
+    return [found[0], broken, *found[1:]]
+
+
+@pytest.fixture(scope="module")
+def alone(paths, off):
+    """Fits in one process, by estimator."""
+    with archive.opened(paths, off) as bags:
+        return {kind: fit_batch(bags, off, kind) for kind in ("ls", "ml")}
+
+
+def same(fit, other):
+    np.testing.assert_allclose(fit.values, other.values, rtol=1e-12)
+    np.testing.assert_allclose(fit.covariance, other.covariance, rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(fit.rmse, other.rmse, rtol=1e-12)
+    assert fit.samples == other.samples
+    assert fit.notes == other.notes
+    assert fit.provenance == other.provenance
+
+
+def test_an_unreadable_bag_is_named_and_left_out(alone):
+    for fit in alone.values():
+        assert [b["file"] for b in fit.provenance["bags"]] == ["0.mcap", "1.mcap", "2.mcap"]
+        assert any("left out" in n and "broken.mcap" in n for n in fit.notes)
+        assert fit.duration == pytest.approx(60.0, abs=0.5)
+
+
+def test_information_adds(paths, off, alone):
+    with archive.opened(paths[:1], off) as bags:
+        one = fit_batch(bags, off, "ml")
+    gain = np.median(one.std / alone["ml"].std)
+    assert gain == pytest.approx(np.sqrt(3.0), rel=0.35)
+
+
+@pytest.mark.parametrize("kind", ["ls", "ml"])
+def test_several_processes_give_the_same(paths, off, alone, kind):
+    seen = []
+    with archive.opened(
+        paths, off, jobs=2, progress=lambda name, done, total: seen.append((name, done, total))
+    ) as bags:
+        same(fit_batch(bags, off, kind), alone[kind])
+    assert seen == [(p.name, i + 1, 4) for i, p in enumerate(paths)]
+
+
+def test_dask_gives_the_same(paths, off, alone):
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    with archive.opened(paths, off, jobs=2, dask="local") as bags:
+        same(fit_batch(bags, off, "ml"), alone["ml"])
+
+
+def test_no_scheduler_is_said(paths, off):
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    with (
+        pytest.raises(UserError, match="no Dask scheduler answers at"),
+        archive.opened(paths, off, dask="tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_nothing_readable_is_refused(paths, off, jobs):
+    with (
+        pytest.raises(UserError, match=r"broken\.mcap"),
+        archive.opened([paths[1], paths[1]], off, jobs=jobs),
+    ):
+        pass
+
+
+def test_the_command(paths, tmp_path, heavy_path):
+    out, report, saved = tmp_path / "fit.json", tmp_path / "fit.html", tmp_path / "fitted.yaml"
+    command = [
+        sys.executable, "-m", "rov_ident.cli", "fit", *map(str, paths), "--config", heavy_path,
+        "--estimator", "ls", "--jobs", "2", "--json", out, "--report", report, "--save", saved,
+        "--quiet",
+    ]  # fmt: skip
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert "broken.mcap" in done.stderr
+    result = json.loads(out.read_text())
+    assert result["estimator"] == "ls"
+    assert set(result) >= {"coefficients", "samples", "duration_s", "open_loop"}
+    assert set(result["open_loop"]["rmse"]) == set("uvwpqr")
+    assert set(result["coefficients"]["X_u"]) == {"value", "std", "unit", "identifiable"}
+    assert result["coefficients"]["X_u"]["identifiable"] is True
+    assert result["base_parameters"]["condition"] > 1.0
+    page = report.read_text()
+    assert page.count("<svg") > 20 and "http" not in page.replace("http://www.w3.org", "")
+    assert "X_udot" in saved.read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--estimator", "rls", "--channels", "surge"], "--channels has no meaning"),
+        (["--estimator", "ml", "--ordinary"], "--ordinary has no meaning"),
+        (["--estimator", "ml", "--channels", "warp"], "no channel 'warp'"),
+    ],
+)
+def test_options_that_would_not_be_heeded_are_refused(paths, heavy_path, options, said):
+    command = [sys.executable, "-m", "rov_ident.cli", "fit", paths[0], "--config", heavy_path]
+    command = list(map(str, [*command, *options]))
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+# ------------------------------------------------------------------ hindsight
+
+
+def test_hindsight_knows_bias_and_attitude_better(heavy):
+    suite = sensors.Suite(gyro_bias_std=0.005)
+    run = sensors.dive(heavy, duration=60.0, suite=suite, seed=1)
+    live = np.concatenate(list(sensors.samples_of(heavy, run)))
+    after = hindsight(live)
+    origin = min(m.stamp for *_, m in run.messages)
+    t = live["t"] + (origin - sensors.START) * 1e-9
+    from rov_ident.frames import gravity_direction
+
+    down = gravity_direction(run.truth.orientation)
+    true_down = np.stack([np.interp(t, run.truth.t, c) for c in down.T], axis=1)
+    true_rate = np.stack([np.interp(t, run.truth.t, c) for c in run.truth.nu[:, 3:].T], axis=1)
+
+    def off(samples):
+        tilt = np.std(samples["down"] - true_down)
+        early = samples["t"] < 5.0
+        return tilt, np.abs(np.nanmean((samples["gyro"] - true_rate)[early], axis=0)).max()
+
+    (tilt, bias), (tilt_after, bias_after) = off(live), off(after)
+    assert tilt_after < 0.7 * tilt
+    assert bias_after < 0.5 * bias
+    slope = np.diff(after["down"], axis=0) / after["dt"][1:, None]
+    np.testing.assert_allclose(after["down_slope"][1:], slope, atol=1e-9)

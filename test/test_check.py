@@ -1,0 +1,229 @@
+"""What a bag can identify, said beforehand; and which manoeuvre to run next."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rov_ident import sensors
+from rov_ident import swing as swings
+from rov_ident.archive import of_records
+from rov_ident.batch import fit_batch
+from rov_ident.check import BAD, GOOD, WARNING, check
+from rov_ident.errors import UserError
+from rov_ident.excitation import authority
+from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.plan import propose
+from rov_ident.recording import write_messages
+from rov_ident.records import read_record
+from rov_ident.swing import Limits, Swing, fly
+
+DURATION = 40.0
+
+
+@pytest.fixture(scope="module")
+def messages(heavy):
+    return sensors.dive(heavy, duration=DURATION, seed=1).messages
+
+
+@pytest.fixture(scope="module")
+def checked(heavy, messages, tmp_path_factory):
+    """check() of the messages after a change of each."""
+    folder = tmp_path_factory.mktemp("check")
+
+    def run(change=lambda role, m: m, config=heavy):
+        path = folder / "bag.mcap"
+        kept = [(at, role, change(role, m)) for at, role, m in messages]
+        write_messages(path, [row for row in kept if row[2] is not None])
+        return check(path, config)
+
+    return run
+
+
+def of(found, subject):
+    return next(r for r in found.remarks if r.subject == subject)
+
+
+def test_a_good_bag_is_good(checked):
+    found = checked()
+    assert found.fit
+    assert {r.level for r in found.remarks} == {GOOD}
+    assert all(p.verdict == "well" for p in found.prospects)
+    assert "20.0 Hz" in of(found, "odometry").text
+
+
+def test_the_prediction_is_what_a_fit_states(checked, heavy, messages, tmp_path):
+    found = checked()
+    write_messages(tmp_path / "bag.mcap", messages)
+    fit = fit_batch(of_records([read_record(tmp_path / "bag.mcap", heavy)]), heavy, "ml")
+    bound = np.array([fit.more["cramer_rao_std"][p.name] for p in found.prospects])
+    predicted = np.array([p.std for p in found.prospects])
+    assert np.all(predicted > 0.8 * bound)  # careful: a floor of disturbances is allowed for
+    assert np.all(predicted < 2.0 * bound)
+
+
+def flipped(axis, part):
+    """Messages whose vector ``part`` has an axis of the wrong sign."""
+    sign = np.ones(3)
+    sign[axis] = -1.0
+
+    def change(role, m):
+        return m._replace(**{part: sign * getattr(m, part)}) if hasattr(m, part) else m
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "subject", "said"),
+    [
+        (flipped(0, "force"), "wrench against motion", "surge"),
+        (flipped(2, "torque"), "wrench against motion", "yaw"),
+        (flipped(1, "angular_velocity"), "gyro against odometry", "pitch"),
+        (flipped(2, "linear_acceleration"), "imu axes", "specific force"),
+        (flipped(0, "linear"), "pose against velocity", ""),
+    ],
+)
+def test_wrong_signs_are_named(checked, change, subject, said):
+    found = checked(change)
+    remark = of(found, subject)
+    assert remark.level == BAD or subject == "pose against velocity" and remark.level != GOOD
+    assert said in remark.text
+    assert not found.fit or remark.level == WARNING
+
+
+def test_a_late_wrench_is_noticed(checked):
+    late = 60_000_000
+
+    def change(role, m):
+        return m._replace(stamp=m.stamp - late) if isinstance(m, Wrench) else m
+
+    remark = of(checked(change), "motion behind the wrench")
+    assert remark.level == WARNING
+    assert float(remark.text.split()[0]) == pytest.approx(60.0, abs=15.0)
+
+
+def test_a_late_odometry_is_noticed(checked):
+    def change(role, m):
+        return m._replace(stamp=m.stamp + 50_000_000) if isinstance(m, Odometry) else m
+
+    remark = of(checked(change), "odometry behind the IMU")
+    assert remark.level == WARNING
+    assert float(remark.text.split()[0]) == pytest.approx(50.0, abs=8.0)
+
+
+def test_pauses_and_slow_topics_are_noticed(checked):
+    def change(role, m):
+        if isinstance(m, Imu):
+            return None
+        t = (m.stamp - sensors.START) * 1e-9
+        if isinstance(m, Odometry):
+            return None if 10.0 < t < 14.0 or int(20.0 * t) % 8 else m
+        return m
+
+    found = checked(change)
+    assert "there is none" in of(found, "imu").text
+    assert "pauses" in of(found, "odometry").text
+    assert "least" in of(found, "odometry").text
+
+
+def test_what_is_not_driven_is_said(heavy, tmp_path):
+    run = sensors.dive(heavy, "rest", 20.0, seed=1)
+    write_messages(tmp_path / "rest.mcap", run.messages)
+    found = check(tmp_path / "rest.mcap", heavy)
+    assert not found.fit
+    assert "not driven" in of(found, "excitation of surge").text
+    unknown = {p.name for p in found.prospects if p.verdict == "not"}
+    assert {"X_uu", "Y_vv", "N_rr"} <= unknown
+
+
+def test_the_command(heavy_path, messages, tmp_path):
+    write_messages(tmp_path / "bag.mcap", messages)
+    out = tmp_path / "check.json"
+    command = [sys.executable, "-m", "rov_ident.cli", "check", tmp_path / "bag.mcap"]
+    command += ["--config", heavy_path, "--json", out]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert "fit for identification" in done.stdout
+    result = json.loads(out.read_text())
+    assert result["fit_for_identification"] is True
+    assert result["coefficients"]["X_u"]["predicted_std"] > 0.0
+
+
+# ------------------------------------------------------------------ manoeuvres
+
+
+def test_waypoints_swing_the_thrusters_between_their_limits(heavy):
+    limits = Limits()
+    swing = next(s for s in swings.library(limits) if s.name == "sway swing")
+    flown = fly(heavy, swing, 40.0, limits)
+    bound = authority(heavy.dynamics)
+    assert np.all(np.abs(flown.demand) <= bound * (1.0 + 1e-12))
+    at_limit = np.abs(flown.demand[:, 1]) > 0.99 * bound[1]
+    assert at_limit.mean() > 0.15
+    assert {-1.0, 1.0} == set(np.sign(flown.demand[at_limit, 1]))
+    assert np.all(flown.reach <= limits.half)
+
+
+@pytest.fixture(scope="module")
+def surge_only(heavy, tmp_path_factory):
+    """A bag of a vehicle that has only gone forth and back."""
+    path = tmp_path_factory.mktemp("plan") / "surge.mcap"
+    swing = Swing("surge", (1.0, 0.0, 0.0, 0.0), (3.0, 9.0, 9.0, 9.0))
+    write_messages(path, swings.dive(heavy, swing, 20.0, Limits(), sensors.Suite()).messages)
+    return of_records([read_record(path, heavy)])
+
+
+@pytest.fixture(scope="module")
+def proposal(heavy, surge_only):
+    return propose(heavy, surge_only, 30.0, Limits((4.0, 4.0, 1.5)))
+
+
+def test_the_proposal_is_safe_and_shrinks_the_worst(heavy, proposal):
+    before = {p.name: p.std for p in proposal.before}
+    after = {p.name: p.std for p in proposal.after}
+    assert after[proposal.worst] < 0.5 * before[proposal.worst]
+    assert all(after[n] <= before[n] * (1.0 + 1e-9) for n in before)
+    flown = proposal.best.flown
+    assert np.all(flown.reach <= [1.8, 1.8, 0.55])
+    assert proposal.worst in proposal.sentence
+    plan = proposal.to_dict()
+    assert plan["manoeuvre"]["waypoints"][0]["t_s"] == 0.0
+    json.dumps(plan, allow_nan=False)
+
+
+def test_the_prediction_holds_in_simulation(heavy, surge_only, proposal, tmp_path):
+    """Fly it with a vehicle that is not quite the configured one, fit both bags, and compare."""
+    factor = np.random.default_rng(5).uniform(0.9, 1.1, len(heavy.model.theta))
+    true = heavy.with_model(heavy.model.with_theta(heavy.model.theta * factor))
+    predicted = np.array([p.std for p in proposal.after])
+    ratios, stated = [], []
+    for seed in range(4):
+        path = tmp_path / f"{seed}.mcap"
+        swing = Swing("surge", (1.0, 0.0, 0.0, 0.0), (3.0, 9.0, 9.0, 9.0))
+        first = swings.dive(true, swing, 20.0, Limits(), sensors.Suite(), seed)
+        write_messages(path, first.messages)
+        records = [read_record(path, heavy)]
+        write_messages(path, proposal.best.dive(true, seed=seed + 10).messages)
+        records.append(read_record(path, heavy))
+        fit = fit_batch(of_records(records), heavy, "ml")
+        stated.append(fit.std / predicted)
+        ratios.append((fit.values - true.model.theta) / predicted)
+    assert 0.4 < np.median(stated) < 1.3
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
+def test_no_room_is_said(heavy):
+    with pytest.raises(UserError, match="leaves no room"):
+        propose(heavy, None, 20.0, Limits((0.3, 0.3, 0.3)))
+    with pytest.raises(UserError, match="10 s are the least"):
+        propose(heavy, None, 2.0)
+
+
+def test_less_thrust_is_heeded(heavy):
+    limits = dataclasses.replace(Limits(), thrust=0.3)
+    swing = swings.library(limits)[0]
+    flown = fly(heavy, swing, 10.0, limits)
+    assert np.all(np.abs(flown.demand) <= 0.3 * authority(heavy.dynamics) * (1.0 + 1e-12))

@@ -1,0 +1,194 @@
+"""Batch least squares: rows against textbook matrices, what is identifiable, bias and its cure."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rov_ident import least_squares as ls
+from rov_ident import rls, sensors
+from rov_ident.errors import UserError
+from rov_ident.estimate import prior_of
+from rov_ident.model import build
+
+CLASSICAL = {
+    "X_udot": -6.4, "Y_vdot": -7.1, "Z_wdot": -18.7, "K_pdot": -0.19, "M_qdot": -0.13,
+    "N_rdot": -0.22, "X_u": -13.7, "Y_v": -8.0, "Z_w": -33.0, "K_p": -0.1, "M_q": -0.8, "N_r": -0.2,
+}  # fmt: skip
+FULL = CLASSICAL | {
+    "X_uu": -141.0, "Y_vv": -217.0, "Z_ww": -190.0, "K_pp": -1.2, "M_qq": -0.5, "N_rr": -1.5,
+    "Y_rdot": 0.3, "Z_qdot": -0.3, "Y_r": 0.5, "N_uv": -4.0, "X_vv": -10.0, "M_w": 0.4,
+}  # fmt: skip
+
+
+def log_of(model, n=400, seed=0):
+    """Any motion, and the wrench that it takes by the inverse dynamics."""
+    rng = np.random.default_rng(seed)
+    nu, nu_dot = rng.standard_normal((2, n, 6))
+    down = rng.standard_normal((n, 3))
+    down /= np.linalg.norm(down, axis=1)[:, None]
+    wrench = np.array([model.wrench(*row) for row in zip(nu, nu_dot, down)])
+    return ls.Log(nu, nu_dot, wrench, down)
+
+
+@pytest.fixture(scope="module", params=[CLASSICAL, FULL], ids=["classical", "full"])
+def model(request, heavy):
+    return build(heavy.model.body, request.param)
+
+
+@pytest.mark.parametrize("tsqr", [False, True])
+@pytest.mark.parametrize("n", [100, 128, 300])  # within, at and beyond a block
+def test_a_log_gives_the_coefficients_that_made_it(model, tsqr, n):
+    found = ls.equation_error(model, log_of(model, n), tsqr=tsqr)
+    np.testing.assert_allclose(found, model.theta, rtol=1e-9)
+
+
+@pytest.mark.parametrize("tsqr", [False, True])
+def test_a_noisy_log_gives_what_lstsq_does(model, tsqr):
+    log = log_of(model)
+    noisy = dataclasses.replace(
+        log, wrench=log.wrench + np.random.default_rng(1).standard_normal(log.wrench.shape)
+    )
+    weight = np.array([1.0, 2.0, 0.5, 30.0, 40.0, 50.0])
+    known = model.with_theta(np.zeros(len(model.theta)))
+    rows = zip(noisy.nu, noisy.nu_dot, noisy.wrench, noisy.down)
+    parts = [(model.regressor(v, a), w - known.wrench(v, a, d)) for v, a, w, d in rows]
+    scale = np.tile(np.sqrt(weight), len(parts))
+    matrix = np.concatenate([p[0] for p in parts]) * scale[:, None]
+    goal = np.concatenate([p[1] for p in parts]) * scale
+    expected = np.linalg.lstsq(matrix, goal, rcond=None)[0]
+    found = ls.equation_error(model, noisy, weight, tsqr=tsqr)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_householder_keeps_what_normal_equations_lose(heavy):
+    model = build(heavy.model.body, {"X_u": -10.0, "X_uu": -100.0})
+    rng = np.random.default_rng(0)
+    nu, nu_dot = np.zeros((2000, 6)), np.zeros((2000, 6))
+    nu[:, 0] = 1.0 + 1e-6 * rng.standard_normal(2000)  # nearly one speed: |u| u = 2 u - 1
+    down = np.tile([0.0, 0.0, 1.0], (2000, 1))
+    wrench = np.array([model.wrench(*row) for row in zip(nu, nu_dot, down)])
+    log = ls.Log(nu, nu_dot, wrench, down)
+    good = ls.equation_error(model, log, tsqr=True)
+    np.testing.assert_allclose(good, model.theta, rtol=1e-7)
+    try:
+        poor = ls.equation_error(model, log)
+    except UserError:
+        return
+    assert np.abs(poor / model.theta - 1.0).max() > 1e-6
+
+
+def test_what_a_log_does_not_tell_is_said(heavy):
+    model = build(heavy.model.body, CLASSICAL)
+    log = log_of(model)
+    still = dataclasses.replace(log, nu=log.nu * 0.0, nu_dot=log.nu_dot * 0.0)
+    with pytest.raises(UserError, match="says nothing of X_udot"):
+        ls.equation_error(model, still)
+    spoilt = log.nu.copy()
+    spoilt[5, 0] = np.nan
+    with pytest.raises(UserError, match="not finite"):
+        ls.equation_error(model, dataclasses.replace(log, nu=spoilt))
+
+
+# ------------------------------------------------------------------ records
+
+
+def in_one(samples):
+    return lambda function, *arguments: [function(samples, *arguments)]
+
+
+def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1):
+    run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
+    return np.concatenate(list(sensors.samples_of(config, run)))
+
+
+@pytest.fixture(scope="module")
+def off(heavy):
+    """A configuration that is wrong by a quarter."""
+    factor = np.random.default_rng(3).uniform(0.75, 1.25, len(heavy.model.theta))
+    return heavy.with_model(heavy.model.with_theta(heavy.model.theta * factor))
+
+
+def test_the_rows_are_those_of_the_recursive_estimator(heavy):
+    """Solved at once they give what recursive least squares gives without gates."""
+    samples = samples_of(heavy, 20.0, sensors.Suite().scaled(0.0))
+    task = rls.problem(heavy)
+    rows = ls.rows(task, samples)
+    assert rows.shape == (len(rows), 6, len(task.scale) + 1)
+    assert len(rows) == pytest.approx(200, abs=3)
+    # without noise the true coefficients, here the prior, leave nothing
+    wrench = samples["wrench"].std(axis=0)
+    assert np.all(rows[:, :, -1].std(axis=0) < 5e-3 * wrench)
+
+
+@pytest.mark.parametrize("options", [{}, {"weighted": False}, {"instrumental": True}])
+def test_coefficients_are_found(heavy, off, options):
+    samples = samples_of(heavy, 120.0)
+    found = ls.solve(in_one(samples), off, **options)
+    error = np.abs(found.values / heavy.model.theta - 1.0)
+    assert np.median(error) < 0.01
+    assert error.max() < 0.1
+    off_by = (found.values - heavy.model.theta) / np.sqrt(np.diag(found.covariance))
+    assert np.sqrt(np.mean(off_by**2)) < 2.5
+
+
+def test_several_bags_are_one(heavy, off):
+    a, b = samples_of(heavy, 40.0, seed=1), samples_of(heavy, 40.0, seed=2)
+
+    def both(function, *arguments):
+        return [function(part, *arguments) for part in (a, b)]
+
+    joint, alone = ls.solve(both, off), ls.solve(in_one(a), off)
+    assert np.all(np.diag(joint.covariance) < 1.1 * np.diag(alone.covariance))
+    assert joint.rows == pytest.approx(2 * alone.rows, rel=0.02)
+
+
+def test_a_strong_prior_holds(heavy, off):
+    samples = samples_of(heavy, 20.0)
+    held = ls.solve(in_one(samples), off, precision=1e12)
+    np.testing.assert_allclose(held.values, off.model.theta, rtol=1e-4)
+
+
+def test_noise_biases_least_squares_and_instruments_cure_it(heavy, off):
+    """Noisy velocities: the mean error over dives, in standard errors of that mean."""
+    suite = dataclasses.replace(
+        sensors.Suite(imu_rate=0.0), linear_std=0.08, angular_std=0.04, wrench_std=0.0
+    )
+    errors = {False: [], True: []}
+    for seed in range(8):
+        samples = samples_of(heavy, 90.0, suite, seed=seed)
+        for instrumental, into in errors.items():
+            found = ls.solve(in_one(samples), off, instrumental=instrumental, precision=1e-6)
+            into.append(found.values / heavy.model.theta - 1.0)
+    mean = {k: np.abs(np.mean(v, axis=0)) for k, v in errors.items()}
+    scatter = {k: np.std(v, axis=0, ddof=1) / np.sqrt(8) for k, v in errors.items()}
+    assert np.mean((mean[False] / scatter[False]) ** 2) > 10.0  # biased
+    assert np.mean((mean[True] / scatter[True]) ** 2) < 4.0  # chance
+    assert np.median(mean[True]) < 0.3 * np.median(mean[False])
+
+
+# ------------------------------------------------------------------ what a bag can tell
+
+
+def test_one_speed_tells_a_combination_only(heavy):
+    names, scale = ("X_u", "X_uu", "Y_v"), np.array([5.0, 50.0, 3.0])
+    speed = 0.5
+    row = np.array([speed, speed * speed, 0.0]) * scale
+    found = ls.base_parameters(names, 100.0 * np.outer(row, row), scale)
+    assert found.unexcited == ("Y_v",)
+    assert set(found.unidentified) == {"X_u", "X_uu", "Y_v"}
+    (only,) = found.combinations
+    # X_u u + X_uu u^2 is known: X_u + 0.5 X_uu, or X_uu + 2 X_u
+    ((other, factor),) = only.others
+    assert {only.name, other} == {"X_u", "X_uu"}
+    assert factor == pytest.approx(speed if only.name == "X_u" else 1.0 / speed)
+    assert found.collinear[0][:2] == ("X_uu", "X_u")
+
+
+def test_a_rich_dive_tells_everything(heavy):
+    samples = samples_of(heavy, 60.0)
+    found = ls.solve(in_one(samples), heavy)
+    base = ls.base_parameters(heavy.model.names, found.information, prior_of(heavy).std)
+    assert base.unidentified == ()
+    assert 1.0 < base.condition < 1e4
+    assert {str(c) for c in base.combinations} == set(heavy.model.names)

@@ -1,0 +1,217 @@
+"""Maximum likelihood: sensitivities, whiteness, calibration, and what it needs to find."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rov_ident import maximum_likelihood as ml
+from rov_ident import sensors
+from rov_ident.archive import of_records
+from rov_ident.batch import Settings, fit_batch
+from rov_ident.errors import UserError
+from rov_ident.hindsight import hindsight
+from rov_ident.recording import write_messages
+from rov_ident.records import predicted, read_record
+
+
+def in_one(samples):
+    return lambda function, *arguments: [function(samples, *arguments)]
+
+
+def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1):
+    run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
+    return hindsight(np.concatenate(list(sensors.samples_of(config, run))))
+
+
+@pytest.fixture(scope="module")
+def samples(heavy):
+    return samples_of(heavy)
+
+
+@pytest.fixture(scope="module")
+def off(heavy):
+    factor = np.random.default_rng(3).uniform(0.6, 1.4, len(heavy.model.theta))
+    return heavy.with_model(heavy.model.with_theta(heavy.model.theta * factor))
+
+
+EVERY = np.arange(15)
+
+
+def exact(heavy):
+    """The wrench without error, and the start too: pure output error of one long simulation."""
+    noise = ml.assumed(heavy)
+    return dataclasses.replace(
+        noise, measurement=np.full(6, 1e-12), floor=np.zeros(6), relative=0.0
+    )
+
+
+def test_without_process_noise_the_innovation_is_the_output_error(heavy, samples):
+    part = samples[:2000]
+    found = ml.innovations(part, heavy.model, exact(heavy))
+    # a vanishing measurement variance would draw the filter to the data: start variance is zero too
+    simulated = predicted(heavy.model, part, np.inf)
+    seen = np.isfinite(found.e[:, 0])
+    assert seen.sum() > 300
+    free = dataclasses.replace(exact(heavy), measurement=np.ones(6))
+    run = ml.innovations(part, heavy.model, free)
+    # with start variance that of one measurement, the run stays within that of the simulation
+    off = run.nu[seen, :3] - simulated[seen, :3]
+    assert np.abs(off).max() < 0.03
+
+
+@pytest.mark.parametrize("relative", [0.0, 0.01])
+def test_sensitivities_are_the_derivatives_of_the_innovations(heavy, samples, relative):
+    """The score is minus half the cost's slope where the gain does not move, and the information
+    is that of the differences of the innovations."""
+    part, model = samples[:1500], heavy.model
+    noise = dataclasses.replace(ml.assumed(heavy), relative=relative)
+    at = ml.one_pass(part, model, EVERY, noise)
+    base = ml.innovations(part, model, noise)
+    keep = np.isfinite(base.e)
+    slopes = []
+    for i in EVERY:
+        theta = model.theta.copy()
+        step = 1e-4 * abs(theta[i])
+        theta[i] += step
+        high = ml.innovations(part, model.with_theta(theta), noise)
+        theta[i] -= 2.0 * step
+        low = ml.innovations(part, model.with_theta(theta), noise)
+        slopes.append((high.e[keep] - low.e[keep]) / (2.0 * step))
+    j = np.array(slopes) / np.sqrt(base.s[keep])
+    information = j @ j.T
+    size = np.sqrt(np.diag(at.information))
+    np.testing.assert_allclose(
+        information / np.outer(size, size), at.information / np.outer(size, size), atol=0.02
+    )
+    score = -j @ (base.e[keep] / np.sqrt(base.s[keep]))
+    # exact in the first order of the gain's own dependence
+    np.testing.assert_allclose(score / size, at.score / size, atol=0.3)
+
+
+def test_innovations_of_the_truth_are_white_and_of_unit_size(heavy, samples):
+    found = ml.innovations(samples, heavy.model, ml.assumed(heavy))
+    for axis in range(6):
+        e = (found.e / np.sqrt(found.s))[:, axis]
+        e = e[np.isfinite(e)]
+        assert np.mean(e**2) == pytest.approx(1.0, abs=0.15)
+        for lag in (1, 2, 5):
+            assert abs(np.mean(e[lag:] * e[:-lag])) < 4.0 / np.sqrt(len(e)) + 0.02
+
+
+def test_noise_levels_are_found(heavy):
+    suite = dataclasses.replace(sensors.Suite(), wrench_std=0.03)
+    samples = samples_of(heavy, 90.0, suite)
+    samples["odometry_variance"] /= 4.0  # the messages claim half the noise
+    found = ml.maximise(in_one(samples), heavy, heavy.model)
+    np.testing.assert_allclose(np.sqrt(found.noise.measurement[:3]), 2.0, rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(found.noise.measurement[3:]), 1.0, rtol=0.1)
+    assert found.noise.relative == pytest.approx(0.03, rel=0.15)
+
+
+def test_the_truth_is_found_from_afar_within_the_stated_errors(heavy, off):
+    ratios = []
+    for seed in range(4):
+        samples = samples_of(heavy, 60.0, seed=seed)
+        found = ml.maximise(in_one(samples), off, off.model)
+        assert found.converged
+        std = np.sqrt(np.diag(found.covariance))
+        ratios.append((found.values - heavy.model.theta) / std)
+        assert np.all(np.diag(found.bound) <= np.diag(found.covariance) * (1.0 + 1e-9))
+        error = np.abs(found.values / heavy.model.theta - 1.0)
+        assert np.median(error) < 0.005
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.35)
+
+
+def test_coloured_residuals_widen_the_intervals(heavy, samples):
+    """Repeat every measurement's error over half a second: as many samples say much less."""
+    slow = samples.copy()
+    truth = ml.innovations(samples, heavy.model, ml.assumed(heavy)).nu
+    rng = np.random.default_rng(0)
+    steps = (slow["t"] / 0.5).astype(int)
+    error = rng.standard_normal((steps.max() + 1, 6))[steps]
+    slow["odometry"][:, :3] = np.where(
+        np.isfinite(slow["odometry"][:, :3]), truth[:, :3] + 0.008 * error[:, :3], np.nan
+    )
+    slow["gyro"] = np.where(np.isfinite(slow["gyro"]), truth[:, 3:] + 0.003 * error[:, 3:], np.nan)
+    found = ml.maximise(in_one(slow), heavy, heavy.model, process=False)
+    widened = np.sqrt(np.diag(found.covariance) / np.diag(found.bound))
+    assert np.median(widened) > 2.0
+
+
+def test_outliers_are_refused(heavy, samples):
+    spoilt = samples.copy()
+    measured = np.flatnonzero(np.isfinite(spoilt["odometry"][:, 0]))
+    bad = np.random.default_rng(0).choice(measured[20:], 15, replace=False)
+    spoilt["odometry"][bad, 0] += 0.5
+    found = ml.maximise(in_one(spoilt), heavy, heavy.model)
+    assert 15 <= found.total.outliers <= 20
+    clean = ml.maximise(in_one(samples), heavy, heavy.model)
+    off = (found.values - clean.values) / np.sqrt(np.diag(clean.covariance))
+    assert np.abs(off).max() < 0.7
+
+
+# ------------------------------------------------------------------ channel by channel
+
+
+@pytest.fixture(scope="module")
+def archive_of(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("channels")
+
+    def make(config, name, **options):
+        path = folder / f"{name}.mcap"
+        write_messages(path, sensors.dive(config, **options).messages)
+        return of_records([read_record(path, config)])
+
+    return make
+
+
+def test_a_channel_fitted_alone_holds_in_the_joint_run(heavy, off, archive_of):
+    alone = archive_of(heavy, "steps", duration=60.0, seed=2)
+    stages = (("surge",), ("roll",), ("sway", "yaw"), ("heave", "pitch"))
+    fit = fit_batch(alone, off, "ml", Settings(stages))
+    assert all(fit.identifiable)
+    fitted = dict(zip(fit.names, fit.values))
+    true = dict(zip(heavy.model.names, heavy.model.theta))
+    error = np.array([abs(fitted[n] / true[n] - 1.0) for n in fit.names])
+    assert np.median(error) < 0.02 and error.max() < 0.15
+    rmse_before = fit.more["open_loop_before"]["rmse"]
+    assert all(after < 0.7 * rmse_before[n] for n, after in zip("uvwpqr", fit.rmse))
+
+
+def test_a_good_channel_is_left_alone(heavy, archive_of):
+    bags = archive_of(heavy, "good", duration=30.0, seed=4)
+    fit = fit_batch(bags, heavy, "ml", Settings((("surge",),)))
+    assert any("surge: left alone" in n for n in fit.notes)
+    np.testing.assert_array_equal(fit.values, heavy.model.theta)
+    assert not any(fit.identifiable)
+
+
+def test_a_channel_that_is_not_excited_is_refused_with_the_reason(heavy, off, archive_of):
+    """As the longitudinal run of the sea trial: nothing but a hand's breadth of heave."""
+    resting = dataclasses.replace(
+        heavy, model=dataclasses.replace(
+            heavy.model, body=dataclasses.replace(
+                heavy.model.body, buoyancy=heavy.model.body.weight + 0.02
+            )
+        )
+    )  # fmt: skip
+    bags = archive_of(resting, "still", name="rest", duration=20.0, seed=4)
+    body = resting.model.body
+    wrong = off.with_model(dataclasses.replace(off.model, body=body))
+    # a wrong trim, so that the open loop is not good already
+    wrong = wrong.with_model(
+        dataclasses.replace(wrong.model, body=dataclasses.replace(body, buoyancy=body.weight + 5.0))
+    )
+    fit = fit_batch(bags, wrong, "ml", Settings((("heave", "pitch"),)))
+    assert any("heave, pitch: not fitted, the motion does not show it" in n for n in fit.notes)
+    np.testing.assert_array_equal(fit.values, off.model.theta)
+
+
+def test_unknown_estimators_and_empty_channels_are_refused(heavy, archive_of):
+    bags = archive_of(heavy, "short", duration=10.0, seed=4)
+    with pytest.raises(UserError, match="no estimator 'best'"):
+        fit_batch(bags, heavy, "best")
+    few = dataclasses.replace(heavy, estimate=("X_u",))
+    with pytest.raises(UserError, match="no coefficient of yaw"):
+        fit_batch(bags, few, "ml", Settings((("yaw",),)))
