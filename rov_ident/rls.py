@@ -46,11 +46,7 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
-<<<<<<< HEAD
-from rov_ident.estimate import Estimate, Prior, prior_of, theta_of
-=======
-from rov_ident.estimate import Estimate, Prior, calibrated, prior_of
->>>>>>> ukf
+from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
     Structure,
