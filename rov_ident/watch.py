@@ -39,6 +39,7 @@ from rov_ident.evidence import Evidence, Linear
 from rov_ident.excitation import authority
 from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, parameter
 from rov_ident.messages import Array
+from rov_ident.model import Model
 from rov_ident.samples import SAMPLE, joined
 from rov_ident.scores import SURE, inflation
 from rov_ident.shooting import Motion
@@ -51,6 +52,8 @@ ALARM = 1e-4
 """How often a memory full of windows with nothing missing may raise a false alarm."""
 SHARE = 0.5
 """The least that an effect must explain: of the residual's power in one of six components."""
+LEAST = 0.03
+"""The least size of an effect, over one that matters: less is what the attitude is off by."""
 
 _SPACING = 0.045  # s; measurements closer than that add cost, hardly information
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed
@@ -104,6 +107,7 @@ class Task(NamedTuple):
     units: tuple[tuple[Key, ...], ...]
     prior: Array  # (B,) precision of the base about its values in the configuration
     centre: Array  # (B,)
+    sizes: Mapping[Key, float]  # at which a watched parameter matters
 
 
 class State(NamedTuple):
@@ -137,7 +141,22 @@ def problem(config: Config) -> Task:
         np.array(
             [config.effects[e][n] if e in EFFECTS else centre(config, (e, n)) for e, n in base]
         ),
+        _sizes(config, [key for unit in units for key in unit]),
     )
+
+
+def _sizes(config: Config, keys: Sequence[Key]) -> dict[Key, float]:
+    """The size at which each parameter matters; of a place times its amplitude."""
+    found = tuple(parse(name) for section, name in keys if section == COEFFICIENTS)
+    absent = typical(Model(config.model.body, found, np.zeros(len(found))))
+    sizes = {(COEFFICIENTS, c.name): float(s) for c, s in zip(found, absent, strict=True)}
+    for key in keys:
+        if key[0] != COEFFICIENTS:
+            sizes[key] = parameter(key).typical
+            if _is_place(key):
+                amplitude = next(p for p in EFFECTS[key[0]].parameters if p.role == "amplitude")
+                sizes[key] *= amplitude.typical
+    return sizes
 
 
 def _units(effect: Effect, config: Config) -> list[tuple[Key, ...]]:
@@ -399,7 +418,8 @@ class _Memory:
             value, after = self.solve([*chosen, *unit])
             change = value[len(before.keys) :]
             amplitudes = [(k, d) for k, d in zip(unit, change, strict=True) if not _is_place(k)]
-            if all(_allowed(key, delta) for key, delta in amplitudes):
+            matters = np.abs(change / [self.task.sizes[key] for key in unit]).max() > LEAST
+            if matters and all(_allowed(key, delta) for key, delta in amplitudes):
                 trials.append((unit, change, after))
         if not trials:
             return None

@@ -89,7 +89,7 @@ def flipped(axis, part):
 def test_wrong_signs_are_named(checked, change, subject, said):
     found = checked(change)
     remark = of(found, subject)
-    assert remark.level == BAD or subject == "pose against velocity" and remark.level != GOOD
+    assert remark.level == BAD or (subject == "pose against velocity" and remark.level != GOOD)
     assert said in remark.text
     assert not found.fit or remark.level == WARNING
 
