@@ -13,10 +13,9 @@ Phi', and the square of a noisy velocity is too large on average, by the noise's
     sum w Z' (y - Phi theta) = 0,   Z: the same rows along the *simulated* motion
 
 simulated from the wrench with the present coefficients, and again with the new ones (refined
-instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias and not the
-second, as an expected square is no matter of correlation; so Phi is taken along the velocity that a
-Kalman filter with the present coefficients finds (:mod:`rov_ident.maximum_likelihood`), whose error
-is several times smaller and not correlated with it.
+instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias, which is the
+added masses'. It does not cure the second, that of the quadratic damping: an expected square is no
+matter of correlation. Maximum likelihood has neither.
 
 *From a log with accelerations* (:func:`equation_error`), a million samples take one pass in bounded
 memory: normal equations, or blockwise Householder (TSQR; Demmel et al. 2012), which keeps all
@@ -39,7 +38,6 @@ from rov_ident.config import Config
 from rov_ident.effects import compiled
 from rov_ident.errors import UserError
 from rov_ident.jit import inlined, kernel, reordered
-from rov_ident.maximum_likelihood import Noise, assumed, innovations
 from rov_ident.model import Array, Model, coriolis_of, extend, six, symmetric_product
 from rov_ident.records import HORIZON, predicted
 
@@ -71,7 +69,6 @@ class Batch(NamedTuple):
     free: NDArray[np.bool_]  # (6,) axes whose rows count
     instruments: Model | None  # the model along whose motion the instruments are taken
     effects: object  # effects.Acting, of the simulation
-    noise: Noise  # as the configuration states it
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ def solve(
     """
     free = np.ones(6, dtype=bool) if free is None else free
     say = progress or (lambda what: None)
-    batch = Batch(rls.problem(config), free, None, compiled(config.effects), assumed(config))
+    batch = Batch(rls.problem(config), free, None, compiled(config.effects))
     n = len(batch.task.scale)
     prior: Array = np.eye(n) * precision
     repeats = 2.0 / (float(batch.task.settings["corner"][0]) * PERIOD)
@@ -201,23 +198,14 @@ def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array
 
 
 def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+    phi = rows(batch.task, samples)
     if batch.instruments is None:
-        phi = z = rows(batch.task, samples)
+        z = phi
     else:
-        phi = rows(batch.task, _filtered(samples, batch))
         z = rows(batch.task, _simulated(samples, batch))
         z[:, :, -1] = phi[:, :, -1]
     good = np.isfinite(z).all(axis=(1, 2))
     return phi[good], z[good]
-
-
-def _filtered(samples: Samples, batch: Batch) -> Samples:
-    """The samples with the motion that is likeliest with the model, given what was measured."""
-    assert batch.instruments is not None
-    out = samples.copy()
-    nu = innovations(samples, batch.instruments, batch.noise).nu
-    out["nu"] = np.where(np.isfinite(nu).all(axis=1, keepdims=True), nu, samples["nu"])
-    return out
 
 
 def _simulated(samples: Samples, batch: Batch) -> Samples:
@@ -290,9 +278,11 @@ def equation_error(
     pattern, count = _pattern(model)
     known = model.with_theta(np.zeros(n))
     arguments: tuple[Any, ...] = (
-        known.structure, known.body.mass_matrix[:, :, None], known.body.restoring,
-        *(np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)),
-    )  # fmt: skip
+        known.structure,
+        known.body.mass_matrix[:, :, None],
+        known.body.restoring,
+        *[np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)],
+    )
     if tsqr:
         root = _householder(arguments, pattern, count, weight, n)
         length = np.sqrt(np.sum(root[:, :n] ** 2, axis=0))
@@ -302,7 +292,7 @@ def equation_error(
             raise UserError(_NOT_TOLD)
         return np.array(np.linalg.solve(scaled[:n], root[:n, n]) / length)
     sums = np.zeros((6, n + 1, n + 1))
-    _accumulate(*arguments, pattern, count, sums)
+    _accumulate(*(*arguments, pattern, count, sums))
     whole = np.einsum("k,kij->ij", weight, sums)
     a, b = whole[:-1, :-1] + np.tril(whole[:-1, :-1], -1).T, whole[-1, :-1]
     length = np.sqrt(np.diag(a))
@@ -357,7 +347,7 @@ def _householder(
     total = len(arguments[3])
     for first in range(0, total, _BLOCK):
         size = min(_BLOCK, total - first)
-        _fill(*arguments, first, block)
+        _fill(*(*arguments, first, block))
         for axis in range(6):
             mine = block[axis, pattern[axis, : count[axis]], :size].T
             stacked = np.vstack([roots[axis], mine])
