@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check accuracy bench explain-bench bag picture clean
+.PHONY: demo test check accuracy validate bench explain-bench bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -26,6 +26,10 @@ check: .venv/test.stamp
 ## accuracy over seeds, the tables of docs/accuracy.md (a quarter of an hour)
 accuracy: .venv/demo.stamp
 	$(BIN)/python bench/accuracy.py
+
+## offline fits against the truth, the tables of docs/offline.md (ten minutes)
+validate: .venv/demo.stamp
+	@$(BIN)/python bench/validate.py
 
 ## speed against peers, the table of docs/speed.md (ten minutes; let nothing else run)
 bench: .venv/bench.stamp

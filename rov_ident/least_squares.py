@@ -276,13 +276,7 @@ def equation_error(
     weight = np.ones(6) if weight is None else weight
     n = len(model.theta)
     pattern, count = _pattern(model)
-    known = model.with_theta(np.zeros(n))
-    arguments: tuple[Any, ...] = (
-        known.structure,
-        known.body.mass_matrix[:, :, None],
-        known.body.restoring,
-        *[np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)],
-    )
+    arguments = _arguments(model, log)
     if tsqr:
         root = _householder(arguments, pattern, count, weight, n)
         length = np.sqrt(np.sum(root[:, :n] ** 2, axis=0))
@@ -303,6 +297,20 @@ def equation_error(
         raise UserError(_NOT_TOLD) from error
     solution: Array = cho_solve(factor, b / length) / length
     return solution
+
+
+def fill(model: Model, log: Log, out: Array) -> None:
+    """Regressor and goal of all samples into out (6, n + 1, N)."""
+    _fill(*(*_arguments(model, log), 0, out))
+
+
+def _arguments(model: Model, log: Log) -> tuple[Any, ...]:
+    return (
+        model.structure,
+        model.body.mass_matrix[:, :, None],
+        model.body.restoring,
+        *[np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)],
+    )
 
 
 _NOT_TOLD = (
@@ -473,7 +481,7 @@ def _fill(structure, mass, restoring, nu, nu_dot, wrench, down, first, out):
         _features(structure, mass, restoring, nu, nu_dot, wrench, down, first + begin, s, block)
         for i in range(6):
             for j in range(out.shape[1]):
-                for k in range(_LANES):
+                for k in range(min(_LANES, out.shape[2] - begin)):
                     out[i, j, begin + k] = block[i, j, k]
 
 

@@ -56,8 +56,9 @@ def without_outliers(
         raise UserError(
             f"an outlier is judged by an odd number of neighbours from 3 on, not {width}"
         )
-    size = (width,) + (1,) * (x.ndim - 1)
-    middle = median_filter(x, size, mode="nearest")
+    neighbours = np.ones((width,) + (1,) * (x.ndim - 1), dtype=bool)
+    neighbours[width // 2] = False  # its own median a value would not be far from
+    middle = median_filter(x, footprint=neighbours, mode="nearest")
     off = np.abs(x - middle)
     spread = _ROBUST * np.median(off, axis=0)
     bad = off > limit * np.maximum(spread, 1e-12)
