@@ -387,8 +387,9 @@ _SCRATCH = np.dtype(
 
 
 @reordered
-def _load(restoring, nu, nu_dot, wrench, down, first, s):
+def _load(restoring, nu, nu_dot, wrench, down, first, scratch):
     """Samples from ``first`` on into the lanes, their goal without inertia into ``h``."""
+    s = scratch[0]
     size = min(_LANES, len(nu) - first)
     for k in range(size):
         for i in range(6):
@@ -405,9 +406,10 @@ def _load(restoring, nu, nu_dot, wrench, down, first, s):
 
 
 @reordered
-def _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, s, block):
+def _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, scratch, block):
     """Into block (6, n + 1, _LANES) regressor and goal from ``first`` on; zeros beyond the end."""
-    _load(restoring, nu, nu_dot, wrench, down, first, s)
+    _load(restoring, nu, nu_dot, wrench, down, first, scratch)
+    s = scratch[0]
     masses, terms = len(structure.mass_row), len(structure.row)
     for k in range(_LANES):
         v = six(s.nu, k)
@@ -473,12 +475,14 @@ def _unit(i):
 @kernel
 def _fill(structure, mass, restoring, nu, nu_dot, wrench, down, first, out):
     """Into out (6, n + 1, size) the samples from ``first`` on."""
-    s = np.zeros(1, dtype=_SCRATCH)[0]
+    scratch = np.zeros(1, dtype=_SCRATCH)  # the array: a record does not keep it alive
     block = np.zeros((6, out.shape[1], _LANES))
     for begin in range(0, out.shape[2], _LANES):
         if first + begin >= len(nu):
             break
-        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first + begin, s, block)
+        _features(
+            structure, mass, restoring, nu, nu_dot, wrench, down, first + begin, scratch, block
+        )
         for i in range(6):
             for j in range(out.shape[1]):
                 for k in range(min(_LANES, out.shape[2] - begin)):
@@ -488,10 +492,10 @@ def _fill(structure, mass, restoring, nu, nu_dot, wrench, down, first, out):
 @kernel
 def _accumulate(structure, mass, restoring, nu, nu_dot, wrench, down, pattern, count, sums):
     """Add to sums (6, n + 1, n + 1), lower halves, the squares of all rows, axis by axis."""
-    s = np.zeros(1, dtype=_SCRATCH)[0]
+    scratch = np.zeros(1, dtype=_SCRATCH)  # the array: a record does not keep it alive
     block = np.zeros((6, sums.shape[1], _LANES))
     for first in range(0, len(nu), _LANES):
-        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, s, block)
+        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, scratch, block)
         for axis in range(6):
             _squares(block[axis], pattern[axis], count[axis], sums[axis])
 

@@ -56,11 +56,11 @@ def without_outliers(
         raise UserError(
             f"an outlier is judged by an odd number of neighbours from 3 on, not {width}"
         )
-    neighbours = np.ones((width,) + (1,) * (x.ndim - 1), dtype=bool)
-    neighbours[width // 2] = False  # its own median a value would not be far from
-    middle = median_filter(x, footprint=neighbours, mode="nearest")
+    middle = median_filter(x, (width,) + (1,) * (x.ndim - 1), mode="nearest")
     off = np.abs(x - middle)
-    spread = _ROBUST * np.median(off, axis=0)
+    # many a value is the median itself, whatever the noise: those say nothing of the spread
+    spread = _ROBUST * np.nanmedian(np.where(off > 0.0, off, np.nan), axis=0)
+    spread = np.nan_to_num(spread)
     bad = off > limit * np.maximum(spread, 1e-12)
     return np.where(bad, middle, x), bad
 
