@@ -45,6 +45,8 @@ setup(
             "types-PyYAML",
         ],
         "bench": ["padasip>=1.2"],
+        # `rov-ident fit --dask`
+        "dask": ["distributed>=2024.1"],
     },
     zip_safe=True,
     maintainer="rov_ident maintainers",

@@ -10,6 +10,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import resource
 import signal
 import statistics
 import subprocess
@@ -30,6 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rov_ident import config as configuration
+from rov_ident import least_squares as batch
 from rov_ident import rls, sensors, ukf
 from rov_ident.cdr import encode
 from rov_ident.coefficients import ABSOLUTE, EXTENDED_SIZE, NEGATIVE, ONE, PLAIN
@@ -295,6 +297,37 @@ def simulation() -> Iterator[Row]:
 
 
 @contextmanager
+def least_squares() -> Iterator[Row]:
+    """A million samples, 24 coefficients, six rows each."""
+    model, n = heavy().model, 1_000_000
+    rng = np.random.default_rng(0)
+    down = np.tile([0.0, 0.0, 1.0], (n, 1))
+    nu, nu_dot, wrench = (rng.uniform(-1.0, 1.0, (n, 6)) for _ in range(3))
+    log = batch.Log(nu, nu_dot, wrench, down)
+    count = n // 10  # numpy's matrix of a million takes a gibibyte: a tenth, it is linear in them
+    block = np.empty((6, len(model.theta) + 1, count))
+    batch.fill(model, log, block)
+    matrix = np.ascontiguousarray(block.transpose(2, 0, 1)).reshape(6 * count, -1)
+    part = batch.Log(nu[:count], nu_dot[:count], wrench[:count], down[:count])
+    theirs = np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None)[0]
+    for tsqr in (False, True):
+        apart = float(np.abs(batch.equation_error(model, part, tsqr=tsqr) / theirs - 1.0).max())
+        name = "TSQR" if tsqr else "normal equations"
+        yield Row(f"least squares, {name}, equal to lstsq", "", "", apart, 1e-8, False, "")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    batch.equation_error(model, log)
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
+    yield Row("least squares, memory beyond the log", "", "", grown, 100.0, False, "MiB")
+    ours, blocks, peer = in_turn(
+        5,
+        (lambda: batch.equation_error(model, log), n),
+        (lambda: batch.equation_error(model, log, tsqr=True), n),
+        (lambda: np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None), count),
+    )
+    yield faster("least squares, a sample", ours, peer, 150.0, "numpy.linalg.lstsq")
+    yield faster("same by TSQR", blocks, peer, 1.0, "numpy.linalg.lstsq")
+
+
 def hour_long_bag() -> Iterator[tuple[Path, Path]]:
     """A bag and its configuration, in a folder that goes away."""
     path = shipped("config/bluerov2_heavy.yaml")
@@ -562,6 +595,7 @@ ROWS: dict[str, Callable[[], Iterator[Row]]] = {
     "ukf": ukf_step,
     "rls": rls_step,
     "simulation": simulation,
+    "least-squares": least_squares,
     "fit": offline_fit,
     "node": live_node,
 }

@@ -10,10 +10,9 @@ the left factor by what is not noisy::
     sum w Z' (y - Phi theta) = 0,   Z: the same rows along the *simulated* motion
 
 simulated from the wrench with the present coefficients, and again with the new ones (refined
-instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias and not the
-second, as an expected square is no matter of correlation; so Phi is taken along the velocity that a
-Kalman filter with the present coefficients finds (:mod:`rov_ident.maximum_likelihood`), whose error
-is several times smaller and not correlated with it.
+instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias, which is the
+added masses'. It does not cure the second, that of the quadratic damping: an expected square is no
+matter of correlation. Maximum likelihood has neither.
 
 *From a log with accelerations* (:func:`equation_error`), a million samples take one pass in bounded
 memory: normal equations, or blockwise Householder (TSQR; Demmel et al. 2012), which keeps all
@@ -36,7 +35,6 @@ from rov_ident.effects import compiled
 from rov_ident.errors import UserError
 from rov_ident.excitation import authority
 from rov_ident.jit import inlined, kernel, reordered
-from rov_ident.maximum_likelihood import Noise, assumed, innovations
 from rov_ident.model import Array, Model, coriolis_of, extend, six, symmetric_product
 from rov_ident.records import HORIZON, predicted
 from rov_ident.regression import Regression, filtered_rows, regression
@@ -69,7 +67,6 @@ class Batch(NamedTuple):
     free: NDArray[np.bool_]  # (6,) axes whose rows count
     instruments: Model | None  # the model along whose motion the instruments are taken
     effects: object  # effects.Acting, of the simulation
-    noise: Noise  # as the configuration states it
 
 
 @dataclass(frozen=True)
@@ -104,7 +101,7 @@ def solve(
     """
     free = np.ones(6, dtype=bool) if free is None else free
     say = progress or (lambda what: None)
-    batch = Batch(regression(config), free, None, compiled(config.effects), assumed(config))
+    batch = Batch(regression(config), free, None, compiled(config.effects))
     n = len(batch.task.scale)
     prior: Array = np.eye(n) * precision
     repeats = 2.0 / (batch.task.corner * PERIOD)
@@ -199,23 +196,14 @@ def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array
 
 
 def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+    phi = filtered_rows(batch.task, samples, PERIOD)
     if batch.instruments is None:
-        phi = z = filtered_rows(batch.task, samples, PERIOD)
+        z = phi
     else:
-        phi = filtered_rows(batch.task, _filtered(samples, batch), PERIOD)
         z = filtered_rows(batch.task, _simulated(samples, batch), PERIOD)
         z[:, :, -1] = phi[:, :, -1]
     good = np.isfinite(z).all(axis=(1, 2))
     return phi[good], z[good]
-
-
-def _filtered(samples: Samples, batch: Batch) -> Samples:
-    """The samples with the motion that is likeliest with the model, given what was measured."""
-    assert batch.instruments is not None
-    out = samples.copy()
-    nu = innovations(samples, batch.instruments, batch.noise).nu
-    out["nu"] = np.where(np.isfinite(nu).all(axis=1, keepdims=True), nu, samples["nu"])
-    return out
 
 
 def _simulated(samples: Samples, batch: Batch) -> Samples:
@@ -275,11 +263,7 @@ def equation_error(
     weight = np.ones(6) if weight is None else weight
     n = len(model.theta)
     pattern, count = _pattern(model)
-    known = model.with_theta(np.zeros(n))
-    arguments: tuple[Any, ...] = (
-        known.structure, known.body.mass_matrix[:, :, None], known.body.restoring,
-        *(np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)),
-    )  # fmt: skip
+    arguments = _arguments(model, log)
     if tsqr:
         root = _householder(arguments, pattern, count, weight, n)
         length = np.sqrt(np.sum(root[:, :n] ** 2, axis=0))
@@ -289,7 +273,7 @@ def equation_error(
             raise UserError(_NOT_TOLD)
         return np.array(np.linalg.solve(scaled[:n], root[:n, n]) / length)
     sums = np.zeros((6, n + 1, n + 1))
-    _accumulate(*arguments, pattern, count, sums)  # type: ignore[call-arg]
+    _accumulate(*(*arguments, pattern, count, sums))
     whole = np.einsum("k,kij->ij", weight, sums)
     a, b = whole[:-1, :-1] + np.tril(whole[:-1, :-1], -1).T, whole[-1, :-1]
     length = np.sqrt(np.diag(a))
@@ -300,6 +284,20 @@ def equation_error(
         raise UserError(_NOT_TOLD) from error
     solution: Array = cho_solve(factor, b / length) / length
     return solution
+
+
+def fill(model: Model, log: Log, out: Array) -> None:
+    """Regressor and goal of all samples into out (6, n + 1, N)."""
+    _fill(*(*_arguments(model, log), 0, out))
+
+
+def _arguments(model: Model, log: Log) -> tuple[Any, ...]:
+    return (
+        model.structure,
+        model.body.mass_matrix[:, :, None],
+        model.body.restoring,
+        *[np.ascontiguousarray(a, dtype=float) for a in (log.nu, log.nu_dot, log.wrench, log.down)],
+    )
 
 
 _NOT_TOLD = (
@@ -344,7 +342,7 @@ def _householder(
     total = len(arguments[3])
     for first in range(0, total, _BLOCK):
         size = min(_BLOCK, total - first)
-        _fill(*arguments, first, block)  # type: ignore[call-arg]
+        _fill(*(*arguments, first, block))
         for axis in range(6):
             mine = block[axis, pattern[axis, : count[axis]], :size].T
             stacked = np.vstack([roots[axis], mine])
@@ -376,8 +374,9 @@ _SCRATCH = np.dtype(
 
 
 @reordered
-def _load(restoring, nu, nu_dot, wrench, down, first, s):
+def _load(restoring, nu, nu_dot, wrench, down, first, scratch):
     """Samples from ``first`` on into the lanes, their goal without inertia into ``h``."""
+    s = scratch[0]
     size = min(_LANES, len(nu) - first)
     for k in range(size):
         for i in range(6):
@@ -394,9 +393,10 @@ def _load(restoring, nu, nu_dot, wrench, down, first, s):
 
 
 @reordered
-def _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, s, block):
+def _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, scratch, block):
     """Into block (6, n + 1, _LANES) regressor and goal from ``first`` on; zeros beyond the end."""
-    _load(restoring, nu, nu_dot, wrench, down, first, s)
+    _load(restoring, nu, nu_dot, wrench, down, first, scratch)
+    s = scratch[0]
     masses, terms = len(structure.mass_row), len(structure.row)
     for k in range(_LANES):
         v = six(s.nu, k)
@@ -462,25 +462,27 @@ def _unit(i):
 @kernel
 def _fill(structure, mass, restoring, nu, nu_dot, wrench, down, first, out):
     """Into out (6, n + 1, size) the samples from ``first`` on."""
-    s = np.zeros(1, dtype=_SCRATCH)[0]
+    scratch = np.zeros(1, dtype=_SCRATCH)  # the array: a record does not keep it alive
     block = np.zeros((6, out.shape[1], _LANES))
     for begin in range(0, out.shape[2], _LANES):
         if first + begin >= len(nu):
             break
-        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first + begin, s, block)
+        _features(
+            structure, mass, restoring, nu, nu_dot, wrench, down, first + begin, scratch, block
+        )
         for i in range(6):
             for j in range(out.shape[1]):
-                for k in range(_LANES):
+                for k in range(min(_LANES, out.shape[2] - begin)):
                     out[i, j, begin + k] = block[i, j, k]
 
 
 @kernel
 def _accumulate(structure, mass, restoring, nu, nu_dot, wrench, down, pattern, count, sums):
     """Add to sums (6, n + 1, n + 1), lower halves, the squares of all rows, axis by axis."""
-    s = np.zeros(1, dtype=_SCRATCH)[0]
+    scratch = np.zeros(1, dtype=_SCRATCH)  # the array: a record does not keep it alive
     block = np.zeros((6, sums.shape[1], _LANES))
     for first in range(0, len(nu), _LANES):
-        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, s, block)
+        _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, scratch, block)
         for axis in range(6):
             _squares(block[axis], pattern[axis], count[axis], sums[axis])
 

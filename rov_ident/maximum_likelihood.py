@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
+from rov_ident.errors import UserError
 from rov_ident.estimate import prior_of
 from rov_ident.excitation import authority
 from rov_ident.jit import inner, kernel
@@ -43,6 +44,7 @@ _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; an innovation further off is an outlier
 _NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
 _ITERATIONS = 25
+_MAX_STEP = 0.05  # s
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
 LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
 
@@ -276,8 +278,8 @@ def maximise(
 
     Raises
     ------
-    ValueError
-        If nothing was measured.
+    UserError
+        If the model cannot be simulated.
     """
     free = np.ones(6, dtype=bool) if free is None else free
     prior = prior_of(config)
@@ -371,7 +373,18 @@ def _noise_levels(
 
 
 def inverse_of(information: Array) -> Array:
-    """Inverse of an information matrix, scaled to a unit diagonal meanwhile."""
+    """Inverse of an information matrix, scaled to a unit diagonal meanwhile.
+
+    Raises
+    ------
+    UserError
+        If it is not finite, as the model could not be simulated.
+    """
+    if not np.isfinite(information).all():
+        raise UserError(
+            "the simulation diverges along this motion: check the signs and sizes of the "
+            "coefficients and the axes of the bag"
+        )
     size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(size, size)
     inverse: Array = np.linalg.pinv(scaled, hermitian=True, rcond=1e-13) * np.outer(size, size)
@@ -486,72 +499,80 @@ def _filter(
                 pace[i] = (sample.nu[i] - old[i]) / dt
             old[i] = sample.nu[i]
 
-        # the mean: Runge and Kutta; wrench and attitude go in a line
-        for part in range(4):
-            ahead = (-0.5, 0.0, 0.0, 0.5)[part] * dt
+        parts = max(1, int(np.ceil(dt / _MAX_STEP - 1e-9)))
+        dt /= parts
+        for step in range(parts):
+            # of this part, from the middle of the sample's interval
+            offset = (step + 0.5 - 0.5 * parts) * dt
+            # the mean: Runge and Kutta; wrench and attitude go in a line
+            for part in range(4):
+                ahead = (-0.5, 0.0, 0.0, 0.5)[part] * dt
+                for i in range(6):
+                    force[i] = sample.wrench[i] + (offset + ahead) * sample.wrench_slope[i]
+                    for j in range(3):
+                        down = sample.down[j]
+                        down += (offset + ahead - 0.5 * parts * dt) * sample.down_slope[j]
+                        force[i] += eq.restoring[i, j] * down
+                if part == 0:
+                    _pace(eq, force, x, pace, a, work)
+                elif part == 1:
+                    for i in range(6):
+                        stage[i] = x[i] + 0.5 * dt * a[i]
+                    _pace(eq, force, stage, pace, b, work)
+                elif part == 2:
+                    for i in range(6):
+                        stage[i] = x[i] + 0.5 * dt * b[i]
+                        middle[i] = stage[i]
+                    _slope(eq, force, stage, pace, c, jacobian, work)
+                else:
+                    for i in range(6):
+                        stage[i] = x[i] + dt * c[i]
+                    _pace(eq, force, stage, pace, d, work)
             for i in range(6):
-                force[i] = sample.wrench[i] + ahead * sample.wrench_slope[i]
-                for j in range(3):
-                    down = sample.down[j] + (ahead - 0.5 * dt) * sample.down_slope[j]
-                    force[i] += eq.restoring[i, j] * down
-            if part == 0:
-                _pace(eq, force, x, pace, a, work)
-            elif part == 1:
-                for i in range(6):
-                    stage[i] = x[i] + 0.5 * dt * a[i]
-                _pace(eq, force, stage, pace, b, work)
-            elif part == 2:
-                for i in range(6):
-                    stage[i] = x[i] + 0.5 * dt * b[i]
-                    middle[i] = stage[i]
-                _slope(eq, force, stage, pace, c, jacobian, work)
-            else:
-                for i in range(6):
-                    stage[i] = x[i] + dt * c[i]
-                _pace(eq, force, stage, pace, d, work)
-        for i in range(6):
-            x[i] += dt / 6.0 * (a[i] + 2.0 * (b[i] + c[i]) + d[i])
-            for j in range(6):
-                jacobian[i, j] *= dt
-        _product(jacobian, jacobian, square)
-        for i in range(6):
-            for j in range(6):
-                unit = 1.0 if i == j else 0.0
-                phi[i, j] = unit + jacobian[i, j] + 0.5 * square[i, j]
-                square[i, j] = dt * (unit + 0.5 * jacobian[i, j] + square[i, j] / 6.0)
-        _product(square, eq.inverse, push)
-        if tangent:
-            columns(eq.structure, c, momentum, force_of)
-            columns(eq.structure, middle, momentum_of, force_of)
-            _product(phi, s, new_s)
-            for i in range(6):
-                for j in range(n):
-                    e = eq.estimated[j]
-                    effect[i, j] = momentum[i, e] + force_of[i, e]
+                x[i] += dt / 6.0 * (a[i] + 2.0 * (b[i] + c[i]) + d[i])
+                for j in range(6):
+                    jacobian[i, j] *= dt
+            _product(jacobian, jacobian, square)
             for i in range(6):
                 for j in range(6):
-                    f = push[i, j]
-                    if f != 0.0:
-                        for q in range(n):
-                            new_s[i, q] -= f * effect[j, q]
+                    unit = 1.0 if i == j else 0.0
+                    phi[i, j] = unit + jacobian[i, j] + 0.5 * square[i, j]
+                    square[i, j] = dt * (unit + 0.5 * jacobian[i, j] + square[i, j] / 6.0)
+            _product(square, eq.inverse, push)
+            if tangent:
+                columns(eq.structure, c, momentum, force_of)
+                columns(eq.structure, middle, momentum_of, force_of)
+                _product(phi, s, new_s)
+                for i in range(6):
+                    for j in range(n):
+                        e = eq.estimated[j]
+                        effect[i, j] = momentum[i, e] + force_of[i, e]
+                for i in range(6):
+                    for j in range(6):
+                        f = push[i, j]
+                        if f != 0.0:
+                            for q in range(n):
+                                new_s[i, q] -= f * effect[j, q]
+                for i in range(6):
+                    for j in range(n):
+                        s[i, j] = new_s[i, j] if eq.free[i] else 0.0
+            # the covariance: phi p phi' + push q push' / dt
+            _product(phi, p, square)
             for i in range(6):
-                for j in range(n):
-                    s[i, j] = new_s[i, j] if eq.free[i] else 0.0
-        # the covariance: phi p phi' + push q push' / dt
-        _product(phi, p, square)
-        for i in range(6):
-            for j in range(i + 1):
-                total = 0.0
-                for q in range(6):
-                    total += square[i, q] * phi[j, q]
-                    total += push[i, q] * process[k, q] * push[j, q] / dt
-                new_p[i, j] = total
-                new_p[j, i] = total
+                for j in range(i + 1):
+                    total = 0.0
+                    for q in range(6):
+                        total += square[i, q] * phi[j, q]
+                        total += push[i, q] * process[k, q] * push[j, q] / dt
+                    new_p[i, j] = total
+                    new_p[j, i] = total
+            for i in range(6):
+                for j in range(6):
+                    p[i, j] = new_p[i, j] if eq.free[i] and eq.free[j] else 0.0
+        dt = sample.dt
         for i in range(6):
             if not eq.free[i]:
                 x[i] = sample.nu[i]
-            for j in range(6):
-                p[i, j] = new_p[i, j] if eq.free[i] and eq.free[j] else 0.0
 
         for j in range(n):
             now[j] = 0.0

@@ -56,10 +56,11 @@ def without_outliers(
         raise UserError(
             f"an outlier is judged by an odd number of neighbours from 3 on, not {width}"
         )
-    size = (width,) + (1,) * (x.ndim - 1)
-    middle = median_filter(x, size, mode="nearest")
+    middle = median_filter(x, (width,) + (1,) * (x.ndim - 1), mode="nearest")
     off = np.abs(x - middle)
-    spread = _ROBUST * np.median(off, axis=0)
+    # many a value is the median itself, whatever the noise: those say nothing of the spread
+    spread = _ROBUST * np.nanmedian(np.where(off > 0.0, off, np.nan), axis=0)
+    spread = np.nan_to_num(spread)
     bad = off > limit * np.maximum(spread, 1e-12)
     return np.where(bad, middle, x), bad
 

@@ -8,7 +8,7 @@ import pytest
 from rov_ident import maximum_likelihood as ml
 from rov_ident import sensors
 from rov_ident.archive import of_records
-from rov_ident.batch import Settings, fit_batch
+from rov_ident.batch import Settings, fit_batch, open_loop_rmse
 from rov_ident.errors import UserError
 from rov_ident.hindsight import hindsight
 from rov_ident.recording import write_messages
@@ -158,25 +158,26 @@ def test_outliers_are_refused(heavy, samples):
 def archive_of(tmp_path_factory):
     folder = tmp_path_factory.mktemp("channels")
 
-    def make(config, name, **options):
-        path = folder / f"{name}.mcap"
-        write_messages(path, sensors.dive(config, **options).messages)
+    def make(config, file, manoeuvre="steps", **options):
+        path = folder / f"{file}.mcap"
+        write_messages(path, sensors.dive(config, manoeuvre, **options).messages)
         return of_records([read_record(path, config)])
 
     return make
 
 
 def test_a_channel_fitted_alone_holds_in_the_joint_run(heavy, off, archive_of):
-    alone = archive_of(heavy, "steps", duration=60.0, seed=2)
+    """One axis moves at a time; then all move at once."""
+    alone = archive_of(heavy, "alone", manoeuvre="single-axis", duration=150.0, seed=2)
+    joint = archive_of(heavy, "joint", duration=40.0, seed=5)
     stages = (("surge",), ("roll",), ("sway", "yaw"), ("heave", "pitch"))
     fit = fit_batch(alone, off, "ml", Settings(stages))
+    assert [s["channels"] for s in fit.more["stages"]] == [list(s) for s in stages]
     assert all(fit.identifiable)
-    fitted = dict(zip(fit.names, fit.values))
-    true = dict(zip(heavy.model.names, heavy.model.theta))
-    error = np.array([abs(fitted[n] / true[n] - 1.0) for n in fit.names])
-    assert np.median(error) < 0.02 and error.max() < 0.15
-    rmse_before = fit.more["open_loop_before"]["rmse"]
-    assert all(after < 0.7 * rmse_before[n] for n, after in zip("uvwpqr", fit.rmse))
+    error = np.abs(fit.values / heavy.model.theta - 1.0)
+    assert np.median(error) < 0.02 and error.max() < 0.2
+    before, after = (open_loop_rmse(joint, c) for c in (off, heavy.with_model(fit.model)))
+    assert np.all(after < 0.6 * before)
 
 
 def test_a_good_channel_is_left_alone(heavy, archive_of):
@@ -196,7 +197,7 @@ def test_a_channel_that_is_not_excited_is_refused_with_the_reason(heavy, off, ar
             )
         )
     )  # fmt: skip
-    bags = archive_of(resting, "still", name="rest", duration=20.0, seed=4)
+    bags = archive_of(resting, "still", "rest", duration=20.0, seed=4)
     body = resting.model.body
     wrong = off.with_model(dataclasses.replace(off.model, body=body))
     # a wrong trim, so that the open loop is not good already
