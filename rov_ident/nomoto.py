@@ -38,6 +38,7 @@ from rov_ident.zigzag import Zigzag
 METHODS = ("oe", "fd", "iv", "rls")
 STEP = 0.05  # s, largest of the integration
 MOST_JUMPS = 200  # of a rudder, beyond which their instants are not estimated
+_DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
 _MIN_SAMPLES = 20
 
 
@@ -446,6 +447,8 @@ def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto
         firsts, shares = [first for first, _ in states], [share for _, share in states]
         other = _descend(runs, 2, nonlinear, start, firsts, shares)
         best = min(best, other, key=lambda m: m.rmse)
+    if not math.isfinite(best.rmse):
+        raise UserError("the fit does not converge: try --order 1 without --nonlinear")
     return best
 
 
@@ -511,8 +514,9 @@ def _descend(
         gtol=1e-12,
         max_nfev=100 if bounded else 200 * len(sizes),
     )
-    if not result.cost < 1e10:
-        raise UserError("the fit does not converge: try --order 1 without --nonlinear")
+    if not result.cost < _DIVERGED:
+        zeros = np.zeros((n, n))
+        return Nomoto(order, nonlinear, "oe", start, zeros, runs[0].unit, math.inf)
     free = result.active_mask == 0  # a jump's instant on its bound is no free parameter
     lengths = [int(k.sum()) for k in known]
     covariance = np.zeros((len(sizes), len(sizes)))
