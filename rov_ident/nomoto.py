@@ -32,11 +32,13 @@ from rov_ident import densify
 from rov_ident.errors import UserError
 from rov_ident.jit import kernel
 from rov_ident.messages import Array
+from rov_ident.model import Model
 from rov_ident.zigzag import Zigzag
 
 METHODS = ("oe", "fd", "iv", "rls")
 STEP = 0.05  # s, largest of the integration
 MOST_JUMPS = 200  # of a rudder, beyond which their instants are not estimated
+_DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
 _MIN_SAMPLES = 20
 
 
@@ -368,6 +370,29 @@ def others(
     return found
 
 
+def of_model(model: Model, speed: float) -> Nomoto:
+    """The second-order model of the equations of motion for small motions at ``speed`` [m/s].
+
+    Sway and yaw alone, ``M (v', r') = A (v, r) + B delta``; eliminating v gives, with
+    ``F = M^-1 A``, ``G = M^-1 B``: ``a0 = det F, a1 = -tr F, b1 = G_2, b0 = F_21 G_1 - F_11 G_2``.
+    """
+    down, still = np.array([0.0, 0.0, 1.0]), np.zeros(6)
+    rows = np.array([1, 5])
+    f = np.empty((2, 2))
+    inverse = np.linalg.inv(model.mass_matrix[np.ix_(rows, rows)])
+    for i, row in enumerate(rows):
+        ends = []
+        for side in (-1e-6, 1e-6):
+            nu = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+            nu[row] = side
+            ends.append(-inverse @ model.wrench(nu, still, down)[rows])
+        f[:, i] = (ends[1] - ends[0]) / 2e-6
+    g = inverse @ (model.fin_wrench(speed, {"r": 1e-6})[rows] / 1e-6)
+    b0 = f[1, 0] * g[0] - f[0, 0] * g[1]
+    theta = np.array([np.linalg.det(f), -np.trace(f), b0, g[1], 0.0])
+    return Nomoto(2, False, "linearised", theta, np.zeros((5, 5)), "rad", 0.0)
+
+
 def check(run: Zigzag, order: int = 1, nonlinear: bool = False) -> None:
     """Whether a run can tell anything about the model.
 
@@ -408,17 +433,48 @@ def dense(run: Zigzag, method: str, step: float | None = None, scale: float = 1.
 
 
 def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
+    """Output error from the best linear model of a grid, and for the second order also from the
+    fitted first-order one with a fast second time constant: the better of the two."""
+    start, firsts = _linear_start(runs, order)
+    best = _descend(runs, order, nonlinear, _with_cubic(start, nonlinear), firsts)
+    if order == 2:
+        simple = _output_error(runs, 1, nonlinear)
+        x = dict(zip(simple.names, simple.theta))
+        fast = 0.1 * abs(x["a0"]) ** -1.0
+        start = np.array([x["a0"] / fast, x["a0"] + 1.0 / fast, x["b0"] / fast, 0.0, x["delta_0"]])
+        start = _with_cubic(start, nonlinear, x.get("c", 0.0) / fast)
+        states = [_first_state(2, nonlinear, start, run) for run in runs]
+        firsts, shares = [first for first, _ in states], [share for _, share in states]
+        other = _descend(runs, 2, nonlinear, start, firsts, shares)
+        best = min(best, other, key=lambda m: m.rmse)
+    if not math.isfinite(best.rmse):
+        raise UserError("the fit does not converge: try --order 1 without --nonlinear")
+    return best
+
+
+def _with_cubic(theta: Array, nonlinear: bool, c: float = 0.0) -> Array:
+    return np.insert(theta, len(theta) - 1, c) if nonlinear else theta
+
+
+def _descend(
+    runs: Sequence[Zigzag],
+    order: int,
+    nonlinear: bool,
+    start: Array,
+    firsts: Sequence[Array],
+    shares: Sequence[Array | None] = (),
+) -> Nomoto:
     """Least squares on the simulated headings over theta, every run's first state, and the instants
     of jumps that fall between two rows (:attr:`Zigzag.reversals`)."""
-    start, firsts = _linear_start(runs, order)
-    if nonlinear:
-        start = np.insert(start, len(start) - 1, 0.0)
     n, states = len(start), _states(order)
     known = [run.known for run in runs]
     speed = max(float(np.std(np.gradient(r.heading[k], r.t[k]))) for r, k in zip(runs, known))
     names = _names(order, nonlinear)
-    # Scales: of the offset the rudder's spread, of the cubic term one that equals a0 at r_rms.
+    # Scales: of the offset the rudder's spread, of the cubic term one that equals a0 at r_rms,
+    # of b1 what T3 of the geometric mean of T1 and T2 would make it.
     scale = np.abs(start)
+    if order == 2:
+        scale[3] = scale[2] / np.sqrt(scale[0])
     scale[names.index("delta_0")] = 0.1 * max(float(np.std(run.rudder)) for run in runs)
     if nonlinear:
         scale[names.index("c")] = abs(start[0]) / speed**2
@@ -426,10 +482,12 @@ def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto
     jumps = [_jumps(run) for run in runs]
     scales, x0 = [scale], [start / scale]
     lower, upper = [np.full(n, -np.inf)], [np.full(n, np.inf)]
-    for first, count in zip(firsts, jumps):
+    for i, (first, count) in enumerate(zip(firsts, jumps)):
+        guess = shares[i] if shares else None
+        guess = np.full(count, 0.5) if guess is None else np.clip(guess, 0.01, 0.99)
         size = np.array([0.1, *[speed] * order])
         scales += [size, np.ones(count)]
-        x0 += [first[:states] / size, np.full(count, 0.5)]
+        x0 += [first[:states] / size, guess]
         lower += [np.full(states, -np.inf), np.zeros(count)]
         upper += [np.full(states, np.inf), np.ones(count)]
     sizes = np.concatenate(scales)
@@ -456,8 +514,9 @@ def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto
         gtol=1e-12,
         max_nfev=100 if bounded else 200 * len(sizes),
     )
-    if not result.cost < 1e10:
-        raise UserError("the fit does not converge: try --order 1 without --nonlinear")
+    if not result.cost < _DIVERGED:
+        zeros = np.zeros((n, n))
+        return Nomoto(order, nonlinear, "oe", start, zeros, runs[0].unit, math.inf)
     free = result.active_mask == 0  # a jump's instant on its bound is no free parameter
     lengths = [int(k.sum()) for k in known]
     covariance = np.zeros((len(sizes), len(sizes)))

@@ -3,6 +3,7 @@
 import json
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from rov_ident.densify import densify, spiral
 from rov_ident.errors import UserError
 from rov_ident.frames import quaternion_from_euler
 from rov_ident.messages import Odometry
+from rov_ident.model import build
 from rov_ident.zigzag import Zigzag, read
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -269,14 +271,56 @@ def test_k_is_reported_with_the_sign_of_the_data(remus):
     assert value(nomoto.fit([turned]), "K") == pytest.approx(-value(nomoto.fit([dense]), "K"))
 
 
+def stable(remus_config):
+    """A REMUS with linear damping instead of its cross-flow drag, and without rolling in turns."""
+    model = remus_config.model
+    body = replace(model.body, cog=np.zeros(3))
+    values = dict(zip(model.names, model.theta)) | model.fins | {"Y_v": -60.0, "N_r": -15.0}
+    for name in ("Y_vv", "N_rr", "Y_rr", "N_vv"):
+        del values[name]
+    return build(body, values)
+
+
+def test_linearised_equations_of_motion():
+    """Nomoto's constants from the model, beside the formulas of the literature and a zigzag."""
+    model = stable(config.load(ROOT / "config" / "remus100.yaml"))
+    found = {name: x[0] for name, x in nomoto.of_model(model, 1.5).parameters().items()}
+    # eliminated by hand (couplings Y_rdot, N_vdot kept)
+    c, u = dict(zip(model.names, model.theta)) | model.fins, 1.5
+    mass = model.mass_matrix
+    m22, m26, m66 = mass[1, 1], mass[1, 5], mass[5, 5]
+    y_v, n_r = c["Y_uv"] * u + c["Y_v"], c["N_ur"] * u + c["N_r"] - (-c["Y_rdot"]) * u
+    y_r = c["Y_ur"] * u - (model.body.mass - c["X_udot"]) * u
+    n_v = c["N_uv"] * u - (c["X_udot"] - c["Y_vdot"]) * u
+    y_d, n_d = c["Y_uudr"] * u**2, c["N_uudr"] * u**2
+    det = y_v * n_r - y_r * n_v
+    assert found["K"] == pytest.approx((n_v * y_d - y_v * n_d) / det, rel=1e-6)
+    assert found["T1T2"] == pytest.approx((m22 * m66 - m26**2) / det, rel=1e-6)
+    total = -(m22 * n_r + m66 * y_v - m26 * (y_r + n_v)) / det
+    assert found["T1_plus_T2"] == pytest.approx(total, rel=1e-6)
+    t3 = (m22 * n_d - m26 * y_d) / (n_v * y_d - y_v * n_d)
+    assert found["T3"] == pytest.approx(t3, rel=1e-6)
+    # so small that cross-flow drag and the loss of speed do not matter
+    run = autopilot.manoeuvre(model, "zigzag", np.radians(0.1), duration=60.0).zigzag()
+    fitted = nomoto.fit([run], order=2).parameters()
+    for name, near in (("K", 0.03), ("T1", 0.03), ("T2", 0.1), ("T3", 0.1)):
+        assert fitted[name][0] == pytest.approx(found[name], rel=near), name
+
+
+def test_second_order_is_never_worse_than_first(remus):
+    for run in (every(remus, 0.1), every(remus, 0.5)):
+        assert nomoto.fit([run], order=2).rmse <= nomoto.fit([run]).rmse
+
+
 # ------------------------------------------------------------------ measured zigzags
 
 
 @pytest.mark.skipif(not KVLCC2.is_dir(), reason="the measured zigzags are not here")
 @pytest.mark.parametrize("fitted, judged, limit", [((10, 25), 20, 2.5), ((10, 20), 25, 3.0)])
-def test_measured_zigzags_are_predicted(fitted, judged, limit):
+@pytest.mark.parametrize("order", [1, 2])
+def test_measured_zigzags_are_predicted(fitted, judged, limit, order):
     runs = {a: read(KVLCC2 / f"hsva_Z_{a}_05.csv") for a in (10, 20, 25)}
-    model = nomoto.fit([runs[a] for a in fitted], nonlinear=True)
+    model = nomoto.fit([runs[a] for a in fitted], order, nonlinear=True)
     assert np.degrees(nomoto.predict(model, runs[judged])[1]) < limit
 
 
