@@ -18,7 +18,6 @@ from rov_ident.excitation import authority
 from rov_ident.jit import inlined
 
 FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
-ROOM = 1.5  # the power of summed innovations from which noise is added; 1 is expected
 SUM_TIME = 1.0  # s; over which innovations are added up
 FIRST_TIME, TIME = (
     1.0,
@@ -80,14 +79,19 @@ def interrupt(adaptation):
 
 
 @inlined
-def adapt(adaptation, floor, innovation):
-    """Take in one innovation, given in its standard deviations; ``floor`` of the density."""
+def adapt(adaptation, floor, room, innovation):
+    """Take in one innovation, given in its standard deviations; ``floor`` of the density.
+
+    ``room`` is the power of summed innovations from which noise is added; 1 is expected. Noise that
+    is added by chance does not go below the floor by chance: the less room, the more information is
+    lost to that, and the better the intervals where the model is wrong.
+    """
     a = adaptation
     keep = np.exp(-a.since / SUM_TIME)
     a.seen += a.since
     a.summed = keep * a.summed + min(max(innovation, -LARGEST), LARGEST)
     a.expected = keep * keep * a.expected + 1.0
-    excess = min(a.summed * a.summed / a.expected, STEADY) - ROOM
+    excess = min(a.summed * a.summed / a.expected, STEADY) - room
     blend = min(a.since / min(FIRST_TIME + 0.25 * a.seen, TIME), 0.1)
     a.density = max(a.density + blend * excess * a.acting, floor)
     a.since = 0.0

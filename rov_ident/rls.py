@@ -97,6 +97,7 @@ _PATIENCE_TIME = 3.0  # s; over which that is counted
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in the noise
 _STEADY_MEAN = 0.92  # what that is in the mean, of a normal distribution
 _NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged; less at first
+_ROOM = 1.2  # of the process noise: see process_noise.adapt (docs/accuracy.md)
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 3.0  # its value from which the vehicle has changed; 1 is expected
 _RELEARNING_TIME = 20.0  # s; in which the suspects then become as uncertain as at first
@@ -756,7 +757,7 @@ def _update(task, state, work, sample, side, info):
         excess = (min(info.ratio[i], _STEADY) - _STEADY_MEAN) * r[i] / spread
         c.noise[i] *= 1.0 + min(since / averaging, 0.1) * excess
         c.noise[i] = min(max(c.noise[i], 0.5), _NOISIEST)
-        adapt(state.adaptation[i], task.process[0].floor[i], e / np.sqrt(spread))
+        adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, e / np.sqrt(spread))
     c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
     if wild or (gated and c.refused < _PATIENCE):
         c.refused += 1.0

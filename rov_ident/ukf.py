@@ -71,6 +71,7 @@ _MAX_STEP = 0.05  # s; of one Runge-Kutta step
 _LIGHTEST = 0.2  # of the rigid body's own inertia: no sigma point is lighter
 _PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
 _LAG = 4.0  # s; of the window over the correlation of that influence
+_ROOM = 1.5  # of the process noise: see process_noise.adapt (docs/accuracy.md)
 _LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
 _SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
 _RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
@@ -685,7 +686,7 @@ def _update(task, state, work, sample, side, out):
             worst = max(worst, out.ratio[i])
             surprise += min(out.ratio[i], s.gate**2)
             count += 1
-            adapt(state.adaptation[i], task.process[0].floor[i], innovation)
+            adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, innovation)
         if worst > s.gate**2:
             out.reason = GATED
             continue
