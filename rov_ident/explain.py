@@ -30,7 +30,7 @@ from rov_ident.findings import (
 )
 from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
 from rov_ident.model import Array
-from rov_ident.scores import SURE, inflation
+from rov_ident.scores import PRICE, SURE, inflation
 from rov_ident.streams import Streams, joined
 
 BLOCK = 10.0  # s; held-out data are whole blocks, and windows for judging are as long
@@ -161,6 +161,14 @@ def explain(
     everything = Evidence(streams, thinned(halves))
     last = everything.fit(final.hypothesis, None) or final
     last = everything.dated(last)
+    for f in [
+        f for f in found if weighty(f) and not _certain(last, search.keys_of(last, f.effect))
+    ]:
+        minor.append(f)
+        gone = search.keys_of(final, f.effect)
+        final = search.evidence.fit(final.hypothesis.without(gone), final.look) or final
+        last = everything.fit(last.hypothesis.without(gone), last.look, update_noise=True) or last
+    found = [f for f in found if f not in minor]
     findings = sorted(
         [
             *(f for f in sensor_findings if weighty(f)),
@@ -401,6 +409,20 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
         tuple(a for _, a in sorted(alternatives, key=lambda x: -x[0])),
         sentence(name, parameters, gain),
     )
+
+
+def _certain(last: Fitted, keys: Sequence[Key]) -> bool:
+    """Whether all of the data tell an effect from nothing as surely as it takes to join a model.
+
+    The squared distance of its amplitudes from null, in units of their deviation (Wald).
+    """
+    keys = [k for k in keys if k[0] not in EFFECTS or parameter(k).role == "amplitude"]
+    at = last.linear.index(keys)
+    away = np.array([last.hypothesis.values[k] - bounds(k)[0] for k in keys])
+    wide = covariance(last)[np.ix_(at, at)]
+    size = np.sqrt(np.maximum(np.diag(wide), 1e-300))
+    unit = np.linalg.pinv(wide / np.outer(size, size), hermitian=True)
+    return bool((away / size) @ unit @ (away / size) >= PRICE * len(keys) + SURE)
 
 
 def _pinned(key: Key, value: float) -> bool:
