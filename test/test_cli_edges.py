@@ -15,8 +15,8 @@ from rov_ident.errors import UserError
 from rov_ident.recording import write_messages
 
 COMMANDS = (
-    "demo", "replay", "fit", "check", "plan", "explain", "simulate", "import", "export", "import-model",
-    "nomoto", "forces", "steer", "coefficients",
+    "demo", "replay", "fit", "check", "plan", "explain", "simulate", "import", "export",
+    "import-model", "nomoto", "forces", "steer", "coefficients",
 )  # fmt: skip
 DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
 
