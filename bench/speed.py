@@ -296,7 +296,6 @@ def simulation() -> Iterator[Row]:
 # The batch fit's row goes here: least_squares(), 1e6 samples x 6 x 24 against numpy.linalg.lstsq.
 
 
-@contextmanager
 def least_squares() -> Iterator[Row]:
     """A million samples, 24 coefficients, six rows each."""
     model, n = heavy().model, 1_000_000
@@ -328,6 +327,7 @@ def least_squares() -> Iterator[Row]:
     yield faster("same by TSQR", blocks, peer, 1.0, "numpy.linalg.lstsq")
 
 
+@contextmanager
 def hour_long_bag() -> Iterator[tuple[Path, Path]]:
     """A bag and its configuration, in a folder that goes away."""
     path = shipped("config/bluerov2_heavy.yaml")
