@@ -52,7 +52,7 @@ ALARM = 1e-4
 """How often a memory full of windows with nothing missing may raise a false alarm."""
 SHARE = 0.5
 """The least that an effect must explain: of the residual's power in one of six components."""
-LEAST = 0.03
+LEAST = 0.2
 """The least size of an effect, over one that matters: less is what the attitude is off by."""
 
 _SPACING = 0.045  # s; measurements closer than that add cost, hardly information
