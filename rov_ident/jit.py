@@ -8,7 +8,6 @@ kernel cannot be run, and a new version does not disturb a running one.
 import hashlib
 import os
 import tempfile
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,9 +42,6 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numba  # noqa: E402  (after the number of threads is set)
-
-# Looping over a tuple of functions (effects/__init__.py) is what numba calls experimental.
-warnings.simplefilter("ignore", numba.core.errors.NumbaExperimentalFeatureWarning)
 
 # Not by NUMBA_CACHE_DIR, which a child process with other sources would inherit.
 if not os.environ.get("NUMBA_CACHE_DIR"):

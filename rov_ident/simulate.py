@@ -98,6 +98,7 @@ def simulate(
             ]
         ),
         MAX_STEP,
+        np.zeros(1, dtype=_SCRATCH),
         out,
     )
     if done < n:
@@ -203,14 +204,14 @@ def _derivative(structure, theta, restoring, guided, s, rate):
 @kernel
 def _simulate(
     acting, structure, added_mass, mass, inverse, theta, restoring, t, wrench, wrench_slope, free,
-    guide, attitude, start, max_step, out,
+    guide, attitude, start, max_step, scratch, out,
 ):  # fmt: skip
     """Classical Runge-Kutta; out (N, 19): position, quaternion, nu, nu_dot.
 
     nu_dot is that under the wrench which begins to act at the instant. Returns the number of rows
     that are finite. ``wrench_slope`` may be empty, and ``guide`` where all is free.
     """
-    s = np.zeros(1, dtype=_SCRATCH)[0]
+    s = scratch[0]  # the caller's: a record does not keep its array alive
     state, stage, slope = s.state, s.stage, s.slope
     for i in range(6):
         for j in range(6):

@@ -7,14 +7,13 @@ the section ``effects`` of a configuration.
 from collections.abc import Mapping
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import literal_unroll
 from numpy.typing import NDArray
 
 from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
-from rov_ident.jit import kernel
+from rov_ident.jit import inlined, kernel
 from rov_ident.model import RigidBody, current_wrench
 
 EFFECTS: dict[str, Effect] = {
@@ -27,8 +26,42 @@ EFFECTS: dict[str, Effect] = {
 _INPUT = sorted((e for e in EFFECTS.values() if e.act), key=lambda e: (e.order, e.name))
 _WRENCH = [e for e in EFFECTS.values() if e.wrench]
 _SENSE = sorted((e for e in EFFECTS.values() if e.sense), key=lambda e: (e.order, e.name))
-_ACTS = tuple(e.act for e in _INPUT)
-_WRENCHES = tuple(e.wrench for e in _WRENCH)
+
+
+def _acts(effects: list[Effect]) -> Any:
+    """A function for kernels that lets all input effects that are there act in turn, from i = 0 on.
+
+    Not a loop over a tuple of functions: numba may take that for one of pointers, which do not
+    survive in its cache.
+    """
+    if not effects:
+        return inlined(lambda i, there, parameters, state, t, dt, wrench: None)
+    first, others = effects[0].act, _acts(effects[1:])
+
+    def calls(i, there, parameters, state, t, dt, wrench):  # type: ignore[no-untyped-def]
+        if there[i]:
+            first(parameters[i], state[i], t, dt, wrench)
+        others(i + 1, there, parameters, state, t, dt, wrench)
+
+    return inlined(calls)
+
+
+def _wrenches(effects: list[Effect]) -> Any:
+    """The same of all wrench effects."""
+    if not effects:
+        return inlined(lambda i, there, parameters, t, nu, rotation, out: None)
+    first, others = effects[0].wrench, _wrenches(effects[1:])
+
+    def calls(i, there, parameters, t, nu, rotation, out):  # type: ignore[no-untyped-def]
+        if there[i]:
+            first(parameters[i], t, nu, rotation, out)
+        others(i + 1, there, parameters, t, nu, rotation, out)
+
+    return inlined(calls)
+
+
+_ALL_ACTS = _acts(_INPUT)
+_ALL_WRENCHES = _wrenches(_WRENCH)
 
 
 Values = Mapping[str, Mapping[str, float]]
@@ -133,11 +166,7 @@ def memory() -> Array:
 @kernel
 def act(acting, state, t, dt, wrench):
     """wrench (6,), demanded from t to t + dt, becomes the mean of what acts in that time."""
-    i = 0
-    for effect in literal_unroll(_ACTS):
-        if acting.inputs[i]:
-            effect(acting.input_parameters[i], state[i], t, dt, wrench)
-        i += 1  # noqa: SIM113 (unrolled: no enumerate)
+    _ALL_ACTS(0, acting.inputs, acting.input_parameters, state, t, dt, wrench)
 
 
 @kernel
@@ -153,11 +182,7 @@ def acted(acting, t, demand):
 @kernel
 def add_wrenches(acting, t, nu, rotation, out):
     """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water."""
-    i = 0
-    for effect in literal_unroll(_WRENCHES):
-        if acting.wrenches[i]:
-            effect(acting.wrench_parameters[i], t, nu, rotation, out)
-        i += 1  # noqa: SIM113 (unrolled: no enumerate)
+    _ALL_WRENCHES(0, acting.wrenches, acting.wrench_parameters, t, nu, rotation, out)
 
 
 @kernel
