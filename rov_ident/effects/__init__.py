@@ -7,7 +7,7 @@ the section ``effects`` of a configuration.
 from collections.abc import Mapping
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def _acts(effects: list[Effect]) -> Any:
     """
     if not effects:
         return inlined(lambda i, there, parameters, state, t, dt, wrench: None)
-    first, others = effects[0].act, _acts(effects[1:])
+    first, others = cast(Any, effects[0].act), _acts(effects[1:])
 
     def calls(i, there, parameters, state, t, dt, wrench):  # type: ignore[no-untyped-def]
         if there[i]:
@@ -50,7 +50,7 @@ def _wrenches(effects: list[Effect]) -> Any:
     """The same of all wrench effects."""
     if not effects:
         return inlined(lambda i, there, parameters, t, nu, rotation, out: None)
-    first, others = effects[0].wrench, _wrenches(effects[1:])
+    first, others = cast(Any, effects[0].wrench), _wrenches(effects[1:])
 
     def calls(i, there, parameters, t, nu, rotation, out):  # type: ignore[no-untyped-def]
         if there[i]:
