@@ -34,6 +34,7 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 }
 """What can be fitted by itself: single axes, and those that one pair of actuators moves."""
 
+_MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
@@ -251,7 +252,12 @@ def _excited(
     covariance = maximum_likelihood.inverse_of(information + np.diag(prior.std**-2.0))
     std = np.sqrt(np.diag(covariance))
     known = std**2 < (1.0 - IDENTIFIABLE) * prior.std**2
-    size = np.sqrt(np.mean(np.square([s[0] for s in archive.each(_size)]), axis=0))[free]
+    size, noise = (np.sqrt(np.mean(np.square(x), axis=0)) for x in zip(*archive.each(_size)))
+    # A wrong trim alone makes the prediction move where the vehicle does not: look at it, too.
+    own = [_coefficient(config, n) for n in prior.names]
+    moved_by = [c.column if c.is_added_mass else c.velocity for c in own]
+    known &= (size > _MOVES * noise)[moved_by]
+    size = size[free]
     moved = ", ".join(
         f"{axis} moves {s:.2g} {'m/s' if AXES.index(axis) < 3 else 'rad/s'}"
         for axis, s in zip(np.array(AXES)[free], size, strict=True)

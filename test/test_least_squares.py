@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from rov_ident import least_squares as ls
-from rov_ident import rls, sensors
+from rov_ident import sensors
 from rov_ident.errors import UserError
 from rov_ident.estimate import prior_of
 from rov_ident.model import build
+from rov_ident.regression import filtered_rows, regression
 
 CLASSICAL = {
     "X_udot": -6.4, "Y_vdot": -7.1, "Z_wdot": -18.7, "K_pdot": -0.19, "M_qdot": -0.13,
@@ -109,16 +110,19 @@ def off(heavy):
     return heavy.with_model(heavy.model.with_theta(heavy.model.theta * factor))
 
 
-def test_the_rows_are_those_of_the_recursive_estimator(heavy):
-    """Solved at once they give what recursive least squares gives without gates."""
+def test_rows_of_the_filtered_regression(heavy, off):
+    """Without noise the deviation from the prior leaves nothing of the rows, nor does none."""
     samples = samples_of(heavy, 20.0, sensors.Suite().scaled(0.0))
-    task = rls.problem(heavy)
-    rows = ls.rows(task, samples)
-    assert rows.shape == (len(rows), 6, len(task.scale) + 1)
-    assert len(rows) == pytest.approx(200, abs=3)
-    # without noise the true coefficients, here the prior, leave nothing
-    wrench = samples["wrench"].std(axis=0)
-    assert np.all(rows[:, :, -1].std(axis=0) < 5e-3 * wrench)
+    size = samples["wrench"].std(axis=0)
+    for config in (heavy, off):
+        task = regression(config)
+        rows = filtered_rows(task, samples, ls.PERIOD)
+        assert rows.shape == (len(rows), 6, len(task.scale) + 1)
+        assert len(rows) == pytest.approx(200, abs=3)
+        deviation = (heavy.model.theta - config.model.theta) / task.scale
+        left = rows[:, :, -1] - rows[:, :, :-1] @ deviation
+        assert np.all(left.std(axis=0) < 5e-3 * size)
+    assert np.all(rows[:, :, -1].std(axis=0) > 2e-2 * size)
 
 
 @pytest.mark.parametrize("options", [{}, {"weighted": False}, {"instrumental": True}])

@@ -99,7 +99,8 @@ def test_chance_pays_the_price_as_rarely_as_it_should(size):
     from scipy.stats import chi2
 
     chance = 100 * chi2.sf(watch.price(size, 100), size)
-    assert watch.ALARM / 50.0 < chance <= watch.ALARM
+    # Chernoff's bound on one squared normal x is sqrt(e pi / 2) x too large, and x is some 30.
+    assert watch.ALARM / 100.0 < chance <= watch.ALARM
 
 
 def test_at_rest_and_in_gaps_nothing_is_said(heavy):
