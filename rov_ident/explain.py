@@ -40,6 +40,7 @@ _CHUNK = 2.5  # s; of the bootstrap
 _CLUSTERS = 8  # windows from which their scatter tells anything
 _WORTH = 0.02  # gain from which an effect has practical weight
 _ALL = 0.98  # share of what a finding explains that counts as all of it
+_EARLY = "the same if it was there before the bag began, which this bag cannot tell"
 _AS_WELL = "fits this bag as well"
 _ENOUGH = 600.0  # s; of data to fit
 _LIMIT = 3.0  # a simulation further off than so many standard deviations of the motion has failed
@@ -440,11 +441,29 @@ def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
     keys = search.keys_of(last, finding.effect)
     parameters = parameters_of(last, keys)
     onset = parameters.get("onset")
+    return from_the_start(
+        dataclasses.replace(
+            finding,
+            parameters=parameters,
+            onset_s=None if onset is None else onset.value,
+            sentence=sentence(finding.effect, parameters, finding.gain),
+        )
+    )
+
+
+def from_the_start(finding: Finding) -> Finding:
+    """Not separable from what lasts, where the effect may have begun before the bag did."""
+    onset, lasting = finding.parameters.get("onset"), EFFECTS[finding.effect].lasting
+    if onset is None or not lasting or onset.value - 2.0 * onset.std > 0.0:
+        return finding
+    known = {a.effect for a in finding.alternatives if a.why_not == _AS_WELL}
+    kept = tuple(a for a in finding.alternatives if a.effect in known)
+    early = tuple(Alternative(name, _EARLY) for name in lasting if name not in known)
     return dataclasses.replace(
         finding,
-        parameters=parameters,
-        onset_s=None if onset is None else onset.value,
-        sentence=sentence(finding.effect, parameters, finding.gain),
+        separable=False,
+        manoeuvre=manoeuvre(finding.effect),
+        alternatives=kept + early,
     )
 
 

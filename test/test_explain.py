@@ -20,7 +20,8 @@ from explain import (
     wrong,
 )
 from hidden import EFFECTS, NESTED, Conditions, draw
-from rov_ident.explain import _pinned, explain, thinned, whole
+from rov_ident.explain import _pinned, explain, from_the_start, thinned, whole
+from rov_ident.findings import Finding, Gain, Value
 from rov_ident.scores import _own
 from rov_ident.streams import gather
 
@@ -225,3 +226,15 @@ def test_the_study_is_as_large_as_asked():
     assert len({t.seed for t in trials("triples", 10, "1")}) == 50
     clean = trials("clean", 10, "1") + trials("clean off 50 %", 10, "1")
     assert len(clean) == 300 and not any(t.effects for t in clean)
+
+
+def test_what_may_have_begun_before_the_bag_is_not_told_from_what_lasts():
+    """A payload with an onset of 0 +- 26 s may as well be a loss of buoyancy."""
+    gain = Gain("w", 0.1, 0.05, 50.0, 40.0, 60.0)
+    for onset, std, told in ((0.0, 26.0, False), (40.0, 26.0, False), (40.0, 0.5, True)):
+        values = {"mass_wet": Value(0.3, 0.01, "kg"), "onset": Value(onset, std, "s")}
+        finding = Finding("payload", ("Z",), values, onset, gain, True, None, (), "")
+        found = from_the_start(finding)
+        assert found.separable == told
+        assert (found.manoeuvre is None) == told
+        assert ("buoyancy" in [a.effect for a in found.alternatives]) == (not told)

@@ -107,7 +107,8 @@ class Effect:
     *motion* (between the motion through the water and what is measured) or the *wrench*.
     ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
     effect that does nearly the same and that every vehicle has: this one is looked for only in a
-    model that has some of that.
+    model that has some of that. ``lasting`` are the effects that one with an onset cannot be told
+    from if it has been there from the start.
     """
 
     name: str
@@ -118,6 +119,7 @@ class Effect:
     parameters: tuple[EffectParameter, ...] = ()
     coefficients: tuple[str, ...] = ()
     beyond: str = ""
+    lasting: tuple[str, ...] = ()
     body: Callable[..., Any] | None = None
     wrench: Callable[..., None] | None = None
     water: Callable[..., Array] | None = None

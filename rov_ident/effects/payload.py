@@ -25,6 +25,7 @@ EFFECT = Effect(
     name="payload",
     place="wrench",
     summary="Something heavy (or buoyant) is taken up at a time, or was there from the start.",
+    lasting=("buoyancy", "cog_offset", "constant_force"),
     manoeuvre="drifting without thrust, level and tilted, before and after it was taken up",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
     parameters=(
