@@ -35,6 +35,7 @@ setup(
         # On a ROS 2 machine rclpy and the messages come from apt; these wheels stand in elsewhere.
         "wheels": ["ros-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces"],
         "test": [
+            "distributed>=2024.1",
             "pytest",
             "pytest-timeout",
             "pytest-xdist",
