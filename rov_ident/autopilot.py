@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rov_ident.errors import UserError
-from rov_ident.frames import quaternion_to_euler
+from rov_ident.frames import quaternion_to_euler, wrap_angle
 from rov_ident.messages import Array
 from rov_ident.model import Model
 from rov_ident.simulate import simulate
@@ -107,7 +107,7 @@ def steer(
         )
         position, orientation, nu = run.position[1], run.orientation[1], run.nu[1]
         turned = np.array(quaternion_to_euler(orientation))
-        turned[2] = angles[2] + (turned[2] - angles[2] + np.pi) % (2.0 * np.pi) - np.pi
+        turned[2] = angles[2] + wrap_angle(turned[2] - angles[2])
         angles = turned
     t: Array = step * np.arange(n, dtype=np.float64)
     return Run(t, out[:, :3], out[:, 3:6], out[:, 6:12], dict(zip("sra", out[:, 12:].T)))
@@ -148,7 +148,7 @@ class Heading:
     damping: float = 1.0
 
     def __call__(self, now: Now) -> dict[str, float]:
-        error = (self.target - now.angles[2] + np.pi) % (2.0 * np.pi) - np.pi
+        error = float(wrap_angle(self.target - now.angles[2]))
         return {"r": self.sign * (self.gain * error - self.damping * now.nu[5])}
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rov_ident import least_squares, maximum_likelihood
 from rov_ident.archive import Archive
-from rov_ident.coefficients import Coefficient
+from rov_ident.coefficients import MOTIONS, Coefficient
 from rov_ident.config import Config
 from rov_ident.effects import Acting, compiled
 from rov_ident.errors import UserError
@@ -26,9 +26,8 @@ from rov_ident.model import Model
 from rov_ident.records import HORIZON, VELOCITIES, over_ground, predicted
 
 KINDS = ("ls", "iv", "ml")
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 CHANNELS: dict[str, tuple[str, ...]] = {
-    **{name: (name,) for name in AXES},
+    **{name: (name,) for name in MOTIONS},
     "lateral": ("sway", "yaw"),
     "longitudinal": ("heave", "pitch"),
 }
@@ -95,7 +94,7 @@ def fit_batch(
     values, covariance = prior.mean.copy(), np.diag(prior.std**2)
     identifiable = np.zeros(len(values), dtype=bool)
     now, parts = config, []
-    for stage in settings.stages or (AXES,):
+    for stage in settings.stages or (MOTIONS,):
         found = _stage(archive, now, kind, stage, settings, notes, tell)
         if found is None:
             continue
@@ -145,7 +144,7 @@ def _stage(
     say: Say,
 ) -> _Stage | None:
     """Fit some channels; None, and a note, where there is nothing to do."""
-    free = np.array([axis in channels for axis in AXES])
+    free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
     names = tuple(n for n in config.estimate if _of_channels(_coefficient(config, n), free))
     if not names:
@@ -259,8 +258,8 @@ def _excited(
     known &= (size > _MOVES * noise)[moved_by]
     size = size[free]
     moved = ", ".join(
-        f"{axis} moves {s:.2g} {'m/s' if AXES.index(axis) < 3 else 'rad/s'}"
-        for axis, s in zip(np.array(AXES)[free], size, strict=True)
+        f"{axis} moves {s:.2g} {'m/s' if MOTIONS.index(axis) < 3 else 'rad/s'}"
+        for axis, s in zip(np.array(MOTIONS)[free], size, strict=True)
     )
     return known, (
         "the motion does not show it: it would be known to "

@@ -14,7 +14,8 @@ import numpy as np
 
 from rov_ident import archive
 from rov_ident.bags import Bag, read_messages, select_topics
-from rov_ident.batch import AXES, predicted_information
+from rov_ident.batch import predicted_information
+from rov_ident.coefficients import MOTIONS
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.estimate import prior_of
@@ -207,7 +208,7 @@ def _frames(streams: Streams, config: Config) -> list[Remark]:
             )
             remarks.append(Remark("imu axes", BAD, text))
         gyro = _at(streams.t, streams.imu_t, streams.gyro @ mounting.T)
-        remarks += _signs("gyro against odometry", gyro, streams.nu[:, 3:], AXES[3:], 0.7)
+        remarks += _signs("gyro against odometry", gyro, streams.nu[:, 3:], MOTIONS[3:], 0.7)
     if streams.has_pose:
         step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
         moved = streams.position[step:] - streams.position[:-step]
@@ -247,9 +248,9 @@ def _push(driven: Array, wrench: Array, left: Array) -> Remark:
     for i in np.flatnonzero(driven):
         c = float(np.corrcoef(wrench[:, i], wrench[:, i] - left[:, i])[0, 1])
         if c < -0.3:
-            bad.append(AXES[i])
+            bad.append(MOTIONS[i])
         elif c < 0.5:
-            weak.append(f"{AXES[i]} ({c:.2f})")
+            weak.append(f"{MOTIONS[i]} ({c:.2f})")
     subject = "wrench against motion"
     if bad:
         text = f"the vehicle moves against the wrench in {', '.join(bad)}: check its sign and axes"
@@ -350,7 +351,7 @@ def _excitation(streams: Streams, config: Config, found: Sequence[Prospect]) -> 
     nu = streams.nu
     wrench = streams.demand
     limits = authority(config.dynamics)
-    for i, axis in enumerate(AXES):
+    for i, axis in enumerate(MOTIONS):
         unit, force = ("m/s", "N") if i < 3 else ("rad/s", "N m")
         low, high = np.quantile(nu[:, i], [0.02, 0.98])
         driven = float(np.sqrt(np.mean(wrench[:, i] ** 2)))

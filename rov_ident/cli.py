@@ -20,7 +20,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from rov_ident import config as configuration
-from rov_ident.coefficients import catalogue, fin_catalogue
+from rov_ident.coefficients import MOTIONS, catalogue, fin_catalogue
 from rov_ident.errors import UserError
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ OUT = Console(highlight=False, soft_wrap=True)
 LIVE = ("rls", "ukf")
 BATCH = ("ls", "iv", "ml")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
-CHANNELS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 PAIRS = {"lateral": ("sway", "yaw"), "longitudinal": ("heave", "pitch")}
 
 
@@ -368,10 +367,10 @@ def _count(text: str) -> int:
 
 def _channels(text: str) -> "np.ndarray":
     names = [axis for name in text.split(",") for axis in PAIRS.get(name, (name,))]
-    if unknown := set(names) - set(CHANNELS):
-        known = ",".join((*CHANNELS, *PAIRS))
+    if unknown := set(names) - set(MOTIONS):
+        known = ",".join((*MOTIONS, *PAIRS))
         raise argparse.ArgumentTypeError(f"no channel {min(unknown)!r}: use {known}")
-    return np.array([name in names for name in CHANNELS])
+    return np.array([name in names for name in MOTIONS])
 
 
 def _positive(text: str) -> float:
@@ -443,7 +442,7 @@ def _fit(options: argparse.Namespace) -> None:
                 )
             )  # fmt: skip
             stages = tuple(
-                tuple(name for name, use in zip(CHANNELS, marks) if use)
+                tuple(name for name, use in zip(MOTIONS, marks) if use)
                 for marks in options.channels or ()
             )
             settings = Settings(

@@ -34,6 +34,7 @@ from rov_ident.errors import UserError
 
 AXES = "XYZKMN"
 VELOCITIES = "uvwpqr"
+MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 LINEAR = slice(0, 3)
 ANGULAR = slice(3, 6)
 

@@ -26,7 +26,7 @@ from rov_ident.effects import EFFECTS, estimable, rigid_body
 from rov_ident.errors import UserError
 from rov_ident.frames import FrameDefaults, to_core
 from rov_ident.messages import Wrench
-from rov_ident.model import Array, Model, RigidBody, build
+from rov_ident.model import GRAVITY, Array, Model, RigidBody, build
 
 T = TypeVar("T")
 Vector = tuple[float, ...]
@@ -283,7 +283,7 @@ class Config:
         "coefficients to estimate, and parameters of effects such as thruster_lag.time_constant; "
         "empty: all, of effects what is there from the start and not at its null",
     )
-    gravity: float = option(9.81, "acceleration of free fall", "m/s2", lower=9.7, upper=9.9)
+    gravity: float = option(GRAVITY, "acceleration of free fall", "m/s2", lower=9.7, upper=9.9)
     prior: Prior = Prior()
     frames: Frames = Frames()
     topics: Topics = Topics()

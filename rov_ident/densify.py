@@ -20,6 +20,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from rov_ident.errors import UserError
+from rov_ident.frames import wrap_angle
 from rov_ident.messages import Array
 
 METHODS = ("none", "spline", "spiral")
@@ -59,8 +60,7 @@ def spiral(t: Array, heading: Array, at: Array, scale: float = 1.0) -> Array:
     for i in range(len(t) - 1):
         dt, dy = t[i + 1] - t[i], scale * (heading[i + 1] - heading[i])
         chord = np.arctan2(dy, dt)
-        turn = chord - direction  # both within (-pi, pi), mostly within half of that
-        turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
+        turn = wrap_angle(chord - direction)
         inside = rows == i
         if inside.any():
             share = np.linspace(0.0, 1.0, _FINE)  # theta / theta_e

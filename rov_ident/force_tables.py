@@ -30,7 +30,7 @@ from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.fins import CROSS, Tail, X
 from rov_ident.messages import Array
-from rov_ident.model import Model, build
+from rov_ident.model import Model, build, coriolis
 from rov_ident.tables import CsvTable, read_csv
 
 _FIN_COLUMNS = {
@@ -416,22 +416,15 @@ def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit
     UserError
         If an axis has too few conditions for any structure.
     """
-    coriolis = np.zeros_like(table.nu)
+    munk = np.zeros_like(table.nu)  # C_A(nu) nu
     if added_mass is not None:
-        coriolis = np.array([_coriolis(added_mass, nu) for nu in table.nu])
+        momentum = table.nu @ added_mass.added_mass
+        munk = np.array([coriolis(*row) for row in zip(momentum, table.nu, strict=True)])
     fits = {}
     for axis, force in table.forces.items():
         # M nu_dot + C nu = d + ...: measured is d - C_A nu.
-        fits[axis] = fit_axis(axis, table.nu, table.fins, force + coriolis[:, AXES.index(axis)])
+        fits[axis] = fit_axis(axis, table.nu, table.fins, force + munk[:, AXES.index(axis)])
     return fits
-
-
-def _coriolis(model: Model, nu: Array) -> Array:
-    """C_A(nu) nu (6,) of the added mass alone."""
-    p = model.added_mass @ nu
-    force = np.cross(nu[3:], p[:3])
-    moment = np.cross(nu[3:], p[3:]) + np.cross(nu[:3], p[:3])
-    return np.concatenate([force, moment])
 
 
 def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> AxisFit:

@@ -43,6 +43,9 @@ from rov_ident.jit import inlined, kernel
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+GRAVITY = 9.81
+"""m/s2, where nothing else is said."""
+
 
 class Structure(NamedTuple):
     """Which coefficients a model has, as tables the kernels loop over.

@@ -14,7 +14,7 @@ from rov_ident.config import Config
 from rov_ident.effects import compiled
 from rov_ident.errors import UserError
 from rov_ident.excitation import WORKING_SPEED, authority
-from rov_ident.frames import quaternion_to_matrix
+from rov_ident.frames import quaternion_to_matrix, wrap_angle
 from rov_ident.model import Array
 from rov_ident.sensors import Dive, Suite, measure
 from rov_ident.simulate import simulate
@@ -117,7 +117,7 @@ def fly(config: Config, swing: Swing, duration: float, limits: Limits) -> Flown:
         target = swing.target(float(t))
         off = np.zeros(6)
         off[:3] = r.T @ (target[:3] - position)
-        off[5] = (target[3] - heading + np.pi) % (2.0 * np.pi) - np.pi
+        off[5] = wrap_angle(target[3] - heading)
         wrench = gain * off - damping * nu - model.body.restoring @ r[2]
         wrench[3:5] = bound[3:5] * np.array(swing.torque) * waves[:, k]
         demand[k] = np.clip(wrench, -bound, bound)

@@ -6,8 +6,7 @@ a small ROV carries has little beside the vehicle and its added mass.
 
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.jit import kernel
-
-GRAVITY = 9.81  # m/s2
+from rov_ident.model import GRAVITY
 
 
 @kernel

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rov_ident.coefficients import AXES, VELOCITIES, Coefficient, parse
+from rov_ident.coefficients import AXES, VELOCITIES, Coefficient
 from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
 
@@ -70,8 +70,3 @@ def not_zero(names: Iterable[str], numbers: Iterable[float]) -> dict[str, float]
 def plain(vector: Any) -> list[float]:
     """A list of floats, without negative zeros."""
     return [float(x) for x in np.asarray(vector, dtype=float) + 0.0]
-
-
-def place(name: str) -> tuple[int, ...]:
-    """Equal for two names of one term."""
-    return parse(name).place

@@ -20,15 +20,18 @@ from rov_ident.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficie
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.formats.base import Read, Written, lost_effects, plain, values_of
-from rov_ident.frames import FLIP_BODY, FLIP_WORLD
+from rov_ident.frames import (
+    FLIP_BODY,
+    FLIP_WORLD,
+    quaternion_from_euler,
+    quaternion_to_matrix,
+)
+from rov_ident.model import GRAVITY
 
 SUFFIX = ".sdf"
 
 DENSITY = 1000.0
 """kg/m3, what the Buoyancy plugin assumes unless told otherwise."""
-
-GRAVITY = 9.81
-"""m/s2, for reading: Gazebo's weight is mass times the gravity of the world."""
 
 _FLIP = np.tile(FLIP_BODY, 2)
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
@@ -80,13 +83,13 @@ def write(config: Config) -> Written:
     if current := config.effects.get("ocean_current"):
         ned = np.array([current[axis] for axis in ("north", "east", "down")])
         _text(plugin, "default_current", plain(FLIP_WORLD @ ned))
-    one_sided = []
+    values, one_sided = values_of(config), []
     for c in model.coefficients:
         if c.is_one_sided:
             one_sided.append(c.name)
         elif not c.is_added_mass:
             tag, sign = _damping_tag(c)
-            _text(plugin, tag, plain([sign * values_of(config)[c.name]]))
+            _text(plugin, tag, plain([sign * values[c.name]]))
     if one_sided:
         lost.append(f"the coefficients {', '.join(one_sided)}: its damping knows no direction")
 
@@ -288,6 +291,4 @@ def _numbers(parent: ET.Element, path: str, default: list[float] | None = None) 
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    from rov_ident.frames import quaternion_from_euler, quaternion_to_matrix
-
     return quaternion_to_matrix(quaternion_from_euler(roll, pitch, yaw))
