@@ -33,8 +33,26 @@ for _ in range(os.getpid() % 90):
     next(_DOMAINS)
 
 
+@pytest.fixture(scope="session")
+def compiled():
+    """All that a node runs is compiled, once for all workers.
+
+    How long that takes depends on what else the computer does: no test of a node should wait for it.
+    """
+    import numba
+
+    from rov_ident import watch
+    from rov_ident.nodes.estimator_node import warm_up
+
+    with open(Path(numba.config.CACHE_DIR) / "lock", "a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for estimator in ("rls", "ukf"):
+            warm_up(config.load(HEAVY), estimator)
+        watch.compile_all()
+
+
 @pytest.fixture
-def domain(monkeypatch):
+def domain(monkeypatch, compiled):
     """A DDS domain that no other test of this computer uses, closed to the network."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     for number in _DOMAINS:  # a new one each time: the last test's may not have gone yet
@@ -165,7 +183,7 @@ def live(domain):
         process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
         vehicle = Vehicle(estimator, **kwargs)
         started.append((process, vehicle))
-        vehicle.until(vehicle.connected, 120.0)  # it may have to compile
+        vehicle.until(vehicle.connected)
         vehicle.diagnostics.clear()
         return vehicle
 

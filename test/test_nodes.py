@@ -247,7 +247,7 @@ def test_terminate(domain, heavy_path):
     """SIGTERM, too, is a way to end well; with parting words."""
     process = start_node("rls", heavy_path)
     vehicle = Vehicle()
-    vehicle.until(vehicle.connected, 120.0)
+    vehicle.until(vehicle.connected)
     vehicle.close()
     status, said = end_node(process, signal.SIGTERM)
     assert status == 0, said

@@ -243,7 +243,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
         if not watch.is_compiled():
             self._compiling = subprocess.Popen([sys.executable, "-m", watch.__name__])
-            self._compiling.wait()
+            if self._compiling.wait():
+                return  # we are leaving, or have no memory for it: estimating goes on without
         watch.compile_all()
         self._online.show(watch.Watcher(self._config, self._when_idle))
 
