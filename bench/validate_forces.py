@@ -87,11 +87,11 @@ def round_trip() -> None:
                     kept = {k: v[rest] for k, v in fins.items()}
                     fit = force_tables.fit_axis(axis, nu[rest], kept, force[rest])
                     tried += 1
-                    right += set(fit.terms) == set(truth)
-                    extra += len(set(fit.terms) - set(truth))
-                    missing += len(set(truth) - set(fit.terms))
-                    for name, value, half in zip(fit.terms, fit.values, fit.half):
-                        if name in truth and set(fit.terms) == set(truth):
+                    right += set(fit.names) == set(truth)
+                    extra += len(set(fit.names) - set(truth))
+                    missing += len(set(truth) - set(fit.names))
+                    for name, value, half in zip(fit.names, fit.values, fit.quantile * fit.std):
+                        if name in truth and set(fit.names) == set(truth):
                             inside.append(abs(value - truth[name]) <= half)
                             errors.append(abs(value / truth[name] - 1.0))
             rows.append([what, f"{noise:.0%}", f"{right} of {tried}", str(extra), str(missing),
@@ -110,7 +110,9 @@ def captive() -> None:
     read = force_tables.read_table(CAPTIVE, columns, {"rho": 1000.0, "L": 7.0})
     rows = []
     for axis, f in force_tables.fit(read).items():
-        values = ", ".join(f"{n} = {v:.4g} ± {h:.2g}" for n, v, h in zip(f.terms, f.values, f.half))
+        values = ", ".join(
+            f"{n} = {v:.4g} ± {h:.2g}" for n, v, h in zip(f.names, f.values, f.quantile * f.std)
+        )
         best = f.candidates[0]
         rows.append([axis, values, f"{f.cv_rmse:.3g}", f"{best.cv_rmse:.3g} ({len(best.terms)})",
                      f"{f.r2:.4f}"])  # fmt: skip
@@ -143,8 +145,8 @@ def vehicle() -> None:
     rows = []
     for axis, f in fits.items():
         cells = [f"{n} {v:.4g} ± {h:.2g} ({known.get(n, 0.0):g})"
-                 for n, v, h in zip(f.terms, f.values, f.half)]  # fmt: skip
-        hidden = [n for n in known if n[0] == axis and n in f.pool and n not in f.terms]
+                 for n, v, h in zip(f.names, f.values, f.quantile * f.std)]  # fmt: skip
+        hidden = [n for n in known if n[0] == axis and n in f.pool and n not in f.names]
         rows.append([axis, ", ".join(cells), ", ".join(f"{n} ({known[n]:g})" for n in hidden)])
     head = ["axis", "found ± half of the interval (true)", "not found (true)"]
     table("REMUS 100 from its own table, 2 % noise, added mass known", head, rows)

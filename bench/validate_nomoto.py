@@ -52,8 +52,7 @@ def noisy(run: Zigzag, degrees: float, seed: int) -> Zigzag:
 
 
 def k_and_t(model: Nomoto) -> tuple[float, float]:
-    values = model.parameters()
-    return values["K"][0], values["T"][0]
+    return model.value("K"), model.value("T")
 
 
 def errors(model: Nomoto, truth: Nomoto) -> tuple[float, float]:

@@ -7,7 +7,6 @@ motion does not show is refused, with the reason (Zhao et al. 2018).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from rov_ident.fit import IDENTIFIABLE, Fit
 from rov_ident.messages import Array
 from rov_ident.model import Model
 from rov_ident.records import HORIZON, VELOCITIES, over_ground, predicted
+from rov_ident.result import provenance
 
 KINDS = ("ls", "iv", "ml")
 CHANNELS: dict[str, tuple[str, ...]] = {
@@ -114,23 +114,19 @@ def fit_batch(
     more |= parts[0] if len(parts) == 1 and not settings.stages else {"stages": parts}
     more.pop("channels", None)
     return Fit(
-        kind,
-        prior.names,
-        prior.units,
-        values,
-        covariance,
-        tuple(bool(i) for i in identifiable),
-        now.model,
-        archive.samples,
-        archive.duration,
-        after,
-        {
-            "version": version("rov_ident"),
-            "vehicle": config.name,
-            "bags": [{"file": b.path.name, "sha256": b.sha256} for b in archive.bags],
-        },
-        tuple(notes),
-        more,
+        estimator=kind,
+        names=prior.names,
+        units=prior.units,
+        values=values,
+        covariance=covariance,
+        identifiable=tuple(bool(i) for i in identifiable),
+        model=now.model,
+        samples=archive.samples,
+        duration=archive.duration,
+        rmse=after,
+        provenance=provenance(((b.path.name, b.sha256) for b in archive.bags), vehicle=config.name),
+        notes=tuple(notes),
+        more=more,
     )
 
 

@@ -26,6 +26,7 @@ from rov_ident.errors import UserError
 if TYPE_CHECKING:
     from rov_ident.explain_report import Source
     from rov_ident.records import Record
+    from rov_ident.result import Result
     from rov_ident.streams import Streams
 
 ERR = Console(stderr=True, highlight=False)
@@ -465,15 +466,10 @@ def _fit(options: argparse.Namespace) -> None:
             comment=f"Fitted by rov-ident fit --estimator {options.estimator} to {bags_read}.",
         )
 
-    table = _table(
-        f"{options.estimator}: {fit.samples} samples, {fit.duration:.1f} s",
-        "value", "std", "unit", "configured", "identifiable",
-    )  # fmt: skip
-    for row in zip(fit.names, fit.values, fit.std, fit.units, fit.identifiable):
-        before = config.value(row[0])
-        yes = "yes" if row[4] else "no: the prior decides"
-        table.add_row(row[0], f"{row[1]:.5g}", f"{row[2]:.2g}", row[3], f"{before:.5g}", yes)
-    OUT.print(table)
+    title = f"{options.estimator}: {fit.samples} samples, {fit.duration:.1f} s"
+    configured = [f"{config.value(name):.5g}" for name in fit.names]
+    known = ["yes" if i else "no: the prior decides" for i in fit.identifiable]
+    OUT.print(_numbers(title, fit, configured=configured, identifiable=known))
     for note in () if live else fit.notes:
         ERR.print(note, markup=False, soft_wrap=True)
 
@@ -773,12 +769,7 @@ def _nomoto(options: argparse.Namespace) -> None:
 
         others = nomoto.others(model, runs, options.interpolate, options.step)
         write_text(options.report, table_reports.steering(model, runs, judge, others))
-    table = _table(
-        f"Nomoto's model of order {model.order}, by {model.method}", "value", "std", "unit"
-    )
-    for name, (value, std, unit) in model.parameters().items():
-        table.add_row(name, f"{value:.5g}", f"{std:.2g}", unit)
-    OUT.print(table)
+    OUT.print(_numbers(f"Nomoto's model of order {model.order}, by {model.estimator}", model))
     OUT.print(f"heading RMSE {model.rmse:.4g} rad ({math.degrees(model.rmse):.3g} deg)")
     if judge and validation is not None:
         OUT.print(
@@ -823,10 +814,7 @@ def _forces(options: argparse.Namespace) -> None:
             new, options.out, f"Coefficients from {options.table.name} by rov-ident forces."
         )
     for axis, f in fits.items():
-        table_ = _table(f"{axis}: R2 {f.r2:.4f}", "value", "std", "unit")
-        for name, value, std in zip(f.terms, f.values, f.std):
-            table_.add_row(name, f"{value:.5g}", f"{std:.2g}", force_tables.unit(name))
-        OUT.print(table_)
+        OUT.print(_numbers(f"{axis}: R2 {f.r2:.4f}", f))
         OUT.print(f"{axis}: {f.why}\n", markup=False)
     for note in notes:
         ERR.print(note, markup=False, soft_wrap=True)
@@ -863,6 +851,15 @@ def _coefficients(options: argparse.Namespace) -> None:
     entries += [(c.name, c.unit, c.meaning) for c in fin_catalogue()]
     for name, unit, meaning in entries:
         OUT.print(f"{name:<10} {unit:<18} {meaning}", markup=False)
+
+
+def _numbers(title: str, result: "Result", **more: Sequence[str]) -> Table:
+    """The numbers of a result, with further columns of text (n,)."""
+    table = _table(title, "value", "std", "unit", *more)
+    for i, name in enumerate(result.names):
+        value, std = f"{result.values[i]:.5g}", f"{result.std[i]:.2g}"
+        table.add_row(name, value, std, result.units[i], *(column[i] for column in more.values()))
+    return table
 
 
 def _table(title: str, *columns: str) -> Table:

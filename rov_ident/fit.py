@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,56 +19,33 @@ from rov_ident.messages import Array
 from rov_ident.model import Model
 from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator
 from rov_ident.records import HORIZON, VELOCITIES, Record, score
+from rov_ident.result import Result, provenance
 from rov_ident.samples import Sampler
 
 IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Coefficients identified from records, whatever the estimator.
+@dataclass(frozen=True, kw_only=True)
+class Fit(Result):
+    """Coefficients identified from dives.
 
-    Arrays are (n,) in the order of ``names``; covariance (n, n). ``identifiable`` tells where the
-    data and not the prior made the value. ``rmse`` (6,) is of open-loop windows of HORIZON seconds.
+    ``identifiable`` (n,) tells where the data and not the prior made the value; ``rmse`` (6,) is of
+    open-loop windows of HORIZON seconds.
     """
 
-    estimator: str
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: Array
-    covariance: Array
     identifiable: tuple[bool, ...]
     model: Model
     samples: int
     duration: float
     rmse: Array
-    provenance: dict[str, Any]
-    notes: tuple[str, ...] = ()
     more: dict[str, Any] = field(default_factory=dict)
     """Further parts of the JSON that only some estimators have."""
 
-    @property
-    def std(self) -> Array:
-        return np.sqrt(np.diag(self.covariance))
-
     def to_json(self) -> str:
         """The machine-readable result; numbers that do not exist are null."""
-        coefficients = {
-            name: {
-                "value": value,
-                "std": std,
-                "unit": unit,
-                "identifiable": identifiable,
-            }
-            for name, value, std, unit, identifiable in zip(
-                self.names,
-                self.values.tolist(),
-                self.std.tolist(),
-                self.units,
-                self.identifiable,
-                strict=True,
-            )
-        }
+        coefficients = self.entries()
+        for entry, identifiable in zip(coefficients.values(), self.identifiable, strict=True):
+            entry["identifiable"] = identifiable
         rmse = {
             name: value if math.isfinite(value) else None
             for name, value in zip(VELOCITIES, self.rmse.tolist(), strict=True)
@@ -117,21 +93,17 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     scores = [score(moves, record.samples, effects=effects) for record in records]
     squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
     return Fit(
-        kind,
-        report.names,
-        report.units,
-        report.values,
-        report.covariance,
-        tuple(bool(r > IDENTIFIABLE) for r in removed),
-        model,
-        samples,
-        sum(record.duration for record in records),
-        np.sqrt(np.sum(squares, axis=0) / samples),
-        {
-            "version": version("rov_ident"),
-            "vehicle": config.name,
-            "bags": [{"file": r.path.name, "sha256": r.sha256} for r in records],
-        },
+        estimator=kind,
+        names=report.names,
+        units=report.units,
+        values=report.values,
+        covariance=report.covariance,
+        identifiable=tuple(bool(r > IDENTIFIABLE) for r in removed),
+        model=model,
+        samples=samples,
+        duration=sum(record.duration for record in records),
+        rmse=np.sqrt(np.sum(squares, axis=0) / samples),
+        provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
     )
 
 

@@ -10,7 +10,7 @@ from rov_ident.config import Config
 from rov_ident.fit import Fit
 from rov_ident.messages import Array
 from rov_ident.records import HORIZON, VELOCITIES
-from rov_ident.report import bullets, heading, legend, panels, paragraph, table
+from rov_ident.report import bullets, heading, legend, origin, panels, paragraph, table
 from rov_ident.report import page as document
 
 _BEFORE, _AFTER = "as configured", "retuned"
@@ -54,11 +54,7 @@ def page(fit: Fit, config: Config, drawn: Sequence[Curves]) -> str:
         f"{_TITLES[fit.estimator].capitalize()} on {len(drawn)} bag{'s' * (len(drawn) != 1)}, "
         f"{fit.duration:.0f} s."
     )
-    made = fit.provenance
-    footer = f"rov_ident {made['version']}; " + ", ".join(
-        f"{b['file']} {b['sha256'][:12]}" for b in made["bags"]
-    )
-    return document(f"Fit of {config.name}", lead, sections, footer)
+    return document(f"Fit of {config.name}", lead, sections, origin(fit))
 
 
 def _rmse(errors: Sequence[Array]) -> Array:

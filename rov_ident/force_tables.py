@@ -19,7 +19,7 @@ before the fit.
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ from rov_ident.errors import UserError
 from rov_ident.fins import CROSS, Tail, X
 from rov_ident.messages import Array
 from rov_ident.model import Model, build, coriolis
+from rov_ident.result import Result, provenance
 from rov_ident.tables import CsvTable, read_csv
 
 _FIN_COLUMNS = {
@@ -61,6 +62,7 @@ class ForceTable:
     fins: Mapping[str, Array]
     forces: Mapping[str, Array]
     notes: tuple[str, ...] = ()
+    sha256: str = ""
 
 
 @dataclass(frozen=True)
@@ -71,15 +73,11 @@ class Candidate:
     cv_rmse: float
 
 
-@dataclass(frozen=True)
-class AxisFit:
-    """The structure chosen on an axis: values, covariance, 95 % half-widths, and why this one."""
+@dataclass(frozen=True, kw_only=True)
+class AxisFit(Result):
+    """The structure chosen on an axis, its values, and why this one."""
 
     axis: str
-    terms: tuple[str, ...]
-    values: Array
-    covariance: Array
-    half: Array
     cv_rmse: float
     rmse: float
     r2: float
@@ -89,10 +87,6 @@ class AxisFit:
     aliases: Mapping[str, str] = field(default_factory=dict)
     measured: Array = field(default_factory=lambda: np.zeros(0))
     fitted: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def std(self) -> Array:
-        return np.sqrt(np.diag(self.covariance))
 
 
 # ------------------------------------------------------------------ reading
@@ -160,7 +154,7 @@ def read_table(
     if drift == "auto" and reader.has_flow:
         nu = _as_a_hull_resists(nu, forces, notes)
     reader.refuse_unknown_angles()
-    return ForceTable(path.name, nu, fins, forces, tuple(notes))
+    return ForceTable(path.name, nu, fins, forces, tuple(notes), table.sha256)
 
 
 class _Reader:
@@ -423,7 +417,8 @@ def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit
     fits = {}
     for axis, force in table.forces.items():
         # M nu_dot + C nu = d + ...: measured is d - C_A nu.
-        fits[axis] = fit_axis(axis, table.nu, table.fins, force + munk[:, AXES.index(axis)])
+        found = fit_axis(axis, table.nu, table.fins, force + munk[:, AXES.index(axis)])
+        fits[axis] = replace(found, provenance=provenance([(table.name, table.sha256)]))
     return fits
 
 
@@ -446,7 +441,7 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     best = min(path, key=lambda s: float(np.mean(errors[s] ** 2)))
     chosen, why = _smallest(path, errors, best, names)
     x = scaled[:, chosen]
-    values, covariance, half = _solve(x, force)
+    values, covariance, quantile = _solve(x, force)
     scale = size[list(chosen)]
     fitted = x @ values
     spread = float(np.sum((force - force.mean()) ** 2))
@@ -455,21 +450,24 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
         Candidate(tuple(names[i] for i in s), _rms(errors[s]))
         for s in sorted({*shown, chosen}, key=lambda s: _rms(errors[s]))
     )
+    terms = tuple(names[i] for i in chosen)
     return AxisFit(
-        axis,
-        tuple(names[i] for i in chosen),
-        values / scale,
-        covariance / np.outer(scale, scale),
-        half / scale,
-        _rms(errors[chosen]),
-        _rms(force - fitted),
-        1.0 - float(np.sum((force - fitted) ** 2)) / max(spread, 1e-300),
-        candidates,
-        why,
-        tuple(names),
-        {a: b for a, b in aliases.items() if b in {names[i] for i in chosen}},
-        force,
-        fitted,
+        estimator="ls",
+        names=terms,
+        units=tuple(unit(name) for name in terms),
+        values=values / scale,
+        covariance=covariance / np.outer(scale, scale),
+        quantile=quantile,
+        axis=axis,
+        cv_rmse=_rms(errors[chosen]),
+        rmse=_rms(force - fitted),
+        r2=1.0 - float(np.sum((force - fitted) ** 2)) / max(spread, 1e-300),
+        candidates=candidates,
+        why=why,
+        pool=tuple(names),
+        aliases={a: b for a, b in aliases.items() if b in terms},
+        measured=force,
+        fitted=fitted,
     )
 
 
@@ -586,14 +584,14 @@ def _smallest(
     return chosen, words
 
 
-def _solve(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Values, HC3 covariance, half-widths of the 95 % intervals."""
+def _solve(x: Array, y: Array) -> tuple[Array, Array, float]:
+    """Values, HC3 covariance, and how many standard deviations half a 95 % interval is."""
     values = np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=np.float64)
     left = _left_out(x, y)
     inverse = np.linalg.pinv(x.T @ x)
     covariance = inverse @ (x.T * left**2) @ x @ inverse
     freedom = max(len(y) - x.shape[1], 1)
-    return values, covariance, float(stats.t.ppf(0.975, freedom)) * np.sqrt(np.diag(covariance))
+    return values, covariance, float(stats.t.ppf(0.975, freedom))
 
 
 def _rms(error: Array) -> float:
@@ -608,16 +606,7 @@ def to_json(fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
     axes = {}
     for axis, f in fits.items():
         axes[axis] = {
-            "terms": {
-                name: {
-                    "value": float(value),
-                    "std": float(std),
-                    "unit": unit(name),
-                    "lower": float(value - half),
-                    "upper": float(value + half),
-                }
-                for name, value, std, half in zip(f.terms, f.values, f.std, f.half)
-            },
+            "terms": f.entries(),
             "cv_rmse": f.cv_rmse,
             "rmse": f.rmse,
             "r2": f.r2,
@@ -635,7 +624,7 @@ def remarks(fits: Mapping[str, AxisFit], with_config: bool) -> list[str]:
         if f.aliases:
             pairs = ", ".join(f"{a} for {b}" for a, b in f.aliases.items())
             out.append(f"{axis}: this table would be fitted as well with {pairs}")
-        if f"{axis}_0" in f.terms:
+        if f"{axis}_0" in f.names:
             out.append(
                 f"{axis}_0 is a constant (propeller, asymmetry or an offset of the balance): it is "
                 "no coefficient of the hull and is not written to a configuration"
@@ -675,5 +664,5 @@ def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
     for f in fits.values():
         for name in (*f.pool, *f.aliases):
             values.pop(name, None)
-        values |= {n: float(x) for n, x in zip(f.terms, f.values) if not n.endswith("_0")}
+        values |= {n: float(x) for n, x in zip(f.names, f.values) if not n.endswith("_0")}
     return config.with_model(build(config.model.body, values))

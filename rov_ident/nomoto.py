@@ -33,6 +33,7 @@ from rov_ident.errors import UserError
 from rov_ident.jit import kernel
 from rov_ident.messages import Array
 from rov_ident.model import Model
+from rov_ident.result import Result, provenance
 from rov_ident.zigzag import Zigzag
 
 METHODS = ("oe", "fd", "iv", "rls")
@@ -42,64 +43,71 @@ _DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
 _MIN_SAMPLES = 20
 
 
-@dataclass(frozen=True)
-class Nomoto:
-    """A fitted model: ``theta`` in the order of ``names``, its covariance, and how it was got.
+@dataclass(frozen=True, kw_only=True)
+class Nomoto(Result):
+    """A fitted model. Its numbers are K, T (and T1 T2 T3, n3, delta_0); T1 and T2 are left out
+    where they are complex.
 
-    names: order 1 ``a0 b0 [c] delta_0``, order 2 ``a0 a1 b0 b1 [c] delta_0``; see the head of the
-    module.
+    ``theta`` (n,) is what was fitted: order 1 ``a0 b0 [c] delta_0``, order 2 ``a0 a1 b0 b1 [c]
+    delta_0``, see the head of the module. ``unit`` is that of the input.
     """
 
     order: int
     nonlinear: bool
-    method: str
     theta: Array
-    covariance: Array
     unit: str
-    rmse: float
-    notes: tuple[str, ...] = ()
-    histories: Array | None = None  # (k, len(names)) of the recursive estimator
+    rmse: float  # rad, of the heading
+    histories: Array | None = None  # (k, n) of theta, of the recursive estimator
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return _names(self.order, self.nonlinear)
 
-    def parameters(self) -> dict[str, tuple[float, float, str]]:
-        """K, T (and T1 T2 T3, n3, delta_0): value, standard deviation, unit.
+def _model(
+    order: int, nonlinear: bool, estimator: str, theta: Array, covariance: Array, unit: str,
+    rmse: float, histories: Array | None = None,
+) -> Nomoto:  # fmt: skip
+    """The result that theta (n,) with its covariance (n, n) makes, by linear propagation."""
+    functions = {
+        name: (function, of)
+        for name, (function, of) in _functions(order, nonlinear, unit).items()
+        if np.isfinite(function(theta))
+    }
+    slopes = np.array([_gradient(function, theta) for function, _ in functions.values()])
+    return Nomoto(
+        estimator=estimator,
+        names=tuple(functions),
+        units=tuple(of for _, of in functions.values()),
+        values=np.array([function(theta) for function, _ in functions.values()]),
+        covariance=slopes @ covariance @ slopes.T,
+        order=order,
+        nonlinear=nonlinear,
+        theta=theta,
+        unit=unit,
+        rmse=rmse,
+        histories=histories,
+    )
 
-        Standard deviations by linear propagation. T1 and T2 are left out where they are complex.
-        """
-        rate = "1/s" if self.unit == "rad" else "rad/(s N m)"
-        values: dict[str, tuple[float, float, str]] = {}
-        for name, (function, unit) in self._functions(rate).items():
-            value = function(self.theta)
-            if not np.isfinite(value):
-                continue
-            gradient = _gradient(function, self.theta)
-            std = math.sqrt(max(float(gradient @ self.covariance @ gradient), 0.0))
-            values[name] = (float(value), std, unit)
-        return values
 
-    def _functions(self, rate: str) -> dict[str, tuple[Callable[[Array], float], str]]:
-        n = self.names
-        b0, off = n.index("b0"), n.index("delta_0")
-        found: dict[str, tuple[Callable[[Array], float], str]] = {
-            "K": (lambda x: x[b0] / x[0], rate)
-        }
-        if self.order == 1:
-            found["T"] = (lambda x: 1.0 / x[0], "s")
-        else:
-            found["T"] = (lambda x: x[1] / x[0] - x[3] / x[b0], "s")
-            found["T1"] = (lambda x: _root(x[0], x[1], 1.0), "s")
-            found["T2"] = (lambda x: _root(x[0], x[1], -1.0), "s")
-            found["T3"] = (lambda x: x[3] / x[b0], "s")
-            found["T1T2"] = (lambda x: 1.0 / x[0], "s2")
-            found["T1_plus_T2"] = (lambda x: x[1] / x[0], "s")
-        if self.nonlinear:
-            c = n.index("c")
-            found["n3"] = (lambda x: x[c] / x[0], "s2/rad2")
-        found["delta_0"] = (lambda x: x[off], self.unit)
-        return found
+def _functions(
+    order: int, nonlinear: bool, unit: str
+) -> dict[str, tuple[Callable[[Array], float], str]]:
+    """The numbers that theta stands for, and their units."""
+    names = _names(order, nonlinear)
+    b0, off = names.index("b0"), names.index("delta_0")
+    rate = "1/s" if unit == "rad" else "rad/(s N m)"
+    found: dict[str, tuple[Callable[[Array], float], str]] = {"K": (lambda x: x[b0] / x[0], rate)}
+    if order == 1:
+        found["T"] = (lambda x: 1.0 / x[0], "s")
+    else:
+        found["T"] = (lambda x: x[1] / x[0] - x[3] / x[b0], "s")
+        found["T1"] = (lambda x: _root(x[0], x[1], 1.0), "s")
+        found["T2"] = (lambda x: _root(x[0], x[1], -1.0), "s")
+        found["T3"] = (lambda x: x[3] / x[b0], "s")
+        found["T1T2"] = (lambda x: 1.0 / x[0], "s2")
+        found["T1_plus_T2"] = (lambda x: x[1] / x[0], "s")
+    if nonlinear:
+        c = names.index("c")
+        found["n3"] = (lambda x: x[c] / x[0], "s2/rad2")
+    found["delta_0"] = (lambda x: x[off], unit)
+    return found
 
 
 def _root(a0: float, a1: float, sign: float) -> float:
@@ -124,17 +132,14 @@ def _names(order: int, nonlinear: bool) -> tuple[str, ...]:
 
 def to_json(model: Nomoto, validation: float | None = None) -> str:
     """The result as JSON; ``validation`` is the heading RMSE [rad] on another run."""
-    values = {
-        name: {"value": value, "std": std, "unit": unit}
-        for name, (value, std, unit) in model.parameters().items()
-    }
     document: dict[str, object] = {
         "order": model.order,
-        **values,
+        **model.entries(),
         "heading_rmse_rad": model.rmse,
         "nonlinear": model.nonlinear,
-        "method": model.method,
+        "method": model.estimator,
         "notes": list(model.notes),
+        "provenance": model.provenance,
     }
     if validation is not None:
         document["validation"] = {"heading_rmse_rad": validation}
@@ -350,9 +355,14 @@ def fit(
             "T is not positive: the vehicle has no course stability in this model; K and T then "
             "describe the slope of an unstable balance"
         )
-    elif order == 2 and "T1" not in model.parameters():
+    elif order == 2 and "T1" not in model.names:
         notes.append("T1 and T2 are complex: only T1T2 and T1_plus_T2 are given")
-    return dataclasses.replace(model, rmse=_rmse(measured), notes=tuple(notes))
+    return dataclasses.replace(
+        model,
+        rmse=_rmse(measured),
+        notes=tuple(notes),
+        provenance=provenance((run.name, run.sha256) for run in runs),
+    )
 
 
 def others(
@@ -361,7 +371,7 @@ def others(
     """The same model by every other method that succeeds, by name."""
     found = {}
     for method in METHODS:
-        if method == model.method:
+        if method == model.estimator:
             continue
         try:
             found[method] = fit(runs, model.order, model.nonlinear, method, interpolate, step)
@@ -390,7 +400,7 @@ def of_model(model: Model, speed: float) -> Nomoto:
     g = inverse @ (model.fin_wrench(speed, {"r": 1e-6})[rows] / 1e-6)
     b0 = f[1, 0] * g[0] - f[0, 0] * g[1]
     theta = np.array([np.linalg.det(f), -np.trace(f), b0, g[1], 0.0])
-    return Nomoto(2, False, "linearised", theta, np.zeros((5, 5)), "rad", 0.0)
+    return _model(2, False, "linearised", theta, np.zeros((5, 5)), "rad", 0.0)
 
 
 def check(run: Zigzag, order: int = 1, nonlinear: bool = False) -> None:
@@ -439,7 +449,7 @@ def _output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto
     best = _descend(runs, order, nonlinear, _with_cubic(start, nonlinear), firsts)
     if order == 2:
         simple = _output_error(runs, 1, nonlinear)
-        x = dict(zip(simple.names, simple.theta))
+        x = dict(zip(_names(1, nonlinear), simple.theta))
         fast = 0.1 * abs(x["a0"]) ** -1.0
         start = np.array([x["a0"] / fast, x["a0"] + 1.0 / fast, x["b0"] / fast, 0.0, x["delta_0"]])
         start = _with_cubic(start, nonlinear, x.get("c", 0.0) / fast)
@@ -516,13 +526,13 @@ def _descend(
     )
     if not result.cost < _DIVERGED:
         zeros = np.zeros((n, n))
-        return Nomoto(order, nonlinear, "oe", start, zeros, runs[0].unit, math.inf)
+        return _model(order, nonlinear, "oe", start, zeros, runs[0].unit, math.inf)
     free = result.active_mask == 0  # a jump's instant on its bound is no free parameter
     lengths = [int(k.sum()) for k in known]
     covariance = np.zeros((len(sizes), len(sizes)))
     covariance[np.ix_(free, free)] = _robust_covariance(result.jac[:, free], result.fun, lengths)
     covariance *= np.outer(sizes, sizes)
-    return Nomoto(
+    return _model(
         order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], runs[0].unit,
         _rmse(result.fun),
     )  # fmt: skip
@@ -672,10 +682,8 @@ def _equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomot
         if history is None
         else np.array([_from_solution(row, order, nonlinear) for row in history])
     )
-    return dataclasses.replace(
-        model, method=method, theta=theta, covariance=jacobian @ covariance @ jacobian.T,
-        histories=histories,
-    )  # fmt: skip
+    covariance = jacobian @ covariance @ jacobian.T
+    return _model(order, nonlinear, method, theta, covariance, model.unit, model.rmse, histories)
 
 
 def _evenly(run: Zigzag) -> Zigzag:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
+from rov_ident.result import Result
+
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #fff; --line: #d6dae0; --soft: #5b6470;
   --panel: #f5f7f9; }
@@ -105,6 +107,23 @@ def code(text: str) -> str:
 
 def bullets(items: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
+
+
+def numbers(result: Result) -> str:
+    """The numbers of a result with their 95 % intervals."""
+    columns = (result.values, result.std, result.lower, result.upper)
+    rows = [
+        [name, f"{value:.5g}", f"{std:.2g}", f"{lower:.5g}", f"{upper:.5g}", unit]
+        for name, unit, value, std, lower, upper in zip(result.names, result.units, *columns)
+    ]
+    return table(["", "value", "std", "95 % from", "to", "unit"], rows, text=[5])
+
+
+def origin(result: Result) -> str:
+    """The foot of a page: from which version and which files."""
+    made = result.provenance
+    files = (f"{bag['file']} {bag['sha256'][:12]}" for bag in made["bags"])
+    return f"rov_ident {made['version']}; {', '.join(files)}"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], text: Sequence[int] = ()) -> str:

@@ -19,8 +19,9 @@ from scipy.optimize import least_squares
 from rov_ident.errors import UserError
 from rov_ident.jit import kernel
 from rov_ident.model import Array
+from rov_ident.result import Result
 
-_NAMES = ("k1", "k2", "X_u", "X_uu")
+_UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
 
 
 @dataclass(frozen=True)
@@ -32,13 +33,10 @@ class Run:
     u: Array
 
 
-@dataclass(frozen=True)
-class Surge:
-    """``values`` and ``std`` by name: k1 [N s], k2 [N s2] per shaft speed in 1/s or its unit, X_u
-    [N s/m], X_uu [N s2/m2], X_udot [kg]. ``rmse`` [m/s] of the simulated speed."""
+@dataclass(frozen=True, kw_only=True)
+class Surge(Result):
+    """k1 and k2 are per shaft speed in 1/s or its unit; ``rmse`` [m/s] of the simulated speed."""
 
-    values: dict[str, float]
-    std: dict[str, float]
     rmse: float
 
 
@@ -104,13 +102,16 @@ def fit_surge(
                 f"with {thrust:g} N at rest the runs make mass and added mass {inertia:.3g} kg, "
                 f"less than the mass of {mass:g} kg: check the bollard pull"
             )
-    values = dict(zip(_NAMES, (inertia * ratio).tolist(), strict=True))
-    jacobian = inertia * np.eye(4) + np.outer(ratio, slope)
-    std = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
-    spread = dict(zip(_NAMES, std.tolist(), strict=True))
-    values["X_udot"] = mass - inertia
-    spread["X_udot"] = float(np.sqrt(slope @ covariance @ slope))
-    return Surge(values, spread, float(np.sqrt(np.mean(left**2))))
+    # of the four and of X_udot = mass - inertia, by the four ratios
+    jacobian = np.vstack([inertia * np.eye(4) + np.outer(ratio, slope), -slope])
+    return Surge(
+        estimator="output error",
+        names=tuple(_UNITS),
+        units=tuple(_UNITS.values()),
+        values=np.append(inertia * ratio, mass - inertia),
+        covariance=jacobian @ covariance @ jacobian.T,
+        rmse=float(np.sqrt(np.mean(left**2))),
+    )
 
 
 def _check(runs: Sequence[Run]) -> None:

@@ -1,11 +1,10 @@
 """The pages of `nomoto` and `forces`: what was fitted, how well, and why this structure."""
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 
 import numpy as np
 
-from rov_ident import force_tables, nomoto, plots, report
+from rov_ident import nomoto, plots, report
 from rov_ident.force_tables import AxisFit
 from rov_ident.messages import Array
 from rov_ident.nomoto import Nomoto
@@ -34,21 +33,19 @@ def steering(
     """The page of a Nomoto fit; ``others`` are fits by other methods, for comparison."""
     sections = [
         report.paragraph(f"{_EQUATIONS[model.order, model.nonlinear]}, r = d(heading)/dt"),
-        report.paragraph(f"Fitted by {_METHODS[model.method]}."),
+        report.paragraph(f"Fitted by {_METHODS[model.estimator]}."),
         report.heading("Parameters"),
-        _parameters(model),
+        report.numbers(model),
     ]
     sections += [report.bullets(model.notes)] if model.notes else []
     if others:
         rows = []
-        for name, other in {model.method: model, **others}.items():
-            values = other.parameters()
-            cells = [
-                f"{values[k][0]:.4g} ± {1.96 * values[k][1]:.2g}" if k in values else ""
-                for k in ("K", "T")
-            ]
+        for name, other in {model.estimator: model, **others}.items():
+            # K and T are the first two of every model
+            pairs = list(zip(other.values, other.quantile * other.std))[:2]
+            cells = [f"{value:.4g} ± {half:.2g}" for value, half in pairs]
             rows.append([_METHODS[name], *cells, f"{np.degrees(other.rmse):.3g}"])
-        head = ["", f"K [{model.parameters()['K'][2]}]", "T [s]", "heading RMSE [deg]"]
+        head = ["", f"K [{model.units[0]}]", "T [s]", "heading RMSE [deg]"]
         sections += [report.heading("By other estimators"), report.table(head, rows)]
         sections.append(
             report.paragraph("± is half of the 95 % interval, coloured noise allowed for.")
@@ -63,15 +60,7 @@ def steering(
     if judge is not None:
         lead += f", {np.degrees(nomoto.predict(model, judge)[1]):.3g} deg on {judge.name}"
     names = ", ".join(run.name for run in runs)
-    return report.page(f"Nomoto's model from {names}", lead, sections, _footer())
-
-
-def _parameters(model: Nomoto) -> str:
-    rows = []
-    for name, (value, std, unit) in model.parameters().items():
-        ends = (f"{value + side * std:.5g}" for side in (-1.96, 1.96))
-        rows.append([name, f"{value:.5g}", f"{std:.2g}", *ends, unit])
-    return report.table(["", "value", "std", "95 % from", "to", "unit"], rows, text=[5])
+    return report.page(f"Nomoto's model from {names}", lead, sections, report.origin(model))
 
 
 def _run(model: Nomoto, run: Zigzag, word: str, name: str) -> str:
@@ -89,24 +78,18 @@ def _run(model: Nomoto, run: Zigzag, word: str, name: str) -> str:
     return report.figure(plots.to_svg(figure, name), caption)
 
 
-def forces(
-    name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = (), origin: str = ""
-) -> str:
+def forces(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
     """The page of a force table."""
     sections = [report.bullets(notes)] if notes else []
     for axis, f in fits.items():
         unit = "N" if axis in "XYZ" else "N m"
-        rows = [
-            [n, f"{v:.5g}", f"{s:.2g}", f"{v - h:.5g}", f"{v + h:.5g}", force_tables.unit(n)]
-            for n, v, s, h in zip(f.terms, f.values, f.std, f.half)
-        ]
         tried = [[" ".join(c.terms), f"{c.cv_rmse:.4g}"] for c in f.candidates[:8]]
         sizes: Array = np.array([len(c.terms) for c in f.candidates], dtype=np.float64)
         errors: Array = np.array([c.cv_rmse for c in f.candidates], dtype=np.float64)
-        chosen = [set(c.terms) for c in f.candidates].index(set(f.terms))
+        chosen = [set(c.terms) for c in f.candidates].index(set(f.names))
         sections += [
             report.heading(f"{axis}: R2 {f.r2:.4f}, residual {f.rmse:.3g} {unit}"),
-            report.table(["", "value", "std", "95 % from", "to", "unit"], rows, text=[5]),
+            report.numbers(f),
             report.paragraph(f"Chosen because: {f.why}."),
             report.panels(
                 [
@@ -120,9 +103,6 @@ def forces(
             ),
             report.table(["structure", f"cross-validated error [{unit}]"], tried),
         ]
-    lead = ", ".join(f"{axis}: {' '.join(f.terms)}" for axis, f in fits.items())
-    return report.page(f"Coefficients from {name}", lead, sections, _footer(origin))
-
-
-def _footer(origin: str = "") -> str:
-    return f"rov_ident {version('rov_ident')}. {origin}".strip()
+    lead = ", ".join(f"{axis}: {' '.join(f.names)}" for axis, f in fits.items())
+    origin = report.origin(next(iter(fits.values())))
+    return report.page(f"Coefficients from {name}", lead, sections, origin)

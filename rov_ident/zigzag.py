@@ -30,6 +30,7 @@ class Zigzag:
     rudder: Array
     unit: str = "rad"
     held: bool = False
+    sha256: str = ""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -125,7 +126,7 @@ def from_csv(path: Path) -> Zigzag:
     heading = _angle(table, "heading", blank=True)
     known = np.isfinite(heading)
     heading[known] = np.unwrap(heading[known])
-    return Zigzag(path.name, t, heading, rudder)
+    return Zigzag(path.name, t, heading, rudder, sha256=table.sha256)
 
 
 def _angle(table: CsvTable, name: str, blank: bool) -> Array:
@@ -208,5 +209,6 @@ def from_bag(path: Path) -> Zigzag:
     known = np.full(len(both), np.nan)
     known[np.searchsorted(both, t)] = heading
     return Zigzag(
-        path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m", True
-    )
+        path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m", True,
+        bag.sha256,
+    )  # fmt: skip

@@ -37,7 +37,7 @@ for _ in range(os.getpid() % 90):
 def compiled():
     """All that a node runs is compiled, once for all workers.
 
-    How long that takes depends on what else the computer does: no test of a node should wait for it.
+    How long that takes depends on what else the computer does: no test of a node waits for it.
     """
     import numba
 

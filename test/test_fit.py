@@ -152,10 +152,14 @@ def test_result_is_the_agreed_json(heavy, record, fits, kind):
     assert tuple(result["open_loop"]["rmse"]) == VELOCITIES
     assert tuple(result["coefficients"]) == heavy.model.names
     for i, found in enumerate(result["coefficients"].values()):
+        std = math.sqrt(fit.covariance[i, i])
+        half = 1.959964 * std
         assert found == {
             "value": fit.values[i],
-            "std": math.sqrt(fit.covariance[i, i]),
+            "std": std,
             "unit": heavy.model.coefficients[i].unit,
+            "lower": fit.values[i] - half,
+            "upper": fit.values[i] + half,
             "identifiable": fit.identifiable[i],
         }
     assert result["provenance"]["bags"] == [{"file": "quiet.mcap", "sha256": record.sha256}]

@@ -178,11 +178,11 @@ def test_thrust_and_drag_from_step_up_and_coast_down(anchor):
     for seed in range(6):
         found = fit_surge(surge_runs(seed=seed), MASS, **anchor)
         assert found.rmse == pytest.approx(0.005, rel=0.15)
-        for name, value in TRUE.items():
-            if found.std[name] > 0.0:
-                off.append((found.values[name] - value) / found.std[name])
+        for name, value, std in zip(found.names, found.values, found.std, strict=True):
+            if std > 0.0:
+                off.append((value - TRUE[name]) / std)
             else:
-                assert found.values[name] == pytest.approx(value)
+                assert value == pytest.approx(TRUE[name])
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.5
 
 
