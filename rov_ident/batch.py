@@ -22,7 +22,7 @@ from rov_ident.estimate import Estimate, Prior, physical, prior_of
 from rov_ident.fit import IDENTIFIABLE, Fit
 from rov_ident.messages import Array
 from rov_ident.model import Model
-from rov_ident.records import HORIZON, VELOCITIES, over_ground, predicted
+from rov_ident.records import HORIZON, VELOCITIES, numbers, over_ground, predicted
 from rov_ident.result import provenance
 
 KINDS = ("ls", "iv", "ml")
@@ -108,7 +108,7 @@ def fit_batch(
     motion = archive.each(_range)
     low, high = np.min([m[0] for m in motion], axis=0), np.max([m[1] for m in motion], axis=0)
     more: dict[str, Any] = {
-        "open_loop_before": {"horizon_s": HORIZON, "rmse": _numbers(before)},
+        "open_loop_before": {"horizon_s": HORIZON, "rmse": numbers(before)},
         "range": {n: [a, b] for n, a, b in zip(VELOCITIES, low.tolist(), high.tolist())},
     }
     more |= parts[0] if len(parts) == 1 and not settings.stages else {"stages": parts}
@@ -319,6 +319,7 @@ def _size(samples: Samples) -> tuple[Array, Array]:
 class Curves:
     """Measured and simulated velocities (k, 6) of a bag, thinned for a picture."""
 
+    name: str
     t: Array
     measured: Array
     before: Array
@@ -327,28 +328,27 @@ class Curves:
 
 def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
     """One for each bag: the open-loop simulation in windows of HORIZON, before and after."""
-    found: list[Curves] = archive.each(
-        _curves, before.dynamics, after.dynamics, compiled(before.effects)
-    )
-    return found
+    found = archive.each(_curves, before.dynamics, after.dynamics, compiled(before.effects))
+    return [Curves(bag.path.name, *of) for bag, of in zip(archive.bags, found, strict=True)]
 
 
-def _curves(samples: Samples, before: Model, after: Model, effects: Acting) -> Curves:
+def _curves(samples: Samples, before: Model, after: Model, effects: Acting) -> tuple[Array, ...]:
     keep = slice(None, None, max(1, len(samples) // _POINTS))
-    return Curves(
-        samples["t"][keep],
-        over_ground(samples)[keep],
-        *(predicted(m, samples, HORIZON, None, effects)[keep] for m in (before, after)),
-    )
+    simulated = (predicted(m, samples, HORIZON, None, effects)[keep] for m in (before, after))
+    return samples["t"][keep], over_ground(samples)[keep], *simulated
+
+
+def validation(archive: Archive, before: Config, after: Config) -> dict[str, Any]:
+    """RMSE of the open-loop simulation on bags that no fit has seen, for the JSON of a fit."""
+    return {
+        "horizon_s": HORIZON,
+        "rmse_before": numbers(open_loop_rmse(archive, before)),
+        "rmse": numbers(open_loop_rmse(archive, after)),
+        "bags": [{"file": bag.path.name, "sha256": bag.sha256} for bag in archive.bags],
+    }
 
 
 # ------------------------------------------------------------------ words and numbers
-
-
-def _numbers(values: Array) -> dict[str, float | None]:
-    return {
-        n: v if np.isfinite(v) else None for n, v in zip(VELOCITIES, values.tolist(), strict=True)
-    }
 
 
 def _described(base: least_squares.BaseParameters) -> dict[str, Any]:

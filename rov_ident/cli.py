@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
         "--save", type=Path, metavar="FILE", help="write a configuration with the fitted values"
     )
     fit.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    fit.add_argument(
+        "--validate", type=Path, metavar="BAG", help="judge on this bag, which is not fitted"
+    )
     batch = fit.add_argument_group("ls, iv and ml")
     batch.add_argument(
         "--channels",
@@ -421,11 +424,11 @@ def _replay(options: argparse.Namespace) -> None:
 
 def _fit(options: argparse.Namespace) -> None:
     from rov_ident import archive
-    from rov_ident.batch import Settings, curves, fit_batch
+    from rov_ident.batch import Settings, curves, fit_batch, validation
     from rov_ident.fit import fit_online, write_text
 
     outputs = [options.json, options.save, options.report]
-    _check_outputs(outputs, [*options.bags, options.config])
+    _check_outputs(outputs, [*options.bags, options.config, options.validate])
     live = options.estimator in LIVE
     _check_batch_options(options, live)
     config = configuration.load(options.config, f"{options.estimator}_node" if live else "")
@@ -452,12 +455,17 @@ def _fit(options: argparse.Namespace) -> None:
             fit = fit_batch(bags, config, options.estimator, settings, say)
         fitted = config.with_model(fit.model)
         drawn = curves(bags, config, fitted) if options.report else []
+        seen = []
+        if options.validate:
+            judge = stack.enter_context(archive.opened([options.validate], config))
+            fit.more["validation"] = validation(judge, config, fitted)
+            seen = curves(judge, config, fitted) if options.report else []
     if options.json:
         write_text(options.json, fit.to_json())
     if options.report:
         from rov_ident.fit_report import page
 
-        write_text(options.report, page(fit, config, drawn))
+        write_text(options.report, page(fit, config, drawn, seen))
     if options.save:
         bags_read = ", ".join(path.name for path in options.bags)
         configuration.dump(
@@ -470,6 +478,12 @@ def _fit(options: argparse.Namespace) -> None:
     configured = [f"{config.value(name):.5g}" for name in fit.names]
     known = ["yes" if i else "no: the prior decides" for i in fit.identifiable]
     OUT.print(_numbers(title, fit, configured=configured, identifiable=known))
+    if judged := fit.more.get("validation"):
+        table = _table(f"{options.validate.name}, simulated in open loop: RMSE", "before", "after")
+        for name, before in judged["rmse_before"].items():
+            after = judged["rmse"][name]
+            table.add_row(name, *("" if x is None else f"{x:.4f}" for x in (before, after)))
+        OUT.print(table)
     for note in () if live else fit.notes:
         ERR.print(note, markup=False, soft_wrap=True)
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from rov_ident.errors import UserError
 from rov_ident.messages import Array
 from rov_ident.model import Model
 from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator
-from rov_ident.records import HORIZON, VELOCITIES, Record, score
+from rov_ident.records import HORIZON, Record, numbers, score
 from rov_ident.result import Result, provenance
 from rov_ident.samples import Sampler
 
@@ -46,16 +45,12 @@ class Fit(Result):
         coefficients = self.entries()
         for entry, identifiable in zip(coefficients.values(), self.identifiable, strict=True):
             entry["identifiable"] = identifiable
-        rmse = {
-            name: value if math.isfinite(value) else None
-            for name, value in zip(VELOCITIES, self.rmse.tolist(), strict=True)
-        }
         result = {
             "estimator": self.estimator,
             "coefficients": coefficients,
             "samples": self.samples,
             "duration_s": self.duration,
-            "open_loop": {"horizon_s": HORIZON, "rmse": rmse},
+            "open_loop": {"horizon_s": HORIZON, "rmse": numbers(self.rmse)},
             "notes": list(self.notes),
             **self.more,
             "provenance": self.provenance,

@@ -19,10 +19,8 @@ _TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum
 _MOST = 4  # bags that are drawn
 
 
-def page(fit: Fit, config: Config, drawn: Sequence[Curves]) -> str:
-    """A self-contained HTML document."""
-    before = _rmse([c.before - c.measured for c in drawn])
-    after = _rmse([c.after - c.measured for c in drawn])
+def page(fit: Fit, config: Config, drawn: Sequence[Curves], judged: Sequence[Curves] = ()) -> str:
+    """A self-contained HTML document; ``judged`` are runs that no fit has seen."""
     rows = []
     for i, name in enumerate(fit.names):
         was = config.model.theta[config.model.names.index(name)]
@@ -35,26 +33,36 @@ def page(fit: Fit, config: Config, drawn: Sequence[Curves]) -> str:
         legend({label: (plots.css(colour), ",".join(str(3 * d) for d in dashes), 1.0)
                 for label, (colour, dashes) in plots.MODELS.items()
                 if label in (_BEFORE, _AFTER)}),
-        _bars(before, after),
     ]  # fmt: skip
-    names = [b["file"] for b in fit.provenance["bags"]]
-    for k, curve in enumerate(drawn[:_MOST]):
-        name = names[k] if k < len(names) else ""
-        sections.append(_motion(curve, f"{name}: measured (grey) and simulated", f"m{k}"))
-        sections.append(_error(curve, f"{name}: error of the simulation", f"e{k}"))
-    if len(drawn) > _MOST:
-        sections.append(paragraph(f"The first {_MOST} of {len(drawn)} bags are drawn."))
+    if judged:
+        sections += [heading("On what no fit has seen"), *_curves(judged, "judged")]
+    if drawn:
+        sections += [heading("On what was fitted"), *_curves(drawn, "fitted")]
     sections += [
         heading("Coefficients"),
         table(["", "value", "std", "unit", "configured", "identifiable"], rows, text=(3, 5)),
     ]
     if fit.notes:
         sections += [heading("Notes"), bullets(fit.notes)]
+    bags = len(fit.provenance["bags"])
     lead = (
-        f"{_TITLES[fit.estimator].capitalize()} on {len(drawn)} bag{'s' * (len(drawn) != 1)}, "
+        f"{_TITLES[fit.estimator].capitalize()} on {bags} bag{'s' * (bags != 1)}, "
         f"{fit.duration:.0f} s."
     )
     return document(f"Fit of {config.name}", lead, sections, origin(fit))
+
+
+def _curves(drawn: Sequence[Curves], key: str) -> list[str]:
+    before = _rmse([c.before - c.measured for c in drawn])
+    after = _rmse([c.after - c.measured for c in drawn])
+    sections = [_bars(before, after, key)]
+    for k, curve in enumerate(drawn[:_MOST]):
+        name = curve.name
+        sections.append(_motion(curve, f"{name}: measured (grey) and simulated", f"{key}-m{k}"))
+        sections.append(_error(curve, f"{name}: error of the simulation", f"{key}-e{k}"))
+    if len(drawn) > _MOST:
+        sections.append(paragraph(f"The first {_MOST} of {len(drawn)} bags are drawn."))
+    return sections
 
 
 def _rmse(errors: Sequence[Array]) -> Array:
@@ -68,13 +76,13 @@ def _unit(i: int) -> str:
     return "m/s" if i < 3 else "rad/s"
 
 
-def _bars(before: Array, after: Array) -> str:
+def _bars(before: Array, after: Array, key: str) -> str:
     parts = []
     for label, pick in (("linear", slice(0, 3)), ("angular", slice(3, 6))):
         models = {_BEFORE: before[pick], _AFTER: after[pick]}
         unit = _unit(0 if label == "linear" else 3)
         drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
-        parts.append(plots.to_svg(drawn, f"b{label}"))
+        parts.append(plots.to_svg(drawn, f"{key}-{label}"))
     return panels(parts, "Root mean square error over all bags.")
 
 

@@ -144,3 +144,10 @@ def score(
         rmse = np.sqrt(np.mean(error**2, axis=0))
         r2 = 1.0 - np.sum(error**2, axis=0) / np.sum((nu - nu.mean(axis=0)) ** 2, axis=0)
     return Score(rmse, r2)
+
+
+def numbers(values: Array) -> dict[str, float | None]:
+    """By velocity component; None where there is none, as JSON wants it."""
+    return {
+        n: v if np.isfinite(v) else None for n, v in zip(VELOCITIES, values.tolist(), strict=True)
+    }

@@ -85,6 +85,27 @@ class Swing:
 
 
 @dataclass(frozen=True)
+class Course:
+    """Legs of constant speed and heading, each (duration [s], speed [m/s], heading [rad])."""
+
+    name: str
+    legs: tuple[tuple[float, float, float], ...]
+    torque: tuple[float, float] = (0.0, 0.0)
+
+    def target(self, t: float) -> Array:
+        """Position [m] and heading [rad] (4,) aimed at; at the end of the last leg it stays."""
+        target = np.zeros(4)
+        for duration, speed, heading in self.legs:
+            gone = speed * min(t, duration)
+            target[:2] += gone * np.cos(heading), gone * np.sin(heading)
+            target[3] = heading
+            t -= duration
+            if t <= 0.0:
+                break
+        return target
+
+
+@dataclass(frozen=True)
 class Flown:
     """A swing in simulation: demand (K, 6) from each of ``t`` (K,) on, and how far it went."""
 
@@ -94,7 +115,7 @@ class Flown:
     tilt: float  # rad; the largest
 
 
-def fly(config: Config, swing: Swing, duration: float, limits: Limits) -> Flown:
+def fly(config: Config, swing: Swing | Course, duration: float, limits: Limits) -> Flown:
     """Simulate the configured vehicle under the controller.
 
     Raises
@@ -141,7 +162,12 @@ def _multisine(duration: float) -> Array:
 
 
 def dive(
-    config: Config, swing: Swing, duration: float, limits: Limits, suite: Suite, seed: int = 0
+    config: Config,
+    swing: Swing | Course,
+    duration: float,
+    limits: Limits,
+    suite: Suite,
+    seed: int = 0,
 ) -> Dive:
     """Fly the configured vehicle and measure it."""
     flown = fly(config, swing, duration, limits)

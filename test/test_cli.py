@@ -95,9 +95,14 @@ def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator
     done = run(
         "fit", bag, bag, "--config", tmp_path / "off.yaml", "--estimator", estimator,
         "--json", tmp_path / "fit.json", "--save", tmp_path / "fitted.yaml",
+        "--validate", bag, "--report", tmp_path / "fit.html",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "fit.json").read_text())
+    judged = result["validation"]
+    assert judged["horizon_s"] == 10.0 and judged["bags"][0]["file"] == bag.name
+    assert judged["rmse"]["u"] < 0.5 * judged["rmse_before"]["u"]
+    assert "On what no fit has seen" in (tmp_path / "fit.html").read_text()
     assert result["estimator"] == estimator
     assert result["samples"] > 3000 and result["duration_s"] == pytest.approx(40.0, abs=0.5)
     assert result["open_loop"]["horizon_s"] == 10.0

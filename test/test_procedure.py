@@ -4,62 +4,47 @@ Closed-loop waypoints in the simulator, one channel at a time; cut, cleaned, lev
 channel fitted alone; judged on a joint run with a speed change and a turn.
 """
 
-import dataclasses
+import re
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rov_ident import preprocess, sensors
+from rov_ident import config, preprocess
 from rov_ident import swing as swings
-from rov_ident.archive import of_records
-from rov_ident.batch import Settings, curves, fit_batch, open_loop_rmse
 from rov_ident.errors import UserError
 from rov_ident.frames import quaternion_to_matrix
-from rov_ident.recording import write_messages
-from rov_ident.records import read_record
 from rov_ident.simulate import simulate
 from rov_ident.surge import Run, _simulated, fit_surge
-from rov_ident.swing import Limits, Swing
+from rov_ident.swing import Course, Limits
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "sea_trial.py"
 
 
-def recorded(config, path, swing, duration, seed, suite=None):
-    run = swings.dive(config, swing, duration, Limits(), suite or sensors.Suite(), seed)
-    write_messages(path, run.messages)
-    return read_record(path, config)
-
-
-def test_the_whole_procedure(heavy, tmp_path):
-    factor = np.random.default_rng(8).uniform(0.6, 1.4, len(heavy.model.theta))
-    wrong = heavy.with_model(heavy.model.with_theta(heavy.model.theta * factor))
-    # sensors away from the origin: the configuration says where
-    mounted = dataclasses.replace(
-        heavy,
-        odometry=dataclasses.replace(heavy.odometry, position=(0.15, 0.0, 0.1)),
-        imu=dataclasses.replace(heavy.imu, position=(-0.1, 0.05, 0.0)),
-    )
-    start = dataclasses.replace(wrong, odometry=mounted.odometry, imu=mounted.imu)
-    still = (9.0, 9.0, 9.0, 9.0)
-    runs = [
-        Swing("surge", (1.0, 0.0, 0.0, 0.0), (3.0, *still[1:])),
-        Swing("roll", (0.0, 0.0, 0.0, 0.0), still, (0.7, 0.0)),
-        Swing("lateral", (0.0, 1.0, 0.0, 0.9), (9.0, 3.3, 9.0, 2.7)),
-        Swing("longitudinal", (0.0, 0.0, 0.7, 0.0), (9.0, 9.0, 3.7, 9.0), (0.0, 0.7)),
-    ]
-    fitted, notes = start, []
-    for channels, swing in zip((("surge",), ("roll",), ("sway", "yaw"), ("heave", "pitch")), runs):
-        bags = of_records([recorded(mounted, tmp_path / "bag.mcap", swing, 40.0, 3)])
-        fit = fit_batch(bags, fitted, "ml", Settings((channels,)))
-        fitted = fitted.with_model(fit.model)
-        notes += fit.notes
-    joint = Swing("joint", (1.2, 0.3, 0.3, 1.2), (2.4, 3.5, 5.0, 4.0), (0.3, 0.3))
-    judge = of_records([recorded(mounted, tmp_path / "joint.mcap", joint, 40.0, 9)])
-    before, after = open_loop_rmse(judge, start), open_loop_rmse(judge, fitted)
+def test_the_whole_procedure(heavy, tmp_path, capsys):
+    """From raw logs to a model that predicts a run it has not seen as the true vehicle would."""
+    runpy.run_path(str(EXAMPLE))["main"](["--out", str(tmp_path)])
+    told = capsys.readouterr().out
+    rows = re.findall(r"^  ([uvwpqr]) ([\d.]+)  ([\d.]+)  ([\d.]+)$", told, re.MULTILINE)
+    assert [row[0] for row in rows] == list("uvwpqr")
+    before, after, true = np.array([row[1:] for row in rows], dtype=float).T
     assert np.all(after < before)
-    assert np.median(after / before) < 0.5
-    error = np.abs(fitted.model.theta / heavy.model.theta - 1.0)
-    assert np.median(error) < 0.03
-    (drawn,) = curves(judge, start, fitted)
-    assert drawn.measured.shape == drawn.before.shape == drawn.after.shape
+    assert np.all(after < 1.25 * true)
+    assert np.median(after / before) < 0.7
+    assert "surge: left alone" in told
+    fitted = config.load(tmp_path / "fitted.yaml").model
+    assert np.median(np.abs(fitted.theta / heavy.model.theta - 1.0)) < 0.03
+    assert "<svg" in (tmp_path / "report.html").read_text()
+
+
+def test_a_course_is_followed(heavy):
+    course = Course("there and back", ((2.0, 0.5, 0.0), (4.0, 0.25, np.pi / 2)))
+    np.testing.assert_allclose(course.target(1.0), [0.5, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(course.target(4.0), [1.0, 0.5, 0.0, np.pi / 2], atol=1e-12)
+    np.testing.assert_array_equal(course.target(6.0), course.target(60.0))
+    flown = swings.fly(heavy, course, 12.0, Limits())
+    np.testing.assert_allclose(flown.reach[:2], [1.0, 1.0], atol=0.2)
 
 
 # ------------------------------------------------------------------ pieces
