@@ -9,6 +9,7 @@ Turning FLU into FRD is half a turn about x, ENU into NED half a turn about the 
 diagonal. Both are their own inverse.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -152,6 +153,20 @@ def quaternion_from_rotation_vector(vector: ArrayLike) -> Array:
 def wrap_angle(angle: ArrayLike) -> Array:
     """Angles (rad) brought into (-pi, pi]."""
     return np.pi - np.remainder(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)
+
+
+# --- lever arms -----------------------------------------------------------------------------
+
+
+def velocity_of_arm(omega: Array, arm: Array | Sequence[float]) -> Array:
+    """``omega x r`` (..., 3): by how much a point at ``arm`` [m] of a body turning with ``omega``
+    [rad/s] is faster than the origin, all in body axes."""
+    return np.cross(omega, arm)
+
+
+def acceleration_of_arm(omega: Array, omega_dot: Array, arm: Array | Sequence[float]) -> Array:
+    """``omega_dot x r + omega x (omega x r)`` (..., 3): the same of its acceleration."""
+    return np.cross(omega_dot, arm) + np.cross(omega, np.cross(omega, arm))
 
 
 # --- messages -------------------------------------------------------------------------------

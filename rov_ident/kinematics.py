@@ -26,7 +26,7 @@ from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Reading
 from rov_ident.evidence import Linear
-from rov_ident.frames import quaternion_from_euler, quaternion_to_matrix
+from rov_ident.frames import acceleration_of_arm, quaternion_from_euler, quaternion_to_matrix
 from rov_ident.jit import kernel
 from rov_ident.model import Array
 from rov_ident.scores import SURE, Scores, inflation
@@ -181,8 +181,7 @@ def _at_origin(t: Array, reading: Reading, lever: Array) -> Array:
         return reading.specific_force
     omega = reading.gyro
     turn = np.gradient(omega, t, axis=0)
-    extra = np.cross(turn, lever) + np.cross(omega, np.cross(omega, lever))
-    force: Array = reading.specific_force - extra
+    force: Array = reading.specific_force - acceleration_of_arm(omega, turn, lever)
     return force
 
 

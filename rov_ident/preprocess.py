@@ -12,6 +12,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import savgol_filter
 
 from rov_ident.errors import UserError
+from rov_ident.frames import acceleration_of_arm, velocity_of_arm
 from rov_ident.model import Array
 
 _ROBUST = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
@@ -22,7 +23,7 @@ _ROBUST = 1.4826  # standard deviation of a Gaussian over its median absolute de
 
 def velocity_at_origin(velocity: Array, omega: Array, lever: Array) -> Array:
     """v = v_s - omega x r (N, 3), of a sensor at r (3,) from the body origin."""
-    out: Array = velocity - np.cross(omega, lever)
+    out: Array = velocity - velocity_of_arm(omega, lever)
     return out
 
 
@@ -30,7 +31,7 @@ def acceleration_at_origin(
     acceleration: Array, omega: Array, omega_dot: Array, lever: Array
 ) -> Array:
     """a = a_s - omega_dot x r - omega x (omega x r) (N, 3); specific force likewise."""
-    out: Array = acceleration - np.cross(omega_dot, lever) - np.cross(omega, np.cross(omega, lever))
+    out: Array = acceleration - acceleration_of_arm(omega, omega_dot, lever)
     return out
 
 

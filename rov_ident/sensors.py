@@ -11,10 +11,12 @@ from rov_ident.effects import acted, compiled, sense
 from rov_ident.effects.base import Reading
 from rov_ident.excitation import manoeuvre
 from rov_ident.frames import (
+    acceleration_of_arm,
     quaternion_from_euler,
     quaternion_from_rotation_vector,
     quaternion_multiply,
     quaternion_to_matrix,
+    velocity_of_arm,
 )
 from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
@@ -176,11 +178,10 @@ def _reading(truth: Trajectory, config: Config) -> Reading:
     """What perfect sensors measure where the configuration says that they are, in body axes."""
     v, omega = truth.nu[:, :3], truth.nu[:, 3:]
     v_dot, omega_dot = truth.nu_dot[:, :3], truth.nu_dot[:, 3:]
-    arm = np.array(config.imu.position)
     down = quaternion_to_matrix(truth.orientation)[:, 2, :]
     acceleration = v_dot + np.cross(omega, v) - config.gravity * down
-    acceleration += np.cross(omega_dot, arm) + np.cross(omega, np.cross(omega, arm))
-    linear = v + np.cross(omega, config.odometry.position)
+    acceleration += acceleration_of_arm(omega, omega_dot, config.imu.position)
+    linear = v + velocity_of_arm(omega, config.odometry.position)
     return Reading(linear, omega, omega, acceleration)
 
 

@@ -1,18 +1,15 @@
 """The velocity sensor sits elsewhere than configured: it measures ``v + omega x r``."""
 
-import numpy as np
-
 from rov_ident.effects.base import Effect, EffectParameter, Reading
+from rov_ident.frames import velocity_of_arm
 
 
 def sense(reading: Reading, x: float, y: float, z: float) -> Reading:
-    arm = np.array([x, y, z])
-    return reading._replace(linear=reading.linear + np.cross(reading.angular, arm))
+    return reading._replace(linear=reading.linear + velocity_of_arm(reading.angular, (x, y, z)))
 
 
 def correct(reading: Reading, x: float, y: float, z: float) -> Reading:
-    arm = np.array([x, y, z])
-    return reading._replace(linear=reading.linear - np.cross(reading.angular, arm))
+    return reading._replace(linear=reading.linear - velocity_of_arm(reading.angular, (x, y, z)))
 
 
 EFFECT = Effect(

@@ -24,7 +24,13 @@ from rov_ident.cdr import decode_odometry, encode
 from rov_ident.consumer import HydrodynamicModel
 from rov_ident.errors import UserError
 from rov_ident.excitation import LEVEL, authority
-from rov_ident.frames import from_core, gravity_direction, quaternion_normalise, to_core
+from rov_ident.frames import (
+    from_core,
+    gravity_direction,
+    quaternion_normalise,
+    to_core,
+    velocity_of_arm,
+)
 from rov_ident.messages import Array, Wrench
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, Executor
@@ -104,7 +110,9 @@ class ExampleController(Node):  # type: ignore[misc]
             odometry = to_core(decode_odometry(data), self._config.frames)
         except ValueError:
             return
-        at_origin = odometry.linear - np.cross(odometry.angular, self._config.odometry.position)
+        at_origin = odometry.linear - velocity_of_arm(
+            odometry.angular, self._config.odometry.position
+        )
         nu = np.concatenate([at_origin, odometry.angular])
         down = gravity_direction(quaternion_normalise(odometry.orientation))
         good = (abs(nu) <= _FASTEST).all() and np.isfinite(down).all()
