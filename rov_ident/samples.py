@@ -188,6 +188,17 @@ class Sampler:
             self._sensitivity.forget()
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
 
+    @property
+    def kinematics(self) -> NDArray[np.void]:
+        """(1,): a copy of the kinematic filter's state, for a checkpoint."""
+        return self._kinematics.copy()
+
+    def begin_with(self, kinematics: NDArray[np.void]) -> None:
+        """Keep the biases of the IMU in another filter's state; motion is measured anew."""
+        self._kinematics = kinematics.copy()
+        self._kinematics["known"] = False
+        self._kinematics["inertial"] = False
+
     # -------------------------------------------------------------- messages in
 
     def push(self, role: str, message: Message) -> NDArray[np.void]:
