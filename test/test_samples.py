@@ -575,7 +575,7 @@ def test_duplicate_and_backward_stamps(heavy, role, make, back, reason):
     assert sampler.counts[f"{role}: {reason} stamp"] == 1
 
 
-@pytest.mark.parametrize("wild", [1, 3600 * SECOND, 5 * 10**18])
+@pytest.mark.parametrize("wild", [1, 3600 * SECOND, 2 * 10**18])
 def test_single_wild_stamps_now_and_then(heavy, wild):
     """A driver that now and then says 1970: every time one message is lost, never the motion."""
     parts, messages = list(steady(100.0, 110.0)), []

@@ -246,6 +246,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         What is not compiled yet is compiled by another process: a thread of ours would stop us.
         """
         self._judge = ThreadPoolExecutor(1, "watch")
+        self._leaving = threading.Event()
         self._compiling: subprocess.Popen[bytes] | None = None
         begun = self._judge.submit(self._load_watcher)
         begun.add_done_callback(self._complain)
@@ -256,9 +257,13 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _load_watcher(self) -> None:
         from rov_ident import watch  # here: not needed to begin with
 
-        if not watch.is_compiled():
+        if not watch.is_compiled() and not self._leaving.is_set():
             self._compiling = subprocess.Popen([sys.executable, "-m", watch.__name__])
+            if self._leaving.is_set():
+                self._compiling.terminate()
             self._compiling.wait()
+        if self._leaving.is_set():  # a process does not end before its threads do
+            return
         watch.compile_all()
         self._online.show(watch.Watcher(self._config, self._when_idle))
 
@@ -486,6 +491,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         return response
 
     def take_leave(self) -> None:
+        self._leaving.set()
         self._judge.shutdown(wait=False, cancel_futures=True)
         if self._keeper is not None:
             self._keep()
