@@ -18,7 +18,7 @@ import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from operator import attrgetter
@@ -537,6 +537,7 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._times: tuple[int, int] | None = None  # ns, first and last
         self._flushed = time.monotonic()
+        self._broken = False  # the disk is full, or gone
 
     def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
         """Announces a topic; only needed where it is latched (transient local) or may stay empty.
@@ -545,48 +546,71 @@ class BagWriter:
             UserError: the type is not one of ROS 2 Jazzy's.
         """
         text, type_hash = _definition(type_name)
-        if type_name not in self._schemas:
-            self._schemas[type_name] = self._writer.register_schema(
-                type_name, "ros2msg", text.encode()
-            )
         qos = [_LATCHED_QOS] if latched else []
-        channel = self._writer.register_channel(
-            topic,
-            "cdr",
-            self._schemas[type_name],
-            {
-                "offered_qos_profiles": _to_yaml(qos) if qos else "",
-                "topic_type_hash": type_hash,
-            },
-        )
+        with self._writing():
+            if type_name not in self._schemas:
+                self._schemas[type_name] = self._writer.register_schema(
+                    type_name, "ros2msg", text.encode()
+                )
+            channel = self._writer.register_channel(
+                topic,
+                "cdr",
+                self._schemas[type_name],
+                {
+                    "offered_qos_profiles": _to_yaml(qos) if qos else "",
+                    "topic_type_hash": type_hash,
+                },
+            )
         self._topics[topic] = _WrittenTopic(channel, type_name, type_hash, qos)
 
     def write(self, topic: str, type_name: str, stamp: int, data: bytes) -> None:
-        """Appends a CDR message with this log time (ns, not negative)."""
+        """Appends a CDR message with this log time (ns, not negative).
+
+        Raises:
+            UserError: the disk is full, or gone; what a live recording has so far can be read.
+        """
         if topic not in self._topics:
             self.add_topic(topic, type_name)
         entry = self._topics[topic]
-        self._writer.add_message(entry.channel, stamp, data, stamp, entry.count)
-        entry.count += 1
-        first, last = self._times or (stamp, stamp)
-        self._times = min(first, stamp), max(last, stamp)
-        if self._crash_safe and time.monotonic() - self._flushed > _FLUSH_PERIOD:
-            self._writer.flush()
-            self._flushed = time.monotonic()
+        with self._writing():
+            self._writer.add_message(entry.channel, stamp, data, stamp, entry.count)
+            entry.count += 1
+            first, last = self._times or (stamp, stamp)
+            self._times = min(first, stamp), max(last, stamp)
+            if self._crash_safe and time.monotonic() - self._flushed > _FLUSH_PERIOD:
+                self._writer.flush()
+                self._flushed = time.monotonic()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """What the disk refuses is the user's to mend; from then on nothing more is written."""
+        try:
+            yield
+        except OSError as error:
+            self._broken = True
+            rest = ": what is complete in it can be read" if self._crash_safe else ""
+            raise UserError(f"{self.path} cannot be written ({error.strerror}){rest}.") from error
 
     def close(self) -> None:
-        """Completes the bag and gives it its name."""
-        self._writer.finish()
-        self._stream.close()
-        if self._is_directory:
-            (self._part / "metadata.yaml").write_text(_to_yaml(self._metadata()), "utf-8")
-        if not self._crash_safe:
-            self._part.replace(self.path)
+        """Completes the bag and gives it its name. Raises UserError where the disk refuses."""
+        try:
+            with self._writing():
+                self._writer.finish()
+                self._stream.close()
+                if self._is_directory:
+                    (self._part / "metadata.yaml").write_text(_to_yaml(self._metadata()), "utf-8")
+                if not self._crash_safe:
+                    self._part.replace(self.path)
+        except UserError:
+            self.abort()
+            raise
 
     def abort(self) -> None:
-        """Drops the unfinished bag."""
-        self._stream.close()
-        self._remove_part()
+        """Drops the unfinished bag; a live recording is kept as it is."""
+        with suppress(OSError):  # it may be a full disk that has led here
+            self._stream.close()
+        if not self._crash_safe:
+            self._remove_part()
 
     def __enter__(self) -> "BagWriter":
         return self
@@ -598,7 +622,7 @@ class BagWriter:
         traceback: TracebackType | None,
     ) -> None:
         # A live recording is worth keeping whatever ended it.
-        if exception_type is None or self._crash_safe:
+        if not self._broken and (exception_type is None or self._crash_safe):
             self.close()
         else:
             self.abort()

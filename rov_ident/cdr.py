@@ -118,6 +118,8 @@ def _read_stamp(data: bytes) -> tuple[int, int]:
     if len(data) < 12:
         raise ValueError(f"{len(data)} bytes end within the header")
     seconds, nanoseconds = _STAMP.unpack_from(data, 4)
+    if nanoseconds >= _SECOND:
+        raise ValueError(f"{nanoseconds} nanoseconds are no part of a second")
     return seconds * _SECOND + nanoseconds, 12
 
 

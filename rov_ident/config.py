@@ -746,6 +746,11 @@ def _plain(value: Any) -> Any:
     return float(value)
 
 
+def as_file_name(name: str) -> str:
+    """A vehicle's name as part of a file's name: nothing that would lead to another folder."""
+    return re.sub(r"[^\w.-]", "_", name).lstrip(".") or "vehicle"
+
+
 # ------------------------------------------------------------------ words
 
 

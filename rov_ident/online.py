@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rov_ident import rls, ukf
 from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
+from rov_ident.errors import UserError
 from rov_ident.estimate import Estimate, physical, prior_of
 from rov_ident.messages import Array, Message
 from rov_ident.samples import Sampler
@@ -70,6 +71,22 @@ class Report:
         return {name: value for name, value in values if "." in name}
 
 
+class Memory(NamedTuple):
+    """All that an estimator has learnt; arrays, but for ``stamp`` [ns] of the last sample used.
+
+    ``state`` is a State of the estimator's module; the others are what :class:`OnlineEstimator`
+    keeps beside it, and the sampler's kinematics with the biases of the IMU.
+    """
+
+    state: Any
+    gained: Array
+    window: Array
+    variance: Array
+    safe: Array
+    kinematics: NDArray[np.void]
+    stamp: int
+
+
 class OnlineEstimator:
     """Sampler and estimator in one: :meth:`push` messages, ask for a :meth:`report` at any time.
 
@@ -92,10 +109,11 @@ class OnlineEstimator:
         """Back to the prior; the input buffers and counts go on."""
         self._state = self._module.init(self._task)
         self._last_t = math.nan
+        self._recalled = 0  # ns: the stamp before the first sample
         self._centred = -math.inf
         # information over the prior's: in the window that is filling, and in the one before
         self._gained = np.zeros((2, len(self.prior.names)))
-        self._window = 0.0  # s of the window that is filling
+        self._window = np.zeros(1)  # s of the window that is filling
         self._variance = self._estimate().std ** 2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
@@ -132,7 +150,7 @@ class OnlineEstimator:
 
     @property
     def state(self) -> object:
-        """The estimator's state, for a checkpoint or a comparison."""
+        """The estimator's state, for a comparison."""
         return self._state
 
     def push(self, role: str, message: Message) -> NDArray[np.void]:
@@ -159,13 +177,7 @@ class OnlineEstimator:
         self._watch(float(samples["dt"].sum()))
         if self.config.estimate_effects and abs(self._last_t - self._centred) >= CENTRING_TIME:
             self._centred = self._last_t
-            # The rigid body is the estimator's own, and what acts on it all but linear.
-            found = {
-                name: value
-                for name, value in self.report().effects.items()
-                if EFFECTS[name.partition(".")[0]].body is None
-            }
-            self.sampler.recentre(self.config.with_values(found))
+            self._recentre()
         if self.watcher is not None and self.sampler.demands is not None:
             window = self.watcher.take(samples, self.sampler.demands)
             if window is not None:
@@ -173,6 +185,51 @@ class OnlineEstimator:
                 values = zip(report.names, report.values.tolist(), strict=True)
                 self.watcher.look(window, dict(values))
         return info
+
+    def _recentre(self) -> None:
+        """Have the sampler take over the parameters of effects as they are estimated now."""
+        # The rigid body is the estimator's own, and what acts on it all but linear.
+        found = {
+            name: value
+            for name, value in self.report().effects.items()
+            if EFFECTS[name.partition(".")[0]].body is None
+        }
+        self.sampler.recentre(self.config.with_values(found))
+
+    def memory(self) -> Memory:
+        """What is learnt so far, for :mod:`rov_ident.checkpoint`. The arrays are not to be changed.
+
+        The velocity is not worth keeping: who recalls it begins with a measured one.
+        """
+        return Memory(
+            self._state,
+            self._gained.copy(),
+            self._window.copy(),
+            self._variance,
+            self._safe,
+            self.sampler.kinematics,
+            self.stamp,
+        )
+
+    def recall(self, memory: Memory) -> None:
+        """Go on from what another run of the same configuration has learnt.
+
+        Raises
+        ------
+        UserError
+            If the numbers make no estimate; then nothing has changed.
+        """
+        estimate = self._module.estimate(self._task, memory.state, self.prior)
+        if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
+            raise UserError("its numbers are not finite")
+        self.reset()
+        self._state, self._recalled = memory.state, memory.stamp
+        self._gained, self._window = memory.gained.copy(), memory.window.copy()
+        self._variance, self._safe = memory.variance, memory.safe
+        self.sampler.begin_with(memory.kinematics)
+        self._paused = True  # whatever has happened in between
+        if self.config.estimate_effects:
+            self._recentre()
 
     def _watch(self, elapsed: float) -> None:
         """Information gained per coefficient, in windows of EXCITATION_TIME."""
@@ -183,7 +240,7 @@ class OnlineEstimator:
         self._window += elapsed
         if self._window >= EXCITATION_TIME:
             self._gained[1], self._gained[0] = self._gained[0], 0.0
-            self._window = 0.0
+            self._window[0] = 0.0
 
     def _estimate(self) -> Estimate:
         estimate: Estimate = self._module.estimate(self._task, self._state, self.prior)
@@ -209,7 +266,7 @@ class OnlineEstimator:
         upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
         upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
         return Report(
-            self._stamp(),
+            self.stamp,
             self.prior.names,
             self.prior.units,
             values,
@@ -223,9 +280,11 @@ class OnlineEstimator:
             self._module.condition(self._task, self._state),
         )
 
-    def _stamp(self) -> int:
+    @property
+    def stamp(self) -> int:
+        """Of the last sample used [ns], also before a checkpoint; 0: of none."""
         if math.isnan(self._last_t) or self.sampler.origin is None:
-            return 0
+            return self._recalled
         return self.sampler.origin + round(self._last_t * 1e9)
 
     def _judge(

@@ -79,6 +79,13 @@ ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
 _MERGE = 0.05  # s; an odometry message is carried to the IMU message that follows this closely
 _MAX_GAP = 0.5  # s without a measurement: restart rather than bridge
 _MAX_JUMP = 10.0  # s; a stamp this far ahead, or 1 s back, is another clock (a bag starting over)
+_LATEST = 1.0  # s; a topic that is later than this is not waited for
+_LATER = 1.25  # times as late as a topic was is how long it is waited for from then on
+_LOST = 3.0  # times the longest interval between demands of late: another one is missing
+_QUEUED = 10.0  # s; of demands that are kept while nothing else comes
+_LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
+_REASONS = 100  # names of refusals; what else is wrong is counted together
+_GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
 _KINEMATICS = np.dtype(
@@ -139,6 +146,7 @@ class Sampler:
         self._last_stamp: dict[str, int] = {}
         self._suspect: dict[str, int] = {}  # a stamp out of line, by topic
         self.demands: list[tuple[float, Array]] | None = None
+        self._late = 0.0  # s; how long a topic is waited for because it was that late before
         self._clear()
 
     def configure(self, config: Config) -> None:
@@ -183,10 +191,23 @@ class Sampler:
         self._kinematics["gyro_bias_variance"] = self._settings["gyro_bias_variance"]
         self._demand: Array | None = None
         self._demand_time = -math.inf
+        self._intervals: deque[float] = deque(maxlen=50)  # s; between demands
+        self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
         self._memory = memory()
         if self._sensitivity is not None:
             self._sensitivity.forget()
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
+
+    @property
+    def kinematics(self) -> NDArray[np.void]:
+        """(1,): a copy of the kinematic filter's state, for a checkpoint."""
+        return self._kinematics.copy()
+
+    def begin_with(self, kinematics: NDArray[np.void]) -> None:
+        """Keep the biases of the IMU in another filter's state; motion is measured anew."""
+        self._kinematics = kinematics.copy()
+        self._kinematics["known"] = False
+        self._kinematics["inertial"] = False
 
     # -------------------------------------------------------------- messages in
 
@@ -194,7 +215,10 @@ class Sampler:
         """Take a message as it is on the wire; the samples (k,) of SAMPLE that are now complete."""
         reason = self._refusal(role, message)
         if reason:
-            self.counts[f"{role}: {reason}"] += 1
+            name = f"{role}: {reason}"
+            if name not in self.counts and len(self.counts) >= _REASONS:
+                name = f"{role}: refused for yet another reason"
+            self.counts[name] += 1
             return self._none
         if self.origin is None:
             self.origin = message.stamp
@@ -220,6 +244,9 @@ class Sampler:
         self._suspect.pop(role, None)
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
+            lateness = _LATER * (max(self._newest.values()) - t)
+            if lateness <= _LATEST:
+                self._late = max(self._late, lateness)
             if role != WRENCH:
                 return self._none
         self._enqueue(role, t, message)
@@ -234,7 +261,32 @@ class Sampler:
             self._first = t
         self.counts[role] += 1
         self._newest[role] = t
+        if isinstance(message, Odometry):
+            message = self._marked(message)
         self._queues[role].append((t, to_core(message, self._defaults)))
+        if role == WRENCH:
+            queue = self._queues[WRENCH]
+            while queue[-1][0] - queue[0][0] > _QUEUED:
+                queue.popleft()
+
+    def _marked(self, message: Odometry) -> Odometry:
+        """A velocity that is repeated to the last digit has not been measured again.
+
+        Its sensor has lost the ground, or is slower than its messages. Only where velocities are
+        rounded to a grid may it have been.
+        """
+        velocity, before = message.linear.tobytes(), self._velocity
+        self._velocity = velocity
+        if velocity == before:
+            if self._fine:
+                variance = message.twist_variance.copy()
+                variance[:3] = _REPEATED
+                return message._replace(twist_variance=variance)
+        else:
+            steps = message.linear / _GRID
+            off = bool(np.any(np.abs(steps - np.rint(steps)) > 0.01))
+            self._fine = 20 if off else max(self._fine - 1, 0)
+        return message
 
     def _corrected(self, message: Message) -> Message:
         """The message (FRD) without what the effects on the sensors have added."""
@@ -266,30 +318,33 @@ class Sampler:
         """Why the message cannot be used, or an empty string."""
         if message.stamp <= 0:
             return "zero stamp"
+        if message.stamp >= _LAST_STAMP:
+            return "stamp at the end of time"
         frames: tuple[str, ...]
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)
             p, q, v, w = message.position, message.orientation, message.linear, message.angular
             if not 0.5 < q.dot(q) < 2.0:  # NaN too
                 return "orientation is not a unit quaternion"
-            size = v.dot(v) + w.dot(w) + 1e-6 * p.dot(p)
+            size = v.dot(v) + w.dot(w) + 1e-12 * p.dot(p)
         elif isinstance(message, Imu):
             frames = (message.frame_id,)
             w, f = message.angular_velocity, message.linear_acceleration
-            size = w.dot(w) + f.dot(f)
+            size = w.dot(w) + f.dot(f) / 400.0
         else:
             frames = (message.frame_id,)
             f, w = message.force, message.torque
-            size = f.dot(f) + w.dot(w)
-        # one comparison refuses NaN, infinities and values no vehicle reaches
-        if not size < 1e12:
+            size = 2.5e-9 * (f.dot(f) + w.dot(w))
+        # One comparison refuses NaN, infinities and what no vehicle reaches: 50 m/s, 50 rad/s,
+        # 100 g, 1 MN.
+        if not size < 2500.0:
             return "not finite or absurdly large"
         if self._frame_ids.get(role) == frames:
             return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
-            return f"frame '{frames[-1]}' is a world frame, body axes are needed"
+            return f"frame {_shown(frames[-1:])} is a world frame, body axes are needed"
         if self._frame_ids.setdefault(role, frames) != frames:
-            return f"frame changed from {self._frame_ids[role]} to {frames}"
+            return f"frame changed from {_shown(self._frame_ids[role])} to {_shown(frames)}"
         return ""
 
     # -------------------------------------------------------------- samples out
@@ -318,15 +373,15 @@ class Sampler:
 
     def _reached(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t, or it is not worth waiting."""
-        horizon = max(self._newest.values())
-        if horizon - t > self._grace:
+        horizon, grace = max(self._newest.values()), max(self._grace, self._late)
+        if horizon - t > grace:
             return True
         for role in (ODOMETRY, IMU, WRENCH):
             newest = self._newest.get(role)
             if newest is None:
-                if t - self._first <= self._grace:
+                if t - self._first <= grace:
                     return False
-            elif newest < t and t - newest <= self._grace:
+            elif newest < t and t - newest <= grace:
                 return False
         return True
 
@@ -368,7 +423,9 @@ class Sampler:
             mean, slope, pose is not None, shift, odometry, inertial, gyro, gyro_variance, specific,
         )  # fmt: skip
         if pose is not None and not taken:
-            self.counts["odom: outlier, or marked as not measured"] += 1
+            repeated = odometry[10] == _REPEATED
+            why = "velocity repeated" if repeated else "outlier, or marked as not measured"
+            self.counts[f"odom: {why}"] += 1
         if wrench is None or not known:
             self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
             self._previous = math.nan
@@ -393,10 +450,13 @@ class Sampler:
                 now = at
             elif self._demand is None:
                 start = now = max(at, start)
+            if self._demand_time > -math.inf:
+                self._intervals.append(at - self._demand_time)
             self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
             if self.demands is not None:
                 self.demands.append((at, self._demand))
-        if self._demand is None or end - self._demand_time > self._hold:
+        hold = min(self._hold, _LOST * max(self._intervals, default=math.inf))
+        if self._demand is None or end - self._demand_time > hold:
             self._demand = None
             self._memory = memory()
             if self._sensitivity is not None:
@@ -428,6 +488,11 @@ class Sampler:
         if self._sensitivity is not None:
             self._sensitivity.act(t, dt, self._demand)
         return wrench
+
+
+def _shown(frames: tuple[str, ...]) -> str:
+    """Frame ids as they may stand in a log, whatever is in them."""
+    return ", ".join(repr(frame if len(frame) <= 40 else f"{frame[:37]}...") for frame in frames)
 
 
 def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
@@ -497,6 +562,8 @@ _ZERO_WRENCH = np.zeros(6)
 
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
 _UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
+_SUREST = 1e-4  # of the configured variance; no message is believed to be surer than that
+_REPEATED = 2e3  # ours, of a velocity that is not measured again
 _POWER_TIME = 5.0  # s; over which it is judged whether a component of nu moves
 _MOVING = 4.0  # mean square over noise variance from which it does; at rest it is 1. Higher values
 # hold coefficients that still act, and their error goes into the others.
@@ -535,7 +602,9 @@ def fuse(
     _set(out.wrench_slope, wrench_slope)
     for i in range(4):
         out.attitude[i] = nan
-    gyro_variance = gyro_given if 0.0 < gyro_given < 1.0 else s.gyro_variance
+    gyro_variance = s.gyro_variance
+    if 0.0 < gyro_given < 1.0:
+        gyro_variance = max(gyro_given, _SUREST * s.gyro_variance)
     started = k.inertial
     for i in range(3):
         out.gyro[i] = nan
@@ -545,17 +614,19 @@ def fuse(
     variance = np.empty(6)
     for i in range(6):
         given = has_odometry and 0.0 < odometry[10 + i] < _UNKNOWN
-        variance[i] = odometry[10 + i] if given else s.odometry_variance[i]
+        least = _SUREST * s.odometry_variance[i]
+        variance[i] = max(odometry[10 + i], least) if given else s.odometry_variance[i]
         out.odometry_variance[i] = variance[i]
     r_linear = (variance[0] + variance[1] + variance[2]) / 3.0
     r_angular = (variance[3] + variance[4] + variance[5]) / 3.0
 
     # What is marked as unknown is not used, unless the gyro knows it.
+    has_velocity = has_odometry
     for i in range(3):
         if _UNKNOWN <= odometry[10 + i] < np.inf:
-            has_odometry = False
+            has_velocity = False
         if _UNKNOWN <= odometry[13 + i] < np.inf and not has_imu:
-            has_odometry = False
+            has_velocity = has_odometry = False
 
     # attitude, by the rate known so far; the odometry's own rate if there is no IMU
     rate = np.empty(3)
@@ -643,8 +714,8 @@ def fuse(
         k.gyro_bias_variance += s.gyro_bias_variance * dt / _BIAS_TIME
 
     # odometry: velocity at the origin, carried to the sample's instant
-    taken = has_odometry
-    if has_odometry:
+    taken = has_velocity
+    if has_velocity:
         v, angular, lever = np.empty(3), odometry[7:10], s.odometry_lever
         for i in range(3):
             j, m = (i + 1) % 3, (i + 2) % 3
@@ -680,8 +751,11 @@ def fuse(
         if taken:
             for i in range(3):
                 out.odometry[i] = v[i] - out.water[i]
-                if not has_imu:
-                    out.odometry[3 + i] = angular[i]
+        k.known = True
+    if has_odometry:
+        if not has_imu and taken == has_velocity:  # what is an outlier is so as a whole
+            for i in range(3):
+                out.odometry[3 + i] = odometry[7 + i]
         if has_imu:
             gain = k.gyro_bias_variance / (k.gyro_bias_variance + r_angular + gyro_variance)
             # the gyro at the instant of the odometry; without a past it cannot be known
@@ -689,8 +763,7 @@ def fuse(
                 k.gyro_bias_variance *= 1.0 - gain
                 for i in range(3):
                     then = rate[i] + min(shift / dt, 1.0) * (k.rate[i] - rate[i])
-                    k.gyro_bias[i] += gain * (then - angular[i])
-        k.known = True
+                    k.gyro_bias[i] += gain * (then - odometry[7 + i])
     if has_imu:
         k.inertial = True
         out.gyro_variance = gyro_variance

@@ -223,7 +223,7 @@ def test_odometry_drops_out_and_returns(heavy):
 
 @pytest.mark.parametrize("silent", [0.8, 3.0])
 def test_silent_wrench(heavy, silent):
-    """Within the timeout the demand holds, beyond it there are no samples."""
+    """Three demands later than the next one should have come there are no samples."""
     dive = clean(heavy, 8.0)
     begin, end = 3.0, 3.0 + silent
     messages = [
@@ -233,14 +233,36 @@ def test_silent_wrench(heavy, silent):
     ]
     samples, sampler = taken(heavy, messages)
     t = samples["t"] + (sampler.origin - sensors.START) * 1e-9
-    gone = (t > begin + heavy.timeout) & (t < end)
-    if silent < heavy.timeout:
-        assert sampler.counts["sample: no wrench"] <= 2
-    else:
-        assert not gone.any()
-        assert sampler.counts["sample: no wrench"] > 20
-        after = np.flatnonzero(t > end)
-        assert samples["restart"][after[0]] and not samples["restart"][after[1:]].any()
+    period = 0.02
+    assert ((t > begin) & (t < begin + 2.0 * period)).any()
+    assert not ((t > begin + 3.0 * period) & (t < end)).any()
+    assert sampler.counts["sample: no wrench"] > 20
+    after = np.flatnonzero(t > end)
+    assert samples["restart"][after[0]] and not samples["restart"][after[1:]].any()
+
+
+def test_a_demand_that_seldom_comes(heavy):
+    """It holds as long as such demands usually do, but not beyond the timeout."""
+    dive = clean(heavy, 12.0)
+    kept, last = [], -1.0
+    for role, m in without_arrival(dive):
+        at = (m.stamp - sensors.START) * 1e-9
+        if role == WRENCH:
+            if at - last < 0.4 or at > 8.0:
+                continue
+            last = at
+        kept.append((role, m))
+    samples, sampler = taken(heavy, kept)
+    t = samples["t"] + (sampler.origin - sensors.START) * 1e-9
+    assert ((t > 1.0) & (t < 8.0)).sum() > 0.99 * 7.0 * 100.0
+    assert last + 0.9 < t.max() < last + 1.1
+
+
+def test_demands_alone_are_not_hoarded(heavy):
+    sampler = Sampler(heavy)
+    for k in range(5000):
+        sampler.push(WRENCH, Wrench(SECOND + k * 20_000_000, "", np.ones(3), np.ones(3)))
+    assert len(sampler._queues[WRENCH]) <= 501
 
 
 def test_no_wrench_at_all(heavy):
@@ -328,7 +350,8 @@ def test_later_than_the_grace_is_counted(heavy):
         late.append((arrival + lag * 1e9, role, message))
     late.sort(key=lambda m: m[0])
     samples, sampler = taken(heavy, [m[1:] for m in late])
-    assert sampler.counts["odom: too late"] > 30
+    first = sampler.counts["odom: too late"]
+    assert 10 < first < 25  # then the sampler waits for as long as that
     assert np.isfinite(samples["nu"]).all()
     assert (np.diff(samples["t"]) > 0).all()
 
@@ -552,7 +575,7 @@ def test_duplicate_and_backward_stamps(heavy, role, make, back, reason):
     assert sampler.counts[f"{role}: {reason} stamp"] == 1
 
 
-@pytest.mark.parametrize("wild", [1, 3600 * SECOND, 5 * 10**18])
+@pytest.mark.parametrize("wild", [1, 3600 * SECOND, 2 * 10**18])
 def test_single_wild_stamps_now_and_then(heavy, wild):
     """A driver that now and then says 1970: every time one message is lost, never the motion."""
     parts, messages = list(steady(100.0, 110.0)), []

@@ -18,6 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
 
+from rov_ident import checkpoint
 from rov_ident import config as configuration
 from rov_ident.cdr import DECODERS, ROLE_TYPES, encode
 from rov_ident.config import Config
@@ -47,9 +49,11 @@ from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
 from rov_ident.online import Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
 
-_OWN_PARAMETERS = ("save_path", "lockstep")
+_OWN_PARAMETERS = ("save_path", "checkpoint_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
 _DIAGNOSTICS_PERIOD = 1.0  # s
+_CHECKPOINT_PERIOD = 0.5  # s; with the time to write it a crash costs less than a second
+_LATE = 2.0  # s; a checkpoint that is older is worth a warning
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
 _SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
@@ -79,13 +83,21 @@ class EstimatorNode(Node):  # type: ignore[misc]
         super().__init__(f"{kind}_node", automatically_declare_parameters_from_overrides=True)
         config = parameters.declare(self, _OWN_PARAMETERS)
         self._save_path = self._own_parameter(
-            "save_path", f"{config.name}_{self.get_name()}.yaml", "file that ~/save writes"
+            "save_path",
+            f"{configuration.as_file_name(config.name)}_{self.get_name()}.yaml",
+            "file that ~/save writes",
         )
         self._lockstep = self._own_parameter("lockstep", False, "a player sets the pace")
+        checkpoint_path = self._own_parameter(
+            "checkpoint_path",
+            "",
+            "file in which what is learnt outlives a crash, or a folder for it; empty: none",
+        )
         started = time.monotonic()
         self.get_logger().info("compiling: half a minute when first started on a computer")
         warm_up(config, kind)
         self._online = OnlineEstimator(config, kind)
+        self._keeper = None if self._lockstep else self._recalled(str(checkpoint_path))
 
         self._undecodable: Counter[str] = Counter()
         self._received: Counter[str] = Counter()
@@ -95,6 +107,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._wrench_frame: str | None = None
         self._ratios: list[NDArray[np.float64]] = []  # (k, 6) since the last diagnostics
         self._published_stamp = 0  # ns
+        self._kept = self._online.stamp  # ns; of the last checkpoint asked for
         self._watched = time.monotonic()
         self._parent = os.getppid()
         self._seen_counts: Counter[str] = Counter()
@@ -122,6 +135,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
         )
         self.create_timer(_WATCH_PERIOD, self._watch, clock=self._steady)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, clock=self._steady)
+        if self._keeper is not None:
+            self.create_timer(_CHECKPOINT_PERIOD, self._keep, clock=self._steady)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
 
@@ -231,6 +246,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         What is not compiled yet is compiled by another process: a thread of ours would stop us.
         """
         self._judge = ThreadPoolExecutor(1, "watch")
+        self._leaving = threading.Event()
         self._compiling: subprocess.Popen[bytes] | None = None
         begun = self._judge.submit(self._load_watcher)
         begun.add_done_callback(self._complain)
@@ -241,10 +257,14 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _load_watcher(self) -> None:
         from rov_ident import watch  # here: not needed to begin with
 
-        if not watch.is_compiled():
+        if not watch.is_compiled() and not self._leaving.is_set():
             self._compiling = subprocess.Popen([sys.executable, "-m", watch.__name__])
+            if self._leaving.is_set():
+                self._compiling.terminate()
             if self._compiling.wait():
                 return  # we are leaving, or have no memory for it: estimating goes on without
+        if self._leaving.is_set():  # a process does not end before its threads do
+            return
         watch.compile_all()
         self._online.show(watch.Watcher(self._config, self._when_idle))
 
@@ -276,6 +296,42 @@ class EstimatorNode(Node):  # type: ignore[misc]
         )
         return to_status(f"{self.get_name()}: model", self._config.name, level, words, values)
 
+    # ---------------------------------------------------------------- checkpoints
+
+    def _recalled(self, given: str) -> checkpoint.Keeper | None:
+        """What keeps checkpoints, where that is asked for; what the last one holds is taken up."""
+        if not given:
+            return None
+        path = Path(given).expanduser()
+        if given.endswith("/") or path.is_dir():
+            node = self.get_fully_qualified_name().replace("/", "_")
+            path /= f"{configuration.as_file_name(self._config.name)}{node}.checkpoint"
+        try:
+            if checkpoint.read(self._online, path):
+                self.get_logger().info(f"going on from {path}, of {self._online.stamp} ns")
+        except UserError as error:
+            self.get_logger().error(f"{error}; beginning with the prior")
+        return checkpoint.Keeper(path, self._online)
+
+    def _keep(self) -> None:
+        assert self._keeper is not None
+        if self._online.stamp != self._kept or self._keeper.failure:
+            self._kept = self._online.stamp
+            self._keeper.keep()
+
+    def _checkpoint_status(self, keeper: checkpoint.Keeper) -> DiagnosticStatus:
+        late = (self._online.stamp - keeper.saved) * 1e-9
+        values = {"path": str(keeper.path), "write time": f"{keeper.took:.3g} s"}
+        level, words = Level.OK, "what is learnt is on disk"
+        if keeper.failure:
+            level = Level.ERROR
+            words = f"{keeper.path} cannot be written ({keeper.failure}): a crash loses what is new"
+        elif self._kept == 0:
+            words = "nothing learnt yet"
+        elif late > _LATE:
+            level, words = Level.WARN, f"the disk is slow: what is on it is {late:.1f} s old"
+        return to_status(f"{self.get_name()}: checkpoint", self._config.name, level, words, values)
+
     # ---------------------------------------------------------------- watching
 
     def _watch(self) -> None:
@@ -299,7 +355,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
         elif self._online.enabled and self._idle > self._config.timeout:
             self._stopped = "no message of the inputs can be used"
         if self._stopped != before:
-            self._show(self._online.flush())
+            if self._stopped:
+                self._show(self._online.flush())
             self._publish()
 
     def _missing(self, role: str) -> bool:
@@ -341,6 +398,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
             self._estimation_status(),
             self._model_status(),
         ]
+        if self._keeper is not None:
+            message.status.append(self._checkpoint_status(self._keeper))
         self._diagnostics.publish(message)
         # Without the numbers, which differ each time.
         complaint = "; ".join(text.partition(" (")[0] for text in complaints)
@@ -433,7 +492,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
         return response
 
     def take_leave(self) -> None:
+        self._leaving.set()
         self._judge.shutdown(wait=False, cancel_futures=True)
+        if self._keeper is not None:
+            self._keep()
+            self._keeper.close()
         if self._compiling is not None:
             self._compiling.terminate()
         used = self._online.counts["sample: used"]
