@@ -646,12 +646,14 @@ def fuse(
     taken = has_odometry
     if has_odometry:
         v, angular, lever = np.empty(3), odometry[7:10], s.odometry_lever
+        # the acceleration between the odometry and now: in a line from that of the IMU before
+        share = 0.5 * shift / dt if has_imu and started and shift < dt else 0.0
         for i in range(3):
             j, m = (i + 1) % 3, (i + 2) % 3
             v[i] = (
                 odometry[4 + i]
                 - (angular[j] * lever[m] - angular[m] * lever[j])
-                + shift * acceleration[i]
+                + shift * (acceleration[i] + share * (k.acceleration[i] - acceleration[i]))
             )
         if not k.known or not (has_imu and started):
             _set(k.v, v)
