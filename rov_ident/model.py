@@ -279,6 +279,11 @@ def skew(a: Sequence[float] | Array) -> Array:
 # vanish (one lane) or become vector instructions. These want one long expression a lane and rows of
 # known length, hence the tuples.
 
+# of the classical Runge-Kutta step: when a stage is, its weight, how far its slope takes the next
+NODES = (0.0, 0.5, 0.5, 1.0)
+WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+AHEAD = (0.5, 0.5, 1.0, 0.0)
+
 
 @inlined
 def extend(lanes, nu, extended):

@@ -49,6 +49,9 @@ from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
+    AHEAD,
+    NODES,
+    WEIGHTS,
     Structure,
     add_added_mass,
     columns,
@@ -522,7 +525,7 @@ def _predict(task, state, work, sample, side):
     steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
     dt = sample.dt / steps
     for step in range(steps):
-        _linearise(task, work, nu, (step + 0.5) * dt - 0.5 * sample.dt, dt)
+        _linearise(task, work, nu, step * dt - 0.5 * sample.dt, dt)
         # the regressor, in the middle of the step
         columns(task.structure, s.rate, work.of_rate, work.of_motion)
         if free < n:
@@ -600,32 +603,32 @@ def _advance(transition, x, into, drive, out):
 
 @inlined
 def _linearise(task, work, nu, late, dt):
-    """A step of the midpoint rule from nu, ``late`` seconds after mid-interval in its middle.
+    """A Runge-Kutta step from nu, which begins ``late`` seconds after mid-interval.
 
-    s.rate is nu_dot there; s.transition is ``d nu(end) / d nu``, s.into ``d nu(end) / d wrench``,
-    both to second order in dt.
+    s.rate is the mean of nu_dot over it; s.transition is ``d nu(end) / d nu``, s.into
+    ``d nu(end) / d wrench``, both to second order in dt, about s.middle.
     """
     s = work.scratch[0]
     for i in range(6):
         s.one_nu[i, 0] = nu[i]
-    generalized_force(
-        1, task.structure, s.one_mass, work.one_theta, s.one_nu, s.one_h, s.one_extended
-    )
+        s.rate[i] = 0.0
+    for n in range(4):
+        generalized_force(
+            1, task.structure, s.one_mass, work.one_theta, s.one_nu, s.one_h, s.one_extended
+        )
+        at = late + NODES[n] * dt
+        for i in range(6):
+            total = 0.0
+            for j in range(6):
+                total += s.inverse[i, j] * (s.force[j] + at * s.slope[j] - s.one_h[j, 0])
+            s.rate[i] += WEIGHTS[n] * total
+            s.one_nu[i, 0] = nu[i] + AHEAD[n] * dt * total
     for i in range(6):
-        total = 0.0
-        for j in range(6):
-            # the force of mid-step serves for the start of it, too: to second order
-            total += s.inverse[i, j] * (s.force[j] + late * s.slope[j] - s.one_h[j, 0])
-        s.middle[i] = nu[i] + 0.5 * dt * total
-    for i in range(6):
+        s.middle[i] = nu[i] + 0.5 * dt * s.rate[i]
         for k in range(_POINTS):
             s.nu[i, k] = s.middle[i] + (_SHIFT if k == i + 1 else 0.0)
     generalized_force(_POINTS, task.structure, s.mass, work.theta, s.nu, s.h, s.extended)
     for i in range(6):
-        total = 0.0
-        for j in range(6):
-            total += s.inverse[i, j] * (s.force[j] + late * s.slope[j] - s.h[j, 0])
-        s.rate[i] = total
         for k in range(6):
             total = 0.0
             for j in range(6):

@@ -102,6 +102,7 @@ _KINEMATICS = np.dtype(
         ("acceleration", "f8", (3,)),  # m/s2 at the origin, body axes
         ("gyro_bias", "f8", (3,)),
         ("gyro_bias_variance", "f8"),
+        ("attitude_bias", "f8"),  # rad2/s: covariance of attitude and gyro bias
         ("accelerometer_bias", "f8", (3,)),
         ("p_vv", "f8"),
         ("p_vb", "f8"),
@@ -648,14 +649,18 @@ def fuse(
     if k.known:
         _set(k.q, turned(k.q, mean_rate * dt))
         k.attitude_variance += gyro_variance * dt * dt + 1e-8 * dt
+        if has_imu:
+            k.attitude_variance += dt * (dt * k.gyro_bias_variance - 2.0 * k.attitude_bias)
+            k.attitude_bias -= dt * k.gyro_bias_variance
     if has_odometry:
         q = turned(odometry[:4] / np.sqrt(np.sum(odometry[:4] ** 2)), rate * shift)
         if not k.known or not k.inertial:
             _set(k.q, q)
             k.attitude_variance = s.attitude_variance
+            k.attitude_bias = 0.0
         else:
-            gain = k.attitude_variance / (k.attitude_variance + s.attitude_variance)
-            k.attitude_variance *= 1.0 - gain
+            total = k.attitude_variance + s.attitude_variance
+            gain = k.attitude_variance / total
             # vector part of conj(k.q) * q: half the rotation from one to the other
             a, b = k.q, q
             e = np.empty(3)
@@ -663,7 +668,16 @@ def fuse(
             e[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
             e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
             sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
-            _set(k.q, turned(k.q, 2.0 * sign * gain * e))
+            e *= 2.0 * sign
+            _set(k.q, turned(k.q, gain * e))
+            bias_gain = k.attitude_bias / total
+            # A heading that was set anew is no bias of the gyro.
+            if e[0] ** 2 + e[1] ** 2 + e[2] ** 2 < 3.0 * s.gate**2 * total:
+                for i in range(3):
+                    k.gyro_bias[i] += bias_gain * e[i]
+                k.gyro_bias_variance -= bias_gain * k.attitude_bias
+            k.attitude_bias *= 1.0 - gain
+            k.attitude_variance *= 1.0 - gain
         _set(out.attitude, q)
     _set(out.orientation, k.q)
     to_world = rotation(k.q)
@@ -717,12 +731,14 @@ def fuse(
     taken = has_velocity
     if has_velocity:
         v, angular, lever = np.empty(3), odometry[7:10], s.odometry_lever
+        # the acceleration between the odometry and now: in a line from that of the IMU before
+        share = 0.5 * shift / dt if has_imu and started and shift < dt else 0.0
         for i in range(3):
             j, m = (i + 1) % 3, (i + 2) % 3
             v[i] = (
                 odometry[4 + i]
                 - (angular[j] * lever[m] - angular[m] * lever[j])
-                + shift * acceleration[i]
+                + shift * (acceleration[i] + share * (k.acceleration[i] - acceleration[i]))
             )
         if not k.known or not (has_imu and started):
             _set(k.v, v)
@@ -757,13 +773,19 @@ def fuse(
             for i in range(3):
                 out.odometry[3 + i] = odometry[7 + i]
         if has_imu:
-            gain = k.gyro_bias_variance / (k.gyro_bias_variance + r_angular + gyro_variance)
+            total = k.gyro_bias_variance + r_angular + gyro_variance
+            gain, angle_gain = k.gyro_bias_variance / total, k.attitude_bias / total
             # the gyro at the instant of the odometry; without a past it cannot be known
             if k.inertial and dt > 0.0 and r_angular < _UNKNOWN:
                 k.gyro_bias_variance *= 1.0 - gain
+                k.attitude_variance -= angle_gain * k.attitude_bias
+                k.attitude_bias *= 1.0 - gain
+                change = np.empty(3)
                 for i in range(3):
                     then = rate[i] + min(shift / dt, 1.0) * (k.rate[i] - rate[i])
-                    k.gyro_bias[i] += gain * (then - odometry[7 + i])
+                    change[i] = then - odometry[7 + i]
+                    k.gyro_bias[i] += gain * change[i]
+                _set(k.q, turned(k.q, angle_gain * change))
     if has_imu:
         k.inertial = True
         out.gyro_variance = gyro_variance

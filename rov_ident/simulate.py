@@ -12,7 +12,7 @@ from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.effects import Acting, add_surroundings, has_surroundings
 from rov_ident.errors import UserError
 from rov_ident.jit import inner, kernel
-from rov_ident.model import Array, Model, generalized_force, six, symmetric_product
+from rov_ident.model import NODES, Array, Model, generalized_force, six, symmetric_product
 
 MAX_STEP = 0.02  # s; within 1e-5 m/s of an adaptive integration for a BlueROV2 driven hard
 
@@ -168,8 +168,6 @@ _SCRATCH = np.dtype(
     align=True,
 )
 
-_NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta step
-
 
 @inner
 def _derivative(structure, theta, restoring, guided, s, rate):
@@ -236,7 +234,7 @@ def _simulate(
         dt = span / steps
         for n in range(steps):
             for k in range(4):
-                ahead = _NODES[k] * dt
+                ahead = NODES[k] * dt
                 for j in range(13):
                     stage[j] = state[j] + ahead * slope[k - 1, j] if k > 0 else state[j]
                 now = n * dt + ahead

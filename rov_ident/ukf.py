@@ -41,6 +41,9 @@ from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
 from rov_ident.jit import inlined, inner, kernel, reordered
 from rov_ident.model import (
+    AHEAD,
+    NODES,
+    WEIGHTS,
     Structure,
     add_added_mass,
     generalized_force,
@@ -475,11 +478,6 @@ def _push(task, work, side):
                 s.push[i, k] += side[i, j] * (work.theta[first + j, k] - side[12, j])
 
 
-_NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta step
-_WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
-_AHEAD = (0.5, 0.5, 1.0, 0.0)  # from a stage's slope to the next stage
-
-
 @reordered
 def _propagate(structure, work, late, dt):
     """One Runge-Kutta step of the sigma points, beginning ``late`` seconds after mid-interval."""
@@ -492,10 +490,10 @@ def _propagate(structure, work, late, dt):
             total[i, k] = nu[i, k]
     for n in range(4):
         generalized_force(LANES, structure, s.mass, work.theta, stage, h, s.extended)
-        at = late + _NODES[n] * dt
+        at = late + NODES[n] * dt
         a, b, c = force[0] + at * slope[0], force[1] + at * slope[1], force[2] + at * slope[2]
         d, e, f = force[3] + at * slope[3], force[4] + at * slope[4], force[5] + at * slope[5]
-        weight, ahead = _WEIGHTS[n] * dt, _AHEAD[n] * dt
+        weight, ahead = WEIGHTS[n] * dt, AHEAD[n] * dt
         for k in range(LANES):
             rest = (
                 a + push[0, k] - h[0, k], b + push[1, k] - h[1, k], c + push[2, k] - h[2, k],
