@@ -284,7 +284,7 @@ class Judge:
         self._guided = evidence.guided
         self._limit = _LIMIT * evidence.measured.std(axis=0) + 1e-9
         times = evidence.times
-        self._chunk = (times / _CHUNK).astype(int)
+        self._chunk = np.unique((times / _CHUNK).astype(int), return_inverse=True)[1]
 
     def squares(self, h: Hypothesis) -> Array:
         """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
@@ -299,14 +299,12 @@ class Judge:
     def gain(self, before: Hypothesis, after: Hypothesis) -> Gain:
         """Of the component that gains most, of those that surely gain if any do."""
         free = np.flatnonzero(~self._guided)
-        a, b = (_summed(self._chunk, self.squares(h)[:, free]) for h in (before, after))
+        a, b = (self.summed(h)[:, free] for h in (before, after))
         return gain_of([VELOCITIES[i] for i in free], a, b, len(self._chunk))
 
-
-def _summed(chunk: NDArray[np.int64], squares: Array) -> Array:
-    """Squares (N, K) summed over the chunks of time that they lie in, (C, K)."""
-    _, at = np.unique(chunk, return_inverse=True)
-    return np.stack([np.bincount(at, column) for column in squares.T], axis=1)
+    def summed(self, h: Hypothesis) -> Array:
+        """Squared errors (C, 6) summed over chunks of time."""
+        return np.stack([np.bincount(self._chunk, x) for x in self.squares(h).T], axis=1)
 
 
 def gain_of(components: Sequence[str], before: Array, after: Array, count: float | Array) -> Gain:
@@ -415,6 +413,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
     alternatives, separable = [], True
     for rival, fitted in trial.rivals.items():
         if rival.startswith(UNKNOWN):
+            separable = separable and search.cost(fitted, final) > best - SURE
             continue
         share = (trial.rest.rss - fitted.rss) / max(explained, 1e-9)
         if search.cost(fitted, final) - best < SURE:
