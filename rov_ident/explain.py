@@ -30,7 +30,7 @@ from rov_ident.findings import (
 )
 from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
 from rov_ident.model import Array
-from rov_ident.scores import PRICE, SURE, inflation
+from rov_ident.scores import SURE, inflation
 from rov_ident.streams import Streams, joined
 
 BLOCK = 10.0  # s; held-out data are whole blocks, and windows for judging are as long
@@ -163,9 +163,7 @@ def explain(
     everything = Evidence(streams, thinned(halves))
     last = everything.fit(final.hypothesis, None) or final
     last = everything.dated(last)
-    for f in [
-        f for f in found if weighty(f) and not _certain(last, search.keys_of(last, f.effect))
-    ]:
+    for f in [f for f in found if weighty(f) and not _certain(search, last, f.effect)]:
         minor.append(f)
         gone = search.keys_of(final, f.effect)
         final = search.evidence.fit(final.hypothesis.without(gone), final.look) or final
@@ -283,8 +281,9 @@ class Judge:
         self._evidence = evidence
         self._guided = evidence.guided
         self._limit = _LIMIT * evidence.measured.std(axis=0) + 1e-9
-        times = evidence.times
-        self._chunk = np.unique((times / _CHUNK).astype(int), return_inverse=True)[1]
+        self._number, self._chunk = np.unique(
+            (evidence.times / _CHUNK).astype(int), return_inverse=True
+        )
 
     def squares(self, h: Hypothesis) -> Array:
         """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
@@ -296,11 +295,22 @@ class Judge:
         error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
 
-    def gain(self, before: Hypothesis, after: Hypothesis) -> Gain:
-        """Of the component that gains most, of those that surely gain if any do."""
+    def gain(
+        self, before: Hypothesis, after: Hypothesis, beside: tuple[float, float] | None = None
+    ) -> Gain:
+        """Of the component that gains most, of those that surely gain if any do.
+
+        The windows that reach into the time ``beside`` (from and to [s]) do not count.
+        """
+        e, use = self._evidence, np.ones(len(self._number), dtype=bool)
+        if beside is not None:
+            begin, end = e.steps.t[e.first], e.steps.t[e.last]
+            out = (end > beside[0]) & (begin < beside[1])
+            use[self._chunk[out[e.window]]] = False
+        use = use if use.any() else ~use
         free = np.flatnonzero(~self._guided)
-        a, b = (self.summed(h)[:, free] for h in (before, after))
-        return gain_of([VELOCITIES[i] for i in free], a, b, len(self._chunk))
+        a, b = (self.summed(h)[np.ix_(use, free)] for h in (before, after))
+        return gain_of([VELOCITIES[i] for i in free], a, b, int(use[self._chunk].sum()))
 
     def summed(self, h: Hypothesis) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
@@ -407,7 +417,13 @@ def _by_time(t: Array, squares: Array, at: Array) -> Array:
 
 def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Trial) -> Finding:
     keys = search.keys_of(final, name)
-    gain = judge.gain(trial.rest.hypothesis, final.hypothesis)
+    parameters = parameters_of(final, keys)
+    onset = parameters.get("onset")
+    # When it began, between two windows of the fit, what is held out there cannot be predicted.
+    beside = None
+    if onset is not None:
+        beside = onset.value - 2.0 * onset.std, onset.value + 2.0 * onset.std
+    gain = judge.gain(trial.rest.hypothesis, final.hypothesis, beside)
     best = search.cost(final, final)
     explained = trial.rest.rss - final.rss
     alternatives, separable = [], True
@@ -427,8 +443,6 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
     if not separable:
         alternatives = [a for a in alternatives if a[1].why_not == _AS_WELL]
     separable = separable and not any(_pinned(k, final.hypothesis.values[k]) for k in keys)
-    parameters = parameters_of(final, keys)
-    onset = parameters.get("onset")
     return Finding(
         name,
         _axes(search, final, keys),
@@ -442,18 +456,10 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
     )
 
 
-def _certain(last: Fitted, keys: Sequence[Key]) -> bool:
-    """Whether all of the data tell an effect from nothing as surely as it takes to join a model.
-
-    The squared distance of its amplitudes from null, in units of their deviation (Wald).
-    """
-    keys = [k for k in keys if k[0] not in EFFECTS or parameter(k).role == "amplitude"]
-    at = last.linear.index(keys)
-    away = np.array([last.hypothesis.values[k] - bounds(k)[0] for k in keys])
-    wide = covariance(last)[np.ix_(at, at)]
-    size = np.sqrt(np.maximum(np.diag(wide), 1e-300))
-    unit = np.linalg.pinv(wide / np.outer(size, size), hermitian=True)
-    return bool((away / size) @ unit @ (away / size) >= PRICE * len(keys) + SURE)
+def _certain(search: Search, last: Fitted, name: str) -> bool:
+    """Whether all of the data tell an effect from nothing as surely as it takes to join a model."""
+    rest = last.look.evidence.fit(last.hypothesis.without(search.keys_of(last, name)), last.look)
+    return rest is None or search.worth(rest, last, last) >= SURE
 
 
 def _pinned(key: Key, value: float) -> bool:
