@@ -15,6 +15,7 @@ lies in the bracket of the tier. Where no strength does that the next seed is ta
 """
 
 import argparse
+import dataclasses
 import hashlib
 import itertools
 import json
@@ -40,6 +41,7 @@ import hidden
 from hidden import NESTED, SENSOR_EFFECTS, UNKNOWN, UNOBSERVABLE, Case, Conditions
 from rov_ident import explain as engine
 from rov_ident import kinematics
+from rov_ident.coefficients import VELOCITIES
 from rov_ident.discrepancy import Search
 from rov_ident.effects import EFFECTS
 from rov_ident.evidence import Evidence
@@ -229,37 +231,40 @@ def _certain(gain: Gain) -> float:
     return gain.percent / 100.0 if gain.low > 0.0 else 0.0
 
 
-def _retuned(case: Case, streams: Streams) -> np.ndarray:
-    """RMSE (6,) of the given structure, refitted: of the median held-out window.
+def gain_of_unknown(case: Case, streams: Streams) -> float:
+    """What knowing the wrench of an effect outside the library gains, over its mean in the world.
 
-    The windows of two dives are not the same: one that is unstable must not decide.
+    A constant force is in the library, and what of the effect is no more than that has a name. The
+    wrench that is known is added to what is demanded, and the given structure refitted.
     """
+    truth = case.truth
+    rotation = fossen.rotations(truth.orientation)
+    steady = np.zeros_like(truth.foreign)
+    steady[:, :3] = np.mean(np.einsum("kij,kj->ki", rotation, truth.foreign[:, :3]), 0) @ rotation
+    begin = 1e-9 * (min(m.stamp for _, _, m in case.messages) - hidden.START)
+    middle = streams.demand_t + begin + 0.5 * float(np.median(np.diff(streams.demand_t)))
     fit, held = engine.split(streams.duration)
-    search, evidence = Search(streams, case.config, fit), Evidence(streams, held)
-    fitted = search.evidence.fit(search.given)
-    if fitted is None:
-        return np.full(6, math.nan)
-    squares = engine.Judge(evidence).squares(fitted.hypothesis)
-    windows = [squares[evidence.window == w].mean(axis=0) for w in np.unique(evidence.window)]
-    rmse: np.ndarray = np.sqrt(np.median(windows, axis=0))
-    return rmse
+    squares = []
+    for wrench in (steady, truth.foreign):
+        known = np.stack([np.interp(middle, truth.t, column) for column in wrench.T], axis=1)
+        there = dataclasses.replace(streams, demand=streams.demand + known)
+        search, judge = Search(there, case.config, fit), engine.Judge(Evidence(there, held))
+        fitted = search.evidence.fit(search.given)
+        if fitted is None:
+            return math.nan
+        squares.append(judge.summed(fitted.hypothesis))
+    return _certain(engine.gain_of(VELOCITIES, *squares, 1.0))
 
 
 def bag(trial: Trial, seed: int, strengths: Sequence[float]) -> Bag:
-    """The bag of a seed at these strengths, and what is to be gained there.
-
-    What an unknown effect would gain is measured by the same dive without it.
-    """
+    """The bag of a seed at these strengths, and what is to be gained there."""
     case = hidden.draw(
         seed, trial.effects, strengths or 1.0, conditions=trial.conditions, unknown=trial.unknown
     )
     streams = streams_of(case)
     gains = true_gains(case, streams)
     if trial.unknown:
-        twin = hidden.draw(seed, trial.effects, [*strengths[:-1], 0.0],
-                           conditions=trial.conditions, unknown=trial.unknown)  # fmt: skip
-        left = 1.0 - _retuned(twin, streams_of(twin)) / _retuned(case, streams)
-        gains.append(float(np.max(left)))
+        gains.append(gain_of_unknown(case, streams))
     return Bag(case, streams, tuple(strengths), tuple(gains))
 
 

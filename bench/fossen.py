@@ -275,6 +275,15 @@ def _unknown_force(kind, axis, p, t, position, r, nu, out):
 
 
 @_fast
+def unknown_forces(kind, axis, p, t, motion, out):
+    """Add the wrenches (N, 6) of an effect that is not in the library along a motion (N, 25) as
+    :func:`run` gives it; its water is at rest."""
+    for i in range(len(t)):
+        r = _matrix(motion[i, 3:7])
+        _unknown_force(kind, axis, p, t[i], motion[i, :3], r, motion[i, 7:13], out[i])
+
+
+@_fast
 def _acceleration(plant, world, kind, axis, p, t, position, r, nu, wrench):
     """nu_dot (6,) from M_RB nu_dot + C_RB nu + M_A nu_r_dot + C_A nu_r = all forces."""
     v, w = nu[:3], nu[3:]

@@ -518,8 +518,9 @@ UNKNOWN: dict[str, Unknown] = {
 @dataclass(frozen=True)
 class Truth:
     """The true motion at ``t`` (N,): position (N, 3), orientation (N, 4) w x y z, nu (N, 6),
-    nu_dot (N, 6), the wrench (N, 6) that acts from the instant on, and, at ``command_t`` (K,), the
-    wrench (K, 6) demanded from there to the next."""
+    nu_dot (N, 6), the wrench (N, 6) that acts from the instant on, that of an effect outside the
+    library (N, 6), and, at ``command_t`` (K,), the wrench (K, 6) demanded from there to the next.
+    """
 
     t: Array
     position: Array
@@ -527,6 +528,7 @@ class Truth:
     nu: Array
     nu_dot: Array
     acting: Array
+    foreign: Array
     command_t: Array
     command: Array
 
@@ -933,9 +935,12 @@ def _dive(
         plant, world, foreign.kind, foreign.axis, foreign.parameters, drive, control, t, asked,
         shares, command_t, start, demand, out,
     )  # fmt: skip
+    other = np.zeros((len(t), 6))
+    fossen.unknown_forces(foreign.kind, foreign.axis, foreign.parameters, t, out, other)
     return Truth(
-        t, out[:, :3], out[:, 3:7], out[:, 7:13], out[:, 13:19], out[:, 19:], command_t, demand
-    )
+        t, out[:, :3], out[:, 3:7], out[:, 7:13], out[:, 13:19], out[:, 19:], other, command_t,
+        demand,
+    )  # fmt: skip
 
 
 def _roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Array:

@@ -9,8 +9,9 @@
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from rov_ident.evidence import Evidence, Fitted, Look
 from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
 from rov_ident.model import Array
 from rov_ident.patterns import Pattern, patterns
-from rov_ident.scores import PRICE, SURE, inflation, own_inflation, scores_of
+from rov_ident.scores import PRICE, SURE, Scores, inflation, own_inflation, scores_of
 from rov_ident.streams import Streams
 
 Progress = Callable[[str], None]
@@ -47,12 +48,15 @@ _SHARE = 0.3  # of the best promise: what promises less is not fitted
 class Candidate:
     """Something that might be there: parameters to add, where to start, what is promised.
 
-    ``promise`` is what it takes off the scaled squared residuals beyond its price.
+    ``promise`` is what it takes off the scaled squared residuals beyond its price. A candidate that
+    is not ``firm`` promises that only if what is left were white: where a model is so far off that
+    a linear view of it leaves colour, only a fit shows what there is.
     """
 
     name: str
     start: Mapping[Key, float]
     promise: float
+    firm: bool = True
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,15 @@ class Trial:
 
 
 Trials = dict[str, Trial]
+
+
+class Scanned(NamedTuple):
+    """The best shape {parameter: value} of an effect, its linear amplitudes, and their promise."""
+
+    promise: float
+    shape: Mapping[str, float]
+    change: Mapping[Key, float]
+    firm: bool
 
 
 class Search:
@@ -108,25 +121,28 @@ class Search:
         found: list[Fitted] = []
         while len(found) < _MOST_PATTERNS:
             screened = self.screen_patterns(final)
-            if not screened or screened[0][0].promise < SURE:
+            if not screened:
                 break
-            candidate, pattern = screened[0]
-            longer = self.fit_pattern(final, candidate, pattern)
-            if longer is None or self.worth(final, longer, longer) < SURE:
+            tried = (self.fit_pattern(final, *s) for s in screened[:_PATTERNS_TRIED])
+            price = SURE + _choice(self._patterns(final))
+            fits = [f for f in tried if f is not None and self.worth(final, f, f) >= price]
+            if not fits:
                 break
-            final = longer
+            final = min(fits, key=lambda f: self.cost(f, fits[0]))
             found.append(final)
         return found
 
     def longer(self, now: Fitted, progress: Progress | None = None) -> Fitted | None:
         """The model with the one effect more that explains most; None where nothing is left."""
         candidates = [c for c in self.screen(now) if not self._early(c.name, now.hypothesis)]
-        fits = self.fit_best(now, candidates)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.promise:.0f}" for c in candidates[:5]))
-        best = self._best(now, fits)
+        firm = [c for c in candidates if c.firm]
+        best = self._best(now, self.fit_best(now, firm))
         if best is None:
-            best = self._ahead(now, candidates)
+            best = self._ahead(now, firm)
+        if best is None:
+            best = self._best(now, self.fit_best(now, [c for c in candidates if not c.firm]))
         if best is None:
             return None
         return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
@@ -193,9 +209,10 @@ class Search:
 
         A pattern can imitate any cause, with the freedom to follow noise besides, and what a model
         should have anyway is likelier than what few vehicles meet: the rival must explain clearly
-        more.
+        more. A pattern that is in the model anyway need not.
         """
         now = self.cost(final, final)
+        there = self.named(final)
         explained = max(trial.rest.rss - final.rss, 1e-9)
         choices = [trial.rest]
         for rival, fit in trial.rivals.items():
@@ -203,7 +220,7 @@ class Search:
             if rival in EFFECTS and EFFECTS[rival].beyond == name:
                 continue
             if rival.startswith(UNKNOWN) and not name.startswith(UNKNOWN):
-                margin = _IMITATION
+                margin = 0.0 if rival in there else _IMITATION
             elif name in PLAIN and rival not in PLAIN:
                 margin = _LIKELIER
             if margin == 0.0 or (
@@ -220,6 +237,8 @@ class Search:
     def rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
         """What else might explain what ``name`` explains: fits by the name of the rival."""
         candidates = [c for c in self.screen(rest) if c.name != name]
+        firm = any(c.firm and c.promise > 0.0 for c in candidates)
+        candidates = [c for c in candidates if c.firm or not firm]
         fits = {self.newest(rest, f): f for f in self.fit_best(rest, candidates)}
         for candidate, pattern in self.screen_patterns(rest)[:_PATTERNS_TRIED]:
             fit = self.fit_pattern(rest, candidate, pattern)
@@ -245,7 +264,8 @@ class Search:
         return best
 
     def _score(self, now: Fitted, pattern: Pattern) -> tuple[list[Key], list[float], float]:
-        """Columns of a pattern that are worth adding, how much of each, and what they promise."""
+        """Columns of a pattern that are worth adding, how much of each, and what they promise if
+        what they leave is white."""
         h, look = now.hypothesis, now.look
         columns = [i for i, k in enumerate(pattern.keys) if k not in h.values]
         keys = [pattern.keys[i] for i in columns]
@@ -253,7 +273,9 @@ class Search:
             return [], [], 0.0
         scores = scores_of(look, keys, look.of(pattern.force()[:, :, columns]))
         units = [keys] if pattern.frequency else [(k,) for k in keys]
-        chosen, change, promise = scores.best(units, bounds)
+        chosen, change, _, _ = _chosen(scores, units)
+        reached = scores.solve(chosen, bounds)[1]
+        promise = reached / scores.variance(reached, len(chosen)) - PRICE * len(chosen)
         return chosen, change.tolist(), promise - (PRICE if pattern.frequency else 0.0)
 
     def newest(self, rest: Fitted, longer: Fitted) -> str:
@@ -346,13 +368,13 @@ class Search:
         scores = scores_of(look, extra, columns)
         candidates = []
         for name, units in plain.items():
-            chosen, change, promise = scores.best(units, bounds, name in PLAIN)
-            if not chosen and units and name in PLAIN:
-                chosen = [k for unit in units for k in unit]
+            chosen, change, promise, firm = _chosen(scores, units, name in PLAIN)
+            if units and name in PLAIN and not (chosen and firm):
+                chosen, firm = [k for unit in units for k in unit], True
                 change, promise = scores.solve(chosen, bounds)[0], -np.inf
             if chosen:
                 start = self._start(dict(zip(chosen, change.tolist(), strict=True)))
-                candidates.append(Candidate(name, start, promise))
+                candidates.append(Candidate(name, start, promise, firm))
         for effect in EFFECTS.values():
             roles = {p.role for p in effect.parameters}
             if effect.name in h.effects:
@@ -363,7 +385,7 @@ class Search:
                 candidates += self._attached(now, effect)
             elif "frequency" in roles:
                 candidates += self._oscillating(now, effect)
-        return sorted(candidates, key=lambda c: -c.promise)
+        return sorted(candidates, key=lambda c: (not c.firm, -c.promise))
 
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
         """Parameters of an effect that h lacks, in the groups in which they may join."""
@@ -409,7 +431,7 @@ class Search:
         )
         if best is None:
             return []
-        near = best[1]["onset"] + np.linspace(-0.04, 0.04, 17) * duration
+        near = best.shape["onset"] + np.linspace(-0.04, 0.04, 17) * duration
         best = self._scan(now, effect, [{"onset": float(t)} for t in near]) or best
         return [self._scanned(effect, best)]
 
@@ -425,7 +447,7 @@ class Search:
 
     def _scan(
         self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]
-    ) -> tuple[float, Mapping[str, float], dict[Key, float]] | None:
+    ) -> "Scanned | None":
         """The most promising shape (onset, place) of an effect, with its linear amplitudes.
 
         Where a place is not part of the shape, the moments that it makes are fitted as well: a
@@ -440,15 +462,15 @@ class Search:
             values = {(effect.name, n): v for n, v in shape.items()}
             return self.evidence.columns(h.having(values), look.motion, keys)
 
-        best = None
+        best: Scanned | None = None
         for shape in shapes:
             at_origin = column(shape)
             moved = [column({**shape, p.name: 1.0}) - at_origin for p in places]
             mine = look.of(np.concatenate([at_origin, *moved], axis=2))
             scores = scores_of(look, [*keys, *moments], mine)
             units = [(*keys, *moments)] if moments else [(k,) for k in keys]
-            chosen, change, promise = scores.best(units, bounds)
-            if chosen and (best is None or promise > best[0]):
+            chosen, change, promise, firm = _chosen(scores, units)
+            if chosen and (best is None or (firm, promise) > (best.firm, best.promise)):
                 found = dict(zip(chosen, change.tolist(), strict=True))
                 there = {
                     p.name: float(
@@ -456,20 +478,18 @@ class Search:
                     )
                     for p, m in zip(places, moments, strict=True)
                 }
-                best = promise, {**shape, **there}, {k: found[k] for k in keys if k in found}
+                change_of = {k: found[k] for k in keys if k in found}
+                best = Scanned(promise, {**shape, **there}, change_of, firm)
         return best
 
-    def _scanned(
-        self, effect: Effect, best: tuple[float, Mapping[str, float], dict[Key, float]]
-    ) -> Candidate:
-        promise, shape, change = best
-        start = self._start(change)
+    def _scanned(self, effect: Effect, best: "Scanned") -> Candidate:
+        start = self._start(best.change)
         start |= {
-            (effect.name, p.name): shape.get(p.name, p.null)
+            (effect.name, p.name): best.shape.get(p.name, p.null)
             for p in effect.parameters
             if p.role in ("onset", "place")
         }
-        return Candidate(effect.name, start, promise - PRICE)
+        return Candidate(effect.name, start, best.promise - PRICE, best.firm)
 
     def _oscillating(self, now: Fitted, effect: Effect) -> list[Candidate]:
         """Sinusoidal forces in the world: the spectrum of the adjoint shows their frequency."""
@@ -495,7 +515,10 @@ class Search:
             start[effect.name, "frequency"] = frequency
             start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
             promise = gain / scores.scatter(labels, change) - PRICE * len(start)
-            candidates.append(Candidate(effect.name, start, promise))
+            firm = promise > 0.0
+            if not firm:
+                promise = gain / scores.variance(gain, len(labels)) - PRICE * len(start)
+            candidates.append(Candidate(effect.name, start, promise, firm))
         return sorted(candidates, key=lambda c: -c.promise)[:1]
 
     # -------------------------------------------------------------- patterns
@@ -504,10 +527,10 @@ class Search:
         """Wrenches of no known cause that would explain something, the best first.
 
         All are ranked by what they would explain with all their columns, the first few scored
-        properly.
+        properly, but as if what they leave were white: only a fit shows what they do leave.
         """
-        tried = [p for p in self._patterns(now) if self._simulated(p.axis)]
-        price = 2.0 * np.log(len(tried))
+        tried = self._patterns(now)
+        price = _choice(tried)
         ranked = sorted(tried, key=lambda p: -self._reach(now.look, p))
         found = []
         for pattern in ranked[:_SCORED]:
@@ -546,13 +569,29 @@ class Search:
                 angle = 2.0 * np.pi * frequency * middle
                 waves = np.stack([np.cos(angle), np.sin(angle)], axis=1)
                 found.append(Pattern(axis, "time", waves, frequency=frequency))
-        return found
+        return [p for p in found if self._simulated(p.axis)]
 
     def adopt(self, pattern: Pattern) -> None:
         """Make the parameters of a pattern known to the evidence."""
         force = pattern.force()
         for i, key in enumerate(pattern.keys):
             self.evidence.patterns[key] = force[:, :, i]
+
+
+def _choice(tried: Sequence[Pattern]) -> float:
+    """What the best of so many must explain more than one that was meant from the outset."""
+    return 2.0 * float(np.log(max(len(tried), 1)))
+
+
+def _chosen(
+    scores: Scores, units: Iterable[Sequence[Key]], together: bool = False
+) -> tuple[list[Key], Array, float, bool]:
+    """The parameters worth having, what they promise, and whether that is firm."""
+    units = list(units)
+    found = scores.best(units, bounds, together)
+    if found[0]:
+        return *found, True
+    return *scores.best(units, bounds, together, white=True), False
 
 
 def group_of(key: Key) -> str:

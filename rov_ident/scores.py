@@ -68,31 +68,37 @@ class Scores:
         self.kappa = inflation(linear, b)
 
     def best(
-        self, units: Iterable[Sequence[Key]], bounds: Bounds, together: bool = False
+        self,
+        units: Iterable[Sequence[Key]],
+        bounds: Bounds,
+        together: bool = False,
+        white: bool = False,
     ) -> tuple[list[Key], Array, float]:
         """Of units of parameters that join together those worth having, one after the other.
 
         Gives their keys, their estimated distance from null, and what they take off the scaled
         squared residuals beyond their price. ``together``: where that is more, beginning with all
-        of them; each alone may not show while the others are missing.
+        of them; each alone may not show while the others are missing. ``white``: as if what is left
+        were white, which is too good to believe but good enough to try.
         """
         left = [list(u) for u in units]
-        found = self._grown([], left, bounds)
+        found = self._grown([], left, bounds, white)
         if together and len(left) > 1:
-            other = self._grown(left, left, bounds)
+            other = self._grown(left, left, bounds, white)
             found = max(found, other, key=lambda f: f[2])
         return found
 
     def _grown(
-        self, begin: Sequence[list[Key]], units: Sequence[list[Key]], bounds: Bounds
+        self, begin: Sequence[list[Key]], units: Sequence[list[Key]], bounds: Bounds, white: bool
     ) -> tuple[list[Key], Array, float]:
         """From the units ``begin`` on: those that are not worth their price leave, others join."""
         have = list(begin)
-        change, reached, kappa = np.zeros(0), 0.0, self.kappa
+        nothing = self.variance(0.0, 0) if white else self.kappa
+        change, reached, kappa = np.zeros(0), 0.0, nothing
         while have:
             keys = [k for u in have for k in u]
             change, reached = self.solve(keys, bounds)
-            kappa = self.scatter(keys, change)
+            kappa = self.variance(reached, len(keys)) if white else self.scatter(keys, change)
             without = [[k for o in have if o is not u for k in o] for u in have]
             lost = [
                 (reached - self.solve(rest, bounds)[1]) / kappa - PRICE * len(u)
@@ -102,7 +108,7 @@ class Scores:
             if lost[worst] > 0.0:
                 break
             del have[worst]
-            change, reached, kappa = np.zeros(0), 0.0, self.kappa
+            change, reached, kappa = np.zeros(0), 0.0, nothing
         left = [u for u in units if all(u is not h for h in have)]
         while left:
             chosen = [k for u in have for k in u]
@@ -111,7 +117,8 @@ class Scores:
             there, new, unit = trials[int(np.argmax(worth))]
             if new <= reached:
                 break
-            scatter = self.scatter(chosen + unit, there)
+            keys = chosen + unit
+            scatter = self.variance(new, len(keys)) if white else self.scatter(keys, there)
             if (new - reached) / scatter <= PRICE * len(unit):
                 break
             change, reached, kappa = there, new, scatter
@@ -119,6 +126,11 @@ class Scores:
             left = [u for u in left if u is not unit]
         chosen = [k for u in have for k in u]
         return chosen, change, reached / kappa - PRICE * len(chosen)
+
+    def variance(self, reached: float, count: int) -> float:
+        """Of the residuals, with ``count`` parameters that take ``reached`` off their squares."""
+        total, b = float(self._linear.rss.sum()), len(self._base)
+        return max((total - reached) / max(self._linear.count - count - b, 1), 1e-9)
 
     def scatter(self, keys: Sequence[Key], change: Array) -> float:
         """``kappa`` with the parameters changed and the base refitted along."""
