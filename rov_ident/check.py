@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident import archive
-from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident import archive, inputs
+from rov_ident.bags import Bag
 from rov_ident.batch import predicted_information
 from rov_ident.coefficients import MOTIONS
 from rov_ident.config import Config
@@ -119,9 +119,7 @@ def check(path: Path, config: Config) -> Check:
     """
     record = read_record(path, config)
     bag = Bag(path)
-    topics = select_topics(bag, vars(config.topics))
-    messages = ((role, m) for role, m in read_messages(bag, topics) if m is not None)
-    streams = gather(messages, config)
+    streams = gather(inputs.messages(bag, inputs.select(bag, config), config), config)
     if streams.duration < 1.0:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     remarks = [*_rates(streams), *(Remark("messages", WARNING, n) for n in record.notes)]

@@ -610,18 +610,18 @@ def _explained(options: argparse.Namespace, config: configuration.Config) -> Non
 
 def _gather(path: Path, config: configuration.Config) -> "tuple[Streams, Source]":
     """A bag's messages in arrays, behind a progress bar; damage is told on standard error."""
-    from rov_ident.bags import Bag, read_messages, select_topics
+    from rov_ident import inputs
+    from rov_ident.bags import Bag
     from rov_ident.explain_report import Source
     from rov_ident.streams import gather
 
     bag = Bag(path)
-    topics = select_topics(bag, vars(config.topics))
-    total = sum(bag.topics[name].message_count for name in topics.values() if name)
+    topics = inputs.select(bag, config)
+    total = inputs.total(bag, topics)
     with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
-        bar = progress.track(
-            read_messages(bag, topics), total=total, description=f"reading {path.name}"
-        )
-        streams = gather(((role, m) for role, m in bar if m is not None), config)
+        messages = inputs.messages(bag, topics, config)
+        bar = progress.track(messages, total=total, description=f"reading {path.name}")
+        streams = gather(bar, config)
     if bag.damage:
         ERR.print(bag.damage, markup=False, soft_wrap=True)
     return streams, Source(bag.path.name, bag.sha256)
