@@ -16,8 +16,6 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from rov_ident import cdr
 from rov_ident.bags import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.config import (
@@ -31,8 +29,8 @@ from rov_ident.config import (
     thruster_signal,
 )
 from rov_ident.errors import UserError
-from rov_ident.frames import from_core
-from rov_ident.messages import Array, Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.frames import from_core, quaternion_between
+from rov_ident.messages import Commands, Message, Odometry, Pose, Twist, Wrench
 from rov_ident.thrusters import Allocator
 
 ODOMETRY, IMU, WRENCH, POSE = "odom", "imu", "wrench", "pose"
@@ -191,19 +189,8 @@ class Reader:
         return after._replace(
             stamp=stamp,
             position=before.position + share * (after.position - before.position),
-            orientation=_between(before.orientation, after.orientation, share),
+            orientation=quaternion_between(before.orientation, after.orientation, share),
         )
-
-
-def _between(p: Array, q: Array, share: float) -> Array:
-    """The attitude a share of the way from p to q, along the shortest rotation."""
-    cosine = float(p @ q)
-    q, cosine = (q, cosine) if cosine >= 0.0 else (-q, -cosine)
-    angle = float(np.arccos(min(cosine, 1.0)))
-    if angle < 1e-6:
-        return (1.0 - share) * p + share * q
-    mixed: Array = np.sin((1.0 - share) * angle) * p + np.sin(share * angle) * q
-    return mixed / np.sin(angle)
 
 
 # ------------------------------------------------------------------ bags
