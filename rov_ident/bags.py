@@ -181,7 +181,9 @@ class Bag:
 
 
 def select_topics(
-    bag: Bag, overrides: Mapping[str, str] | None = None, roles: Iterable[str] = tuple(ROLE_TYPES)
+    bag: Bag,
+    overrides: Mapping[str, str] | None = None,
+    roles: Iterable[str] = tuple(ROLE_TYPES),
 ) -> dict[str, str | None]:
     """Which topic plays which role: `odom`, `imu`, `wrench`; `imu` may be None.
 
@@ -194,7 +196,10 @@ def select_topics(
     overrides = overrides or {}
     if unknown := set(overrides) - set(ROLE_TYPES):
         raise UserError(f"{min(unknown)} is not an input: use one of {', '.join(ROLE_TYPES)}.")
-    return {role: _select_topic(bag, role, overrides.get(role, "")) for role in roles}
+    return {
+        role: select_topic(bag, role, ROLE_NAMES[role], ROLE_TYPES[role], overrides.get(role, ""))
+        for role in roles
+    }
 
 
 def read_messages(
@@ -215,8 +220,8 @@ def read_messages(
             yield role, message
 
 
-def _select_topic(bag: Bag, role: str, override: str) -> str | None:
-    type_name, name = ROLE_TYPES[role], ROLE_NAMES[role]
+def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) -> str | None:
+    """As :func:`select_topics` for one role, which is called ``name`` and of ``type_name``."""
     filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
     holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
     if override:
@@ -234,7 +239,7 @@ def _select_topic(bag: Bag, role: str, override: str) -> str | None:
     if candidates:
         raise UserError(
             f"{bag.path} has several topics that may be {role}: {', '.join(candidates)}; "
-            f"name the one to use, as in {role}={candidates[0]}."
+            f"name the one to use, as in topics.{role}: {candidates[0]}."
         )
     if named:
         raise UserError(

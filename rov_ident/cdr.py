@@ -1,8 +1,8 @@
-"""The three input messages to and from CDR bytes, without middleware.
+"""Input messages from CDR bytes, and the three of the core to them, without middleware.
 
 Layout (XCDR1, little-endian): four bytes of encapsulation header, then the fields, each aligned to
-its size counted from behind that header. All three messages are a `std_msgs/Header` (and a second
-string for Odometry) followed by nothing but float64, so that one `frombuffer` reads the rest.
+its size counted from behind that header. The three messages of the core are a `std_msgs/Header`
+(and a second string for Odometry) followed by nothing but float64: one `frombuffer` reads the rest.
 """
 
 import struct
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
+from rov_ident.messages import Array, Commands, Imu, Message, Odometry, Pose, Twist, Wrench
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -41,6 +41,10 @@ _IMU = _Layout(
 )  # orientation 4 + 9, angular velocity 3 + 9, acceleration 3 + 9
 _WRENCH = _Layout(6, np.r_[0:6])
 _IMU_ORIENTATION_COVARIANCE = 4
+_TWIST = _Layout(6, np.r_[0:6])
+_TWIST_WITH_COVARIANCE = _Layout(42, np.r_[0:6, 6:42:7])
+_POSE = _Layout(7, np.r_[0:3, 6, 3:6])
+_POSE_WITH_COVARIANCE = _Layout(43, _POSE.kept)
 
 
 def decode_odometry(data: bytes) -> Odometry:
@@ -69,6 +73,73 @@ def decode_wrench(data: bytes) -> Wrench:
     frame_id, offset = _read_string(data, offset)
     n = _read_numbers(data, offset, _WRENCH)
     return Wrench(stamp, frame_id, n[:3], n[3:])
+
+
+def decode_bare_wrench(data: bytes) -> Wrench:
+    """A geometry_msgs/msg/Wrench: no stamp (0), no frame. ValueError on malformed bytes."""
+    _check_header(data, 4)
+    n = _read_numbers(data, 4, _WRENCH)
+    return Wrench(0, "", n[:3], n[3:])
+
+
+def decode_twist(data: bytes, layout: _Layout = _TWIST) -> Twist:
+    """A geometry_msgs/msg/TwistStamped, axes as on the wire. ValueError on malformed bytes."""
+    stamp, offset = _read_stamp(data)
+    frame_id, offset = _read_string(data, offset)
+    n = _read_numbers(data, offset, layout)
+    variance = n[6:] if len(n) > 6 else np.zeros(6)
+    return Twist(stamp, frame_id, n[:3], n[3:6], variance)
+
+
+def decode_twist_with_covariance(data: bytes) -> Twist:
+    """The same of a geometry_msgs/msg/TwistWithCovarianceStamped."""
+    return decode_twist(data, _TWIST_WITH_COVARIANCE)
+
+
+def decode_pose(data: bytes, layout: _Layout = _POSE) -> Pose:
+    """A geometry_msgs/msg/PoseStamped, axes as on the wire. ValueError on malformed bytes."""
+    stamp, offset = _read_stamp(data)
+    frame_id, offset = _read_string(data, offset)
+    n = _read_numbers(data, offset, layout)
+    return Pose(stamp, frame_id, n[:3], n[3:7])
+
+
+def decode_pose_with_covariance(data: bytes) -> Pose:
+    """The same of a geometry_msgs/msg/PoseWithCovarianceStamped."""
+    return decode_pose(data, _POSE_WITH_COVARIANCE)
+
+
+def decode_joint_state(data: bytes) -> Commands:
+    """The efforts of a sensor_msgs/msg/JointState. ValueError on malformed bytes."""
+    stamp, offset = _read_stamp(data)
+    _, offset = _read_string(data, offset)
+    names, offset = _read_length(data, offset)
+    for _ in range(names):
+        _, offset = _read_string(data, offset)
+    for _ in range(3):  # position, velocity, effort
+        values, offset = _read_sequence(data, offset, "<f8")
+    return Commands(stamp, values)
+
+
+def decode_channels(data: bytes) -> Commands:
+    """A mavros_msgs/msg/RCOut: header and uint16[]. ValueError on malformed bytes."""
+    stamp, offset = _read_stamp(data)
+    _, offset = _read_string(data, offset)
+    values, _ = _read_sequence(data, offset, "<u2")
+    return Commands(stamp, values)
+
+
+def decode_multi_array(data: bytes, kind: str) -> Commands:
+    """A std_msgs/msg/...MultiArray of NumPy's ``kind``: no stamp. ValueError on malformed bytes."""
+    _check_header(data, 4)
+    dimensions, offset = _read_length(data, 4)
+    for _ in range(dimensions):
+        _, offset = _read_string(data, offset)
+        for _ in range(2):  # size, stride
+            _, offset = _read_length(data, offset)
+    _, offset = _read_length(data, offset)  # data_offset
+    values, _ = _read_sequence(data, offset, kind)
+    return Commands(0, values)
 
 
 DECODERS: dict[str, Callable[[bytes], Message]] = {
@@ -111,12 +182,37 @@ def encode(message: Message) -> bytes:
     return _ENCAPSULATION + bytes(body)
 
 
-def _read_stamp(data: bytes) -> tuple[int, int]:
-    """The stamp in ns and the offset behind it."""
+def _check_header(data: bytes, least: int) -> None:
     if data[:2] != _ENCAPSULATION[:2]:
         raise ValueError(f"not little-endian CDR: encapsulation header {bytes(data[:4]).hex()!r}")
-    if len(data) < 12:
+    if len(data) < least:
         raise ValueError(f"{len(data)} bytes end within the header")
+
+
+def _read_length(data: bytes, offset: int) -> tuple[int, int]:
+    """The uint32 at the next multiple of four and the offset behind it."""
+    start = offset + (-offset % 4)
+    if len(data) < start + 4:
+        raise ValueError(f"{len(data)} bytes end within a length")
+    (length,) = _LENGTH.unpack_from(data, start)
+    return length, start + 4
+
+
+def _read_sequence(data: bytes, offset: int, kind: str) -> tuple[Array, int]:
+    """The numbers of a sequence as float64 (k,), and the offset behind them."""
+    length, offset = _read_length(data, offset)
+    if length == 0:  # then there is no padding either
+        return np.zeros(0), offset
+    size = np.dtype(kind).itemsize
+    offset += -(offset - 4) % size
+    if len(data) < offset + size * length:
+        raise ValueError(f"{len(data)} bytes end within {length} numbers")
+    return np.frombuffer(data, kind, length, offset).astype(float), offset + size * length
+
+
+def _read_stamp(data: bytes) -> tuple[int, int]:
+    """The stamp in ns and the offset behind it."""
+    _check_header(data, 12)
     seconds, nanoseconds = _STAMP.unpack_from(data, 4)
     if nanoseconds >= _SECOND:
         raise ValueError(f"{nanoseconds} nanoseconds are no part of a second")

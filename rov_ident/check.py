@@ -5,15 +5,15 @@ the measured motion holds about each of them (:mod:`rov_ident.maximum_likelihood
 and noise of the configuration.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rov_ident import archive
-from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident import archive, inputs
+from rov_ident.bags import Bag
 from rov_ident.batch import predicted_information
 from rov_ident.coefficients import MOTIONS
 from rov_ident.config import Config
@@ -28,6 +28,8 @@ from rov_ident.model import Array
 from rov_ident.records import Record, read_record
 from rov_ident.regression import filtered_rows, regression
 from rov_ident.streams import Streams, gather
+
+Tell = Callable[..., None]
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
 WELL = (
@@ -81,6 +83,8 @@ class Check:
     remarks: tuple[Remark, ...]
     prospects: tuple[Prospect, ...]
     information: Array = field(repr=False)
+    record: Record = field(repr=False)
+    streams: Streams = field(repr=False)
 
     @property
     def fit(self) -> bool:
@@ -109,30 +113,31 @@ class Check:
         }
 
 
-def check(path: Path, config: Config) -> Check:
-    """Look at a bag.
+def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
+    """Look at a bag; ``tell`` is called with what is being done, and what share of it is.
 
     Raises
     ------
     UserError
         If it cannot be read, or has not the messages that it takes to look at anything.
     """
-    record = read_record(path, config)
+    say = tell or (lambda what, share=None: None)
+    record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
+    say("looking at its messages")
     bag = Bag(path)
-    topics = select_topics(bag, vars(config.topics))
-    messages = ((role, m) for role, m in read_messages(bag, topics) if m is not None)
-    streams = gather(messages, config)
+    streams = gather(inputs.messages(bag, inputs.select(bag, config), config), config)
     if streams.duration < 1.0:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     remarks = [*_rates(streams), *(Remark("messages", WARNING, n) for n in record.notes)]
     remarks += _frames(streams, config)
     remarks += _delays(streams, config)
     remarks += _dynamics(record, config)
+    say("predicting what a fit would tell")
     one = archive.of_records([record])
     information = predicted_information(one, config)
     found = prospects(config, information)
     remarks += _excitation(streams, config, found)
-    return Check(path.name, streams.duration, tuple(remarks), found, information)
+    return Check(path.name, streams.duration, tuple(remarks), found, information, record, streams)
 
 
 def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:

@@ -6,13 +6,14 @@ Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
 import argparse
 import contextlib
 import dataclasses
+import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -25,9 +26,12 @@ from rov_ident.errors import UserError
 
 if TYPE_CHECKING:
     from rov_ident.explain_report import Source
+    from rov_ident.online import Report
     from rov_ident.records import Record
     from rov_ident.result import Result
     from rov_ident.streams import Streams
+
+T = TypeVar("T")
 
 ERR = Console(stderr=True, highlight=False)
 OUT = Console(highlight=False, soft_wrap=True)
@@ -36,6 +40,10 @@ LIVE = ("rls", "ukf")
 BATCH = ("ls", "iv", "ml")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 PAIRS = {"lateral": ("sway", "yaw"), "longitudinal": ("heave", "pitch")}
+
+
+# The commands whose result fits one plain file besides those that declare it themselves.
+_JSON = ("replay", "simulate", "import", "export", "import-model", "steer", "coefficients")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -121,7 +129,6 @@ def _parser() -> argparse.ArgumentParser:
     batch.add_argument("--output-error", action="store_true", help="ml: take the wrench as exact")
     batch.add_argument("--jobs", type=_count, help="processes that read bags (all processors)")
     batch.add_argument("--dask", default="", metavar="ADDRESS", help="a Dask scheduler, or `local`")
-    fit.add_argument("--quiet", action="store_true", help="no progress on standard error")
     fit.set_defaults(run=_fit)
 
     check = commands.add_parser(
@@ -129,6 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     _bag_and_config(check)
     check.add_argument("--json", type=Path, help="write what was found here")
+    check.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
     check.set_defaults(run=_check)
 
     plan = commands.add_parser(
@@ -153,6 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         help="the largest wrench on each axis, relative to what holds working speed (1)",
     )
     plan.add_argument("--json", type=Path, help="write the plan here")
+    plan.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
     plan.add_argument("--out", type=Path, metavar="BAG", help="write the simulated manoeuvre here")
     plan.set_defaults(run=_plan)
 
@@ -196,8 +205,17 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--drop", type=_share, default=0.0, help="share of messages lost (0)")
     simulate.set_defaults(run=_simulate)
 
-    import_ = commands.add_parser("import", help="turn plain CSV logs into a bag")
-    import_.add_argument("csv", nargs="+", type=Path, metavar="CSV")
+    import_ = commands.add_parser("import", help="turn plain CSV or ArduSub logs into a bag")
+    import_.add_argument(
+        "log",
+        nargs="+",
+        type=Path,
+        metavar="LOG",
+        help="CSV files, or one .BIN or .tlog of ArduSub",
+    )
+    import_.add_argument(
+        "--config", type=Path, help="of a .BIN or .tlog: its `thrusters` turn pulses into a wrench"
+    )
     import_.add_argument("--out", required=True, type=Path, metavar="BAG")
     import_.add_argument(
         "--map",
@@ -227,9 +245,13 @@ def _parser() -> argparse.ArgumentParser:
     export.set_defaults(run=_export)
 
     model = commands.add_parser(
-        "import-model", help="a configuration from a Gazebo model or auv_controllers' parameters"
+        "import-model",
+        help="a configuration from a Gazebo model, auv_controllers' parameters or a URDF",
     )
     model.add_argument("file", type=Path, metavar="FILE")
+    model.add_argument(
+        "--config", type=Path, help="what the file does not hold, as a URDF the coefficients"
+    )
     model.add_argument("--out", required=True, type=Path, metavar="CONFIG")
     model.set_defaults(run=_import_model)
 
@@ -239,6 +261,14 @@ def _parser() -> argparse.ArgumentParser:
 
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
+
+    completion = commands.add_parser("completion", help="print a shell's completion script")
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    completion.set_defaults(run=_completion)
+    for name, command in commands.choices.items():
+        command.add_argument("--quiet", action="store_true", help="no progress on standard error")
+        if name in _JSON:
+            command.add_argument("--json", type=Path, help="write the result here")
     return parser
 
 
@@ -391,25 +421,31 @@ def _positive(text: str) -> float:
 def _demo(options: argparse.Namespace) -> None:
     from rov_ident.demo import demo
 
-    demo(options.out, options.rate, ERR, OUT)
+    # Its own pictures are the progress: with --quiet there are none.
+    err = Console(stderr=True, quiet=True) if options.quiet else ERR
+    demo(options.out, options.rate, err, OUT)
 
 
 def _replay(options: argparse.Namespace) -> None:
     from rov_ident.nodes.replay import replay
 
     estimators = options.estimator or LIVE
-    with ERR.status("starting the nodes") as status:
-        result = replay(
-            options.bag,
-            options.config,
-            estimators,
-            options.rate,
-            options.out,
-            lambda name, report: status.update(
-                f"{name}: {sum(level == 0 for level in report.levels)} of {len(report.levels)} "
-                "coefficients converged"
-            ),
-        )
+    with _progress(options) as tell:
+        tell("starting the nodes")
+
+        def show(name: str, report: "Report") -> None:
+            known, count = sum(level == 0 for level in report.levels), len(report.levels)
+            tell(f"{name}: {known} of {count} coefficients converged", known / count)
+
+        result = replay(options.bag, options.config, estimators, options.rate, options.out, show)
+    _write_json(
+        options.json,
+        {
+            "messages": result.messages,
+            "seconds": result.seconds,
+            "estimators": {name: _published(report) for name, report in result.reports.items()},
+        },
+    )
     for name, report in result.reports.items():
         if not report.stamp:
             raise UserError(f"{options.bag}: {name} could not use any of its messages")
@@ -422,6 +458,15 @@ def _replay(options: argparse.Namespace) -> None:
         ERR.print(f"recorded: {result.out}")
 
 
+def _published(report: "Report") -> dict[str, object]:
+    """The last report of a node."""
+    rows = zip(report.names, report.values, report.std, report.units, report.messages, strict=True)
+    return {
+        name: {"value": float(value), "std": float(std), "unit": unit, "state": state}
+        for name, value, std, unit, state in rows
+    }
+
+
 def _fit(options: argparse.Namespace) -> None:
     from rov_ident import archive
     from rov_ident.batch import Settings, curves, fit_batch, validation
@@ -432,17 +477,18 @@ def _fit(options: argparse.Namespace) -> None:
     live = options.estimator in LIVE
     _check_batch_options(options, live)
     config = configuration.load(options.config, f"{options.estimator}_node" if live else "")
-    with _steps(options.quiet) as say, contextlib.ExitStack() as stack:
+    with _progress(options) as tell, contextlib.ExitStack() as stack:
         if live:
-            records = [_read(path, config) for path in options.bags]
+            records = [_read(path, config, tell) for path in options.bags]
             bags = archive.of_records(records)
+            tell("estimating")
             fit = fit_online(records, config, options.estimator)
         else:
             jobs = options.jobs or archive.default_jobs()
             bags = stack.enter_context(
                 archive.opened(
                     options.bags, config, jobs, options.dask,
-                    lambda name, done, total: say(f"read {name} ({done} of {total})"),
+                    lambda name, done, total: tell(f"read {name}", done / total),
                 )
             )  # fmt: skip
             stages = tuple(
@@ -452,8 +498,9 @@ def _fit(options: argparse.Namespace) -> None:
             settings = Settings(
                 stages, not options.no_prior, not options.ordinary, not options.output_error
             )
-            fit = fit_batch(bags, config, options.estimator, settings, say)
+            fit = fit_batch(bags, config, options.estimator, settings, tell)
         fitted = config.with_model(fit.model)
+        tell("drawing")
         drawn = curves(bags, config, fitted) if options.report else []
         seen = []
         if options.validate:
@@ -503,26 +550,52 @@ def _check_batch_options(options: argparse.Namespace, live: bool) -> None:
             raise UserError(f"{name} has no meaning with --estimator {options.estimator}")
 
 
+class Tell(Protocol):
+    """Says what is being done, and the share of it that is."""
+
+    def __call__(self, what: str, share: float | None = None) -> None: ...
+
+
 @contextlib.contextmanager
-def _steps(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A line on standard error that says what is being done; nothing where nobody looks."""
-    shown = ERR.is_terminal and not quiet
+def _progress(options: argparse.Namespace) -> Iterator[Tell]:
+    """A line and a bar on standard error; nothing with --quiet, or where nobody looks."""
+    shown = ERR.is_terminal and not options.quiet
     with Progress(console=ERR, transient=True, disable=not shown) as progress:
         bar = progress.add_task("", total=None)
-        yield lambda what: progress.update(bar, description=what)
+
+        def tell(what: str, share: float | None = None) -> None:
+            total = None if share is None else 1.0
+            progress.update(bar, description=what, completed=share or 0.0, total=total)
+
+        yield tell
+
+
+def _finite(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None
+
+
+def _write_json(path: Path | None, result: Mapping[str, object]) -> None:
+    """The machine-readable result of a command, where it is wanted."""
+    from rov_ident.fit import write_text
+
+    if path:
+        write_text(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
 
 
 def _check(options: argparse.Namespace) -> None:
-    import json
-
     from rov_ident.check import check
-    from rov_ident.fit import write_text
 
-    _check_outputs([options.json], [options.bag, options.config])
+    _check_outputs([options.json, options.report], [options.bag, options.config])
     config = configuration.load(options.config)
-    found = check(options.bag, config)
-    if options.json:
-        write_text(options.json, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+    with _progress(options) as tell:
+        found = check(options.bag, config, tell)
+        if options.report:
+            from rov_ident.check_report import of_check
+            from rov_ident.fit import write_text
+
+            tell("drawing")
+            write_text(options.report, of_check(found, config))
+    _write_json(options.json, found.to_dict())
     verdict = "fit for identification" if found.fit else "not fit for identification"
     OUT.print(f"{found.bag}, {found.duration:.1f} s: {verdict}", markup=False)
     for remark in found.remarks:
@@ -535,22 +608,30 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _plan(options: argparse.Namespace) -> None:
-    import json
-
     from rov_ident import archive
-    from rov_ident.fit import write_text
     from rov_ident.plan import Limits, propose
 
-    _check_outputs([options.json, options.out], [*options.bag, options.config])
+    outputs = [options.json, options.out, options.report]
+    _check_outputs(outputs, [*options.bag, options.config])
     config = configuration.load(options.config)
     limits = Limits(options.tank, options.thrust)
-    with _steps(False) as say, contextlib.ExitStack() as stack:
+    with _progress(options) as tell, contextlib.ExitStack() as stack:
         bags = None
         if options.bag:
-            bags = stack.enter_context(archive.opened(options.bag, config))
-        found = propose(config, bags, options.duration, limits, say)
-    if options.json:
-        write_text(options.json, json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n")
+            bags = stack.enter_context(
+                archive.opened(
+                    options.bag, config,
+                    progress=lambda name, done, total: tell(f"read {name}", done / total),
+                )
+            )  # fmt: skip
+        found = propose(config, bags, options.duration, limits, tell)
+        if options.report:
+            from rov_ident.check_report import of_plan
+            from rov_ident.fit import write_text
+
+            tell("drawing")
+            write_text(options.report, of_plan(found, config))
+    _write_json(options.json, found.to_dict())
     if options.out:
         from rov_ident.recording import write_messages
 
@@ -582,15 +663,11 @@ def _explained(options: argparse.Namespace, config: configuration.Config) -> Non
     from rov_ident import explain_report
     from rov_ident.explain import BLOCK, explain
 
-    read = [_gather(path, config) for path in options.bags]
-    judge = _gather(options.validate, config) if options.validate else None
-    with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
-        bar = progress.add_task("", total=1.0)
+    with _progress(options) as tell:
+        read = [_gather(path, config, tell) for path in options.bags]
+        judge = _gather(options.validate, config, tell) if options.validate else None
         explanation = explain(
-            [streams for streams, _ in read],
-            config,
-            judge[0] if judge else None,
-            lambda what, share: progress.update(bar, description=what, completed=share),
+            [streams for streams, _ in read], config, judge[0] if judge else None, tell
         )
     made = explain_report.origin(
         [source for _, source in read], options.config, judge[1] if judge else None
@@ -622,23 +699,29 @@ def _explained(options: argparse.Namespace, config: configuration.Config) -> Non
     ERR.print(f"report: {options.out / 'report.html'}", markup=False, soft_wrap=True)
 
 
-def _gather(path: Path, config: configuration.Config) -> "tuple[Streams, Source]":
-    """A bag's messages in arrays, behind a progress bar; damage is told on standard error."""
-    from rov_ident.bags import Bag, read_messages, select_topics
+def _gather(path: Path, config: configuration.Config, tell: Tell) -> "tuple[Streams, Source]":
+    """A bag's messages in arrays; damage is told on standard error."""
+    from rov_ident import inputs
+    from rov_ident.bags import Bag
     from rov_ident.explain_report import Source
     from rov_ident.streams import gather
 
     bag = Bag(path)
-    topics = select_topics(bag, vars(config.topics))
-    total = sum(bag.topics[name].message_count for name in topics.values() if name)
-    with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
-        bar = progress.track(
-            read_messages(bag, topics), total=total, description=f"reading {path.name}"
-        )
-        streams = gather(((role, m) for role, m in bar if m is not None), config)
+    topics = inputs.select(bag, config)
+    total = inputs.total(bag, topics)
+    tell(f"reading {path.name}")
+    streams = gather(_shown(inputs.messages(bag, topics, config), total, path, tell), config)
     if bag.damage:
         ERR.print(bag.damage, markup=False, soft_wrap=True)
     return streams, Source(bag.path.name, bag.sha256)
+
+
+def _shown(messages: Iterator[T], total: int, path: Path, tell: Tell) -> Iterator[T]:
+    """The same, telling now and then how many there have been."""
+    for done, message in enumerate(messages):
+        if done % 2000 == 0:
+            tell(f"reading {path.name}", done / total)
+        yield message
 
 
 def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]) -> None:
@@ -655,13 +738,11 @@ def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]
             raise UserError(f"{out} cannot be written: its folder is not yours to write in")
 
 
-def _read(path: Path, config: configuration.Config) -> "Record":
-    """A bag's samples behind a progress bar, and what had to be refused on standard error."""
+def _read(path: Path, config: configuration.Config, tell: Tell) -> "Record":
+    """A bag's samples, and what had to be refused on standard error."""
     from rov_ident.records import read_record
 
-    with Progress(console=ERR, transient=True, disable=not ERR.is_terminal) as progress:
-        bar = progress.add_task(f"reading {path.name}")
-        record = read_record(path, config, lambda k, n: progress.update(bar, completed=k, total=n))
+    record = read_record(path, config, lambda k, n: tell(f"reading {path.name}", k / max(n, 1)))
     for note in record.notes:
         ERR.print(note, markup=False, soft_wrap=True)
     return record
@@ -685,9 +766,13 @@ def _simulate(options: argparse.Namespace) -> None:
         jitter=options.jitter,
         drop=options.drop,
     )
-    run = dive(config, options.manoeuvre, options.duration, suite, options.seed)
-    write_messages(options.out, run.messages)
+    with _progress(options) as tell:
+        tell("simulating")
+        run = dive(config, options.manoeuvre, options.duration, suite, options.seed)
+        tell("writing")
+        write_messages(options.out, run.messages)
     ERR.print(f"{options.out}: {len(run.messages)} messages, {options.duration:g} s")
+    _write_json(options.json, {"messages": len(run.messages), "duration_s": options.duration})
 
 
 def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
@@ -697,10 +782,12 @@ def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
     from rov_ident.records import HORIZON, VELOCITIES, predicted, score
     from rov_ident.sensors import odometry_of
 
-    record = _read(options.bag, config)
     free = options.channels
     model, effects = config.dynamics, compiled(config.effects)
-    run = predicted(model, record.samples, math.inf, free, effects)
+    with _progress(options) as tell:
+        record = _read(options.bag, config, tell)
+        tell("simulating")
+        run = predicted(model, record.samples, math.inf, free, effects)
     if not np.isfinite(run).all():
         raise UserError(
             f"the simulation diverges on {options.bag}: check the signs and sizes of the "
@@ -709,37 +796,92 @@ def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
     write_messages(options.out, odometry_of(record.samples["t"], run))
     whole = score(model, record.samples, math.inf, free, effects)
     windows = score(model, record.samples, HORIZON, free, effects)
+    chosen = [i for i in range(6) if free is None or free[i]]
+    _write_json(
+        options.json,
+        {
+            "bag": options.bag.name,
+            "horizon_s": HORIZON,
+            "velocities": {
+                VELOCITIES[i]: {
+                    "r2": _finite(whole.r2[i]),
+                    "rmse": _finite(whole.rmse[i]),
+                    "rmse_windows": _finite(windows.rmse[i]),
+                    "unit": "m/s" if i < 3 else "rad/s",
+                }
+                for i in chosen
+            },
+        },
+    )
     table = _table(
         f"open-loop simulation against {options.bag.name}",
         "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit",
     )  # fmt: skip
-    for i, name in enumerate(VELOCITIES):
-        if free is not None and not free[i]:
-            continue
+    for i in chosen:
         table.add_row(
-            name, f"{whole.r2[i]:.3f}", f"{whole.rmse[i]:.4f}", f"{windows.rmse[i]:.4f}",
+            VELOCITIES[i], f"{whole.r2[i]:.3f}", f"{whole.rmse[i]:.4f}", f"{windows.rmse[i]:.4f}",
             "m/s" if i < 3 else "rad/s",
         )  # fmt: skip
     OUT.print(table)
 
 
 def _import(options: argparse.Namespace) -> None:
+    from rov_ident import ardupilot
+
+    _check_outputs([options.out], [*options.log, options.config])
+    if any(path.suffix.lower() in ardupilot.SUFFIXES for path in options.log):
+        _import_ardupilot(options)
+    else:
+        _import_csv(options)
+
+
+def _import_ardupilot(options: argparse.Namespace) -> None:
+    from rov_ident.ardupilot import import_log
+
+    if len(options.log) > 1:
+        raise UserError("import ArduSub's logs one by one: each has a clock of its own")
+    if not options.config:
+        raise UserError(
+            f"{options.log[0].name} holds pulse widths: --config names the parameter file whose "
+            "thrusters turn them into a wrench"
+        )
+    config = configuration.load(options.config)
+    name = options.log[0].name
+    with _progress(options) as tell:
+        report = import_log(
+            options.log[0], options.out, config, lambda share: tell(f"reading {name}", share)
+        )
+    for note in report.notes:
+        ERR.print(note, markup=False, soft_wrap=True)
+    ERR.print(
+        f"{options.out}: {report.odometry} odometry, {report.imu} IMU and {report.wrench} wrench "
+        f"messages, {report.duration:.1f} s"
+    )
+    _write_json(options.json, vars(report))
+
+
+def _import_csv(options: argparse.Namespace) -> None:
     from rov_ident.importer import import_csv, parse_columns
 
-    report = import_csv(
-        options.csv,
-        options.out,
-        columns=parse_columns(options.map),
-        body_frame=options.body_frame,
-        mask_rates_above=options.mask_rates_above,
-        wrench_timing=options.wrench_timing,
-    )
+    if options.config:
+        raise UserError("--config is for ArduSub's logs: a CSV holds the wrench itself")
+    with _progress(options) as tell:
+        tell("reading")
+        report = import_csv(
+            options.log,
+            options.out,
+            columns=parse_columns(options.map),
+            body_frame=options.body_frame,
+            mask_rates_above=options.mask_rates_above,
+            wrench_timing=options.wrench_timing,
+        )
     for note in report.notes:
         ERR.print(note, markup=False, soft_wrap=True)
     ERR.print(
         f"{options.out}: {report.odometry} odometry messages from {report.rows} rows, "
         f"{report.duration:.1f} s"
     )
+    _write_json(options.json, vars(report))
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -752,17 +894,20 @@ def _export(options: argparse.Namespace) -> None:
     for what in written.lost:
         ERR.print(f"lost in {options.format}: {what}", markup=False, soft_wrap=True)
     ERR.print(f"written: {options.out}", markup=False, soft_wrap=True)
+    _write_json(options.json, {"format": options.format, "lost": list(written.lost)})
 
 
 def _import_model(options: argparse.Namespace) -> None:
     from rov_ident.formats import import_model
 
-    _check_outputs([options.out], [options.file])
-    config, notes = import_model(options.file)
+    _check_outputs([options.out], [options.file, options.config])
+    base = configuration.load(options.config) if options.config else None
+    config, notes = import_model(options.file, base)
     configuration.dump(config, options.out, comment=f"From {options.file.name}.")
     for note in notes:
         ERR.print(f"note: {note}", markup=False, soft_wrap=True)
     ERR.print(f"written: {options.out}", markup=False, soft_wrap=True)
+    _write_json(options.json, {"name": config.name, "notes": list(notes)})
 
 
 def _nomoto(options: argparse.Namespace) -> None:
@@ -772,8 +917,11 @@ def _nomoto(options: argparse.Namespace) -> None:
     _check_outputs([options.json, options.report], [*options.files, options.validate])
     runs = [zigzag.read(path) for path in options.files]
     judge = zigzag.read(options.validate) if options.validate else None
-    model = nomoto.fit(
-        runs, options.order, options.nonlinear, options.method, options.interpolate, options.step,
+    with _progress(options) as tell:
+        tell("fitting")
+        model = nomoto.fit(
+            runs, options.order, options.nonlinear, options.method, options.interpolate,
+            options.step,
         )  # fmt: skip
     validation = nomoto.predict(model, judge)[1] if judge else None
     if options.json:
@@ -814,7 +962,9 @@ def _forces(options: argparse.Namespace) -> None:
     )
     if config:
         config = force_tables.with_hull(config, hull)
-    fits = force_tables.fit(table, config.model if config else None)
+    with _progress(options) as tell:
+        tell("fitting")
+        fits = force_tables.fit(table, config.model if config else None)
     notes = (*table.notes, *force_tables.remarks(fits, config is not None))
     new = force_tables.configured(config, fits) if config and options.out else None
     if options.json:
@@ -858,6 +1008,13 @@ def _steer(options: argparse.Namespace) -> None:
         f"{options.manoeuvre}: heading from {heading.min():.1f} to {heading.max():.1f} deg, depth "
         f"at the end {run.position[-1, 2]:.2f} m, speed {run.nu[-1, 0]:.2f} m/s"
     )
+    result = {
+        "manoeuvre": options.manoeuvre,
+        "heading_deg": [float(heading.min()), float(heading.max())],
+        "depth_m": float(run.position[-1, 2]),
+        "speed_mps": float(run.nu[-1, 0]),
+    }
+    _write_json(options.json, result)
 
 
 def _coefficients(options: argparse.Namespace) -> None:
@@ -865,6 +1022,8 @@ def _coefficients(options: argparse.Namespace) -> None:
     entries += [(c.name, c.unit, c.meaning) for c in fin_catalogue()]
     for name, unit, meaning in entries:
         OUT.print(f"{name:<10} {unit:<18} {meaning}", markup=False)
+    table = {name: {"unit": unit, "meaning": meaning} for name, unit, meaning in entries}
+    _write_json(options.json, table)
 
 
 def _numbers(title: str, result: "Result", **more: Sequence[str]) -> Table:
@@ -874,6 +1033,27 @@ def _numbers(title: str, result: "Result", **more: Sequence[str]) -> Table:
         value, std = f"{result.values[i]:.5g}", f"{result.std[i]:.2g}"
         table.add_row(name, value, std, result.units[i], *(column[i] for column in more.values()))
     return table
+
+
+def _completion(options: argparse.Namespace) -> None:
+    try:
+        import shtab
+    except ImportError as error:
+        raise UserError("completion needs shtab: pip install shtab") from error
+    parser = _parser()
+    for command in (parser, *_commands(parser).values()):
+        for action in command._actions:  # shtab, too, goes through them
+            if action.type is Path:
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, options.shell))
+
+
+def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parser of every command, by name."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    return {}
 
 
 def _table(title: str, *columns: str) -> Table:

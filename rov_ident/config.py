@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
+from rov_ident import thrusters
 from rov_ident.coefficients import catalogue, parse, parse_fin
 from rov_ident.effects import EFFECTS, estimable, rigid_body
 from rov_ident.errors import UserError
@@ -34,6 +35,9 @@ Names = tuple[str, ...]
 
 POSITIVE = 1e-9
 """The lower bound of what must be greater than zero."""
+
+ANY = -1
+"""The ``size`` of a list of any length."""
 
 LARGEST = 1e20
 """No number of a vehicle is larger; below it nothing computed from them overflows."""
@@ -76,9 +80,9 @@ def option(
 class Parameter:
     """One key of the parameter file.
 
-    ``type`` is float, int, str, Vector (of ``size`` numbers) or Names. ``default`` is None for what
-    is required or computed from other keys. ``lower`` and ``upper`` are inclusive, for vectors of
-    every element. ``live``: may change while a node runs.
+    ``type`` is float, int, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is None
+    for what is required or computed from other keys. ``lower`` and ``upper`` are inclusive, for
+    vectors of every element. ``live``: may change while a node runs.
     """
 
     key: str
@@ -149,9 +153,92 @@ class Frames(FrameDefaults):
 class Topics:
     """`topics`: which topics of a bag to read; empty: found by name, then by type."""
 
-    odom: str = option("", "nav_msgs/Odometry topic in a bag")
+    odom: str = option("", "topic in a bag of the type inputs.odom")
     imu: str = option("", "sensor_msgs/Imu topic in a bag")
-    wrench: str = option("", "geometry_msgs/WrenchStamped topic in a bag")
+    wrench: str = option("", "topic in a bag of the type inputs.wrench")
+    pose: str = option("", "topic in a bag of the type inputs.pose, where inputs.odom is a twist")
+
+
+ODOMETRY_TYPES = (
+    "nav_msgs/Odometry",
+    "geometry_msgs/TwistStamped",
+    "geometry_msgs/TwistWithCovarianceStamped",
+)
+POSE_TYPES = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")
+WRENCH_TYPES = ("geometry_msgs/WrenchStamped", "geometry_msgs/Wrench")
+FORCE_TYPES = ("sensor_msgs/JointState", "std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
+PULSE_TYPES = ("std_msgs/UInt16MultiArray", "std_msgs/Int16MultiArray", "mavros_msgs/RCOut")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """`inputs`: the types in which motion and thrust are published."""
+
+    odom: str = option(
+        "nav_msgs/Odometry",
+        "type of the motion: odometry, or a twist in body axes that is joined with the poses of "
+        "topic pose by their stamps",
+        choices=ODOMETRY_TYPES,
+    )
+    pose: str = option(
+        "geometry_msgs/PoseStamped",
+        "type of the pose that goes with a twist; interpolated to the stamp of the twist",
+        choices=POSE_TYPES,
+    )
+    wrench: str = option(
+        "geometry_msgs/WrenchStamped",
+        "type of the thrust: a wrench, or an array of thruster commands that `thrusters` turns "
+        "into one; a type without a header is stamped on arrival",
+        choices=WRENCH_TYPES + FORCE_TYPES + PULSE_TYPES,
+    )
+
+    @property
+    def is_twist(self) -> bool:
+        return self.odom != ODOMETRY_TYPES[0]
+
+    @property
+    def is_allocated(self) -> bool:
+        """Whether the thrust comes as commands of single thrusters."""
+        return self.wrench not in WRENCH_TYPES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thrusters:
+    """`thrusters`: from the commands of single thrusters to a wrench."""
+
+    signal: str = option(
+        "auto",
+        "what a command is: a force (N), a pulse width (us), normalized (-1 to 1, for 1100 to 1900 "
+        "us); auto: a force in arrays of floats, a pulse width in arrays of whole numbers",
+        choices=("auto", *thrusters.SIGNALS),
+    )
+    position: Vector = option(
+        (), "of each thruster from the body origin: x y z of the first, the second ...", "m",
+        size=ANY,
+    )  # fmt: skip
+    direction: Vector = option(
+        (),
+        "in which each thruster pushes the vehicle at a positive command (a pulse above 1500 us): "
+        "x y z of the first, the second ...; any length",
+        size=ANY,
+    )
+    allocation: Vector = option(
+        (),
+        "in place of position and direction: X Y Z K M N per newton of the first thruster, the "
+        "second ...",
+        "1, m",
+        size=ANY,
+    )
+    channels: Vector = option(
+        (), "which element of the array is each thruster, from 1; empty: the first ones", size=ANY
+    )
+    voltage: float = option(
+        16.0, "supply of the thrusters, for the curve of the T200", "V", lower=POSITIVE
+    )
+    curve_pwm: Vector = option(
+        (), "pulse widths of another thruster's curve of thrust; empty: the T200's", "us", size=ANY
+    )
+    curve_force: Vector = option((), "thrust at each of curve_pwm", "N", size=ANY)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,6 +374,8 @@ class Config:
     prior: Prior = Prior()
     frames: Frames = Frames()
     topics: Topics = Topics()
+    inputs: Inputs = Inputs()
+    thrusters: Thrusters = Thrusters()
     odometry: OdometrySensor = OdometrySensor()
     imu: ImuSensor = ImuSensor()
     wrench: WrenchNoise = WrenchNoise()
@@ -426,6 +515,12 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
             sensor = settings[section]
             turned = {name: tuple((signs * getattr(sensor, name) + 0.0).tolist()) for name in names}
             settings[section] = dataclasses.replace(sensor, **turned)
+    if "thrusters" in settings:
+        settings["thrusters"] = _turned(settings["thrusters"], signs)
+    inputs = settings.get("inputs", Inputs())
+    if inputs.is_allocated:
+        chosen = settings.get("thrusters", Thrusters())
+        thrusters.check(chosen, thruster_signal(inputs, chosen))
     if "prior" in settings:
         prior = settings["prior"]
         std = {_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}
@@ -519,7 +614,7 @@ def _checked(parameter: Parameter, value: Any) -> Any:
             if not all(isinstance(item, str) for item in items):
                 raise UserError(refusal)
             return items
-        if len(items) != parameter.size:
+        if parameter.size not in (ANY, len(items)):
             raise UserError(f"{key} has {len(items)} values, but must be {_expected(parameter)}")
         numbers = tuple(_number(item, key, _expected(parameter)) for item in items)
         for number in numbers:
@@ -651,6 +746,23 @@ def _estimated(
     )
 
 
+def thruster_signal(inputs: Inputs, chosen: Thrusters) -> str:
+    """What a command is: one of thrusters.SIGNALS."""
+    if chosen.signal != "auto":
+        return chosen.signal
+    return thrusters.PWM if inputs.wrench in PULSE_TYPES else thrusters.FORCE
+
+
+def _turned(given: Thrusters, signs: Array) -> Thrusters:
+    """The same in forward-starboard-down: vectors of ``vehicle.frame`` in threes."""
+    turned: dict[str, Any] = {}
+    for name in ("position", "direction", "allocation"):
+        values = np.array(getattr(given, name))
+        if len(values) % 3 == 0:  # else refused where it is used
+            turned[name] = tuple((np.tile(signs, len(values) // 3) * values + 0.0).tolist())
+    return dataclasses.replace(given, **turned)
+
+
 def _in_model(model: Model, name: str, key: str) -> str:
     """The model's own name of a coefficient (N_vdot may be its Y_rdot)."""
     by_place = {c.place: c.name for c in model.coefficients}
@@ -775,6 +887,8 @@ def _expected(parameter: Parameter) -> str:
     if parameter.choices:
         return "one of " + ", ".join(parameter.choices)
     unit = f" ({parameter.unit})" if parameter.unit else ""
+    if parameter.type is Vector and parameter.size == ANY:
+        return f"a list of numbers{unit}"
     if parameter.type is Vector:
         return f"a list of {parameter.size} numbers{unit}"
     words = {float: "a number", int: "a whole number", str: "text", Names: "a list of names"}

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident import inputs
+from rov_ident.bags import Bag
 from rov_ident.config import Config
 from rov_ident.effects import compiled
 from rov_ident.errors import UserError
@@ -73,9 +74,8 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         estimator.sampler = Sampler(config)
         if config.estimate_effects:  # samples depend on what is known by then
             bag = Bag(record.path)
-            for role, message in read_messages(bag, select_topics(bag, vars(config.topics))):
-                if message is not None:
-                    estimator.push(role, message)
+            for role, message in inputs.messages(bag, inputs.select(bag, config), config):
+                estimator.push(role, message)
             estimator.flush()
         else:
             estimator.take(record.samples)

@@ -150,6 +150,17 @@ def quaternion_from_rotation_vector(vector: ArrayLike) -> Array:
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1)
 
 
+def quaternion_between(p: Array, q: Array, share: float) -> Array:
+    """The unit quaternion (4,) a share of the way from p to q, along the shortest rotation."""
+    cosine = float(p @ q)
+    q, cosine = (q, cosine) if cosine >= 0.0 else (-q, -cosine)
+    angle = float(np.arccos(min(cosine, 1.0)))
+    if angle < 1e-6:
+        return (1.0 - share) * p + share * q
+    mixed: Array = np.sin((1.0 - share) * angle) * p + np.sin(share * angle) * q
+    return mixed / np.sin(angle)
+
+
 def wrap_angle(angle: ArrayLike) -> Array:
     """Angles (rad) brought into (-pi, pi]."""
     return np.pi - np.remainder(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)

@@ -1,4 +1,4 @@
-"""The three input messages, free of middleware.
+"""The three input messages, and what else they are made from, free of middleware.
 
 The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
 forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
@@ -45,6 +45,32 @@ class Wrench(NamedTuple):
     frame_id: str
     force: Array  # (3,) N
     torque: Array  # (3,) N m
+
+
+class Twist(NamedTuple):
+    """geometry_msgs/Twist(WithCovariance)Stamped: velocity in body axes."""
+
+    stamp: int  # ns
+    frame_id: str  # body
+    linear: Array  # (3,) m/s
+    angular: Array  # (3,) rad/s
+    variance: Array  # (6,) diagonal of the covariance; zeros: not given
+
+
+class Pose(NamedTuple):
+    """geometry_msgs/Pose(WithCovariance)Stamped: the body in the world."""
+
+    stamp: int  # ns
+    frame_id: str  # world
+    position: Array  # (3,) m
+    orientation: Array  # (4,) w x y z, body -> world
+
+
+class Commands(NamedTuple):
+    """One number for each thruster, or each output of an autopilot."""
+
+    stamp: int  # ns; 0: the message has none
+    values: Array  # (k,)
 
 
 Message = Odometry | Imu | Wrench

@@ -239,6 +239,66 @@ def draw_bars(ax: Axes, groups: Sequence[str], models: Mapping[str, Array]) -> N
     ax.margins(y=0.12)
 
 
+def precision(names: Sequence[str], models: Mapping[str, Array], limit: float) -> Figure:
+    """A row for each name: from the first to the last of the values (n,) in percent, logarithmic;
+    ``limit`` is marked."""
+    figure = Figure(figsize=(9.0, 0.24 * len(names) + 1.1), layout="constrained")
+    ax = figure.subplots()
+    rows = np.arange(len(names))[::-1]
+    first, *_, last = models.values()
+    ax.hlines(rows, first, last, color=INK, lw=1.2, alpha=0.35)
+    for colour, (label, values) in zip((COLOURS[1], COLOURS[0]), models.items()):
+        ax.plot(values, rows, color=colour, marker="o", ms=5.0, lw=0.0, label=label)
+    ax.axvline(limit, color=INK, lw=1.0, ls="--", alpha=0.6)
+    ax.set_xscale("log")
+    ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.set_yticks(rows, names)
+    ax.set_xlabel("standard deviation [% of the value]")
+    ax.margins(y=0.04)
+    figure.legend(loc="outside upper right", ncols=len(models))
+    return figure
+
+
+def cloud(x: Array, y: Array, title: str, x_label: str, y_label: str, limit: float) -> Figure:
+    """One panel of points (k,), with lines at y = +-limit where these are near."""
+    figure, ax = panel(title, x_label, y_label)
+    ax.plot(x, y, color=COLOURS[0], marker="o", ms=1.6, lw=0.0, alpha=0.35, rasterized=True)
+    if np.abs(y).max() > 0.1 * limit:
+        for side in (-limit, limit):
+            ax.axhline(side, color=INK, lw=1.0, ls="--", alpha=0.5)
+    return figure
+
+
+def steps(t: Array, y: Array, title: str, x_label: str, y_label: str) -> Figure:
+    """One panel of what is held from each instant (k,) to the next; thinned to its extremes."""
+    figure, ax = panel(title, x_label, y_label)
+    group = max(1, len(t) // 1500)
+    if group > 1:
+        whole = len(t) // group * group
+        blocks = y[:whole].reshape(-1, group)
+        largest = np.abs(blocks).argmax(axis=1)
+        t, y = t[:whole:group], blocks[np.arange(len(blocks)), largest]
+    ax.step(t, y, color=COLOURS[0], lw=1.0, where="post")
+    ax.set_xlim(t[0], t[-1])
+    return figure
+
+
+def way(
+    x: Array, y: Array, title: str, x_label: str, y_label: str, half: tuple[float, float]
+) -> Figure:
+    """One panel of a path (k,) within a box of half sides ``half`` about its start."""
+    figure = Figure(figsize=(4.6, 3.4), layout="constrained")
+    ax = figure.subplots()
+    right, top = half
+    corners = [(-right, -top), (right, -top), (right, top), (-right, top), (-right, -top)]
+    ax.plot(*zip(*corners), color=INK, lw=1.0, ls="--", alpha=0.5)
+    ax.plot(x, y, color=COLOURS[0], lw=1.2)
+    ax.plot(x[0], y[0], color=COLOURS[1], marker="o", ms=6.0, lw=0.0)
+    ax.set(xlabel=x_label, ylabel=y_label, aspect="equal")
+    ax.set_title(title, loc="left", fontsize=9)
+    return figure
+
+
 def overview(title: str) -> tuple[Figure, tuple[Axes, Axes, Axes, Axes]]:
     """A figure of one wide pair of axes above three."""
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident import inputs
+from rov_ident.bags import Bag
 from rov_ident.config import Config
 from rov_ident.effects import Acting
 from rov_ident.errors import UserError
@@ -53,25 +54,22 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
         If the bag cannot be read, lacks a topic, or yields no sample, naming what is missing.
     """
     bag = Bag(Path(path))
-    topics = select_topics(bag, vars(config.topics))
-    total = sum(bag.topics[name].message_count for name in topics.values() if name)
+    topics = inputs.select(bag, config)
+    total = inputs.total(bag, topics)
     sampler = Sampler(config.with_effects_held)
     parts: list[NDArray[np.void]] = []
-    undecodable: Counter[str] = Counter()
-    for done, (role, message) in enumerate(read_messages(bag, topics)):
-        if message is None:
-            undecodable[f"{role}: cannot be decoded"] += 1
-        else:
-            part = sampler.push(role, message)
-            if len(part):
-                parts.append(part)
+    unusable: Counter[str] = Counter()
+    for done, (role, message) in enumerate(inputs.messages(bag, topics, config, unusable)):
+        part = sampler.push(role, message)
+        if len(part):
+            parts.append(part)
         if progress is not None and done % 2000 == 0:
             progress(done, total)
     parts.append(sampler.flush())
     if progress is not None:
         progress(total, total)
     samples = joined(parts)
-    counts = sampler.counts + undecodable
+    counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
     if len(samples) < 2:

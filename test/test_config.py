@@ -14,9 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rov_ident.config import (
+    ANY,
     LARGEST,
     PARAMETERS,
     VEHICLE_PARAMETERS,
+    WRENCH_TYPES,
     Config,
     Names,
     Vector,
@@ -398,6 +400,8 @@ def values_of(parameter: Any) -> st.SearchStrategy[Any]:
         return st.integers(int(lower), int(upper))
     if parameter.type is Names:
         return st.lists(st.sampled_from(["X_udot", "X_u", "X_uu"]))
+    if parameter.type is Vector and parameter.size == ANY:
+        return st.lists(st.floats(lower, upper), max_size=7)
     if parameter.type is Vector:
         return st.tuples(*[st.floats(lower, upper)] * parameter.size).map(list)
     return st.floats(lower, upper)
@@ -407,6 +411,10 @@ def values_of(parameter: Any) -> st.SearchStrategy[Any]:
 def configurations(draw: Any) -> Config:
     chosen = draw(st.sets(st.sampled_from(PARAMETERS), max_size=8))
     parameters = {p.key: draw(values_of(p)) for p in chosen}
+    if parameters.get("inputs.wrench") not in (None, *WRENCH_TYPES):  # then these are checked
+        columns = [draw(FINITE) for _ in range(6 * draw(st.integers(1, 3)))]
+        parameters = {k: v for k, v in parameters.items() if not k.startswith("thrusters.")}
+        parameters["thrusters.allocation"] = columns
     positive = st.floats(1e-3, 1e6)
     coefficient = st.floats(-1e6, 0.0)
     return from_parameters(
@@ -544,7 +552,7 @@ def test_every_parameter_is_declared_in_full():
         assert parameter.description
         assert not parameter.description.endswith(".")
         assert parameter.type in (float, int, str, Vector, Names)
-        assert (parameter.type is Vector) == (parameter.size > 0)
+        assert (parameter.type is Vector) == (parameter.size != 0)
         if parameter.type is not Vector and parameter.default is not None:
             assert type(parameter.default) is (tuple if parameter.type is Names else parameter.type)
         numbers = parameter.default if parameter.type is Vector else (parameter.default,)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rov_ident.config import Config, from_parameters
 from rov_ident.errors import UserError
-from rov_ident.formats import auv_controllers, gazebo, mss
+from rov_ident.formats import auv_controllers, gazebo, mss, urdf
 from rov_ident.formats.base import Written
 
 WRITERS = {"auv_controllers": auv_controllers, "gazebo": gazebo, "mss": mss}
@@ -18,10 +18,11 @@ def export(config: Config, name: str) -> Written:
     return WRITERS[name].write(config)
 
 
-def import_model(path: str | Path) -> tuple[Config, tuple[str, ...]]:
+def import_model(path: str | Path, base: Config | None = None) -> tuple[Config, tuple[str, ...]]:
     """A configuration from a file of another program, and what had to be assumed.
 
-    SDFormat is told from YAML by its first character.
+    SDFormat and URDF are told from YAML by their first character, and from each other by the name
+    of their root. ``base`` is what a URDF does not hold.
 
     Raises
     ------
@@ -33,9 +34,14 @@ def import_model(path: str | Path) -> tuple[Config, tuple[str, ...]]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
-    reader = READERS["gazebo" if text.lstrip().startswith("<") else "auv_controllers"]
+    is_xml, is_urdf = text.lstrip().startswith("<"), "<robot" in text
+    if base is not None and not (is_xml and is_urdf):
+        raise UserError(f"{path} is no URDF: --config adds to a URDF alone")
     try:
-        parameters, notes = reader.read(text)
+        if is_xml and is_urdf:
+            parameters, notes = urdf.read(text, base)
+        else:
+            parameters, notes = READERS["gazebo" if is_xml else "auv_controllers"].read(text)
         return from_parameters(parameters), notes
     except UserError as error:
         raise UserError(f"{path}: {error}") from error

@@ -176,7 +176,7 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
             "neutral, with the centre of buoyancy at the body origin"
         )
     density = _numbers(root, ".//uniform_fluid_density", [DENSITY])[0]
-    coefficients = _coefficients(plugin, notes)
+    coefficients = damping(plugin, notes)
     flag = (plugin.findtext("disable_added_mass") or "").strip() in ("true", "1")
     if flag:
         coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
@@ -202,7 +202,7 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
     return Read(parameters, tuple(notes))
 
 
-def _coefficients(plugin: ET.Element, notes: list[str]) -> dict[str, float]:
+def damping(plugin: ET.Element, notes: list[str]) -> dict[str, float]:
     """Damping and, in old files, added mass of the plugin, forward-starboard-down."""
     found: dict[tuple[int, ...], tuple[str, float]] = {}
     for element in plugin:

@@ -38,13 +38,14 @@ from std_srvs.srv import SetBool, Trigger
 
 from rov_ident import checkpoint
 from rov_ident import config as configuration
-from rov_ident.cdr import DECODERS, ROLE_TYPES, encode
+from rov_ident.cdr import encode
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.frames import from_core
+from rov_ident.inputs import Reader
 from rov_ident.messages import Imu, Odometry, Wrench
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
+from rov_ident.nodes.common import LATCHED, STREAM, Executor, subscribed
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
 from rov_ident.online import Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
@@ -99,9 +100,10 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._online = OnlineEstimator(config, kind)
         self._keeper = None if self._lockstep else self._recalled(str(checkpoint_path))
 
-        self._undecodable: Counter[str] = Counter()
+        self._reader = Reader(config)
+        self._sources = subscribed(config.inputs)
         self._received: Counter[str] = Counter()
-        self._silence = dict.fromkeys(INPUTS, 0.0)  # s since the last message
+        self._silence = dict.fromkeys(self._sources, 0.0)  # s since the last message
         self._idle = 0.0  # s since the last sample
         self._stopped = ""  # why there are no samples
         self._wrench_frame: str | None = None
@@ -148,7 +150,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         # Raw: our decoder is fifty times as fast, and the one that reads bags.
         self._inputs = {
             role: self.create_subscription(type_, name, partial(self._receive, role), qos, raw=True)
-            for role, (name, type_) in INPUTS.items()
+            for role, (name, type_) in self._sources.items()
         }
         self._publish()
         self._begin_watching()
@@ -173,14 +175,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
     # ---------------------------------------------------------------- messages in
 
-    def _receive(self, role: str, data: bytes) -> None:
-        self._received[role] += 1
-        self._silence[role] = 0.0
-        try:
-            message = DECODERS[ROLE_TYPES[role]](data)
-        except ValueError:
-            self._undecodable[f"{role}: bytes that are no {ROLE_TYPES[role]}"] += 1
-        else:
+    def _receive(self, source: str, data: bytes) -> None:
+        self._received[source] += 1
+        self._silence[source] = 0.0
+        arrival = self.get_clock().now().nanoseconds
+        for role, message in self._reader.read(source, data, arrival):
             info = self._online.push(role, message)
             # The sampler keeps to the frame of the first message that it takes.
             if role == WRENCH and self._wrench_frame is None and self._online.counts[WRENCH]:
@@ -365,7 +364,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _complaints(self) -> list[str]:
         """What keeps the inputs from being used, in words."""
         complaints = []
-        for role, (name, _) in INPUTS.items():
+        for role, (name, _) in self._sources.items():
             if not self._missing(role) or self._lockstep:
                 continue
             topic = self.resolve_topic_name(name)
@@ -380,7 +379,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
                 )
             else:
                 complaints.append(f"no message received on {topic}: remap it or start the driver")
-        counts = self._online.counts + self._undecodable
+        counts = self._online.counts + self._reader.counts
         refused = counts - self._seen_counts
         complaints += describe({k: n for k, n in refused.items() if k not in _NO_COMPLAINT})
         self._seen_counts = counts

@@ -7,7 +7,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,8 +17,9 @@ from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
 from rov_ident import config as configuration
-from rov_ident.bags import Bag, BagWriter, RawMessage, select_topics
-from rov_ident.config import Qos
+from rov_ident import inputs
+from rov_ident.bags import Bag, BagWriter
+from rov_ident.config import Inputs, Qos
 from rov_ident.errors import UserError
 from rov_ident.nodes.player import OnReport, Player
 from rov_ident.online import ESTIMATORS, Report
@@ -63,8 +64,7 @@ def replay(
         raise UserError(f"{out} is the bag to play: give another name for the recording")
     recorded = Bag(Path(bag))
     config = configuration.load(config_path)
-    chosen = select_topics(recorded, vars(config.topics))
-    roles = {topic: role for role, topic in chosen.items() if topic}
+    topics = inputs.select(recorded, config)
     started = time.monotonic()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     with ExitStack() as stack:
@@ -78,7 +78,9 @@ def replay(
             # Written anew: it may hold what our reader takes and that of ROS 2 does not.
             parameters = folder / f"{name}.yaml"
             settings = replace(
-                configuration.load(config_path, name), qos=Qos(reliability="reliable")
+                configuration.load(config_path, name),
+                qos=Qos(reliability="reliable"),
+                inputs=Inputs(),  # the player converts: see inputs.as_played
             )
             configuration.dump(settings, parameters)
             nodes.append(stack.enter_context(_Process(name, parameters)))
@@ -92,8 +94,8 @@ def replay(
         stack.callback(rclpy.try_shutdown, context=context)
         player = Player(context, estimators, writer, on_report, check)
         stack.callback(player.destroy_node)
-        player.wait_for_nodes(next(recorded.iter_raw(roles)).log_time)
-        count = player.play(_by_role(recorded, roles), rate)
+        player.wait_for_nodes(next(recorded.iter_raw(topics.values())).log_time)
+        count = player.play(inputs.as_played(recorded, topics, config), rate)
         player.finish()
         return ReplayResult(
             dict(player.reports),
@@ -101,11 +103,6 @@ def replay(
             time.monotonic() - started,
             None if out is None else Path(out),
         )
-
-
-def _by_role(bag: Bag, roles: Mapping[str, str]) -> Iterator[tuple[str, RawMessage]]:
-    for raw in bag.iter_raw(roles):
-        yield roles[raw.topic], raw
 
 
 class _Process:

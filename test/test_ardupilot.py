@@ -1,0 +1,280 @@
+"""Logs of an autopilot into bags: written here as ArduPilot writes them, read by pymavlink."""
+
+import struct
+
+import numpy as np
+import pytest
+from conftest import HEAVY
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from test_inputs import DIRECTION, GEOMETRY, POSITION, configured, estimate
+
+from rov_ident import config, thrusters
+from rov_ident.ardupilot import import_log
+from rov_ident.cli import main
+from rov_ident.errors import UserError
+from rov_ident.frames import quaternion_to_euler, quaternion_to_matrix, to_core
+from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.recording import write_messages
+from rov_ident.samples import IMU, ODOMETRY, WRENCH
+
+VOLTAGE = 15.2
+FORMATS = {  # type: (name, format, columns), as ArduPilot's LogStructure.h has them
+    128: ("FMT", "BBnNZ", "Type,Length,Name,Format,Columns"),
+    1: ("XKF1", "QBccCfffffffccce", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD,GX,GY,GZ,OH"),
+    2: ("XKQ", "QBffff", "TimeUS,C,Q1,Q2,Q3,Q4"),
+    3: ("IMU", "QBffffffIIfBBHH", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz"),
+    4: ("RCOU", "Q" + 14 * "H", "TimeUS," + ",".join(f"C{i}" for i in range(1, 15))),
+    5: ("BAT", "QBff", "TimeUS,Inst,Volt,VoltR"),
+    6: ("ATT", "QccccCCCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw,ErrRP,ErrYaw"),
+}
+SIZES = {**dict(zip("BbHhIifdQq", "BbHhIifdQq", strict=True)), "c": "h", "C": "H", "e": "i",
+         "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
+
+
+def structure(kind):
+    return struct.Struct("<" + "".join(SIZES[c] for c in FORMATS[kind][1]))
+
+
+def record(kind, *values):
+    return bytes([0xA3, 0x95, kind]) + structure(kind).pack(*values)
+
+
+def dataflash(path, rows, kinds=FORMATS):
+    """A log of (type, *values); the formats of ``kinds`` are declared first."""
+    head = [
+        record(128, kind, 3 + structure(kind).size, *(text.encode() for text in FORMATS[kind]))
+        for kind in kinds
+    ]
+    path.write_bytes(b"".join(head + [record(*row) for row in rows]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def dive(short_dive):
+    """What the autopilot knows, in its axes: [(time [us], role, core message or pulses)].
+
+    The odometry has the gyro's rates, and no variances: a log holds neither.
+    """
+    matrix = thrusters.allocation(np.array(POSITION), np.array(DIRECTION))
+    curve = thrusters.t200(VOLTAGE)
+    inverse = np.linalg.pinv(matrix)
+    core = [(m.stamp // 1000 - 1_000_000, role, to_core(m)) for _, role, m in short_dive]
+    gyro_t = np.array([t for t, role, _ in core if role == IMU])
+    gyro = np.array([m.angular_velocity for _, role, m in core if role == IMU])
+    rows = []
+    for t, role, m in sorted(core, key=lambda row: (row[0], row[1] != WRENCH)):
+        if role == WRENCH:
+            m = 1100 + np.searchsorted(curve, inverse @ np.concatenate([m.force, m.torque]))
+        elif role == ODOMETRY:
+            if not gyro_t[0] <= t <= gyro_t[-1]:
+                continue
+            rates = np.array([np.interp(t, gyro_t, column) for column in gyro.T])
+            m = m._replace(angular=rates, twist_variance=np.zeros(6))
+        rows.append((t, role, m))
+    return rows
+
+
+def expected(path, dive, quantise=lambda role, t, m: (t, m)):
+    """The report from a bag of the same numbers that never were in a log."""
+    matrix = thrusters.allocation(np.array(POSITION), np.array(DIRECTION))
+    curve = thrusters.t200(VOLTAGE)
+    messages = []
+    for t, role, m in dive:
+        t, m = quantise(role, t, m)
+        stamp = 1000 * (t + 1_000_000)
+        if role == WRENCH:
+            tau = matrix @ curve[m - 1100]
+            m = Wrench(stamp, "base_link_frd", tau[:3], tau[3:])
+        elif role == IMU:
+            zero = np.zeros(3)
+            m = Imu(stamp, "imu_frd", np.zeros(4), m.angular_velocity, m.linear_acceleration,
+                    zero, zero)  # fmt: skip
+        else:
+            m = m._replace(stamp=stamp, frame_id="world_ned", child_frame_id="base_link_frd")
+        messages.append((stamp, role, m))
+    write_messages(path, messages)
+    return estimate(path, config.load(HEAVY))
+
+
+def assert_close(report, reference, rtol):
+    assert report.stamp == reference.stamp
+    np.testing.assert_allclose(report.values, reference.values, rtol=rtol)
+    np.testing.assert_allclose(report.std, reference.std, rtol=rtol)
+
+
+def rows_of(dive, quaternion=True):
+    """What ArduSub logs of the dive; a second core, IMU and battery say something else."""
+    yield 5, 0, 0, VOLTAGE, VOLTAGE
+    yield 5, 1, 1, 3.3, 3.3
+    for t, role, m in dive:
+        if role == WRENCH:
+            yield 4, t, *m.tolist(), *[0] * 6
+        elif role == IMU:
+            yield 3, t, 0, *m.angular_velocity, *m.linear_acceleration, 0, 0, 40.0, 1, 1, 100, 100
+            yield 3, t, 1, *[9.0] * 6, 0, 0, 40.0, 1, 1, 100, 100
+        else:
+            degrees = np.degrees(quaternion_to_euler(m.orientation))
+            roll, pitch, yaw = np.round(100 * degrees).astype(int).tolist()
+            if quaternion:
+                yield 2, t, 0, *m.orientation
+                yield 2, t, 1, 1.0, 0.0, 0.0, 0.0
+            else:
+                yield 6, t, 0, roll, 0, pitch, 0, yaw % 36000, 0, 0
+            v = quaternion_to_matrix(m.orientation) @ m.linear
+            yield 1, t, 0, 0, 0, 0, *v, 0.0, *m.position, 0, 0, 0, 0
+            yield 1, t, 1, 0, 0, 0, *[5.0] * 7, 0, 0, 0, 0
+
+
+def test_a_dataflash_log(tmp_path, dive):
+    """The estimate of the dive itself, to the single precision of the log."""
+    path = dataflash(tmp_path / "00000012.BIN", rows_of(dive))
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    counts = {role: sum(own == role for _, own, _ in dive) for role in (ODOMETRY, IMU, WRENCH)}
+    assert (report.odometry, report.imu, report.wrench) == tuple(counts.values())
+    assert report.notes == (f"battery from {VOLTAGE} to {VOLTAGE} V, as measured",)
+    reference = expected(tmp_path / "direct.mcap", dive)
+    assert_close(estimate(tmp_path / "log.mcap", config.load(HEAVY)), reference, 2e-5)
+
+
+def test_an_attitude_in_hundredths_of_a_degree(tmp_path, dive):
+    """Without the EKF's quaternion the autopilot's angles serve: 0.005 deg at most off."""
+    kinds = [kind for kind in FORMATS if kind != 2]
+    path = dataflash(tmp_path / "log.bin", rows_of(dive, quaternion=False), kinds)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    assert "the attitude is the autopilot's angles" in report.notes[-1]
+    reference = expected(tmp_path / "direct.mcap", dive)
+    found = estimate(tmp_path / "log.mcap", config.load(HEAVY))
+    assert found.stamp == reference.stamp
+    assert np.all(np.abs(found.values - reference.values) < 0.3 * reference.std)
+
+
+def telemetry(path, dive, offset=0):
+    """A .tlog: for each message the time of arrival [us], big-endian, and the packet."""
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    station = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    data = bytearray()
+
+    def add(t, message, sender=mav):
+        data.extend(struct.pack(">Q", 1_700_000_000_000_000 + t) + message.pack(sender))
+
+    add(offset, mav.attitude_encode(offset // 1000, *[0.0] * 6))
+    for t, role, m in dive:
+        t += offset
+        ms = round(t / 1000)
+        if role == WRENCH:
+            pulses = m.tolist()
+            servo = mav.servo_output_raw_encode(t % 2**32, 0, *pulses, *[0] * 8)
+            add(t, servo)
+        elif role == IMU:
+            force = np.round(1000 * m.linear_acceleration / 9.80665).astype(int).tolist()
+            gyro = np.round(1000 * m.angular_velocity).astype(int).tolist()
+            add(t, mav.raw_imu_encode(t, *force, *gyro, 0, 0, 0))
+        else:
+            angles = quaternion_to_euler(m.orientation).tolist()
+            add(t, mav.attitude_encode(ms, *angles, *m.angular.tolist()))
+            v = (quaternion_to_matrix(m.orientation) @ m.linear).tolist()
+            add(t, mav.local_position_ned_encode(ms, *m.position.tolist(), *v))
+            add(t, station.attitude_encode(5 + ms, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0), station)
+            status = [0, 0, 0, 0, round(1000 * VOLTAGE), 0, 0, 0, 0, 0, 0, 0, 0]
+            add(t, mav.sys_status_encode(*status))
+    path.write_bytes(bytes(data))
+    return path
+
+
+def quantised(offset=0):
+    """What MAVLink makes of the numbers: milliseconds, mrad/s, thousandths of g."""
+
+    def quantise(role, t, m):
+        t += offset
+        if role == ODOMETRY:
+            return 1000 * round(t / 1000), m
+        if role == IMU:
+            return t, m._replace(
+                angular_velocity=np.round(1000 * m.angular_velocity) / 1000,
+                linear_acceleration=np.round(1000 * m.linear_acceleration / 9.80665) * 9.80665e-3,
+            )
+        return t, m
+
+    return quantise
+
+
+@pytest.mark.parametrize("offset", [0, 2**32 - 4_000_000])
+def test_a_telemetry_log(tmp_path, dive, offset):
+    """As the dataflash log; also where the 32 bits of the servos' clock run over."""
+    path = telemetry(tmp_path / "dive.tlog", dive, offset)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    assert report.wrench == sum(role == WRENCH for _, role, _ in dive)
+    # The log's odometry takes the rates of the quantised gyro at its own, whole milliseconds.
+    reference = expected(tmp_path / "direct.mcap", dive, quantised(offset))
+    found = estimate(tmp_path / "log.mcap", config.load(HEAVY))
+    assert found.stamp == reference.stamp
+    assert np.all(np.abs(found.values - reference.values) < 0.3 * reference.std)
+
+
+def test_the_command(tmp_path, dive, capsys):
+    config.dump(configured(**GEOMETRY), tmp_path / "c.yaml")
+    path = str(dataflash(tmp_path / "log.BIN", rows_of(dive)))
+    out, result = str(tmp_path / "log.mcap"), tmp_path / "log.json"
+    command = ["import", path, "--config", str(tmp_path / "c.yaml"), "--out", out]
+    assert main([*command, "--json", str(result)]) == 0
+    assert '"odometry": ' in result.read_text()
+    assert "odometry" in capsys.readouterr().err
+    assert main(["import", path, "--out", out]) == 2
+    assert "--config names the parameter file" in capsys.readouterr().err
+    assert main(["import", path, path, "--config", "c", "--out", out]) == 2
+    assert "one by one" in capsys.readouterr().err
+
+
+def test_what_is_missing_is_named(tmp_path, dive):
+    settings = configured(**GEOMETRY)
+    rows = list(rows_of(dive))
+    for kind, words in (
+        (1, "no velocity of an EKF"),
+        (4, "no thruster output"),
+        (2, "no attitude"),
+        (3, "no angular rates"),
+    ):
+        path = dataflash(tmp_path / "log.bin", [row for row in rows if row[0] != kind])
+        with pytest.raises(UserError, match=words):
+            import_log(path, tmp_path / "out.mcap", settings)
+    with pytest.raises(UserError, match="thrusters has no allocation"):
+        import_log(path, tmp_path / "out.mcap", config.load(HEAVY))
+    unmeasured = dataflash(tmp_path / "log.bin", [row for row in rows if row[0] != 5])
+    report = import_log(unmeasured, tmp_path / "out.mcap", settings)
+    assert report.notes[0] == "no voltage of the battery: taken as 16 V (thrusters.voltage)"
+
+
+@pytest.mark.parametrize("name", ["log.bin", "log.tlog", "log.log"])
+@pytest.mark.parametrize("data", [b"", b"\xa3\x95\x80", b"nothing of the kind" * 99, bytes(4000)])
+def test_what_is_no_log_is_refused(tmp_path, capfd, name, data):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(UserError, match=r"is no log|holds no"):
+        import_log(tmp_path / name, tmp_path / "out.mcap", configured(**GEOMETRY))
+    assert capfd.readouterr() == ("", "")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_cut_log_is_read_to_its_end(tmp_path, dive):
+    path = dataflash(tmp_path / "log.bin", rows_of(dive))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 + 5])
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    assert 4.0 < report.duration < 6.0
+
+
+def test_pulses_that_are_none(tmp_path, dive):
+    rows = [(4, row[1], *[3] * 14) if row[0] == 4 else row for row in rows_of(dive)]
+    with pytest.raises(UserError, match="the thruster outputs hold a pulse that is none"):
+        import_log(dataflash(tmp_path / "l.bin", rows), tmp_path / "o.mcap", configured(**GEOMETRY))
+
+
+def test_an_odometry_in_the_bag_is_an_ordinary_one(tmp_path, dive):
+    from rov_ident.bags import Bag, read_messages, select_topics
+
+    import_log(
+        dataflash(tmp_path / "log.bin", rows_of(dive)), tmp_path / "b.mcap", configured(**GEOMETRY)
+    )
+    bag = Bag(tmp_path / "b.mcap")
+    found = next(m for role, m in read_messages(bag, select_topics(bag)) if role == ODOMETRY)
+    assert isinstance(found, Odometry)
+    assert (found.frame_id, found.child_frame_id) == ("world_ned", "base_link_frd")
