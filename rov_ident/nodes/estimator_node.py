@@ -156,6 +156,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _config(self) -> Config:
         return self._online.config
 
+    @property
+    def _label(self) -> str:
+        """In /diagnostics, which all vehicles share."""
+        return str(self.get_fully_qualified_name()).lstrip("/")
+
     # ---------------------------------------------------------------- messages in
 
     def _receive(self, role: str, data: bytes) -> None:
@@ -274,7 +279,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         words = "; ".join(s.sentence for s in found) or (
             "the watch is being compiled" if watcher is None else "nothing is seen to be missing"
         )
-        return to_status(f"{self.get_name()}: model", self._config.name, level, words, values)
+        return to_status(f"{self._label}: model", self._config.name, level, words, values)
 
     # ---------------------------------------------------------------- watching
 
@@ -359,7 +364,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         stopped = self._missing(ODOMETRY) or self._missing(WRENCH)
         level = Level.STALE if stopped else Level.WARN if complaints else Level.OK
         words = "; ".join(complaints) or "all messages are used"
-        return to_status(f"{self.get_name()}: inputs", self._config.name, level, words, values)
+        return to_status(f"{self._label}: inputs", self._config.name, level, words, values)
 
     def _estimation_status(self) -> DiagnosticStatus:
         report = self._online.report()
@@ -386,7 +391,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             level, words = Level.STALE, f"no samples, coefficients held, {words}"
         else:
             level = Level.OK
-        return to_status(f"{self.get_name()}: estimation", self._config.name, level, words, values)
+        return to_status(f"{self._label}: estimation", self._config.name, level, words, values)
 
     # ---------------------------------------------------------------- services
 
