@@ -23,6 +23,7 @@ HOST = "127.0.0.1"
 PERIOD = 0.5  # s; between two messages to a page
 CLIENTS = 16  # pages open at a time
 _PATIENCE = 10.0  # s; for a page to take a message
+_LEAVE = 0.5  # s; for a page to answer that it is closed
 _LARGEST = 4096  # bytes of a message to us, of which there should be none
 _PAGE = files("rov_ident.dashboard") / "page"
 _FILES = {
@@ -34,13 +35,14 @@ _NAMES = (HOST, "localhost")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 STORE = web.AppKey("store", Store)
-PAGES = web.AppKey("pages", set)
+PAGES: web.AppKey[set[web.WebSocketResponse]] = web.AppKey("pages")
 
 
 def application(store: Store, port: int) -> web.Application:
     """The page at `/`, the state at `/state.json`, what is new at `/live` (web socket)."""
     app = web.Application(middlewares=[_guard(port)], client_max_size=_LARGEST)
-    app[STORE], app[PAGES] = store, set()
+    app[STORE] = store
+    app[PAGES] = set()
     app.on_response_prepare.append(_protect)
     app.on_shutdown.append(_hang_up)
     for path in _FILES:
@@ -109,7 +111,9 @@ async def _live(request: web.Request) -> web.StreamResponse:
     pages = request.app[PAGES]
     if len(pages) >= CLIENTS:
         raise web.HTTPServiceUnavailable(text=f"{CLIENTS} pages are open: close one\n")
-    page = web.WebSocketResponse(heartbeat=20.0, max_msg_size=_LARGEST, compress=False)
+    page = web.WebSocketResponse(
+        timeout=_LEAVE, heartbeat=20.0, max_msg_size=_LARGEST, compress=False
+    )
     pages.add(page)
     try:
         await page.prepare(request)
@@ -138,8 +142,9 @@ async def _send(page: web.WebSocketResponse, store: Store) -> None:
 
 
 async def _hang_up(app: web.Application) -> None:
-    for page in tuple(app[PAGES]):
-        await page.close(code=WSCloseCode.GOING_AWAY, message=b"the dashboard has ended")
+    pages = app[PAGES]
+    gone, words = WSCloseCode.GOING_AWAY, b"the dashboard has ended"
+    await asyncio.gather(*(page.close(code=gone, message=words) for page in pages))
 
 
 def _to_json(state: Any) -> str:

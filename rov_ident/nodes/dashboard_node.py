@@ -10,29 +10,31 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.context import Context
-from rclpy.exceptions import InvalidParameterException, InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
+from rov_ident.config import own
 from rov_ident.dashboard.server import serving
 from rov_ident.dashboard.store import Store
 from rov_ident.errors import UserError
+from rov_ident.nodes import parameters
 from rov_ident.nodes.common import Executor
 from rov_ident.nodes.watch_node import WatchNode
 
 PORT = 8050
-_LARGEST_PORT = 65535
-# name: (default, least, description)
-_PARAMETERS = {
-    "port": (PORT, 0, "port of the page on 127.0.0.1; 0: any that is free"),
-    "foxglove_port": (
-        -1,
-        -1,
-        "port for Foxglove on 127.0.0.1 (it asks for 8765); 0: any that is free, -1: none",
+_LARGEST_PORT = 65535.0
+_PARAMETERS = (
+    own(
+        "port", int, PORT, "port of the page on 127.0.0.1; 0: any that is free", lower=0.0,
+        upper=_LARGEST_PORT,
     ),
-}
+    own(
+        "foxglove_port", int, -1,
+        "port for Foxglove on 127.0.0.1 (it asks for 8765); 0: any that is free, -1: none",
+        lower=-1.0, upper=_LARGEST_PORT,
+    ),
+)  # fmt: skip
 
 Announce = Callable[[Mapping[str, str]], None]
 """Is given the addresses: `page`, and `foxglove` where it is served."""
@@ -54,7 +56,11 @@ def dashboard(port: int, foxglove_port: int, announce: Announce) -> None:
 def main() -> int:
     """The node's whole life; 0 after an interrupt, 2 where the user can mend it."""
     try:
-        _live(None, _declare, lambda addresses: print(*addresses.values(), flush=True))
+        _live(
+            None,
+            lambda node: parameters.declare_own(node, _PARAMETERS),
+            lambda addresses: print(*addresses.values(), flush=True),
+        )
     except UserError as error:
         print(f"dashboard_node: {error}", file=sys.stderr)
         return 2
@@ -62,18 +68,7 @@ def main() -> int:
 
 
 def _declare(node: WatchNode) -> Mapping[str, int]:
-    for name, (default, least, description) in _PARAMETERS.items():
-        within = IntegerRange(from_value=least, to_value=_LARGEST_PORT)
-        descriptor = ParameterDescriptor(
-            description=description, read_only=True, integer_range=[within]
-        )
-        try:
-            node.declare_parameter(name, default, descriptor)
-        except (InvalidParameterException, InvalidParameterTypeException, ValueError) as error:
-            raise UserError(
-                f"{name} must be a whole number from {least} to {_LARGEST_PORT}"
-            ) from error
-    return {name: node.get_parameter(name).value for name in _PARAMETERS}
+    return parameters.declare_own(node, _PARAMETERS)
 
 
 def _live(
