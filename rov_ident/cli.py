@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -349,6 +350,17 @@ def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
         help="with --once: for an estimator to be heard (10)",
     )  # fmt: skip
     watch.set_defaults(run=_watch)
+
+    layouts = commands.add_parser(
+        "layouts", help="layouts of this vehicle's topics for Foxglove and PlotJuggler"
+    )
+    layouts.add_argument("--config", required=True, type=Path)
+    layouts.add_argument("--namespace", default="", help="of the nodes (none)")
+    layouts.add_argument(
+        "--out", required=True, type=Path, metavar="DIR",
+        help="folder for foxglove.json and plotjuggler.xml",
+    )  # fmt: skip
+    layouts.set_defaults(run=_layouts)
 
 
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
@@ -915,6 +927,21 @@ def _watch(options: argparse.Namespace) -> None:
         watch_once(options.wait, options.json, OUT)
     else:
         watch(options.json, OUT, ERR)
+
+
+def _layouts(options: argparse.Namespace) -> None:
+    from rov_ident import layouts
+    from rov_ident.fit import write_text
+
+    if not re.fullmatch(r"(/?[A-Za-z_]\w*)*/?", options.namespace):
+        raise UserError(f"{options.namespace!r} is no namespace of ROS 2, such as rov1")
+    config = configuration.load(options.config)
+    for name, write in (
+        ("foxglove.json", layouts.foxglove),
+        ("plotjuggler.xml", layouts.plotjuggler),
+    ):
+        write_text(options.out / name, write(config, options.namespace))
+        ERR.print(f"written: {options.out / name}")
 
 
 def _coefficients(options: argparse.Namespace) -> None:

@@ -16,10 +16,16 @@ import aiohttp
 import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
+from conftest import HEAVY
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import deserialize_message
 
+from rov_ident import config, layouts, sensors
 from rov_ident.dashboard import server
 from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
-from rov_ident.online import Level, OnlineEstimator
+from rov_ident.online import ESTIMATORS, Level, OnlineEstimator
+
+CONFIGS = HEAVY.parent
 
 # ------------------------------------------------------------------ what it keeps
 
@@ -383,3 +389,146 @@ def command(domain):
         _, said = process.communicate(timeout=20)
         assert process.returncode == 0, said
         assert "Traceback" not in said
+
+
+ROLES = ("odom", "imu", "wrench")
+VEHICLES = {"rov1": ("bluerov2_heavy.yaml", 1), "rov2": ("remus100.yaml", 2)}
+NODES = {f"/{vehicle}/{kind}_node": (vehicle, kind) for vehicle in VEHICLES for kind in ESTIMATORS}
+
+
+def test_two_vehicles(command):
+    """Four nodes in two namespaces, each with its own vehicle's numbers to the last bit; and the
+    page, the table, its JSON and Foxglove show all of them."""
+    configs = {vehicle: CONFIGS / name for vehicle, (name, _) in VEHICLES.items()}
+    dives = {
+        vehicle: sensors.dive(config.load(configs[vehicle]), duration=8.0, seed=seed).messages
+        for vehicle, (_, seed) in VEHICLES.items()
+    }
+    expected = {}
+    for node, (vehicle, kind) in NODES.items():
+        online = OnlineEstimator(config.load(configs[vehicle]), kind)
+        for _, role, message in dives[vehicle]:
+            online.push(role, message)
+        online.flush()
+        expected[node] = online.report()
+        options = ["--ros-args", "--params-file", str(configs[vehicle]), "-r", f"__ns:=/{vehicle}"]
+        options += ["-p", "qos.reliability:=reliable", "-p", "timeout:=3.0"]
+        command(f"rov_ident.nodes.{kind}_node", *options)
+    dashboard = command("rov_ident.cli", "dashboard", "--port", "0", "--foxglove", "0", "--json")
+    addresses = json.loads(dashboard.stdout.readline())
+
+    with publishing(dives) as publish:
+        asyncio.run(_until_all_are_shown(addresses["page"], expected, publish))
+        table = command("rov_ident.cli", "watch", "--once")
+        lines = command("rov_ident.cli", "watch", "--once", "--json")
+        asyncio.run(_foxglove(addresses["foxglove"]))
+    shown, _ = table.communicate(timeout=60)
+    for node in NODES:
+        assert node in shown
+    said, _ = lines.communicate(timeout=60)
+    state = json.loads(said)["estimators"]
+    assert sorted(state) == sorted(NODES)
+    for node, report in expected.items():
+        assert state[node]["vehicle"] == config.load(configs[NODES[node][0]]).name
+        assert state[node]["stamp_ns"] == report.stamp
+        for i, name in enumerate(report.names):
+            given = state[node]["coefficients"][name]
+            assert given["value"] == report.values[i] and given["std"] == report.std[i]
+            assert given["level"] == "STALE"  # the dives are over
+        assert set(state[node]["health"]) == {"inputs", "estimation", "model"}
+
+
+@contextlib.contextmanager
+def publishing(dives):
+    """Gives what publishes the dives."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    from rov_ident import cdr
+    from rov_ident.nodes.common import INPUTS, STREAM
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("drivers", context=context)
+    publishers = {
+        (vehicle, role): node.create_publisher(type_, f"/{vehicle}/{topic}", STREAM)
+        for vehicle in dives
+        for role, (topic, type_) in INPUTS.items()
+    }
+    everything = sorted(
+        ((vehicle, *entry) for vehicle, messages in dives.items() for entry in messages),
+        key=lambda message: message[1],  # its arrival
+    )
+    waiting = [(publishers[vehicle, role], message) for vehicle, _, role, message in everything]
+
+    def publish():
+        """Everything, about ten times as fast as life."""
+        for k, (publisher, message) in enumerate(waiting):
+            publisher.publish(cdr.encode(message))
+            if k % 50 == 0:
+                time.sleep(0.01)
+
+    yield publish
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+async def _until_all_are_shown(url, expected, publish):
+    end, published = time.monotonic() + 100.0, False
+    async with aiohttp.ClientSession() as session:
+        while True:
+            await asyncio.sleep(0.2)
+            async with session.get(url + "state.json") as answer:
+                state = (await answer.json())["estimators"]
+            inputs = [known["statuses"].get("inputs", {"values": {}}) for known in state.values()]
+            connected = [s["values"].get(f"{r} publishers") for s in inputs for r in ROLES]
+            if not published and connected == ["1"] * len(NODES) * len(ROLES):
+                publish()
+                published = True
+            told = {node for node, known in state.items() if known["statuses"].keys() >= {"model"}}
+            stamps = {node: known.get("stamp") for node, known in state.items() if node in told}
+            if stamps == {node: report.stamp * 1e-9 for node, report in expected.items()}:
+                break
+            assert time.monotonic() < end, stamps
+    for node, report in expected.items():
+        np.testing.assert_allclose(state[node]["values"], report.values, rtol=1e-5)
+        assert len(state[node]["correlation"]) == len(report.names)
+        assert len(state[node]["residuals"]["rows"]) > 5
+        assert len(state[node]["history"]["rows"]) >= 1
+
+
+async def _foxglove(address):
+    """What Foxglove is offered, and gets: the topics of the layout, in the bytes of ROS."""
+    wanted = {topic for vehicle in VEHICLES for topic in layouts.topics(vehicle)} | {"/diagnostics"}
+    async with aiohttp.ClientSession() as session:
+        protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
+        async with session.ws_connect(address, protocols=protocols) as socket:
+            info = await asyncio.wait_for(socket.receive_json(), 10.0)
+            assert info["op"] == "serverInfo" and info["capabilities"] == []
+            channels = {}
+            while not wanted <= channels.keys():
+                message = await asyncio.wait_for(socket.receive(), 10.0)
+                if message.type == aiohttp.WSMsgType.TEXT:
+                    for channel in json.loads(message.data).get("channels", []):
+                        channels[channel["topic"]] = channel
+            coefficients = channels["/rov1/rls_node/coefficients"]
+            assert coefficients["encoding"] == "cdr"
+            assert coefficients["schemaEncoding"] == "ros2msg"
+            assert "KeyValue[] values" in coefficients["schema"]
+            asked = [{"id": 7, "channelId": coefficients["id"]}]
+            await socket.send_json({"op": "subscribe", "subscriptions": asked})
+            while True:
+                message = await asyncio.wait_for(socket.receive(), 10.0)
+                if message.type == aiohttp.WSMsgType.BINARY and message.data[0] == 1:
+                    break
+    sent = deserialize_message(message.data[13:], DiagnosticArray)  # op, subscription, time
+    assert [status.name for status in sent.status][:1] == ["X_udot"]
+
+
+def test_watch_hears_nobody(domain):
+    ended = subprocess.run(
+        [sys.executable, "-m", "rov_ident.cli", "watch", "--once", "--wait", "0.5"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert ended.returncode == 2 and not ended.stdout
+    assert "no estimator was heard within 0.5 s: start rls_node" in ended.stderr

@@ -160,6 +160,15 @@ class Store:
     # ---------------------------------------------------------------- out
 
     @property
+    def known(self) -> dict[str, int]:
+        """Of every estimator that is there, how many kinds of messages were heard."""
+        with self._lock:
+            return {
+                name: len(known.statuses) + (known.report is not None)
+                for name, known in self._estimators.items()
+            }
+
+    @property
     def reports(self) -> dict[str, tuple[Estimator, float]]:
         """Of every estimator that has spoken: itself, and the seconds since its last report."""
         with self._lock:

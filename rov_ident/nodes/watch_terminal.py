@@ -28,7 +28,7 @@ Heard = Mapping[str, tuple[Estimator, float]]
 """By the full name of a node: what it said, and how long ago it did [s]."""
 
 _REFRESH = 4.0  # Hz
-_SETTLING = 1.5  # s; for others to be heard once one is: all are asked for twice a second
+_SETTLING = 2.0  # s; without news: /diagnostics come once a second
 _COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "dim"}
 _WORDS = {Level.OK: "ok", Level.WARN: "warn", Level.ERROR: "error", Level.STALE: "stale"}
 
@@ -63,18 +63,20 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
         If none is heard within ``patience`` [s].
     """
     with _hearing() as (store, spin, ended):
-        end = time.monotonic() + patience
-        while not store.reports and not ended.is_set():
-            if time.monotonic() > end:
-                raise UserError(
-                    f"no estimator was heard within {patience:g} s: start rls_node or ukf_node, "
-                    "and use its ROS_DOMAIN_ID here"
-                )
+        end, known, since = time.monotonic() + patience, store.known, time.monotonic()
+        while time.monotonic() < end and not ended.is_set():
             spin(0.1)
-        settled = time.monotonic() + _SETTLING
-        while time.monotonic() < settled and not ended.is_set():
-            spin(0.1)
+            before, known = known, store.known
+            if known != before:
+                since = time.monotonic()
+            elif known and all(known.values()) and time.monotonic() - since > _SETTLING:
+                break
         heard = store.reports
+        if not heard and not ended.is_set():
+            raise UserError(
+                f"no estimator was heard within {patience:g} s: start rls_node or ukf_node, and "
+                "use its ROS_DOMAIN_ID here"
+            )
     if heard and as_json:
         _print_json(heard, out)
     elif heard:
