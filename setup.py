@@ -8,10 +8,11 @@ setup(
     name=package_name,
     version="0.1.0",
     packages=find_packages(include=[package_name, f"{package_name}.*"]),
+    package_data={f"{package_name}.dashboard": ["page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
-        (f"share/{package_name}/config", glob("config/*.yaml")),
+        (f"share/{package_name}/config", glob("config/*")),
         (f"share/{package_name}/bags", glob("bags/*.mcap")),
         (f"share/{package_name}/launch", glob("launch/*.launch.py")),
     ],
@@ -30,12 +31,14 @@ setup(
         "PyYAML>=6.0",
         "rich>=13",
         "matplotlib>=3.6",
+        "aiohttp>=3.9",
     ],
     extras_require={
         # On a ROS 2 machine rclpy and the messages come from apt; these wheels stand in elsewhere.
         "wheels": ["ros-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces"],
         "test": [
             "distributed>=2024.1",
+            "foxglove-sdk>=0.14",
             "pytest",
             "pytest-timeout",
             "pytest-xdist",
@@ -46,6 +49,8 @@ setup(
             "types-PyYAML",
         ],
         "bench": ["padasip>=1.2"],
+        # `rov-ident dashboard --foxglove`
+        "foxglove": ["foxglove-sdk>=0.14"],
         # `rov-ident fit --dask`
         "dask": ["distributed>=2024.1"],
     },
@@ -59,6 +64,8 @@ setup(
             "rls_node = rov_ident.nodes.rls_node:main",
             "ukf_node = rov_ident.nodes.ukf_node:main",
             "example_controller = rov_ident.nodes.example_controller:main",
+            "controller_bridge = rov_ident.nodes.controller_bridge:main",
+            "dashboard_node = rov_ident.nodes.dashboard_node:main",
             "rov-ident = rov_ident.cli:main",
         ],
     },

@@ -550,7 +550,7 @@ class BagWriter:
         Raises:
             UserError: the type is not one of ROS 2 Jazzy's.
         """
-        text, type_hash = _definition(type_name)
+        text, type_hash = definition(type_name)
         qos = [_LATCHED_QOS] if latched else []
         with self._writing():
             if type_name not in self._schemas:
@@ -691,7 +691,7 @@ class _PlainDumper(yaml.SafeDumper):
 
 
 @cache
-def _definition(type_name: str) -> tuple[str, str]:
+def definition(type_name: str) -> tuple[str, str]:
     """The message definition and RIHS01 hash of a type. Raises UserError on an unknown one."""
     # Imported late: only writing needs it, and it takes 0.2 s.
     from rosbags.typesys import Stores, TypesysError, get_typestore

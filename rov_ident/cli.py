@@ -9,8 +9,9 @@ import dataclasses
 import json
 import math
 import os
+import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -258,6 +259,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_nomoto(commands)
     _add_forces(commands)
     _add_steer(commands)
+    _add_live(commands)
 
     names = commands.add_parser("coefficients", help="every coefficient, its unit and meaning")
     names.set_defaults(run=_coefficients)
@@ -354,6 +356,43 @@ def _add_steer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     steer.set_defaults(run=_steer)
 
 
+def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    dashboard = commands.add_parser(
+        "dashboard", help="a live page of the running nodes, for a browser on this computer"
+    )
+    dashboard.add_argument("--port", type=_port, default=8050, help="0: any that is free (8050)")
+    dashboard.add_argument(
+        "--foxglove", type=_port, nargs="?", const=8765, default=-1, metavar="PORT",
+        help="serve Foxglove, too (8765)",
+    )  # fmt: skip
+    dashboard.add_argument(
+        "--json", action="store_true", help="print the addresses as a line of JSON"
+    )
+    dashboard.set_defaults(run=_dashboard)
+
+    watch = commands.add_parser("watch", help="a live table of the running nodes")
+    watch.add_argument("--once", action="store_true", help="print what there is, and end")
+    watch.add_argument(
+        "--json", action="store_true", help="a line of JSON for each report, not a table"
+    )
+    watch.add_argument(
+        "--wait", type=_positive, default=10.0, metavar="S",
+        help="with --once: for an estimator to be heard (10)",
+    )  # fmt: skip
+    watch.set_defaults(run=_watch)
+
+    layouts = commands.add_parser(
+        "layouts", help="layouts of this vehicle's topics for Foxglove and PlotJuggler"
+    )
+    layouts.add_argument("--config", required=True, type=Path)
+    layouts.add_argument("--namespace", default="", help="of the nodes (none)")
+    layouts.add_argument(
+        "--out", required=True, type=Path, metavar="DIR",
+        help="folder for foxglove.json and plotjuggler.xml",
+    )  # fmt: skip
+    layouts.set_defaults(run=_layouts)
+
+
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("bag", type=Path, metavar="BAG")
     parser.add_argument("--config", required=True, type=Path)
@@ -383,6 +422,12 @@ def _share(text: str) -> float:
 def _seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
+    return int(text)
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port, from 0 to 65535")
     return int(text)
 
 
@@ -1015,6 +1060,43 @@ def _steer(options: argparse.Namespace) -> None:
         "speed_mps": float(run.nu[-1, 0]),
     }
     _write_json(options.json, result)
+
+
+def _dashboard(options: argparse.Namespace) -> None:
+    from rov_ident.nodes.dashboard_node import dashboard
+
+    def announce(addresses: Mapping[str, str]) -> None:
+        if options.json:
+            print(json.dumps(dict(addresses)), flush=True)
+            return
+        for what, address in addresses.items():
+            OUT.print(f"{what}: {address}")
+
+    dashboard(options.port, options.foxglove, announce)
+
+
+def _watch(options: argparse.Namespace) -> None:
+    from rov_ident.nodes.watch_terminal import watch, watch_once
+
+    if options.once:
+        watch_once(options.wait, options.json, OUT)
+    else:
+        watch(options.json, OUT, ERR)
+
+
+def _layouts(options: argparse.Namespace) -> None:
+    from rov_ident import layouts
+    from rov_ident.fit import write_text
+
+    if not re.fullmatch(r"(/?[A-Za-z_]\w*)*/?", options.namespace):
+        raise UserError(f"{options.namespace!r} is no namespace of ROS 2, such as rov1")
+    config = configuration.load(options.config)
+    for name, write in (
+        ("foxglove.json", layouts.foxglove),
+        ("plotjuggler.xml", layouts.plotjuggler),
+    ):
+        write_text(options.out / name, write(config, options.namespace))
+        ERR.print(f"written: {options.out / name}")
 
 
 def _coefficients(options: argparse.Namespace) -> None:

@@ -80,7 +80,7 @@ def option(
 class Parameter:
     """One key of the parameter file.
 
-    ``type`` is float, int, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is None
+    ``type`` is float, int, bool, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is None
     for what is required or computed from other keys. ``lower`` and ``upper`` are inclusive, for
     vectors of every element. ``live``: may change while a node runs.
     """
@@ -96,6 +96,24 @@ class Parameter:
     size: int
     live: bool
     required: bool
+
+
+def own(
+    key: str,
+    type: Any,
+    default: Any,
+    description: str,
+    unit: str = "",
+    *,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    choices: Names = (),
+    live: bool = False,
+) -> Parameter:
+    """A parameter that belongs to one node and not to the file's keys for all."""
+    return Parameter(
+        key, type, default, description, unit, lower, upper, choices, 0, live, required=False
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -586,7 +604,7 @@ def _read_section(section: type, values: Any, prefix: str) -> dict[str, Any]:
                     f"{key} is missing: {parameter.description}, {_expected(parameter)}"
                 )
         elif key in _BY_KEY:
-            read[name] = _checked(_BY_KEY[key], values[name])
+            read[name] = checked(_BY_KEY[key], values[name])
         elif key == "prior.std":
             read[name] = _numbers(values[name], key, lower=POSITIVE)
         elif key == "effects":
@@ -597,12 +615,16 @@ def _read_section(section: type, values: Any, prefix: str) -> dict[str, Any]:
     return read
 
 
-def _checked(parameter: Parameter, value: Any) -> Any:
+def checked(parameter: Parameter, value: Any) -> Any:
     """The value as its declared type, within its bounds."""
     key, kind = parameter.key, parameter.type
     refusal = f"{key} is {_shown(value)}, but must be {_expected(parameter)}"
     if kind is str:
         if not isinstance(value, str) or (parameter.choices and value not in parameter.choices):
+            raise UserError(refusal)
+        return value
+    if kind is bool:
+        if not isinstance(value, bool):
             raise UserError(refusal)
         return value
     if kind in (Vector, Names):
@@ -891,7 +913,13 @@ def _expected(parameter: Parameter) -> str:
         return f"a list of numbers{unit}"
     if parameter.type is Vector:
         return f"a list of {parameter.size} numbers{unit}"
-    words = {float: "a number", int: "a whole number", str: "text", Names: "a list of names"}
+    words = {
+        float: "a number",
+        int: "a whole number",
+        bool: "true or false",
+        str: "text",
+        Names: "a list of names",
+    }
     return words[parameter.type] + unit
 
 

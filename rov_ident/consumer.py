@@ -95,7 +95,7 @@ class HydrodynamicModel:
         if not levels:
             return Taken(refused=refused, reason="it has no coefficient that can be read")
         candidate = self._model.with_values(values)
-        reason = self._unphysical(candidate) if values else ""
+        reason = self.why_unphysical(candidate) if values else ""
         if reason:
             return Taken(refused=refused | dict.fromkeys(values, reason), reason=reason)
         self._model = candidate
@@ -134,7 +134,7 @@ class HydrodynamicModel:
         except (TypeError, ValueError):
             raise ValueError(f"its level {level!r} is none of OK, WARN, ERROR, STALE") from None
 
-    def _unphysical(self, candidate: Model) -> str:
+    def why_unphysical(self, candidate: Model) -> str:
         """Why no passive hull has these coefficients; empty where one may."""
         try:
             build(candidate.body, dict(zip(candidate.names, candidate.theta.tolist())))

@@ -35,7 +35,9 @@ def complete(path):
             (length,) = struct.unpack_from("<I", data, at + 28)
             assert data[at + 32 : at + 32 + length] == b"zstd"
             begin = at + 32 + length + 8
-            records = zstandard.ZstdDecompressor().decompressobj().decompress(data[begin : at + size])
+            records = (
+                zstandard.ZstdDecompressor().decompressobj().decompress(data[begin : at + size])
+            )
             place = 0
             while place < len(records):
                 inner, inner_size = struct.unpack_from("<BQ", records, place)

@@ -173,6 +173,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _config(self) -> Config:
         return self._online.config
 
+    @property
+    def _label(self) -> str:
+        """In /diagnostics, which all vehicles share."""
+        return str(self.get_fully_qualified_name()).lstrip("/")
+
     # ---------------------------------------------------------------- messages in
 
     def _receive(self, source: str, data: bytes) -> None:
@@ -293,7 +298,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         words = "; ".join(s.sentence for s in found) or (
             "the watch is being compiled" if watcher is None else "nothing is seen to be missing"
         )
-        return to_status(f"{self.get_name()}: model", self._config.name, level, words, values)
+        return to_status(f"{self._label}: model", self._config.name, level, words, values)
 
     # ---------------------------------------------------------------- checkpoints
 
@@ -417,7 +422,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         stopped = self._missing(ODOMETRY) or self._missing(WRENCH)
         level = Level.STALE if stopped else Level.WARN if complaints else Level.OK
         words = "; ".join(complaints) or "all messages are used"
-        return to_status(f"{self.get_name()}: inputs", self._config.name, level, words, values)
+        return to_status(f"{self._label}: inputs", self._config.name, level, words, values)
 
     def _estimation_status(self) -> DiagnosticStatus:
         report = self._online.report()
@@ -444,7 +449,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             level, words = Level.STALE, f"no samples, coefficients held, {words}"
         else:
             level = Level.OK
-        return to_status(f"{self.get_name()}: estimation", self._config.name, level, words, values)
+        return to_status(f"{self._label}: estimation", self._config.name, level, words, values)
 
     # ---------------------------------------------------------------- services
 

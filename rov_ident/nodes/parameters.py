@@ -1,9 +1,11 @@
 """The configuration as ROS 2 parameters: declared, described, changed while running."""
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterAlreadyDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -49,6 +51,37 @@ def changed(node: Node, own: Iterable[str], changes: Iterable[RosParameter] = ()
     return config.from_parameters(
         {name: v for name, v in values.items() if name not in own and v not in (None, [])}
     )
+
+
+def declare_own(node: Node, declared: Iterable[config.Parameter]) -> dict[str, Any]:
+    """Declare parameters that are a node's own; their values, checked.
+
+    Raises
+    ------
+    UserError
+        One sentence naming the parameter and what to change.
+    """
+    values = {}
+    for parameter in declared:
+        # Some nodes declare their overrides by themselves.
+        with contextlib.suppress(ParameterAlreadyDeclaredException):
+            node.declare_parameter(parameter.key, None, ParameterDescriptor(dynamic_typing=True))
+        given = node.get_parameter(parameter.key).value
+        value = config.checked(parameter, parameter.default if given is None else given)
+        shown = _as_declared(parameter.type, value)
+        _redeclare(node, parameter.key, shown, _descriptor(parameter))
+        values[parameter.key] = value
+    return values
+
+
+def own(
+    node: Node, declared: Iterable[config.Parameter], changes: Iterable[RosParameter] = ()
+) -> dict[str, Any]:
+    """The values of a node's own parameters with these changes; raises as above."""
+    new = {change.name: change.value for change in changes}
+    return {
+        p.key: config.checked(p, new.get(p.key, node.get_parameter(p.key).value)) for p in declared
+    }
 
 
 def _redeclare(node: Node, key: str, value: Any, descriptor: ParameterDescriptor) -> None:

@@ -1,0 +1,238 @@
+"""What has been heard of every estimator, and what of it a page has not seen yet.
+
+A store is filled by one thread and read by others.
+"""
+
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rov_ident.messages import Array
+from rov_ident.online import Report
+
+POINTS = 600  # of a coefficient's history: more than a picture has room for
+BIN = 0.5  # s of residuals drawn as one
+BINS = 240  # two minutes
+DIGITS = 6  # significant; a picture shows three
+GONE = 3.0  # s without a message of its own after which an estimator is called silent
+
+Mark = tuple[int, int]
+"""What a reader has of a series: (epoch, rows)."""
+
+
+class Series:
+    """Rows in the order of time, at most ``size``: older ones thin out, or go if ``sliding``.
+
+    Where rows that a reader has are no longer those of the series, its epoch is another.
+    """
+
+    def __init__(self, size: int, sliding: bool = False) -> None:
+        self._size, self._sliding = size, sliding
+        self._rows: list[Any] = []
+        self._gone = 0
+        self._epoch = 0
+        self._spacing = 0.0  # s; of what is kept
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def last(self) -> Any:
+        return self._rows[-1] if self._rows else None
+
+    def append(self, t: float, *values: Any) -> None:
+        """One more row ``(t, *values)``; not taken if it is closer to the last one than is kept."""
+        if self._rows and t < self._rows[-1][0]:
+            self.clear()  # a bag that loops, a simulation that was reset
+        if self._rows and t - self._rows[-1][0] < self._spacing:
+            return
+        self._rows.append((t, *values))
+        if len(self._rows) <= self._size:
+            return
+        if self._sliding:
+            del self._rows[0]
+            self._gone += 1
+        else:
+            self._spacing = (self._rows[-1][0] - self._rows[0][0]) / (self._size / 2)
+            del self._rows[1::2]
+            self._epoch += 1
+
+    def clear(self) -> None:
+        self._rows.clear()
+        self._gone, self._spacing = 0, 0.0
+        self._epoch += 1
+
+    def since(self, mark: Mark | None) -> tuple[bool, list[Any], Mark]:
+        """Whether to begin anew, the rows that are new, and the mark to come back with."""
+        now = (self._epoch, self._gone + len(self._rows))
+        if mark is None or mark[0] != self._epoch:
+            return True, list(self._rows), now
+        return False, self._rows[max(0, mark[1] - self._gone) :], now
+
+
+@dataclass(frozen=True)
+class Status:
+    """One status of `/diagnostics`. ``level`` as in diagnostic_msgs/DiagnosticStatus."""
+
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+@dataclass
+class Estimator:
+    """What one estimator node has published. ``heard`` is a time on the store's clock, in s."""
+
+    name: str
+    vehicle: str = ""
+    report: Report | None = None
+    names: tuple[str, ...] = ()
+    correlation: Array | None = None
+    statuses: dict[str, Status] = field(default_factory=dict)
+    heard: float = -math.inf
+    history: Series = field(default_factory=lambda: Series(POINTS))
+    residuals: Series = field(default_factory=lambda: Series(BINS, sliding=True))
+    bin: list[Array] = field(default_factory=list)
+    bin_start: float = math.nan  # s
+
+
+class Store:
+    """All estimators by the full names of their nodes; ``now`` is a steady clock in s."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._lock = threading.Lock()
+        self._estimators: dict[str, Estimator] = {}
+
+    # ---------------------------------------------------------------- in
+
+    def add(self, name: str) -> None:
+        """An estimator is there, even if it has not spoken yet."""
+        with self._lock:
+            self._estimators.setdefault(name, Estimator(name))
+
+    def take_report(self, name: str, vehicle: str, report: Report) -> None:
+        with self._lock:
+            known = self._estimators.setdefault(name, Estimator(name))
+            if report.names != known.names:
+                known.names, known.correlation = report.names, None
+                known.history.clear()
+            known.vehicle, known.report, known.heard = vehicle, report, self._now()
+            # The reports of a node that gets no messages are all of one time.
+            t = report.stamp * 1e-9
+            last = known.history.last
+            if report.stamp and (last is None or last[0] != t):
+                known.history.append(t, report.values, report.std)
+
+    def take_covariance(self, name: str, matrix: Array) -> None:
+        """(n, n), in the order of the coefficients."""
+        std = np.sqrt(np.diag(matrix))
+        with self._lock:
+            known = self._estimators.setdefault(name, Estimator(name))
+            if len(std) == len(known.names) and (std > 0.0).all():
+                known.correlation = matrix / np.outer(std, std)
+
+    def take_residual(self, name: str, stamp: int, residual: Array) -> None:
+        """(6,), at a time in ns; drawn in bins, each with its extremes and its mean square."""
+        t = stamp * 1e-9
+        if not np.isfinite(residual).all():
+            return
+        with self._lock:
+            known = self._estimators.setdefault(name, Estimator(name))
+            if not 0.0 <= t - known.bin_start < BIN:
+                if known.bin:
+                    rows = np.stack(known.bin)
+                    rms = np.sqrt(np.mean(rows**2, axis=0))
+                    known.residuals.append(known.bin_start, rows.min(0), rows.max(0), rms)
+                known.bin, known.bin_start = [], t
+            known.bin.append(residual)
+
+    def take_status(self, name: str, kind: str, status: Status) -> None:
+        """`inputs`, `estimation` or `model` of a node that is known already."""
+        with self._lock:
+            if name in self._estimators:
+                self._estimators[name].statuses[kind] = status
+
+    # ---------------------------------------------------------------- out
+
+    @property
+    def known(self) -> dict[str, int]:
+        """Of every estimator that is there, how many kinds of messages were heard."""
+        with self._lock:
+            return {
+                name: len(known.statuses) + (known.report is not None)
+                for name, known in self._estimators.items()
+            }
+
+    @property
+    def reports(self) -> dict[str, tuple[Estimator, float]]:
+        """Of every estimator that has spoken: itself, and the seconds since its last report."""
+        with self._lock:
+            now = self._now()
+            return {
+                name: (known, now - known.heard)
+                for name, known in sorted(self._estimators.items())
+                if known.report is not None
+            }
+
+    def changes(self, marks: Mapping[str, Sequence[Mark]] | None = None) -> tuple[Any, Any]:
+        """The present state, with what is new since ``marks``; and the marks to come back with.
+
+        The state is plain data for JSON: no number that is not finite.
+        """
+        marks = marks or {}
+        with self._lock:
+            now = self._now()
+            shown, after = {}, {}
+            for name, known in sorted(self._estimators.items()):
+                seen = marks.get(name, (None, None))
+                anew, history, first = known.history.since(seen[0])
+                anew_residuals, residuals, second = known.residuals.since(seen[1])
+                after[name] = (first, second)
+                shown[name] = {
+                    "vehicle": known.vehicle,
+                    "silent": plain(now - known.heard),
+                    "gone": now - known.heard > GONE,
+                    "history": {"anew": anew, "rows": plain(history)},
+                    "residuals": {"anew": anew_residuals, "rows": plain(residuals)},
+                    "correlation": None
+                    if known.correlation is None
+                    else np.round(known.correlation, 2).tolist(),
+                    "statuses": {kind: vars(s) for kind, s in known.statuses.items()},
+                    **_described(known.report),
+                }
+        return {"estimators": shown}, after
+
+
+def _described(report: Report | None) -> dict[str, Any]:
+    if report is None:
+        return {"names": []}
+    return {
+        "stamp": report.stamp * 1e-9,
+        "names": list(report.names),
+        "units": list(report.units),
+        "levels": [int(level) for level in report.levels],
+        "messages": list(report.messages),
+        **{
+            key: plain(getattr(report, key))
+            for key in ("values", "std", "lower", "upper", "excitation")
+        },
+    }
+
+
+def plain(data: Any) -> Any:
+    """Arrays and tuples as lists, numbers in some digits, None for those that are not finite."""
+    if isinstance(data, np.ndarray):
+        return plain(data.tolist())
+    if isinstance(data, list | tuple):
+        return [plain(item) for item in data]
+    if isinstance(data, float):
+        if not math.isfinite(data):
+            return None
+        # Times are large: milliseconds of them count.
+        return round(data, 3) if abs(data) >= 1e6 else float(f"{data:.{DIGITS}g}")
+    return data

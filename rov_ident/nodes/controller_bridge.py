@@ -1,0 +1,446 @@
+"""`controller_bridge`: converged coefficients into the parameters of a running controller.
+
+It sends a set when something in it has left the dead band, not more often than `period`, and in
+approval mode not before somebody said so. A set is sent as a whole or not at all, and read back: a
+controller that took a part of it gets back what it had.
+"""
+
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue, SetParametersResult
+from rcl_interfaces.srv import (
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from rov_ident import bridge
+from rov_ident.bridge import Change, Values
+from rov_ident.config import Names, own
+from rov_ident.consumer import HydrodynamicModel
+from rov_ident.errors import UserError
+from rov_ident.nodes import parameters
+from rov_ident.nodes.common import LATCHED
+from rov_ident.nodes.conversions import from_diagnostics, to_status
+from rov_ident.online import Level
+
+_LOOK_PERIOD = 0.5  # s; between two comparisons of controller and estimator
+_DIAGNOSTICS_PERIOD = 1.0  # s
+_THREADS = 3  # the one that waits for the controller, the one that hears its answer, and services
+
+_OWN = (
+    own("controller", str, "", "full name of the controller's node, such as /rov/velocity"),
+    own("parameter", str, "hydrodynamics.{name}", "the controller's parameter of a coefficient"),
+    own(
+        "mapping", Names, (),
+        "NAME=PARAMETER, NAME=-PARAMETER or NAME=PARAMETER[INDEX]; given any, only these are sent",
+    ),
+    own(
+        "layout", str, "none", "a controller whose parameters are known; instead of parameter",
+        choices=tuple(bridge.LAYOUTS),
+    ),
+    own("approval", bool, True, "send only what ~/approve was called for", live=True),
+    own(
+        "period", float, 5.0, "least time between two sets", "s",
+        lower=0.1, upper=86400.0, live=True,
+    ),
+    own(
+        "dead_band.std", float, 1.0, "a coefficient is new beyond so many standard deviations",
+        lower=0.0, upper=1000.0, live=True,
+    ),
+    own(
+        "dead_band.percent", float, 1.0, "and beyond so much of what the controller has", "%",
+        lower=0.0, upper=1000.0, live=True,
+    ),
+    own(
+        "hold_after", float, 2.0, "coefficients that were not heard for longer are not sent", "s",
+        lower=0.01, upper=3600.0,
+    ),
+    own("patience", float, 2.0, "for an answer of the controller", "s", lower=0.01, upper=60.0),
+)  # fmt: skip
+
+
+class ControllerBridge(Node):  # type: ignore[misc]
+    """`coefficients` in; the parameters of one controller out.
+
+    Publishes `~/pending` (what would be sent) and `/diagnostics`; services `~/approve`, `~/revert`
+    (what the controller had at first, and no more sets until `~/enable`) and `~/enable`.
+
+    Raises
+    ------
+    UserError
+        If the parameters make no configuration.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("controller_bridge", automatically_declare_parameters_from_overrides=True)
+        self._settings = parameters.declare_own(self, _OWN)
+        self._config = parameters.declare(self, [p.key for p in _OWN])
+        controller = self._settings["controller"].rstrip("/")
+        if not controller.startswith("/"):
+            raise UserError(
+                f"controller is {self._settings['controller']!r}, but must be the full name of its "
+                "node, such as /velocity_controller (`ros2 node list` shows it)"
+            )
+        self._controller = controller
+        self._targets = bridge.targets(
+            self._config,
+            self._settings["parameter"],
+            self._settings["mapping"],
+            self._settings["layout"],
+        )
+        self._names = list(dict.fromkeys(target.parameter for target in self._targets))
+
+        self._lock = threading.Lock()  # around what hearing and looking share
+        self._model = HydrodynamicModel(self._config, self._settings["hold_after"])
+        self._wanted: dict[str, float] = {}
+        self._std: dict[str, float] = {}
+        self._refusal = "no coefficients were heard yet"
+
+        self._original: Values | None = None
+        self._open: tuple[Values, Values] | None = None  # before, and a set that is on its way
+        self._pending: Sequence[Change] = ()
+        self._enabled = True
+        self._sent = 0
+        self._tried = -float("inf")  # s, when a set was last sent, taken or not
+        self._level, self._words = Level.WARN, "waiting for the controller"
+        self._logged = ""
+
+        # A callback that waits for the controller must not keep its answer from being heard.
+        answers, looks = ReentrantCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        self._list = self._client(ListParameters, "list_parameters", answers)
+        self._get = self._client(GetParameters, "get_parameters", answers)
+        self._set = self._client(SetParameters, "set_parameters", answers)
+        self._set_all = self._client(SetParametersAtomically, "set_parameters_atomically", answers)
+        self._pending_out = self.create_publisher(DiagnosticArray, "~/pending", LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_subscription(
+            DiagnosticArray, "coefficients", self._take, LATCHED, callback_group=answers
+        )
+        self.create_service(Trigger, "~/approve", self._approve, callback_group=looks)
+        self.create_service(Trigger, "~/revert", self._revert, callback_group=looks)
+        self.create_service(SetBool, "~/enable", self._enable, callback_group=looks)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_LOOK_PERIOD, self._look, looks, clock=steady)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers, clock=steady)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
+
+    def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:
+        return self.create_client(type_, f"{self._controller}/{service}", callback_group=group)
+
+    # ---------------------------------------------------------------- coefficients in
+
+    def _take(self, message: DiagnosticArray) -> None:
+        with self._lock:
+            taken = self._model.take(message, time.monotonic())
+            self._wanted, self._std = {}, {}
+            self._refusal = taken.reason
+            if taken.reason:
+                return
+            try:
+                report = from_diagnostics(message)
+            except ValueError as error:
+                self._refusal = str(error)
+                return
+            std = dict(zip(report.names, report.std.tolist()))
+            places = {target.coefficient for target in self._targets}
+            self._wanted = {name: v for name, v in taken.values.items() if name in places}
+            self._std = {name: std[name] for name in self._wanted}
+            if not self._wanted:
+                self._refusal = "no coefficient has converged"
+
+    def _usable(self) -> tuple[dict[str, float], dict[str, float], str]:
+        """Converged values, their standard deviations, and why there are none."""
+        with self._lock:
+            if not self._refusal and not self._model.fresh(time.monotonic()):
+                return {}, {}, "the coefficients are stale"
+            return dict(self._wanted), dict(self._std), self._refusal
+
+    # ---------------------------------------------------------------- what to send
+
+    def _look(self) -> None:
+        """Compare, and send what is due."""
+        self._pending = ()
+        try:
+            self._settle()
+            self._pending = self._compare()
+            due = time.monotonic() - self._tried >= self._settings["period"]
+            if not self._pending:
+                self._say(Level.OK, "the controller has what is converged")
+            elif self._settings["approval"]:
+                self._say(Level.OK, "waiting for ~/approve")
+            elif due:
+                self._send(self._pending)
+            else:
+                self._say(Level.OK, "waiting for the period to pass")
+        except UserError as error:
+            self._complain(error)
+        self._publish_pending()
+
+    def _compare(self) -> Sequence[Change]:
+        """What should be sent; raises UserError where nothing can be."""
+        held = bridge.read(self._targets, self._read())  # also to know at once what it had
+        if not self._enabled:
+            raise UserError("disabled: nothing is sent until ~/enable")
+        wanted, std, refusal = self._usable()
+        if refusal:
+            raise UserError(refusal)
+        # With what the controller keeps of its own the set may be another than the estimator's.
+        model = self._config.dynamics.with_values(held | wanted)
+        if reason := self._model.why_unphysical(model):
+            raise UserError(f"together with what the controller has: {reason}")
+        settings = self._settings
+        return bridge.changes(
+            held, wanted, std, settings["dead_band.std"], settings["dead_band.percent"]
+        )
+
+    def _send(self, pending: Sequence[Change]) -> None:
+        self._tried = time.monotonic()
+        before = self._read()
+        new = {change.coefficient: change.wanted for change in pending}
+        self._exchange(before, bridge.write(self._targets, before, new))
+        self._sent += 1
+        self._pending = ()
+        self._say(Level.OK, f"sent {'; '.join(change.words for change in pending)}")
+
+    # ---------------------------------------------------------------- the controller
+
+    def _exchange(self, before: Values, new: Values) -> None:
+        """All of ``new`` is in the controller afterwards; or, with a UserError, nothing of it."""
+        self._open = (before, new)
+        try:
+            reason = self._write(new)
+        except UserError as error:  # it may or may not have taken it
+            reason = str(error)
+        self._settle(reason)
+
+    def _settle(self, reason: str = "") -> None:
+        """See what became of the last set; take it back if it was not taken whole.
+
+        Raises UserError unless it was; if the controller cannot be asked now, call it again.
+        """
+        if self._open is None:
+            return
+        before, new = self._open
+        after = self._read()
+        if any(after[name] != value for name, value in new.items()):
+            if any(after[name] != before[name] for name in new):
+                self._write({name: before[name] for name in new})
+                after = self._read()
+                if any(after[name] != before[name] for name in new):
+                    raise _HalfChangedError(
+                        f"{self._controller} took a part of a set and does not take back what it "
+                        "had: call ~/revert, or start it again"
+                    )
+                reason = reason or "it took other values than it was given"
+            self._open = None
+            raise UserError(f"{self._controller} refused: {reason or 'it gave no reason'}")
+        self._open = None
+
+    def _read(self) -> dict[str, bridge.Value]:
+        """The parameters that coefficients are in; raises UserError if they cannot be had."""
+        answer = self._call(self._get, GetParameters.Request(names=self._names))
+        if len(answer.values) != len(self._names):
+            raise UserError(self._missing())
+        values: dict[str, bridge.Value] = {}
+        for name, value in zip(self._names, answer.values):
+            if value.type == ParameterType.PARAMETER_DOUBLE:
+                values[name] = value.double_value
+            elif value.type == ParameterType.PARAMETER_DOUBLE_ARRAY:
+                values[name] = tuple(value.double_array_value)
+            elif value.type == ParameterType.PARAMETER_NOT_SET:
+                raise UserError(self._missing())
+            else:
+                raise UserError(f"{name} of {self._controller} is no floating-point number")
+        if self._original is None:
+            bridge.read(self._targets, values)  # raises where it is not what we were told
+            self._original = values
+        return values
+
+    def _missing(self) -> str:
+        answer = self._call(self._list, ListParameters.Request())
+        missing = sorted(set(self._names) - set(answer.result.names))
+        return (
+            f"{self._controller} has no value of {', '.join(missing or self._names)}: give its "
+            "names under parameter, mapping or layout"
+        )
+
+    def _write(self, values: Values) -> str:
+        """Set parameters; why the controller refused, if it did."""
+        messages = [
+            ParameterMessage(name=name, value=_to_message(value)) for name, value in values.items()
+        ]
+        if self._set_all.service_is_ready():
+            request = SetParametersAtomically.Request(parameters=messages)
+            results = [self._call(self._set_all, request).result]
+        else:
+            request = SetParameters.Request(parameters=messages)
+            results = self._call(self._set, request).results
+        failed = [result.reason or "no reason given" for result in results if not result.successful]
+        return "; ".join(dict.fromkeys(failed))
+
+    def _call(self, client: Any, request: Any) -> Any:
+        if not client.service_is_ready():
+            raise UserError(f"{self._controller} is not there")
+        answer = client.call(request, timeout_sec=self._settings["patience"])
+        if answer is None:
+            raise UserError(
+                f"{self._controller} gave no answer within {self._settings['patience']:g} s"
+            )
+        return answer
+
+    # ---------------------------------------------------------------- services
+
+    def _approve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Send what `~/pending` shows."""
+        try:
+            if not self._pending:
+                raise UserError(f"nothing is pending: {self._words}")
+            if refusal := self._usable()[2]:
+                raise UserError(refusal)
+            self._send(self._pending)
+        except UserError as error:
+            self._complain(error)
+        self._publish_pending()
+        response.success, response.message = self._level == Level.OK, self._words
+        return response
+
+    def _revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._enabled, self._pending = False, ()
+        try:
+            if self._original is None:
+                raise UserError("the controller was never changed")
+            self._exchange(self._read(), self._original)
+            self._say(Level.OK, "the controller has what it had at first; disabled until ~/enable")
+        except UserError as error:
+            self._complain(error)
+        self._publish_pending()
+        response.success, response.message = self._level == Level.OK, self._words
+        return response
+
+    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._enabled = request.data
+        response.success = True
+        response.message = "enabled" if request.data else "disabled: nothing is sent"
+        self.get_logger().info(response.message)
+        return response
+
+    # ---------------------------------------------------------------- telling
+
+    def _say(self, level: Level, words: str) -> None:
+        self._level, self._words = level, words
+        if words == self._logged:
+            return
+        self._logged = words
+        # In two lines: rclpy ties a severity to the line that logs.
+        if level == Level.OK:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
+        self._diagnose()
+
+    def _complain(self, error: UserError) -> None:
+        half_changed = isinstance(error, _HalfChangedError)
+        self._say(Level.ERROR if half_changed else Level.WARN, str(error))
+
+    def _publish_pending(self) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.status = [
+            to_status(
+                change.coefficient,
+                self._controller,
+                Level.OK,
+                change.words,
+                {"held": repr(change.held), "wanted": repr(change.wanted), "std": repr(change.std)},
+            )
+            for change in self._pending
+        ]
+        self._pending_out.publish(message)
+
+    def _diagnose(self) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        values = {
+            "controller": self._controller,
+            "enabled": str(self._enabled).lower(),
+            "approval": str(self._settings["approval"]).lower(),
+            "pending": " ".join(change.coefficient for change in self._pending),
+            "sets sent": str(self._sent),
+        }
+        name = str(self.get_fully_qualified_name()).lstrip("/")
+        status = to_status(f"{name}: bridge", self._config.name, self._level, self._words, values)
+        message.status = [status]
+        self._diagnostics.publish(message)
+
+    # ---------------------------------------------------------------- parameters
+
+    def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            parameters.own(self, _OWN, changes)
+        except UserError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, _: list[Parameter]) -> None:
+        self._settings = parameters.own(self, _OWN)
+
+
+class _HalfChangedError(UserError):
+    """The one thing that must not be: worth a word of its own."""
+
+
+def _to_message(value: bridge.Value) -> ParameterValue:
+    if isinstance(value, tuple):
+        kind = ParameterType.PARAMETER_DOUBLE_ARRAY
+        return ParameterValue(type=kind, double_array_value=list(value))
+    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+
+
+def main() -> int:
+    """The node's whole life; 0 after an interrupt, 2 for a bad configuration."""
+    try:
+        rclpy.init()
+    except Exception as error:  # rclpy gives its RCLError no public name
+        return _refused(str(error).partition(", at ")[0])
+    try:
+        node = ControllerBridge()
+        executor = MultiThreadedExecutor(_THREADS)
+        executor.add_node(node)
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0.5)
+    except UserError as error:
+        return _refused(str(error))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # An interrupt takes the context away under a constructor or a callback.
+        if rclpy.ok():
+            raise
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+def _refused(sentence: str) -> int:
+    print(f"controller_bridge: {sentence}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

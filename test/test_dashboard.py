@@ -1,0 +1,534 @@
+"""The live page: what it keeps, who may read it, and what a browser shows of it."""
+
+import asyncio
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+import pytest
+from browser import CHROMIUM, chromium
+from conftest import HEAVY
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import deserialize_message
+
+from rov_ident import config, layouts, sensors
+from rov_ident.dashboard import server
+from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
+from rov_ident.online import ESTIMATORS, Level, OnlineEstimator
+
+CONFIGS = HEAVY.parent
+
+# ------------------------------------------------------------------ what it keeps
+
+
+def test_series_thins_out():
+    """However long the run, all of it is there, evenly, in no more rows than there is room for."""
+    series = Series(POINTS)
+    for k in range(100_000):
+        series.append(0.2 * k, k)
+        assert len(series) <= POINTS
+    _, rows, _ = series.since(None)
+    times = np.array([t for t, _ in rows])
+    assert times[0] == 0.0 and times[-1] > 0.2 * 99_000
+    assert len(rows) > POINTS / 3
+    assert np.diff(times).max() < 3.0 * np.median(np.diff(times))
+
+
+@pytest.mark.parametrize("sliding", [False, True])
+def test_series_since(sliding):
+    """A reader that comes now and then has in the end just what a new one is given."""
+    series, copy, mark = Series(50, sliding), [], None
+    random = np.random.default_rng(3)
+    t = 0.0
+    for _ in range(400):
+        t = 0.0 if random.random() < 0.01 else t + random.random()  # begins anew at times
+        series.append(t, t)
+        if random.random() < 0.3:
+            anew, rows, mark = series.since(mark)
+            copy = (rows if anew else copy + rows)[-50:]
+    anew, rows, mark = series.since(mark)
+    copy = (rows if anew else copy + rows)[-50:]
+    assert copy == series.since(None)[1]
+    assert series.since(mark) == (False, [], mark)
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def report(heavy):
+    return OnlineEstimator(heavy, "rls").report()
+
+
+def fill(store, report, names=("/rls_node", "/ukf_node"), seconds=60, seed=0):
+    """What nodes would publish in so many seconds of convergence."""
+    random = np.random.default_rng(seed)
+    n = len(report.names)
+    for name in names:
+        store.add(name)
+        for k in range(5 * seconds):
+            known = np.exp(-k / 40.0)
+            std = np.abs(report.values) * (0.002 + 0.3 * known)
+            values = report.values * (1.0 + 0.3 * known * random.standard_normal(n))
+            levels = tuple(Level.OK if known < 0.5 else Level.WARN for _ in range(n))
+            stamp = 10**18 + k * 200_000_000
+            excitation = np.linspace(0.0, 1.0, n)
+            said = replace(
+                report, stamp=stamp, values=values, std=std, levels=levels,
+                lower=values - 1.96 * std, upper=values + 1.96 * std, excitation=excitation,
+            )  # fmt: skip
+            store.take_report(name, "heavy", said)
+            for j in range(4):
+                residual = random.standard_normal(6) * [3, 3, 5, 0.3, 0.2, 0.4]
+                store.take_residual(name, stamp + j * 50_000_000, residual)
+        root = np.eye(n) + 0.3 * random.standard_normal((n, n))
+        store.take_covariance(name, root @ root.T)
+        inputs = {"odom rate": "20.0 Hz", "imu rate": "100.0 Hz", "wrench rate": "50.0 Hz"}
+        store.take_status(name, "inputs", Status(0, "all messages are used", inputs))
+        store.take_status(name, "estimation", Status(0, f"{n} of {n} have converged", {}))
+    suspicion = {"score": "210", "price": "31", "share": "0.83", "alternatives": "lift coupled"}
+    store.take_status(
+        names[0],
+        "model",
+        Status(1, "residual in surge follows |u|u: <b>drag</b> missing?", suspicion),
+    )
+
+
+def test_store(report):
+    clock = Clock()
+    store = Store(clock)
+    fill(store, report, seconds=20)
+    state, marks = store.changes()
+    one = state["estimators"]["/rls_node"]
+    assert json.loads(json.dumps(state, allow_nan=False)) == state
+    assert len(one["history"]["rows"]) == 100
+    t, values, std = one["history"]["rows"][-1]
+    assert t == 1e9 + 19.8
+    np.testing.assert_allclose(values, one["values"], rtol=1e-5)
+    np.testing.assert_allclose(std, one["std"], rtol=1e-5)
+    _, low, high, rms = one["residuals"]["rows"][3]
+    assert len(one["residuals"]["rows"]) == pytest.approx(40, abs=2)
+    assert all(a <= b and r <= max(-a, b) for a, b, r in zip(low, high, rms))
+    assert np.abs(np.diag(one["correlation"])).tolist() == [1.0] * len(report.names)
+    assert one["statuses"]["model"]["level"] == 1
+
+    # What was seen is not sent again; what is new is.
+    state, marks = store.changes(marks)
+    assert state["estimators"]["/rls_node"]["history"] == {"anew": False, "rows": []}
+    store.take_report("/rls_node", "heavy", replace(report, stamp=10**18 + 30 * 10**9))
+    clock.now += 5.0
+    state, marks = store.changes(marks)
+    assert len(state["estimators"]["/rls_node"]["history"]["rows"]) == 1
+    assert state["estimators"]["/rls_node"]["gone"]
+    # Others of whom only /diagnostics speaks are no estimators.
+    store.take_status("/camera", "inputs", Status(0, "", {}))
+    assert "/camera" not in store.changes()[0]["estimators"]
+
+
+def test_residuals_of_long_runs_slide():
+    store = Store(Clock())
+    for k in range(20 * 600):
+        store.take_residual("/rls_node", k * 50_000_000, np.full(6, float(k)))
+    store.take_residual("/rls_node", 10**12, np.full(6, np.nan))
+    rows = store.changes()[0]["estimators"]["/rls_node"]["residuals"]["rows"]
+    assert len(rows) == BINS
+    assert rows[-1][2][0] >= 20 * 599
+
+
+def test_plain():
+    assert plain((np.array([1.23456789, np.nan]), np.inf, "x", 3)) == [
+        [1.23457, None],
+        None,
+        "x",
+        3,
+    ]
+    assert plain(1_700_000_000.12345) == 1_700_000_000.123
+
+
+# ------------------------------------------------------------------ who may read it
+
+
+@contextlib.asynccontextmanager
+async def browsing(store):
+    async with server.serving(store, 0) as url, aiohttp.ClientSession() as session:
+        yield url, int(url.rstrip("/").rpartition(":")[2]), session
+
+
+def test_only_this_computer(report):
+    """Every way of another page, or of another computer, to the data is shut."""
+    asyncio.run(_only_this_computer(report))
+
+
+async def _only_this_computer(report):
+    store = Store(Clock())
+    fill(store, report, seconds=1)
+    async with browsing(store) as (url, port, session):
+        own = f"http://127.0.0.1:{port}"
+
+        async def status(path="", method="GET", **headers):
+            headers = {name.replace("_", "-"): value for name, value in headers.items()}
+            async with session.request(method, url + path, headers=headers) as answer:
+                assert "Access-Control-Allow-Origin" not in answer.headers
+                return answer.status
+
+        async with session.get(url) as answer:
+            policy = answer.headers["Content-Security-Policy"]
+            assert answer.headers["Cache-Control"] == "no-store"
+            assert answer.headers["X-Content-Type-Options"] == "nosniff"
+            assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self';")
+        assert "unsafe" not in policy and "frame-ancestors 'none'" in policy
+        for path in ("", "page.js", "page.css", "state.json"):
+            assert await status(path) == 200
+            assert await status(path, Host=f"localhost:{port}") == 200
+            # A name that was pointed at 127.0.0.1 (DNS rebinding), and this one on another port.
+            for host in ("evil.example", f"evil.example:{port}", "127.0.0.1",
+                         f"127.0.0.1:{port + 1}", f"localhost.evil.example:{port}"):  # fmt: skip
+                assert await status(path, Host=host) == 421, (path, host)
+            for origin in ("http://evil.example", "null", f"http://127.0.0.1:{port + 1}",
+                           f"https://127.0.0.1:{port}"):  # fmt: skip
+                assert await status(path, Origin=origin) == 403, (path, origin)
+            assert await status(path, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="no-cors") == 403
+            assert await status(path, Sec_Fetch_Site="same-site", Sec_Fetch_Mode="cors") == 403
+            for method in ("POST", "PUT", "DELETE", "PATCH"):
+                assert await status(path, method) == 405
+        assert await status("../cli.py") == 404
+        assert await status("page/index.html") == 404
+        assert await status("%2e%2e/%2e%2e/store.py") == 404
+
+        for origin in ("http://evil.example", "null", f"http://localhost:{port}.evil.example"):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await session.ws_connect(url + "live", headers={"Origin": origin})
+            assert refused.value.status == 403
+        for origin in (own, f"http://localhost:{port}"):
+            async with session.ws_connect(url + "live", headers={"Origin": origin}) as socket:
+                state = await asyncio.wait_for(socket.receive_json(), 5.0)
+                assert state == store.changes()[0]
+                # It listens to nobody.
+                await socket.send_str("reset")
+                closed = await asyncio.wait_for(_close_code(socket), 5.0)
+                assert closed == aiohttp.WSCloseCode.POLICY_VIOLATION
+
+
+async def _close_code(socket):
+    async for _ in socket:
+        pass
+    return socket.close_code
+
+
+def test_many_pages(report):
+    """So many and no more; what is closed makes room; the end of the server closes all."""
+    asyncio.run(_many_pages(report))
+
+
+async def _many_pages(report):
+    store = Store(Clock())
+    fill(store, report, seconds=1)
+    async with aiohttp.ClientSession() as session:
+        async with server.serving(store, 0) as url:
+            sockets = [await session.ws_connect(url + "live") for _ in range(server.CLIENTS)]
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await session.ws_connect(url + "live")
+            assert refused.value.status == 503
+            await sockets.pop().close()
+            sockets.append(await session.ws_connect(url + "live"))
+            first = await asyncio.wait_for(sockets[0].receive_json(), 5.0)
+            assert first["estimators"]["/rls_node"]["history"]["anew"]
+            then = await asyncio.wait_for(sockets[0].receive_json(), 5.0)
+            assert not then["estimators"]["/rls_node"]["history"]["anew"]
+            reading = [asyncio.create_task(_close_code(socket)) for socket in sockets]
+            await asyncio.sleep(0.1)
+        codes = await asyncio.wait_for(asyncio.gather(*reading), 5.0)
+        assert codes == [aiohttp.WSCloseCode.GOING_AWAY] * server.CLIENTS
+
+
+def test_listens_on_loopback_only():
+    asyncio.run(_listens_on_loopback_only())
+
+
+async def _listens_on_loopback_only():
+    async with server.serving(Store(Clock()), 0) as url:
+        port = int(url.rstrip("/").rpartition(":")[2])
+        listening = [
+            line.split()[1]
+            for table in ("/proc/net/tcp", "/proc/net/tcp6")
+            for line in Path(table).read_text().splitlines()[1:]
+            if line.split()[3] == "0A" and line.split()[1].endswith(f":{port:04X}")
+        ]
+        assert listening == [f"0100007F:{port:04X}"]
+        with pytest.raises(server.UserError, match="cannot be used"):
+            async with server.serving(Store(Clock()), port):
+                pass
+
+
+class Links(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.found, self.inline = [], []
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.found += [values[key] for key in ("src", "href") if values.get(key)]
+        self.inline += [key for key in values if key.startswith("on") or key == "style"]
+
+
+def test_page_is_self_contained():
+    """It fetches nothing but its own two files, and makes no markup out of what it is told."""
+    links = Links()
+    links.feed((server._PAGE / "index.html").read_text("utf-8"))
+    assert sorted(links.found) == ["data:,", "page.css", "page.js"]
+    assert not links.inline
+    script = (server._PAGE / "page.js").read_text("utf-8")
+    style = (server._PAGE / "page.css").read_text("utf-8")
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacent|document\.write|eval\(", script)
+    addresses = re.findall(r"https?://[^\s\"'`]+", script + style)
+    assert addresses == ["http://www.w3.org/2000/svg"]
+    assert "@import" not in style and "url(" not in style
+
+
+# ------------------------------------------------------------------ in a browser
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_in_a_browser(report):
+    asyncio.run(_in_a_browser(report))
+
+
+async def _in_a_browser(report):
+    store = Store(time.monotonic)
+    async with server.serving(store, 0) as url, chromium() as page:
+        await page.open(url)
+        await page.until("document.body?.innerText.includes('No estimator is heard yet')")
+        fill(store, report, ("/rov1/rls_node", "/rov1/ukf_node", "/rov2/rls_node"), seconds=20)
+        cards = "document.querySelectorAll('[data-coefficient]').length"
+        await page.until(f"{cards} == {len(report.names)}")
+        # Each coefficient's card has two curves with as many points as there were reports, and
+        # the last values as they are.
+        await page.until("document.querySelectorAll('nav button').length == 2")
+        drawn = await page.evaluate(
+            "[...document.querySelector('[data-coefficient=X_u]').querySelectorAll('.curve')]"
+            ".map((curve) => curve.getAttribute('d').split('L').length)"
+        )
+        assert drawn == [100, 100]
+        state = store.changes()[0]["estimators"]["/rov1/rls_node"]
+        value = state["values"][report.names.index("X_u")]
+        shown = await page.evaluate(
+            "document.querySelector('[data-coefficient=X_u] .row').innerText.replace('−', '-')"
+        )
+        assert float(shown.split()[0]) == pytest.approx(value, rel=5e-3)
+        # What a node says is text.
+        assert await page.evaluate("document.querySelector('.note').innerText.includes('<b>drag')")
+        assert await page.evaluate("document.querySelectorAll('.note b').length") == 0
+        for width in (1440, 390):
+            for dark in (False, True):
+                await page.show(width, dark)
+                await page.until(f"innerWidth == {width}")
+                wide = "Math.max(...[...document.querySelectorAll('main *')]"
+                wide += ".map((e) => e.getBoundingClientRect().right))"
+                assert await page.evaluate(wide) <= width
+                ink, paper = await page.evaluate(
+                    "[getComputedStyle(document.body).color, "
+                    "getComputedStyle(document.body).backgroundColor]"
+                )
+                assert (brightness(ink) > brightness(paper)) == dark
+                smallest = await page.evaluate(
+                    "Math.min(...[...document.querySelectorAll('main p, main span, main text')]"
+                    ".map((e) => parseFloat(getComputedStyle(e).fontSize)))"
+                )
+                assert smallest >= 11.0
+        # The other vehicle, on a click.
+        await page.evaluate("document.querySelectorAll('nav button')[1].click()")
+        await page.until("document.querySelectorAll('.tile').length == 1")
+        # A page of elsewhere gets nothing, whatever it tries.
+        other = url.replace("127.0.0.1", "localhost")
+        tried = await page.evaluate(
+            f"fetch('{other}state.json').then(() => 'read', () => 'refused')"
+        )
+        assert tried == "refused"
+        refusals = [text for text in page.complaints if "localhost" not in text]
+        assert refusals == []
+
+
+def brightness(colour):
+    return sum(int(part) for part in re.findall(r"\d+", colour)[:3])
+
+
+# ------------------------------------------------------------------ live, over DDS
+
+
+@pytest.fixture
+def command(domain):
+    """Starts a command; in the end it must end well on an interrupt."""
+    started = []
+
+    def start(*arguments):
+        process = subprocess.Popen(
+            [sys.executable, "-m", *arguments],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+        assert process.returncode == 0, said
+        assert "Traceback" not in said
+
+
+ROLES = ("odom", "imu", "wrench")
+VEHICLES = {"rov1": ("bluerov2_heavy.yaml", 1), "rov2": ("remus100.yaml", 2)}
+NODES = {f"/{vehicle}/{kind}_node": (vehicle, kind) for vehicle in VEHICLES for kind in ESTIMATORS}
+
+
+def test_two_vehicles(command):
+    """Four nodes in two namespaces, each with its own vehicle's numbers to the last bit; and the
+    page, the table, its JSON and Foxglove show all of them."""
+    configs = {vehicle: CONFIGS / name for vehicle, (name, _) in VEHICLES.items()}
+    dives = {
+        vehicle: sensors.dive(config.load(configs[vehicle]), duration=8.0, seed=seed).messages
+        for vehicle, (_, seed) in VEHICLES.items()
+    }
+    expected = {}
+    for node, (vehicle, kind) in NODES.items():
+        online = OnlineEstimator(config.load(configs[vehicle]), kind)
+        for _, role, message in dives[vehicle]:
+            online.push(role, message)
+        online.flush()
+        expected[node] = online.report()
+        options = ["--ros-args", "--params-file", str(configs[vehicle]), "-r", f"__ns:=/{vehicle}"]
+        options += ["-p", "qos.reliability:=reliable", "-p", "timeout:=3.0"]
+        command(f"rov_ident.nodes.{kind}_node", *options)
+    dashboard = command("rov_ident.cli", "dashboard", "--port", "0", "--foxglove", "0", "--json")
+    addresses = json.loads(dashboard.stdout.readline())
+
+    with publishing(dives) as publish:
+        asyncio.run(_until_all_are_shown(addresses["page"], expected, publish))
+        table = command("rov_ident.cli", "watch", "--once")
+        lines = command("rov_ident.cli", "watch", "--once", "--json")
+        asyncio.run(_foxglove(addresses["foxglove"]))
+    shown, _ = table.communicate(timeout=60)
+    for node in NODES:
+        assert node in shown
+    said, _ = lines.communicate(timeout=60)
+    state = json.loads(said)["estimators"]
+    assert sorted(state) == sorted(NODES)
+    for node, report in expected.items():
+        assert state[node]["vehicle"] == config.load(configs[NODES[node][0]]).name
+        assert state[node]["stamp_ns"] == report.stamp
+        for i, name in enumerate(report.names):
+            given = state[node]["coefficients"][name]
+            assert given["value"] == report.values[i] and given["std"] == report.std[i]
+            assert given["level"] == "STALE"  # the dives are over
+        assert set(state[node]["health"]) == {"inputs", "estimation", "model"}
+
+
+@contextlib.contextmanager
+def publishing(dives):
+    """Gives what publishes the dives."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    from rov_ident import cdr
+    from rov_ident.nodes.common import INPUTS, STREAM
+
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("drivers", context=context)
+    publishers = {
+        (vehicle, role): node.create_publisher(type_, f"/{vehicle}/{topic}", STREAM)
+        for vehicle in dives
+        for role, (topic, type_) in INPUTS.items()
+    }
+    everything = sorted(
+        ((vehicle, *entry) for vehicle, messages in dives.items() for entry in messages),
+        key=lambda message: message[1],  # its arrival
+    )
+    waiting = [(publishers[vehicle, role], message) for vehicle, _, role, message in everything]
+
+    def publish():
+        """Everything, about ten times as fast as life."""
+        for k, (publisher, message) in enumerate(waiting):
+            publisher.publish(cdr.encode(message))
+            if k % 50 == 0:
+                time.sleep(0.01)
+
+    yield publish
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+async def _until_all_are_shown(url, expected, publish):
+    end, published = time.monotonic() + 100.0, False
+    async with aiohttp.ClientSession() as session:
+        while True:
+            await asyncio.sleep(0.2)
+            async with session.get(url + "state.json") as answer:
+                state = (await answer.json())["estimators"]
+            inputs = [known["statuses"].get("inputs", {"values": {}}) for known in state.values()]
+            connected = [s["values"].get(f"{r} publishers") for s in inputs for r in ROLES]
+            if not published and connected == ["1"] * len(NODES) * len(ROLES):
+                publish()
+                published = True
+            told = {node for node, known in state.items() if known["statuses"].keys() >= {"model"}}
+            stamps = {node: known.get("stamp") for node, known in state.items() if node in told}
+            if stamps == {node: report.stamp * 1e-9 for node, report in expected.items()}:
+                break
+            assert time.monotonic() < end, stamps
+    for node, report in expected.items():
+        np.testing.assert_allclose(state[node]["values"], report.values, rtol=1e-5)
+        assert len(state[node]["correlation"]) == len(report.names)
+        assert len(state[node]["residuals"]["rows"]) > 5
+        assert len(state[node]["history"]["rows"]) >= 1
+
+
+async def _foxglove(address):
+    """What Foxglove is offered, and gets: the topics of the layout, in the bytes of ROS."""
+    wanted = {topic for vehicle in VEHICLES for topic in layouts.topics(vehicle)} | {"/diagnostics"}
+    async with aiohttp.ClientSession() as session:
+        protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
+        async with session.ws_connect(address, protocols=protocols) as socket:
+            info = await asyncio.wait_for(socket.receive_json(), 10.0)
+            assert info["op"] == "serverInfo" and info["capabilities"] == []
+            channels = {}
+            while not wanted <= channels.keys():
+                message = await asyncio.wait_for(socket.receive(), 10.0)
+                if message.type == aiohttp.WSMsgType.TEXT:
+                    for channel in json.loads(message.data).get("channels", []):
+                        channels[channel["topic"]] = channel
+            coefficients = channels["/rov1/rls_node/coefficients"]
+            assert coefficients["encoding"] == "cdr"
+            assert coefficients["schemaEncoding"] == "ros2msg"
+            assert "KeyValue[] values" in coefficients["schema"]
+            asked = [{"id": 7, "channelId": coefficients["id"]}]
+            await socket.send_json({"op": "subscribe", "subscriptions": asked})
+            while True:
+                message = await asyncio.wait_for(socket.receive(), 10.0)
+                if message.type == aiohttp.WSMsgType.BINARY and message.data[0] == 1:
+                    break
+    sent = deserialize_message(message.data[13:], DiagnosticArray)  # op, subscription, time
+    assert [status.name for status in sent.status][:1] == ["X_udot"]
+
+
+def test_watch_hears_nobody(domain):
+    ended = subprocess.run(
+        [sys.executable, "-m", "rov_ident.cli", "watch", "--once", "--wait", "0.5"],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert ended.returncode == 2 and not ended.stdout
+    assert "no estimator was heard within 0.5 s: start rls_node" in ended.stderr

@@ -1,0 +1,127 @@
+"""The layouts for Foxglove and PlotJuggler: each name in them is one that the nodes publish."""
+
+import json
+import re
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import pytest
+from conftest import HEAVY
+from geometry_msgs.msg import WrenchStamped
+
+from rov_ident import config, layouts
+from rov_ident.cli import main
+from rov_ident.nodes.conversions import to_diagnostics
+from rov_ident.online import OnlineEstimator
+
+FOLDER = HEAVY.parent
+
+
+@pytest.fixture(params=["", "rov1"])
+def namespace(request):
+    return request.param
+
+
+@pytest.fixture
+def with_effects(heavy):
+    """A vehicle with a parameter of an effect and couplings to estimate, besides the diagonal."""
+    return replace(
+        heavy,
+        effects={"thruster_lag": {"time_constant": 0.1}},
+        estimate_effects=(("thruster_lag", "time_constant"),),
+    )
+
+
+def published(configuration, namespace):
+    """A message of each topic, as a node sends it."""
+    report = OnlineEstimator(configuration, "rls").report()
+    above = f"/{namespace}" if namespace else ""
+    messages = {}
+    for node in ("rls_node", "ukf_node"):
+        messages[f"{above}/{node}/coefficients"] = to_diagnostics(report, configuration.name)
+        messages[f"{above}/{node}/wrench_residual"] = WrenchStamped()
+    return messages
+
+
+def follow(message, path):
+    """What is at a Foxglove message path: fields, `[:]`, and filters `{field=="text"}`."""
+    found = [message]
+    for field, every, name, text in re.findall(r'\.(\w+)(\[:\])?(?:\{(\w+)=="([^"]*)"\})?', path):
+        found = [getattr(item, field) for item in found]
+        if every:
+            found = [part for item in found for part in item]
+        if name:
+            found = [item for item in found if getattr(item, name) == text]
+    return found
+
+
+def panels_of(layout):
+    """The panels that a layout shows, each as often as it does."""
+    if isinstance(layout, str):
+        return [layout]
+    return panels_of(layout["first"]) + panels_of(layout["second"])
+
+
+def test_foxglove(with_effects, namespace):
+    messages = published(with_effects, namespace)
+    layout = json.loads(layouts.foxglove(with_effects, namespace))
+    panels = layout["configById"]
+    tabs = panels[layout["layout"]]["tabs"]
+    shown = [panel for tab in tabs for panel in panels_of(tab["layout"])]
+    assert sorted([*shown, layout["layout"]]) == sorted(panels)
+    plotted = set()
+    for identity, panel in panels.items():
+        for path in panel.get("paths", []):
+            topic, rest = re.fullmatch(r"((?:/\w+)+)(\..+)", path["value"]).groups()
+            value = follow(messages[topic], rest)
+            assert len(value) == 1, path
+            float(value[0])
+            plotted.add((topic, identity))
+    names = [*with_effects.estimate, "thruster_lag_time_constant"]
+    names += [f"residual_{axis}" for axis in "XYZKMN"]
+    assert {identity for _, identity in plotted} == {f"Plot!{name}" for name in names}
+    assert {topic for topic, _ in plotted} == set(messages)
+    statuses = [p["selectedName"] for k, p in panels.items() if k.startswith("DiagnosticStatus")]
+    above = f"{namespace}/" if namespace else ""
+    assert statuses == [f"{above}rls_node: model", f"{above}ukf_node: model"]
+
+
+def series(messages):
+    """The names that PlotJuggler gives to the numbers of these messages."""
+    for topic, message in messages.items():
+        for status in getattr(message, "status", []):
+            for pair in status.values:
+                yield f"{topic}/{status.hardware_id}/{status.name}/{pair.key}"
+        for kind in ("force", "torque") if hasattr(message, "wrench") else ():
+            for axis in getattr(message.wrench, kind).get_fields_and_field_types():
+                yield f"{topic}/wrench/{kind}/{axis}"
+
+
+def test_plotjuggler(with_effects, namespace):
+    messages = published(with_effects, namespace)
+    root = ElementTree.fromstring(layouts.plotjuggler(with_effects, namespace).encode())
+    curves = [curve.get("name") for curve in root.iter("curve")]
+    assert set(curves) <= set(series(messages))
+    assert len(curves) == len(set(curves)) == 2 * (3 * (len(with_effects.estimate) + 1) + 6)
+    for splitter in root.iter("DockSplitter"):
+        assert len(splitter) == int(splitter.get("count")) == len(splitter.get("sizes").split(";"))
+    streamer = root.find("previouslyLoaded_Streamer").get("name")
+    plugin = root.find(f"Plugins/plugin[@ID='{streamer}']")
+    assert set(plugin.find("selected_topics").get("value").split(";")) == set(messages)
+
+
+def test_shipped(tmp_path, capsys):
+    """The files in config/ are what the command writes for the vehicle of the demo."""
+    assert main(["layouts", "--config", str(HEAVY), "--out", str(tmp_path)]) == 0
+    for name in ("foxglove.json", "plotjuggler.xml"):
+        assert (FOLDER / name).read_text() == (tmp_path / name).read_text()
+    bad = ["layouts", "--config", str(HEAVY), "--out", str(tmp_path), "--namespace", "a b"]
+    assert main(bad) == 2
+    assert "is no namespace" in capsys.readouterr().err
+
+
+def test_every_shipped_vehicle():
+    for path in sorted(FOLDER.glob("*.yaml")):
+        vehicle = config.load(path)
+        json.loads(layouts.foxglove(vehicle))
+        ElementTree.fromstring(layouts.plotjuggler(vehicle).encode())
