@@ -80,8 +80,8 @@ def option(
 class Parameter:
     """One key of the parameter file.
 
-    ``type`` is float, int, bool, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is None
-    for what is required or computed from other keys. ``lower`` and ``upper`` are inclusive, for
+    ``type`` is float, int, bool, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is
+    None for what is required or computed from other keys. ``lower`` and ``upper`` are inclusive, for
     vectors of every element. ``live``: may change while a node runs.
     """
 

@@ -1,4 +1,4 @@
-"""Recordings whose writer was killed, or had no room: what is complete is read, the loss is told."""
+"""Recordings whose writer was killed, or had no room: what is complete is read, the loss told."""
 
 import os
 import random
@@ -22,7 +22,7 @@ PROGRAM = [sys.executable, "-m", "rov_ident.cli"]
 
 
 def complete(path):
-    """Log times of the messages in the chunks that are whole: a walk of our own through the file."""
+    """Log times of the messages in whole chunks: a walk of our own through the file."""
     data = path.read_bytes()
     assert data.startswith(b"\x89MCAP0\r\n")
     at, times = 8, []
