@@ -81,8 +81,8 @@ class Parameter:
     """One key of the parameter file.
 
     ``type`` is float, int, bool, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is
-    None for what is required or computed from other keys. ``lower`` and ``upper`` are inclusive, for
-    vectors of every element. ``live``: may change while a node runs.
+    None for what is required or computed from other keys. ``lower`` and ``upper`` are inclusive,
+    for vectors of every element. ``live``: may change while a node runs.
     """
 
     key: str
