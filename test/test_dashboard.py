@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.serialization import deserialize_message
 
 from rov_ident import config, layouts, sensors
-from rov_ident.dashboard import server
+from rov_ident.dashboard import foxglove, server
 from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
 from rov_ident.online import ESTIMATORS, Level, OnlineEstimator
 
@@ -536,6 +536,38 @@ async def _foxglove(address):
                     break
     sent = deserialize_message(message.data[13:], DiagnosticArray)  # op, subscription, time
     assert [status.name for status in sent.status][:1] == ["X_udot"]
+
+
+def test_foxglove_for_whom():
+    """Foxglove's site and this computer's programs may read; no other page, whatever its name."""
+    asyncio.run(_foxglove_for_whom())
+
+
+async def _foxglove_for_whom():
+    async with foxglove.serving(0) as served, aiohttp.ClientSession() as session:
+
+        async def status(**headers):
+            try:
+                async with session.ws_connect(
+                    served.address, protocols=["foxglove.sdk.v1"], headers=headers
+                ) as live:
+                    info = await asyncio.wait_for(live.receive_json(), 5.0)
+                    assert info["op"] == "serverInfo"
+                    return 101
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+
+        assert await status() == 101
+        for origin in ("https://app.foxglove.dev", "file://", "http://localhost:8080"):
+            assert await status(Origin=origin) == 101, origin
+        for origin in ("http://evil.example", "null", "http://app.foxglove.dev",
+                       "https://foxglove.dev.evil.example", "https://evilfoxglove.dev",
+                       "https://localhost.evil.example"):  # fmt: skip
+            assert await status(Origin=origin) == 403, origin
+        assert await status(Host="evil.example:8765") == 421
+        with pytest.raises(server.UserError, match="cannot be used"):
+            async with foxglove.serving(int(served.address.rpartition(":")[2])):
+                pass
 
 
 def test_watch_hears_nobody(domain):
