@@ -1,12 +1,13 @@
 """Both estimators on a live vehicle.
 
-ros2 launch rov_ident identify.launch.py namespace:=rov config:=my_vehicle.yaml
+ros2 launch rov_ident identify.launch.py namespace:=rov config:=my_vehicle.yaml dashboard:=true
 
 The input topics are relative to the namespace: odom, imu/data, thruster_wrench.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -21,17 +22,38 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "use_sim_time", default_value="false", description="take time from /clock"
         ),
+        DeclareLaunchArgument(
+            "dashboard",
+            default_value="false",
+            description="serve the live page, at http://127.0.0.1:8050/",
+        ),
     ]
     use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    parameters = [LaunchConfiguration("config"), {"use_sim_time": use_sim_time}]
     nodes = [
         Node(
             package="rov_ident",
-            executable=name,
-            name=name,
+            executable="rls_node",
+            name="rls_node",
             namespace=LaunchConfiguration("namespace"),
-            parameters=[LaunchConfiguration("config"), {"use_sim_time": use_sim_time}],
+            parameters=parameters,
             output="screen",
-        )
-        for name in ("rls_node", "ukf_node")
+        ),
+        Node(
+            package="rov_ident",
+            executable="ukf_node",
+            name="ukf_node",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=parameters,
+            output="screen",
+        ),
+        # It hears the estimators of every namespace: one is enough for all.
+        Node(
+            package="rov_ident",
+            executable="dashboard_node",
+            name="dashboard",
+            output="screen",
+            condition=IfCondition(LaunchConfiguration("dashboard")),
+        ),
     ]
     return LaunchDescription([*arguments, *nodes])

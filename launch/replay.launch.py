@@ -1,6 +1,6 @@
 """Both estimators on a recorded dive.
 
-ros2 launch rov_ident replay.launch.py bag:=dive.mcap config:=my_vehicle.yaml
+ros2 launch rov_ident replay.launch.py bag:=dive.mcap config:=my_vehicle.yaml dashboard:=true
 
 The nodes stay up when the bag has ended, so that their results can be read and saved.
 """
@@ -21,6 +21,11 @@ def generate_launch_description() -> LaunchDescription:
             "namespace", default_value="", description="namespace of the topics in the bag"
         ),
         DeclareLaunchArgument("config", default_value=shipped, description="parameter file"),
+        DeclareLaunchArgument(
+            "dashboard",
+            default_value="false",
+            description="serve the live page, at http://127.0.0.1:8050/",
+        ),
         DeclareLaunchArgument("rate", default_value="1.0", description="speed of the replay"),
         # On their first start the nodes compile for this computer.
         DeclareLaunchArgument(
@@ -35,6 +40,7 @@ def generate_launch_description() -> LaunchDescription:
             "namespace": LaunchConfiguration("namespace"),
             "config": LaunchConfiguration("config"),
             "use_sim_time": "true",
+            "dashboard": LaunchConfiguration("dashboard"),
         }.items(),
     )
     play = ExecuteProcess(

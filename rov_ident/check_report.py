@@ -6,7 +6,7 @@ from importlib.metadata import version
 import numpy as np
 
 from rov_ident import plots, report
-from rov_ident.check import WELL, Check, Prospect
+from rov_ident.check import BAD, GOOD, WARNING, WELL, Check, Prospect
 from rov_ident.coefficients import VELOCITIES
 from rov_ident.config import Config
 from rov_ident.excitation import authority
@@ -17,7 +17,6 @@ from rov_ident.records import HORIZON, over_ground, predicted
 _AXES = "XYZKMN"
 _MOST = 2000  # points of a curve
 _KNOWN = {"well": "well", "roughly": "roughly", "not": "no: the prior decides"}
-_BEFORE, _AFTER = "now", "after it"
 
 
 def of_check(found: Check, config: Config) -> str:
@@ -28,13 +27,17 @@ def of_check(found: Check, config: Config) -> str:
         f"{found.duration:.0f} s, {good}: it would tell {known} of {len(found.prospects)} "
         "coefficients well."
     )
-    remarks = [[r.level, r.subject, r.text] for r in found.remarks]
-    order = {"bad": 0, "warning": 1, "good": 2}
-    remarks.sort(key=lambda row: order[row[0]])
+    order = (BAD, WARNING, GOOD)
+    remarks = sorted(found.remarks, key=lambda r: order.index(r.level))
+    shares = {"configured": _prior(found.prospects), "after a fit": _share(found.prospects)}
+    numbers = [
+        [p.name, f"{p.value:.4g}", f"{p.std:.2g}", p.unit, _KNOWN[p.verdict]]
+        for p in found.prospects
+    ]
+    table = report.table(["", "configured", "std", "unit", "known"], numbers, text=(3, 4))
     sections = [
         report.heading("What a fit of it would tell"),
-        _prospects({"configured": _prior(found.prospects), "after a fit": _share(found.prospects)},
-                   found.prospects),
+        report.beside([_precision(shares, found.prospects)], [table]),
         report.heading("Excitation"),
         _excitation(found, config),
         report.heading("Measured, and the simulation as configured"),
@@ -42,18 +45,8 @@ def of_check(found: Check, config: Config) -> str:
         report.heading("Pauses between messages"),
         _pauses(found),
         report.heading("All that was looked at"),
-        report.table(["", "subject", ""], remarks, text=(1, 2)),
-        report.heading("Coefficients"),
-        report.table(
-            ["", "configured", "std", "prior std", "unit", "known"],
-            [
-                [p.name, f"{p.value:.4g}", f"{p.std:.2g}", f"{p.prior_std:.2g}", p.unit,
-                 _KNOWN[p.verdict]]
-                for p in found.prospects
-            ],
-            text=(4, 5),
-        ),
-    ]  # fmt: skip
+        report.bullets([f"{r.level}: {r.subject}: {r.text}" for r in remarks]),
+    ]
     footer = f"rov_ident {version('rov_ident')}; {found.bag} {found.record.sha256[:12]}"
     return report.page(f"Check of {found.bag} for {config.name}", lead, sections, footer)
 
@@ -63,9 +56,15 @@ def of_plan(found: Proposal, config: Config) -> str:
     best = found.best
     dive = best.dive(config, seed=0)
     others = [[name, f"{100.0 * s:.1f} %"] for name, s in found.others if np.isfinite(s)]
+    shares = {"now": _share(found.before), "after it": _share(found.after)}
+    numbers = [
+        [b.name, f"{b.value:.4g}", f"{b.std:.2g}", f"{a.std:.2g}", b.unit]
+        for b, a in zip(found.before, found.after, strict=True)
+    ]
+    table = report.table(["", "configured", "std now", "std after it", "unit"], numbers, text=(4,))
     sections = [
         report.heading("What it would tell"),
-        _prospects({_BEFORE: _share(found.before), _AFTER: _share(found.after)}, found.before),
+        report.beside([_precision(shares, found.before)], [table]),
         report.heading("The manoeuvre"),
         _demand(best.flown.t, best.flown.demand),
         _way(dive.truth.position, best.limits.tank),
@@ -78,17 +77,6 @@ def of_plan(found: Proposal, config: Config) -> str:
     ]
     if found.left_out:
         sections.append(report.bullets(found.left_out))
-    sections += [
-        report.heading("Coefficients"),
-        report.table(
-            ["", "configured", "std now", "std after it", "unit"],
-            [
-                [b.name, f"{b.value:.4g}", f"{b.std:.2g}", f"{a.std:.2g}", b.unit]
-                for b, a in zip(found.before, found.after, strict=True)
-            ],
-            text=(4,),
-        ),
-    ]
     lead = f"{found.sentence[:1].upper()}{found.sentence[1:]}."
     return report.page(
         f"Next manoeuvre for {config.name}", lead, sections, f"rov_ident {version('rov_ident')}"
@@ -113,7 +101,7 @@ def _relative(prospects: Sequence[Prospect], std: Sequence[float]) -> Array:
     return relative
 
 
-def _prospects(models: Mapping[str, Array], prospects: Sequence[Prospect]) -> str:
+def _precision(models: Mapping[str, Array], prospects: Sequence[Prospect]) -> str:
     names = [p.name for p in prospects]
     figure = plots.precision(names, models, 100.0 * WELL)
     caption = (

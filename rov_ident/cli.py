@@ -43,7 +43,10 @@ LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 PAIRS = {"lateral": ("sway", "yaw"), "longitudinal": ("heave", "pitch")}
 
 
-# The commands whose result fits one plain file besides those that declare it themselves.
+_CONFIG = "the vehicle's parameter file"
+_BAG = "an .mcap file or a rosbag2 directory"
+
+# The commands whose result fits one plain file, besides those that declare it themselves.
 _JSON = ("replay", "simulate", "import", "export", "import-model", "steer", "coefficients")
 
 
@@ -95,8 +98,8 @@ def _parser() -> argparse.ArgumentParser:
     fit = commands.add_parser(
         "fit", help="identify offline, by the code of the nodes or from all the data at once"
     )
-    fit.add_argument("bags", nargs="+", type=Path, metavar="BAG")
-    fit.add_argument("--config", required=True, type=Path)
+    fit.add_argument("bags", nargs="+", type=Path, metavar="BAG", help=_BAG)
+    fit.add_argument("--config", required=True, type=Path, help=_CONFIG)
     fit.add_argument(
         "--estimator",
         choices=(*LIVE, *BATCH),
@@ -143,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
     plan = commands.add_parser(
         "plan", help="the manoeuvre to run next: safe, and best for the worst known coefficient"
     )
-    plan.add_argument("--config", required=True, type=Path)
+    plan.add_argument("--config", required=True, type=Path, help=_CONFIG)
     plan.add_argument(
         "--bag", type=Path, nargs="+", default=[], help="what has been recorded already"
     )
@@ -169,8 +172,8 @@ def _parser() -> argparse.ArgumentParser:
     explain = commands.add_parser(
         "explain", help="what the simulation gets wrong, why, and what mending it gains"
     )
-    explain.add_argument("bags", nargs="+", type=Path, metavar="BAG")
-    explain.add_argument("--config", required=True, type=Path)
+    explain.add_argument("bags", nargs="+", type=Path, metavar="BAG", help=_BAG)
+    explain.add_argument("--config", required=True, type=Path, help=_CONFIG)
     explain.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
         help="folder for findings.json, report.html and extended.yaml",
@@ -184,7 +187,7 @@ def _parser() -> argparse.ArgumentParser:
         "simulate",
         help="simulate open loop: a manoeuvre measured by simulated sensors, or a bag's wrench",
     )
-    simulate.add_argument("--config", required=True, type=Path)
+    simulate.add_argument("--config", required=True, type=Path, help=_CONFIG)
     source = simulate.add_mutually_exclusive_group(required=True)
     source.add_argument("--bag", type=Path, help="drive by the wrench of this bag and compare")
     source.add_argument("--manoeuvre", help="steps, multisine, single-axis, pilot or rest")
@@ -194,7 +197,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="surge,sway,...",
         help="with --bag: simulate these alone, the other velocities and the attitude as measured",
     )
-    simulate.add_argument("--out", required=True, type=Path, metavar="BAG")
+    simulate.add_argument("--out", required=True, type=Path, metavar="BAG", help="bag to write")
     simulate.add_argument("--duration", type=_positive, default=180.0, help="s (180)")
     simulate.add_argument("--seed", type=_seed, default=0, help="of manoeuvre and noise (0)")
     simulate.add_argument("--odometry-rate", type=_positive, default=20.0, help="Hz (20)")
@@ -217,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
     import_.add_argument(
         "--config", type=Path, help="of a .BIN or .tlog: its `thrusters` turn pulses into a wrench"
     )
-    import_.add_argument("--out", required=True, type=Path, metavar="BAG")
+    import_.add_argument("--out", required=True, type=Path, metavar="BAG", help="bag to write")
     import_.add_argument(
         "--map",
         nargs="+",
@@ -226,7 +229,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=HEADING",
         help="headings that are called otherwise (u=surge_speed), constants (w=0), or a YAML file",
     )
-    import_.add_argument("--body-frame", choices=("frd", "flu"), default="frd")
+    import_.add_argument(
+        "--body-frame", choices=("frd", "flu"), default="frd", help="axes of a CSV (frd)"
+    )
     import_.add_argument(
         "--wrench-timing",
         choices=("held", "mean", "bin"),
@@ -240,20 +245,27 @@ def _parser() -> argparse.ArgumentParser:
     import_.set_defaults(run=_import)
 
     export = commands.add_parser("export", help="write the model for a controller or simulator")
-    export.add_argument("--config", required=True, type=Path)
-    export.add_argument("--format", required=True, choices=("auv_controllers", "gazebo", "mss"))
-    export.add_argument("--out", required=True, type=Path, metavar="FILE")
+    export.add_argument("--config", required=True, type=Path, help=_CONFIG)
+    export.add_argument(
+        "--format",
+        required=True,
+        choices=("auv_controllers", "gazebo", "mss"),
+        help="of the other program",
+    )
+    export.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write")
     export.set_defaults(run=_export)
 
     model = commands.add_parser(
         "import-model",
         help="a configuration from a Gazebo model, auv_controllers' parameters or a URDF",
     )
-    model.add_argument("file", type=Path, metavar="FILE")
+    model.add_argument("file", type=Path, metavar="FILE", help="SDFormat, YAML or URDF")
     model.add_argument(
         "--config", type=Path, help="what the file does not hold, as a URDF the coefficients"
     )
-    model.add_argument("--out", required=True, type=Path, metavar="CONFIG")
+    model.add_argument(
+        "--out", required=True, type=Path, metavar="CONFIG", help="parameter file to write"
+    )
     model.set_defaults(run=_import_model)
 
     _add_nomoto(commands)
@@ -265,7 +277,7 @@ def _parser() -> argparse.ArgumentParser:
     names.set_defaults(run=_coefficients)
 
     completion = commands.add_parser("completion", help="print a shell's completion script")
-    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which shell")
     completion.set_defaults(run=_completion)
     for name, command in commands.choices.items():
         command.add_argument("--quiet", action="store_true", help="no progress on standard error")
@@ -280,7 +292,7 @@ def _add_nomoto(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         "files", nargs="+", type=Path, metavar="FILE",
         help="CSV (t_s, heading_rad or heading_deg, rudder_rad or rudder_deg) or bag",
     )  # fmt: skip
-    nomoto.add_argument("--order", type=int, choices=(1, 2), default=1)
+    nomoto.add_argument("--order", type=int, choices=(1, 2), default=1, help="of the model (1)")
     nomoto.add_argument("--nonlinear", action="store_true", help="with Norrbin's cubic term")
     nomoto.add_argument(
         "--interpolate", choices=("none", "spline", "spiral"), default="none",
@@ -304,7 +316,7 @@ def _add_forces(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     forces = commands.add_parser(
         "forces", help="coefficients from CFD, towing-tank, rotating-arm or PMM tables"
     )
-    forces.add_argument("table", type=Path, metavar="TABLE.csv")
+    forces.add_argument("table", type=Path, metavar="TABLE.csv", help="velocities and forces")
     forces.add_argument(
         "--map", nargs="+", action="extend", default=[], metavar="NAME=HEADING",
         help='headings that are called otherwise (beta_deg="beta(deg)"), or a YAML file',
@@ -338,8 +350,13 @@ def _add_steer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     steer = commands.add_parser(
         "steer", help="simulate a vehicle under its fins: zigzag, turn, heading change, dive"
     )
-    steer.add_argument("--config", required=True, type=Path)
-    steer.add_argument("--manoeuvre", required=True, choices=("zigzag", "turn", "heading", "dive"))
+    steer.add_argument("--config", required=True, type=Path, help=_CONFIG)
+    steer.add_argument(
+        "--manoeuvre",
+        required=True,
+        choices=("zigzag", "turn", "heading", "dive"),
+        help="what to steer",
+    )
     steer.add_argument(
         "--angle", type=_number, default=15.0,
         help="deg: of the rudder, or the course of heading (15)",
@@ -352,7 +369,7 @@ def _add_steer(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     steer.add_argument("--sample", type=_positive, default=0.1, help="s between rows (0.1)")
     steer.add_argument("--noise", type=_rate, default=0.0, help="deg, of the heading (0)")
     steer.add_argument("--seed", type=_seed, default=0, help="of the noise (0)")
-    steer.add_argument("--out", required=True, type=Path, metavar="CSV")
+    steer.add_argument("--out", required=True, type=Path, metavar="CSV", help="log to write")
     steer.set_defaults(run=_steer)
 
 
@@ -394,8 +411,8 @@ def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
 
 
 def _bag_and_config(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG")
-    parser.add_argument("--config", required=True, type=Path)
+    parser.add_argument("bag", type=Path, metavar="BAG", help=_BAG)
+    parser.add_argument("--config", required=True, type=Path, help=_CONFIG)
 
 
 def _number(text: str) -> float:

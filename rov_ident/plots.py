@@ -242,7 +242,7 @@ def draw_bars(ax: Axes, groups: Sequence[str], models: Mapping[str, Array]) -> N
 def precision(names: Sequence[str], models: Mapping[str, Array], limit: float) -> Figure:
     """A row for each name: from the first to the last of the values (n,) in percent, logarithmic;
     ``limit`` is marked."""
-    figure = Figure(figsize=(9.0, 0.24 * len(names) + 1.1), layout="constrained")
+    figure = Figure(figsize=(5.2, 0.22 * len(names) + 1.0), layout="constrained")
     ax = figure.subplots()
     rows = np.arange(len(names))[::-1]
     first, *_, last = models.values()
@@ -255,7 +255,7 @@ def precision(names: Sequence[str], models: Mapping[str, Array], limit: float) -
     ax.set_yticks(rows, names)
     ax.set_xlabel("standard deviation [% of the value]")
     ax.margins(y=0.04)
-    figure.legend(loc="outside upper right", ncols=len(models))
+    figure.legend(loc="outside upper left", ncols=len(models))
     return figure
 
 
@@ -270,7 +270,10 @@ def cloud(x: Array, y: Array, title: str, x_label: str, y_label: str, limit: flo
 
 
 def steps(t: Array, y: Array, title: str, x_label: str, y_label: str) -> Figure:
-    """One panel of what is held from each instant (k,) to the next; thinned to its extremes."""
+    """One panel of what is held from each instant (k,) to the next; thinned to its extremes.
+
+    What is never negative is drawn from zero.
+    """
     figure, ax = panel(title, x_label, y_label)
     group = max(1, len(t) // 1500)
     if group > 1:
@@ -280,6 +283,8 @@ def steps(t: Array, y: Array, title: str, x_label: str, y_label: str) -> Figure:
         t, y = t[:whole:group], blocks[np.arange(len(blocks)), largest]
     ax.step(t, y, color=COLOURS[0], lw=1.0, where="post")
     ax.set_xlim(t[0], t[-1])
+    if y.min() >= 0.0:
+        ax.set_ylim(0.0, 1.2 * y.max() + 1e-9)
     return figure
 
 

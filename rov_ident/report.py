@@ -43,6 +43,7 @@ th:first-child, td:first-child, td.text, th.text { text-align: left; }
   figure.one, .panels > svg, .card, pre, tr { break-inside: avoid; } h2 { break-after: avoid; }
   .panels, .panels.wide, .beside { grid-template-columns: 1fr 1fr; }
   .beside .panels { grid-template-columns: 1fr; }
+  th, td { padding: .15rem .4rem; font-size: 8.5pt; }
   .scroll, pre { overflow: visible; } pre { white-space: pre-wrap; } }
 """
 

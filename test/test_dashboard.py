@@ -5,6 +5,7 @@ import contextlib
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.serialization import deserialize_message
 
 from rov_ident import config, layouts, sensors
-from rov_ident.dashboard import server
+from rov_ident.dashboard import foxglove, server
 from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
 from rov_ident.online import ESTIMATORS, Level, OnlineEstimator
 
@@ -215,19 +216,19 @@ async def _only_this_computer(report):
                 await session.ws_connect(url + "live", headers={"Origin": origin})
             assert refused.value.status == 403
         for origin in (own, f"http://localhost:{port}"):
-            async with session.ws_connect(url + "live", headers={"Origin": origin}) as socket:
-                state = await asyncio.wait_for(socket.receive_json(), 5.0)
+            async with session.ws_connect(url + "live", headers={"Origin": origin}) as live:
+                state = await asyncio.wait_for(live.receive_json(), 5.0)
                 assert state == store.changes()[0]
                 # It listens to nobody.
-                await socket.send_str("reset")
-                closed = await asyncio.wait_for(_close_code(socket), 5.0)
+                await live.send_str("reset")
+                closed = await asyncio.wait_for(_close_code(live), 5.0)
                 assert closed == aiohttp.WSCloseCode.POLICY_VIOLATION
 
 
-async def _close_code(socket):
-    async for _ in socket:
+async def _close_code(live):
+    async for _ in live:
         pass
-    return socket.close_code
+    return live.close_code
 
 
 def test_many_pages(report):
@@ -250,7 +251,7 @@ async def _many_pages(report):
             assert first["estimators"]["/rls_node"]["history"]["anew"]
             then = await asyncio.wait_for(sockets[0].receive_json(), 5.0)
             assert not then["estimators"]["/rls_node"]["history"]["anew"]
-            reading = [asyncio.create_task(_close_code(socket)) for socket in sockets]
+            reading = [asyncio.create_task(_close_code(one)) for one in sockets]
             await asyncio.sleep(0.1)
         codes = await asyncio.wait_for(asyncio.gather(*reading), 5.0)
         assert codes == [aiohttp.WSCloseCode.GOING_AWAY] * server.CLIENTS
@@ -330,6 +331,17 @@ async def _in_a_browser(report):
             "document.querySelector('[data-coefficient=X_u] .row').innerText.replace('−', '-')"
         )
         assert float(shown.split()[0]) == pytest.approx(value, rel=5e-3)
+        # Under the pointer is the value of that time.
+        box = await page.evaluate(
+            "JSON.parse(JSON.stringify(document.querySelector('[data-coefficient=X_u] svg')"
+            ".getBoundingClientRect()))"
+        )
+        middle = {"x": box["x"] + 0.5 * box["width"], "y": box["y"] + 0.5 * box["height"]}
+        await page.send("Input.dispatchMouseEvent", type="mouseMoved", **middle)
+        await page.until(
+            "document.querySelector('[data-coefficient=X_u] .state').innerText.endsWith('s ago')"
+        )
+        await page.send("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
         # What a node says is text.
         assert await page.evaluate("document.querySelector('.note').innerText.includes('<b>drag')")
         assert await page.evaluate("document.querySelectorAll('.note b').length") == 0
@@ -385,10 +397,11 @@ def command(domain):
 
     yield start
     for process in started:
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20)
-        assert process.returncode == 0, said
-        assert "Traceback" not in said
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=20)
+            assert "Traceback" not in said
+        assert process.returncode == 0
 
 
 ROLES = ("odom", "imu", "wrench")
@@ -414,17 +427,17 @@ def test_two_vehicles(command):
         options = ["--ros-args", "--params-file", str(configs[vehicle]), "-r", f"__ns:=/{vehicle}"]
         options += ["-p", "qos.reliability:=reliable", "-p", "timeout:=3.0"]
         command(f"rov_ident.nodes.{kind}_node", *options)
+    table = command("rov_ident.cli", "watch")
     dashboard = command("rov_ident.cli", "dashboard", "--port", "0", "--foxglove", "0", "--json")
     addresses = json.loads(dashboard.stdout.readline())
 
     with publishing(dives) as publish:
         asyncio.run(_until_all_are_shown(addresses["page"], expected, publish))
-        table = command("rov_ident.cli", "watch", "--once")
         lines = command("rov_ident.cli", "watch", "--once", "--json")
         asyncio.run(_foxglove(addresses["foxglove"]))
-    shown, _ = table.communicate(timeout=60)
-    for node in NODES:
-        assert node in shown
+    table.send_signal(signal.SIGINT)
+    _, shown = table.communicate(timeout=20)
+    assert all(f"{node} (" in shown for node in NODES)
     said, _ = lines.communicate(timeout=60)
     state = json.loads(said)["estimators"]
     assert sorted(state) == sorted(NODES)
@@ -502,12 +515,12 @@ async def _foxglove(address):
     wanted = {topic for vehicle in VEHICLES for topic in layouts.topics(vehicle)} | {"/diagnostics"}
     async with aiohttp.ClientSession() as session:
         protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
-        async with session.ws_connect(address, protocols=protocols) as socket:
-            info = await asyncio.wait_for(socket.receive_json(), 10.0)
+        async with session.ws_connect(address, protocols=protocols) as live:
+            info = await asyncio.wait_for(live.receive_json(), 10.0)
             assert info["op"] == "serverInfo" and info["capabilities"] == []
             channels = {}
             while not wanted <= channels.keys():
-                message = await asyncio.wait_for(socket.receive(), 10.0)
+                message = await asyncio.wait_for(live.receive(), 10.0)
                 if message.type == aiohttp.WSMsgType.TEXT:
                     for channel in json.loads(message.data).get("channels", []):
                         channels[channel["topic"]] = channel
@@ -516,13 +529,45 @@ async def _foxglove(address):
             assert coefficients["schemaEncoding"] == "ros2msg"
             assert "KeyValue[] values" in coefficients["schema"]
             asked = [{"id": 7, "channelId": coefficients["id"]}]
-            await socket.send_json({"op": "subscribe", "subscriptions": asked})
+            await live.send_json({"op": "subscribe", "subscriptions": asked})
             while True:
-                message = await asyncio.wait_for(socket.receive(), 10.0)
+                message = await asyncio.wait_for(live.receive(), 10.0)
                 if message.type == aiohttp.WSMsgType.BINARY and message.data[0] == 1:
                     break
     sent = deserialize_message(message.data[13:], DiagnosticArray)  # op, subscription, time
     assert [status.name for status in sent.status][:1] == ["X_udot"]
+
+
+def test_foxglove_for_whom():
+    """Foxglove's site and this computer's programs may read; no other page, whatever its name."""
+    asyncio.run(_foxglove_for_whom())
+
+
+async def _foxglove_for_whom():
+    async with foxglove.serving(0) as served, aiohttp.ClientSession() as session:
+
+        async def status(**headers):
+            try:
+                async with session.ws_connect(
+                    served.address, protocols=["foxglove.sdk.v1"], headers=headers
+                ) as live:
+                    info = await asyncio.wait_for(live.receive_json(), 5.0)
+                    assert info["op"] == "serverInfo"
+                    return 101
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+
+        assert await status() == 101
+        for origin in ("https://app.foxglove.dev", "file://", "http://localhost:8080"):
+            assert await status(Origin=origin) == 101, origin
+        for origin in ("http://evil.example", "null", "http://app.foxglove.dev",
+                       "https://foxglove.dev.evil.example", "https://evilfoxglove.dev",
+                       "https://localhost.evil.example"):  # fmt: skip
+            assert await status(Origin=origin) == 403, origin
+        assert await status(Host="evil.example:8765") == 421
+        with pytest.raises(server.UserError, match="cannot be used"):
+            async with foxglove.serving(int(served.address.rpartition(":")[2])):
+                pass
 
 
 def test_watch_hears_nobody(domain):
@@ -532,3 +577,30 @@ def test_watch_hears_nobody(domain):
     )  # fmt: skip
     assert ended.returncode == 2 and not ended.stdout
     assert "no estimator was heard within 0.5 s: start rls_node" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "command, sentence",
+    [
+        (["rov_ident.cli", "dashboard", "--port", "{taken}"], "cannot be used (Address already in"),
+        (
+            ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=99999"],
+            "dashboard_node: port is 99999, but must be between 0 and 65535",
+        ),
+        (
+            ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=auto"],
+            "dashboard_node: port is 'auto' (text), but must be a whole number",
+        ),
+    ],
+)
+def test_refused(domain, command, sentence):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        arguments = [text.format(taken=other.getsockname()[1]) for text in command]
+        ended = subprocess.run(
+            [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=60
+        )
+    assert ended.returncode == 2, ended.stderr
+    assert sentence in " ".join(ended.stderr.split())
+    assert "Traceback" not in ended.stderr

@@ -31,7 +31,9 @@ _FILES = {
     "/page.css": ("page.css", "text/css"),
     "/page.js": ("page.js", "text/javascript"),
 }
-_NAMES = (HOST, "localhost")
+NAMES = (HOST, "localhost")
+"""What this computer is called by those who may ask."""
+
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 STORE = web.AppKey("store", Store)
@@ -40,7 +42,7 @@ PAGES: web.AppKey[set[web.WebSocketResponse]] = web.AppKey("pages")
 
 def application(store: Store, port: int) -> web.Application:
     """The page at `/`, the state at `/state.json`, what is new at `/live` (web socket)."""
-    app = web.Application(middlewares=[_guard(port)], client_max_size=_LARGEST)
+    app = web.Application(middlewares=[guard(port, _own_origins(port))], client_max_size=_LARGEST)
     app[STORE] = store
     app[PAGES] = set()
     app.on_response_prepare.append(_protect)
@@ -52,30 +54,32 @@ def application(store: Store, port: int) -> web.Application:
     return app
 
 
-def _origins(port: int) -> set[str]:
-    return {f"http://{name}:{port}" for name in _NAMES}
+def _own_origins(port: int) -> Callable[[str], bool]:
+    return {f"http://{name}:{port}" for name in NAMES}.__contains__
 
 
-def _guard(port: int) -> Any:
-    """Answers only those who ask this computer by its name and are no other page."""
-    hosts = {f"{name}:{port}" for name in _NAMES}
-    origins = _origins(port)
+def guard(port: int, may: Callable[[str], bool], cross_site: bool = False) -> Any:
+    """Middleware that answers only those who ask this computer by its name and whose origin may.
+
+    Browsers give the origin of every web socket; programs need not. Without ``cross_site`` no other
+    page gets anything, whatever it claims to be.
+    """
+    hosts = {f"{name}:{port}" for name in NAMES}
 
     @web.middleware
-    async def guard(request: web.Request, handler: _Handler) -> web.StreamResponse:
+    async def check(request: web.Request, handler: _Handler) -> web.StreamResponse:
         hosts_given = request.headers.getall("Host", [])
         if len(hosts_given) != 1 or hosts_given[0].lower() not in hosts:
             raise web.HTTPMisdirectedRequest(text="ask for http://localhost or 127.0.0.1\n")
-        # Browsers always give it with a web socket; programs need not.
-        if any(origin not in origins for origin in request.headers.getall("Origin", [])):
-            raise web.HTTPForbidden(text="not for other pages\n")
-        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and (
-            request.headers.get("Sec-Fetch-Mode") != "navigate"  # a link may lead here
-        ):
+        site = request.headers.get("Sec-Fetch-Site", "none")
+        foreign = not cross_site and site not in ("none", "same-origin")
+        if request.headers.get("Sec-Fetch-Mode") == "navigate":
+            foreign = False  # a link may lead here
+        if foreign or not all(may(origin) for origin in request.headers.getall("Origin", [])):
             raise web.HTTPForbidden(text="not for other pages\n")
         return await handler(request)
 
-    return guard
+    return check
 
 
 async def _protect(request: web.Request, response: web.StreamResponse) -> None:
@@ -160,25 +164,32 @@ async def serving(store: Store, port: int) -> AsyncIterator[str]:
     UserError
         If the port is taken.
     """
-    with contextlib.closing(_listen(port)) as listening:
-        port = listening.getsockname()[1]
-        runner = web.AppRunner(application(store, port), access_log=None, shutdown_timeout=2.0)
+    async with listening(lambda port: application(store, port), port) as port:
+        yield f"http://{HOST}:{port}/"
+
+
+@contextlib.asynccontextmanager
+async def listening(make: Callable[[int], web.Application], port: int) -> AsyncIterator[int]:
+    """Serves an application, made for the port that it gets, on 127.0.0.1 within the block."""
+    with contextlib.closing(_listen(port)) as open_socket:
+        port = open_socket.getsockname()[1]
+        runner = web.AppRunner(make(port), access_log=None, shutdown_timeout=2.0)
         await runner.setup()
         try:
-            await web.SockSite(runner, listening).start()
-            yield f"http://{HOST}:{port}/"
+            await web.SockSite(runner, open_socket).start()
+            yield port
         finally:
             await runner.cleanup()
 
 
 def _listen(port: int) -> socket.socket:
-    listening = socket.socket()
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    open_socket = socket.socket()
+    open_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((HOST, port))
+        open_socket.bind((HOST, port))
     except OSError as error:
-        listening.close()
+        open_socket.close()
         raise UserError(
             f"port {port} cannot be used ({error.strerror}): give another one, or 0 for any"
         ) from None
-    return listening
+    return open_socket

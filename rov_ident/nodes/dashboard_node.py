@@ -103,10 +103,9 @@ async def _serve(
     async with contextlib.AsyncExitStack() as stack:
         addresses = {"page": await stack.enter_async_context(serving(store, port))}
         if foxglove_port >= 0:
-            from rov_ident.dashboard.foxglove import Foxglove
+            from rov_ident.dashboard import foxglove as for_foxglove
 
-            foxglove = Foxglove(foxglove_port)
-            stack.callback(foxglove.close)
+            foxglove = await stack.enter_async_context(for_foxglove.serving(foxglove_port))
             node.forward = foxglove.forward
             addresses["foxglove"] = foxglove.address
         stack.enter_context(_hearing(node))

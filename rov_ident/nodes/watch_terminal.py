@@ -175,7 +175,12 @@ def _health(name: str, known: Estimator, silent: float) -> Text:
 
 def _table(namespace: str, estimators: Mapping[str, Estimator], width: int) -> Table:
     wide = width >= 60 + 30 * len(estimators)
-    table = Table(title=namespace, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(
+        title=namespace.rstrip("/") or None,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
     table.add_column("")
     names: dict[str, str] = {}  # name and unit of coefficients
     for node, known in estimators.items():

@@ -145,7 +145,7 @@ function keyOf(parent, index, name) {
 
 function levelCounts(state) {
   const counts = [0, 0, 0, 0];
-  for (const level of state.levels ?? []) counts[level] += 1;
+  for (const level of state.levels ?? []) counts[state.gone ? 3 : level] += 1;
   return counts;
 }
 

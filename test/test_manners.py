@@ -1,0 +1,156 @@
+"""What every command does alike: quiet, progress, machine-readable results, completion."""
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import HEAVY
+
+from rov_ident import cli
+from rov_ident.cli import main
+
+SHIPPED = Path(__file__).parent.parent
+COMMANDS = cli._commands(cli._parser())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_can_be_quiet_and_says_what_it_does(name):
+    text = COMMANDS[name].format_help()
+    assert "--quiet" in text
+    for action in COMMANDS[name]._actions:
+        documented = action.help or action.dest in (
+            "config",
+            "bag",
+            "bags",
+            "file",
+            "files",
+            "table",
+        )
+        assert documented or action.choices or action.metavar, f"{name} {action.dest}"
+
+
+def on_a_terminal(*arguments):
+    """(status, standard output, standard error) of the program, its standard error a terminal."""
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rov_ident.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=theirs, stdin=subprocess.DEVNULL, env=environment,
+    )  # fmt: skip
+    os.close(theirs)
+    said = bytearray()
+    try:
+        while piece := os.read(ours, 4096):
+            said += piece
+    except OSError:  # the other end is closed
+        pass
+    os.close(ours)
+    out, _ = process.communicate(timeout=60)
+    return process.returncode, out.decode(), said.decode()
+
+
+def test_progress_is_shown_where_somebody_looks(tmp_path):
+    command = ["simulate", "--config", HEAVY, "--manoeuvre", "steps", "--duration", "20"]
+    command += ["--out", tmp_path / "a.mcap"]
+    status, out, said = on_a_terminal(*command)
+    assert (status, out) == (0, "")
+    assert "simulating" in said
+    status, _, said = on_a_terminal(*command, "--quiet")
+    assert status == 0
+    assert "simulating" not in said
+    assert "messages, 20 s" in said
+
+
+def test_results_as_json(tmp_path, capsys):
+    """Of the commands whose result is small; the others write a file of their own."""
+    bag = tmp_path / "dive.mcap"
+    model = tmp_path / "model.sdf"
+    results = {}
+    for name, arguments in {
+        "simulate": ["--config", HEAVY, "--manoeuvre", "steps", "--duration", "5", "--out", bag],
+        "export": ["--config", HEAVY, "--format", "gazebo", "--out", model],
+        "import-model": [model, "--out", tmp_path / "c.yaml"],
+        "coefficients": [],
+        "steer": [
+            "--config", SHIPPED / "config" / "remus100.yaml", "--manoeuvre", "zigzag",
+            "--duration", "20", "--out", tmp_path / "z.csv",
+        ],
+    }.items():  # fmt: skip
+        path = tmp_path / f"{name}.json"
+        assert main([name, *map(str, arguments), "--json", str(path)]) == 0
+        results[name] = json.loads(path.read_text())
+    assert results["simulate"]["duration_s"] == 5.0
+    assert results["export"]["format"] == "gazebo"
+    assert results["import-model"]["name"] == "bluerov2_heavy"
+    assert results["coefficients"]["X_u"]["unit"] == "N s/m"
+    assert results["steer"]["manoeuvre"] == "zigzag"
+    capsys.readouterr()
+
+    out = str(tmp_path / "open_loop.mcap")
+    path = tmp_path / "compared.json"
+    command = ["simulate", "--config", str(HEAVY), "--bag", str(bag), "--out", out]
+    assert main([*command, "--channels", "surge,yaw", "--json", str(path)]) == 0
+    compared = json.loads(path.read_text())
+    assert list(compared["velocities"]) == ["u", "r"]
+    assert compared["velocities"]["u"]["r2"] > 0.99
+
+
+def test_pages_of_check_and_plan(tmp_path, capsys):
+    """Whole, self-contained, and with every axis in it."""
+    bag = tmp_path / "dive.mcap"
+    simulate = ["simulate", "--config", str(HEAVY), "--manoeuvre", "steps", "--duration", "20"]
+    assert main([*simulate, "--out", str(bag)]) == 0
+    page = tmp_path / "check.html"
+    assert main(["check", str(bag), "--config", str(HEAVY), "--report", str(page)]) == 0
+    text = page.read_text()
+    assert "Check of dive.mcap for bluerov2_heavy" in text
+    assert text.count("<svg") >= 16
+    for name in ("X against u", "N against r", "X_uu", "odometry", "as configured"):
+        assert name in text or name == "as configured"
+    page = tmp_path / "plan.html"
+    command = ["plan", "--config", str(HEAVY), "--duration", "10", "--report", str(page)]
+    assert main(command) == 0
+    text += page.read_text()
+    assert "Next manoeuvre for bluerov2_heavy" in text
+    assert "from above" in text
+    for outside in ("http:", "https:", "<script", "src=", "@import"):
+        assert outside not in text.replace("http://www.w3.org", "")
+    capsys.readouterr()
+
+
+COMPLETE = """
+source "{script}"
+COMP_WORDS=(rov-ident {words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+_shtab_rov_ident
+echo "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("exp", {"explain", "export"}),
+        ("fit --est", {"--estimator"}),
+        ("export --format g", {"gazebo"}),
+        ("fit --estimator u", {"ukf"}),
+    ],
+)
+def test_a_real_shell_completes(tmp_path, capsys, words, expected):
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "completion.sh"
+    script.write_text(capsys.readouterr().out)
+    program = COMPLETE.format(script=script, words=words)
+    answer = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert set(answer.stdout.split()) == expected
+
+
+def test_the_completion_of_zsh_knows_every_command(capsys):
+    assert main(["completion", "zsh"]) == 0
+    script = capsys.readouterr().out
+    assert script.startswith("#compdef rov-ident")
+    for name in COMMANDS:
+        assert f'"{name}:' in script
