@@ -13,6 +13,8 @@ from rov_ident.errors import UserError
 from rov_ident.hindsight import hindsight
 from rov_ident.recording import write_messages
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 
 @pytest.fixture(scope="module")
 def off(heavy):

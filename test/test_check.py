@@ -21,6 +21,8 @@ from rov_ident.recording import write_messages
 from rov_ident.records import read_record
 from rov_ident.swing import Limits, Swing, fly
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 DURATION = 40.0
 
 

@@ -14,6 +14,8 @@ from rov_ident.cdr import decode_odometry, encode
 from rov_ident.messages import Odometry
 from rov_ident.recording import write_messages
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ROOT / "config" / "bluerov2_heavy.yaml"
 

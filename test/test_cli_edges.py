@@ -14,6 +14,8 @@ from rov_ident.demo import shipped
 from rov_ident.errors import UserError
 from rov_ident.recording import write_messages
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 COMMANDS = (
     "demo", "replay", "fit", "check", "plan", "explain", "simulate", "import", "export",
     "import-model", "nomoto", "forces", "steer", "coefficients",

@@ -13,6 +13,8 @@ from conftest import HEAVY
 from rov_ident import cli
 from rov_ident.cli import main
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 SHIPPED = Path(__file__).parent.parent
 COMMANDS = cli._commands(cli._parser())
 

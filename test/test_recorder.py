@@ -17,6 +17,8 @@ import zstandard
 from rov_ident.bags import Bag, BagWriter
 from rov_ident.errors import UserError
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 DEMO = Path(__file__).parent.parent / "bags" / "demo.mcap"
 PROGRAM = [sys.executable, "-m", "rov_ident.cli"]
 

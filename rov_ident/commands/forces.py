@@ -1,0 +1,91 @@
+"""Coefficients from tables of forces."""
+
+import argparse
+from pathlib import Path
+
+from rov_ident import config as configuration
+from rov_ident.commands.common import (
+    ERR,
+    OUT,
+    Commands,
+    check_outputs,
+    progress,
+    result_table,
+)
+from rov_ident.errors import UserError
+
+
+def add(commands: Commands) -> None:
+    forces = commands.add_parser(
+        "forces", help="coefficients from CFD, towing-tank, rotating-arm or PMM tables"
+    )
+    forces.add_argument("table", type=Path, metavar="TABLE.csv", help="velocities and forces")
+    forces.add_argument(
+        "--map", nargs="+", action="extend", default=[], metavar="NAME=HEADING",
+        help='headings that are called otherwise (beta_deg="beta(deg)"), or a YAML file',
+    )  # fmt: skip
+    forces.add_argument(
+        "--nondimensional", metavar="rho=,L=[,T=]",
+        help="forces are over rho/2 U^2 L^2 (with T: L T), moments over L times that",
+    )  # fmt: skip
+    forces.add_argument(
+        "--drift", choices=("auto", "starboard", "port"), default="auto",
+        help="positive beta is a drift to starboard, v = U sin(beta), or to port (default: as a "
+        "hull resists its motion)",
+    )  # fmt: skip
+    forces.add_argument(
+        "--config", type=Path,
+        help="the vehicle: the Coriolis forces of its added mass are not counted twice",
+    )  # fmt: skip
+    forces.add_argument(
+        "--hull", metavar="cylinder:L=,R=",
+        help="with --config: added mass of a cylinder or spheroid of length L, radius R [m], rho",
+    )  # fmt: skip
+    forces.add_argument("--json", type=Path, help="write the result here")
+    forces.add_argument(
+        "--out", type=Path, metavar="CONFIG", help="write the vehicle with the fitted values"
+    )
+    forces.add_argument("--report", type=Path, metavar="FILE", help="write a page with pictures")
+    forces.set_defaults(run=_forces)
+
+
+def _forces(options: argparse.Namespace) -> None:
+    from rov_ident import force_tables
+    from rov_ident.added_mass import parse_hull
+    from rov_ident.fit import write_text
+    from rov_ident.importer import parse_columns
+
+    check_outputs([options.json, options.out, options.report], [options.table, options.config])
+    if not options.config and (options.out or options.hull):
+        raise UserError("--out and --hull need --config: the vehicle's mass, inertia and buoyancy")
+    config = configuration.load(options.config) if options.config else None
+    hull = parse_hull(options.hull) if options.hull else {}
+    scale = options.nondimensional
+    table = force_tables.read_table(
+        options.table,
+        parse_columns(options.map),
+        force_tables.parse_nondimensional(scale) if scale else None,
+        options.drift,
+    )
+    if config:
+        config = force_tables.with_hull(config, hull)
+    with progress(options) as tell:
+        tell("fitting")
+        fits = force_tables.fit(table, config.model if config else None)
+    notes = (*table.notes, *force_tables.remarks(fits, config is not None))
+    new = force_tables.configured(config, fits) if config and options.out else None
+    if options.json:
+        write_text(options.json, force_tables.to_json(fits, notes))
+    if options.report:
+        from rov_ident import table_reports
+
+        write_text(options.report, table_reports.forces(table.name, fits, notes))
+    if new:
+        configuration.dump(
+            new, options.out, f"Coefficients from {options.table.name} by rov-ident forces."
+        )
+    for axis, f in fits.items():
+        OUT.print(result_table(f"{axis}: R2 {f.r2:.4f}", f))
+        OUT.print(f"{axis}: {f.why}\n", markup=False)
+    for note in notes:
+        ERR.print(note, markup=False, soft_wrap=True)
