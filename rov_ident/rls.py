@@ -739,7 +739,9 @@ def _update(task, state, work, sample, side, info):
         return
     # what an innovation owes to coefficients still to be learnt is no surprise
     _whiten(work.root, rows, n, count, scratch.product)
-    count = 0
+    count, moving = 0, 0
+    for i in range(6):
+        moving += work.moving[i]
     for i in range(6):
         if np.isnan(z[i]):
             continue
@@ -753,6 +755,9 @@ def _update(task, state, work, sample, side, info):
         info.ratio[i] = e * e / spread
         gated = gated or info.ratio[i] > s.gate**2
         wild = wild or info.ratio[i] > _WILD**2
+        if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
+            interrupt(state.adaptation[i])
+            continue
         blend = min(since / _SURPRISE_TIME, 1.0)
         c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
         # as far as it is the noise, and not the prediction, that an innovation shows

@@ -798,7 +798,7 @@ def fuse(
         out.nu[i] = k.v[i] - out.water[i]
         out.nu[3 + i] = rate[i]
         r = gyro_variance if has_imu else r_angular
-        blend = min(dt / _POWER_TIME, 1.0) if dt > 0.0 else 1.0
+        blend = min(dt / _POWER_TIME, 1.0)  # a single value may well be noise
         k.power[i] += blend * (out.nu[i] ** 2 - k.power[i])
         k.power[3 + i] += blend * (out.nu[3 + i] ** 2 - k.power[3 + i])
         out.moving[i] = k.power[i] > _MOVING * r_linear

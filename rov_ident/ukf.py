@@ -670,9 +670,10 @@ def _update(task, state, work, sample, side, out):
             z[i] = np.nan
         for j in range(side.shape[1]):
             z[i] += side[6 + i, j] * side[12, j]
-    surprise, count = 0.0, 0
+    surprise, count, moving = 0.0, 0, 0
     for i in range(6):
         state.adaptation[i].since += sample.dt
+        moving += sample.moving[i]
     for first in (0, 3):
         if not np.isfinite(z[first] + z[first + 1] + z[first + 2]):
             continue
@@ -682,6 +683,9 @@ def _update(task, state, work, sample, side, out):
             innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
             out.ratio[i] = innovation**2
             worst = max(worst, out.ratio[i])
+            if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
+                interrupt(state.adaptation[i])
+                continue
             surprise += min(out.ratio[i], s.gate**2)
             count += 1
             adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, innovation)
