@@ -220,7 +220,7 @@ def undisturbed(seed: int, kind: str) -> Run:
 # ------------------------------------------------------------------ outliers
 
 CHANNELS = {
-    ODOMETRY: (("linear", "uvw", 2.0), ("angular", "pqr", 2.0)),
+    ODOMETRY: (("linear", "uvw", 2.0), ("angular", "pqr", 2.0), ("orientation", "wxyz", 1.0)),
     IMU: (("angular_velocity", "xyz", 2.0), ("linear_acceleration", "xyz", 20.0)),
     WRENCH: (("force", "XYZ", 200.0), ("torque", "KMN", 40.0)),
 }
@@ -251,6 +251,8 @@ def spoilt(seed: int, role: str, field: str, index: int, size: float) -> Message
         if name == role and rng.random() < 0.05:
             values = getattr(m, field).copy()
             values[index] = rng.uniform(-size, size)
+            if field == "orientation":
+                values /= np.linalg.norm(values)
             m = m._replace(**{field: values})
         out.append((arrival, name, m))
     return out

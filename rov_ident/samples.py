@@ -88,6 +88,10 @@ _REASONS = 100  # names of refusals; what else is wrong is counted together
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
+_VELOCITY, _RATE, _ATTITUDE = range(3)
+RATIOS = ("velocity", "angular rate", "attitude")
+"""Of the odometry, each behind a gate of its own against the IMU."""
+
 _KINEMATICS = np.dtype(
     [
         ("known", "?"),  # an odometry message has been seen since the last restart
@@ -107,6 +111,8 @@ _KINEMATICS = np.dtype(
         ("p_vv", "f8"),
         ("p_vb", "f8"),
         ("p_bb", "f8"),
+        # squared innovations over their variances, averaged: 1 is expected, see RATIOS
+        ("ratio", "f8", (3,)),
     ],
     align=True,
 )
@@ -198,6 +204,11 @@ class Sampler:
         if self._sensitivity is not None:
             self._sensitivity.forget()
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """Test ratios of the parts of the odometry against the IMU, of late; 1 is expected."""
+        return dict(zip(RATIOS, self._kinematics["ratio"][0].tolist(), strict=True))
 
     @property
     def kinematics(self) -> NDArray[np.void]:
@@ -578,6 +589,12 @@ def _set(a, b):
         a[i] = b[i]
 
 
+@inlined
+def _average(ratio, i, surprise):
+    """Of the last twenty or so; an outlier counts for no more than makes it stand out."""
+    ratio[i] += 0.05 * (min(surprise, 1e3) - ratio[i])
+
+
 @kernel
 def fuse(
     kinematics, settings, sample, t, dt, restart, wrench, wrench_slope, has_odometry, shift,
@@ -652,6 +669,7 @@ def fuse(
         if has_imu:
             k.attitude_variance += dt * (dt * k.gyro_bias_variance - 2.0 * k.attitude_bias)
             k.attitude_bias -= dt * k.gyro_bias_variance
+    credible = True
     if has_odometry:
         q = turned(odometry[:4] / np.sqrt(np.sum(odometry[:4] ** 2)), rate * shift)
         if not k.known or not k.inertial:
@@ -669,16 +687,22 @@ def fuse(
             e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
             sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
             e *= 2.0 * sign
-            _set(k.q, turned(k.q, gain * e))
-            bias_gain = k.attitude_bias / total
-            # A heading that was set anew is no bias of the gyro.
-            if e[0] ** 2 + e[1] ** 2 + e[2] ** 2 < 3.0 * s.gate**2 * total:
+            surprise = (e[0] ** 2 + e[1] ** 2 + e[2] ** 2) / (3.0 * total)
+            _average(k.ratio, _ATTITUDE, surprise)
+            # A heading that is set anew is believed when it stays, but it is no bias of the gyro.
+            credible = surprise < s.gate**2
+            if credible:
+                _set(k.q, turned(k.q, gain * e))
+                bias_gain = k.attitude_bias / total
                 for i in range(3):
                     k.gyro_bias[i] += bias_gain * e[i]
                 k.gyro_bias_variance -= bias_gain * k.attitude_bias
-            k.attitude_bias *= 1.0 - gain
-            k.attitude_variance *= 1.0 - gain
-        _set(out.attitude, q)
+                k.attitude_bias *= 1.0 - gain
+                k.attitude_variance *= 1.0 - gain
+            else:
+                k.attitude_variance += 0.2 * k.attitude_variance + s.attitude_variance
+        if credible:
+            _set(out.attitude, q)
     _set(out.orientation, k.q)
     to_world = rotation(k.q)
     down = to_world[2]
@@ -752,7 +776,9 @@ def fuse(
                 surprise += (v[i] - k.v[i]) ** 2
             # A filter that refuses for seconds is wrong itself: its variance grows until it agrees,
             # faster than a velocity that has run away can.
-            taken = surprise <= 3.0 * s.gate**2 * total
+            surprise /= 3.0 * total
+            _average(k.ratio, _VELOCITY, surprise)
+            taken = surprise <= s.gate**2
             if taken:
                 gain, bias_gain = k.p_vv / total, k.p_vb / total
                 for i in range(3):
@@ -777,15 +803,19 @@ def fuse(
             gain, angle_gain = k.gyro_bias_variance / total, k.attitude_bias / total
             # the gyro at the instant of the odometry; without a past it cannot be known
             if k.inertial and dt > 0.0 and r_angular < _UNKNOWN:
-                k.gyro_bias_variance *= 1.0 - gain
-                k.attitude_variance -= angle_gain * k.attitude_bias
-                k.attitude_bias *= 1.0 - gain
-                change = np.empty(3)
+                change, surprise = np.empty(3), 0.0
                 for i in range(3):
                     then = rate[i] + min(shift / dt, 1.0) * (k.rate[i] - rate[i])
                     change[i] = then - odometry[7 + i]
-                    k.gyro_bias[i] += gain * change[i]
-                _set(k.q, turned(k.q, angle_gain * change))
+                    surprise += change[i] ** 2 / (3.0 * total)
+                _average(k.ratio, _RATE, surprise)
+                if surprise < s.gate**2:
+                    k.gyro_bias_variance *= 1.0 - gain
+                    k.attitude_variance -= angle_gain * k.attitude_bias
+                    k.attitude_bias *= 1.0 - gain
+                    for i in range(3):
+                        k.gyro_bias[i] += gain * change[i]
+                    _set(k.q, turned(k.q, angle_gain * change))
     if has_imu:
         k.inertial = True
         out.gyro_variance = gyro_variance

@@ -439,6 +439,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
             finite = ratios[np.isfinite(ratios[:, i]), i]
             if len(finite):
                 values[f"test ratio {axis}"] = f"{finite.mean():.3g}"
+        for part, ratio in self._online.sampler.ratios.items():
+            values[f"test ratio odom {part}"] = f"{ratio:.3g}"
         converged = sum(level == Level.OK for level in report.levels)
         words = f"{converged} of {len(report.names)} coefficients have converged"
         if not self._online.enabled:
