@@ -41,6 +41,7 @@ from rov_ident.effects import (
     memory,
 )
 from rov_ident.effects.base import Reading
+from rov_ident.excitation import authority
 from rov_ident.frames import FrameDefaults, quaternion_from_euler, to_core
 from rov_ident.jit import inlined, kernel
 from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
@@ -85,6 +86,9 @@ _LOST = 3.0  # times the longest interval between demands of late: another one i
 _QUEUED = 10.0  # s; of demands that are kept while nothing else comes
 _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
+_LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
+_SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
+_PUSH = 0.01  # of the working wrench; of which a demand may
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
@@ -166,6 +170,10 @@ class Sampler:
         self._none = np.zeros(0, dtype=sample_type(len(config.estimate_effects)))
         self._take_effects(config)
         self._settings = _settings(config)
+        self._floors = {
+            IMU: np.repeat([config.imu.gyro_std, _SHAKE], 3),
+            WRENCH: _PUSH * authority(config.dynamics),
+        }
 
     def recentre(self, config: Config) -> None:
         """Go on with other values of the effects' parameters; their memory stays."""
@@ -200,6 +208,8 @@ class Sampler:
         self._demand_time = -math.inf
         self._intervals: deque[float] = deque(maxlen=50)  # s; between demands
         self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
+        self._before: dict[str, Array] = {}  # the last message's numbers
+        self._scatter = {role: floor**2 for role, floor in self._floors.items()}
         self._memory = memory()
         if self._sensitivity is not None:
             self._sensitivity.forget()
@@ -374,6 +384,10 @@ class Sampler:
             t = imu_t if take_imu else pose_t
             if not (final or self._reached(t)):
                 break
+            if take_imu and len(imu) == 1 and not (final or self._waited(t)):
+                break  # its successor tells whether it is an outlier
+            if take_imu and self._is_lone(IMU):
+                continue
             message = imu.popleft()[1] if take_imu else None
             pose = odometry.popleft() if merged or not take_imu else None
             sample = self._sample(t, pose, message)
@@ -383,11 +397,28 @@ class Sampler:
             return self._none
         return samples[0] if len(samples) == 1 else joined(samples)
 
+    def _waited(self, t: float) -> bool:
+        """Whether the newest stamp is so far ahead of t that nothing more is waited for."""
+        return max(self._newest.values()) - t > max(self._grace, self._late)
+
+    def _is_lone(self, role: str) -> bool:
+        """Whether the next message is an outlier between its neighbours; then it is dropped."""
+        queue, before = self._queues[role], self._before.get(role)
+        here = _numbers(queue[0][1])
+        if before is not None and len(queue) > 1:
+            after = _numbers(queue[1][1])
+            if is_lone(before, here, after, self._scatter[role], self._floors[role], _LONE):
+                queue.popleft()
+                self.counts[f"{role}: outlier between its neighbours"] += 1
+                return True
+        self._before[role] = here
+        return False
+
     def _reached(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t, or it is not worth waiting."""
-        horizon, grace = max(self._newest.values()), max(self._grace, self._late)
-        if horizon - t > grace:
+        if self._waited(t):
             return True
+        grace = max(self._grace, self._late)
         for role in (ODOMETRY, IMU, WRENCH):
             newest = self._newest.get(role)
             if newest is None:
@@ -455,6 +486,10 @@ class Sampler:
         pieces: list[tuple[float, float, Array]] = []
         now = start
         while queue and queue[0][0] <= end:
+            if len(queue) == 1 and queue[0][0] == end and self._demand is not None:
+                break  # it does not act yet, and its successor tells whether it is an outlier
+            if self._is_lone(WRENCH):
+                continue
             at, message = queue.popleft()
             assert isinstance(message, Wrench)
             if self._demand is not None and at > now:
@@ -505,6 +540,14 @@ class Sampler:
 def _shown(frames: tuple[str, ...]) -> str:
     """Frame ids as they may stand in a log, whatever is in them."""
     return ", ".join(repr(frame if len(frame) <= 40 else f"{frame[:37]}...") for frame in frames)
+
+
+def _numbers(message: Message) -> Array:
+    """(6,) of what an IMU or a wrench message measures."""
+    if isinstance(message, Imu):
+        return np.concatenate([message.angular_velocity, message.linear_acceleration])
+    assert isinstance(message, Wrench)
+    return np.concatenate([message.force, message.torque])
 
 
 def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
@@ -593,6 +636,25 @@ def _set(a, b):
 def _average(ratio, i, surprise):
     """Of the last twenty or so; an outlier counts for no more than makes it stand out."""
     ratio[i] += 0.05 * (min(surprise, 1e3) - ratio[i])
+
+
+@kernel
+def is_lone(before, here, after, scatter, floor, gate):
+    """Whether some number (n,) jumps there and back between messages by more than is usual.
+
+    ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
+    ``floor`` (n,) is always usual. A step, or a ramp, goes there and does not come back.
+    """
+    lone = False
+    for i in range(len(here)):
+        there, back = here[i] - before[i], after[i] - here[i]
+        jump = min(there * there, back * back) if there * back < 0.0 else 0.0
+        if jump > gate * gate * max(scatter[i], floor[i] * floor[i]):
+            lone = True
+            scatter[i] *= 1.05  # the usual may have changed
+        else:
+            scatter[i] += 0.02 * (jump - scatter[i])
+    return lone
 
 
 @kernel
