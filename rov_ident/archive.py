@@ -153,7 +153,7 @@ def _stored(path: Path, config: Config, file: Path) -> Bag | str:
 
 
 def _of_file(file: Path, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    return function(np.load(file), *arguments)
+    return function(np.load(file, allow_pickle=False), *arguments)
 
 
 def _in_processes(

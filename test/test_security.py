@@ -1,0 +1,229 @@
+"""Nothing that is read is run, nothing is written elsewhere, nodes do what their policy says."""
+
+import ast
+import math
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+
+from rov_ident import config
+from rov_ident.config import PARAMETERS
+from rov_ident.errors import UserError
+
+ROOT = Path(__file__).parent.parent
+SOURCES = sorted((ROOT / "rov_ident").rglob("*.py")) + sorted((ROOT / "launch").glob("*.py"))
+
+# Modules that turn bytes into objects of their choice, or run what they are told.
+FORBIDDEN_MODULES = {
+    "pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "code", "runpy",
+    "ctypes", "pty", "telnetlib", "xmlrpc",
+}  # fmt: skip
+FORBIDDEN_CALLS = {
+    "eval", "exec", "compile", "__import__", "execfile", "unsafe_load", "full_load", "load_all",
+    "unsafe_load_all", "full_load_all", "system", "popen", "mktemp", "loadtxt", "genfromtxt",
+    "fromfile", "memmap", "numexpr",
+}  # fmt: skip
+
+
+def problems(path, text):
+    """What a source file must not hold, with its lines."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        where = f"{path}:{getattr(node, 'lineno', 0)}"
+        if isinstance(node, ast.Import):
+            names = [alias.name.partition(".")[0] for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [(node.module or "").partition(".")[0]]
+        else:
+            names = []
+        found += [f"{where}: import {name}" for name in names if name in FORBIDDEN_MODULES]
+        if not isinstance(node, ast.Call):
+            continue
+        function = node.func
+        name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+        owner = getattr(getattr(function, "value", None), "id", "")
+        words = {word.arg: word.value for word in node.keywords}
+        if name in FORBIDDEN_CALLS and owner != "re":
+            found.append(f"{where}: {name}")
+        if owner in ("np", "numpy") and name == "load":
+            allow = words.get("allow_pickle")
+            if not (isinstance(allow, ast.Constant) and allow.value is False):
+                found.append(f"{where}: np.load without allow_pickle=False")
+        if owner == "yaml" and name == "load":
+            loader = node.args[1] if len(node.args) > 1 else words.get("Loader")
+            if getattr(loader, "id", "") != "_Loader":
+                found.append(f"{where}: yaml.load with another loader")
+        if isinstance(words.get("shell"), ast.Constant) and words["shell"].value:
+            found.append(f"{where}: shell")
+    return found
+
+
+def test_nothing_that_is_read_is_run():
+    assert len(SOURCES) > 50
+    found = [problem for path in SOURCES for problem in problems(path, path.read_text())]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle",
+        "from marshal import loads",
+        "eval('1')",
+        "np.load(f)",
+        "np.load(f, allow_pickle=True)",
+        "yaml.load(f)",
+        "yaml.load(f, yaml.UnsafeLoader)",
+        "yaml.full_load(f)",
+        "os.system('ls')",
+        "subprocess.run('ls', shell=True)",
+    ],
+)
+def test_the_search_finds_what_it_is_for(text):
+    assert len(problems("x", text)) == 1
+
+
+@pytest.mark.parametrize(
+    "tag",
+    [
+        "!!python/object/apply:os.system ['touch {}']",
+        "!!python/name:os.system",
+        "!!python/module:os",
+        "!!python/object/new:os.system ['touch {}']",
+    ],
+)
+def test_yaml_makes_no_objects(tmp_path, heavy_path, tag):
+    made = tmp_path / "made"
+    path = tmp_path / "bad.yaml"
+    text = heavy_path.read_text()
+    path.write_text(text.replace("name: bluerov2_heavy", f"name: {tag.format(made)}", 1))
+    with pytest.raises(UserError, match="not valid YAML"):
+        config.load(path)
+    assert not made.exists()
+
+
+def test_yaml_that_grows(tmp_path):
+    """A billion laughs are refused before anybody laughs."""
+    lines = ["a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
+    path = tmp_path / "bomb.yaml"
+    path.write_text("\n".join(["/**:", "  ros__parameters:", *(f"    {line}" for line in lines)]))
+    with pytest.raises(UserError):
+        config.load(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["../../escaped", "/tmp/escaped", "a/b", "..", "a\n../b", "~root", ".hidden", "a\0b"]
+)
+def test_a_vehicle_s_name_leads_nowhere(name):
+    safe = config.as_file_name(name)
+    assert Path(safe).name == safe
+    assert safe not in ("", ".", "..") and safe[0] not in ".~"
+    assert "\0" not in safe and "\n" not in safe
+
+
+def test_a_configuration_does_not_say_where_to_write(tmp_path, heavy_path):
+    """A stranger's configuration and bag, explained: all that is new is in the folder asked for."""
+    text = heavy_path.read_text().replace("name: bluerov2_heavy", 'name: "../../escaped"', 1)
+    stranger, work = tmp_path / "stranger.yaml", tmp_path / "a" / "b"
+    work.mkdir(parents=True)
+    stranger.write_text(text)
+    command = [sys.executable, "-m", "rov_ident.cli", "simulate", "--config", str(stranger)]
+    command += ["--manoeuvre", "steps", "--duration", "5", "--out", "dive"]
+    done = subprocess.run(command, cwd=work, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert {p for p in tmp_path.rglob("*") if p.is_file()} == {
+        stranger, work / "dive" / "dive_0.mcap", work / "dive" / "metadata.yaml",
+    }  # fmt: skip
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def outside(parameter):
+    """Values that a number's declaration forbids."""
+    yield math.nan
+    yield math.inf
+    yield 1e300
+    yield "much"
+    yield True
+    if parameter.lower > -1e20:
+        yield parameter.lower - 1.0
+    if parameter.upper < 1e20:
+        yield parameter.upper + 1.0
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.key)
+def test_every_number_has_its_range(heavy, parameter):
+    if parameter.type is not float:
+        with pytest.raises(UserError):
+            config.from_parameters(_with(heavy, parameter.key, 1.5j))
+        return
+    for value in outside(parameter):
+        with pytest.raises(UserError, match=parameter.key.replace(".", r"\.")):
+            config.from_parameters(_with(heavy, parameter.key, value))
+
+
+def _with(heavy, key, value):
+    document = config.to_parameters(heavy)
+    section, _, name = key.rpartition(".")
+    place = document
+    for part in filter(None, section.split(".")):
+        place = place.setdefault(part, {})
+    place[name] = value
+    return document
+
+
+# ------------------------------------------------------------------ live
+
+
+def policy(node):
+    """What the policy file allows a node: {kind: full names}."""
+    tree = ET.parse(ROOT / "config" / "security_policy.xml")
+    profile = tree.find(f".//profile[@node='{node}']")
+    allowed = {}
+    for section in profile:
+        (way,) = section.attrib
+        assert section.attrib[way] == "ALLOW"
+        names = {(item.text or "").replace("~", f"/{node}") for item in section}
+        allowed[way] = {name if name.startswith("/") else f"/{name}" for name in names}
+    return allowed
+
+
+@pytest.mark.parametrize("estimator", ["rls", "ukf"])
+def test_a_node_does_what_its_policy_says(live, estimator):
+    """Exactly these topics and services; and no parameter takes a value out of its range."""
+    vehicle = live(estimator=estimator)
+    name = f"{estimator}_node"
+    graph = vehicle.node
+
+    def found():
+        return {
+            "subscribe": graph.get_subscriber_names_and_types_by_node(name, "/"),
+            "publish": graph.get_publisher_names_and_types_by_node(name, "/"),
+            "reply": graph.get_service_names_and_types_by_node(name, "/"),
+            "request": graph.get_client_names_and_types_by_node(name, "/"),
+        }
+
+    allowed = {"request": set(), **policy(name)}
+    vehicle.until(lambda: len(found()["reply"]) >= len(allowed["reply"]))
+    assert {way: {topic for topic, _ in names} for way, names in found().items()} == allowed
+
+    changes = [(p.key, value) for p in PARAMETERS if p.live for value in outside(p)]
+    assert len(changes) > 15
+    changes += [("vehicle.mass", 1.0), ("checkpoint_path", "/etc/passwd"), ("save_path", "/x")]
+    request = SetParameters.Request(
+        parameters=[Parameter(key, value=value).to_parameter_msg() for key, value in changes]
+    )
+    results = vehicle.call(SetParameters, "set_parameters", request).results
+    accepted = [change for change, r in zip(changes, results, strict=True) if r.successful]
+    assert accepted == []
+    vehicle.coefficients.clear()
+    vehicle.until(lambda: len(vehicle.coefficients) > 2)
+    assert np.isfinite(vehicle.values[-1].data).all()
