@@ -769,8 +769,9 @@ def _update(task, state, work, sample, side, info):
     c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
     if wild or (gated and c.refused < _PATIENCE):
         c.refused += 1.0
-        # It may have been the wrench: the observer would be wrong for long.
-        c.started = False
+        # One alone is the sensor's. If it was the wrench, the next measurement is off, too, and the
+        # observer would be wrong for long.
+        c.started = c.refused < _PATIENCE
         info.reason = GATED
         return
     _absorb(state, work, n)

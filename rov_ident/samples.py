@@ -384,8 +384,8 @@ class Sampler:
             t = imu_t if take_imu else pose_t
             if not (final or self._reached(t)):
                 break
-            if take_imu and len(imu) == 1 and not (final or self._waited(t)):
-                break  # its successor tells whether it is an outlier
+            if take_imu and len(imu) < 3 and not (final or self._waited(t)):
+                break  # its successors tell whether it is an outlier
             if take_imu and self._is_lone(IMU):
                 continue
             message = imu.popleft()[1] if take_imu else None
@@ -407,7 +407,10 @@ class Sampler:
         here = _numbers(queue[0][1])
         if before is not None and len(queue) > 1:
             after = _numbers(queue[1][1])
-            if is_lone(before, here, after, self._scatter[role], self._floors[role], _LONE):
+            # the one after that, as outliers may come in pairs; a wrench is not waited for so long
+            last = _numbers(queue[2][1]) if role == IMU and len(queue) > 2 else after
+            scatter, floor = self._scatter[role], self._floors[role]
+            if is_lone(before, here, after, last, scatter, floor, _LONE):
                 queue.popleft()
                 self.counts[f"{role}: outlier between its neighbours"] += 1
                 return True
@@ -639,8 +642,10 @@ def _average(ratio, i, surprise):
 
 
 @kernel
-def is_lone(before, here, after, scatter, floor, gate):
+def is_lone(before, here, after, last, scatter, floor, gate):
     """Whether some number (n,) jumps there and back between messages by more than is usual.
+
+    Back it may be only with the ``last`` message.
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
     ``floor`` (n,) is always usual. A step, or a ramp, goes there and does not come back.
@@ -649,7 +654,9 @@ def is_lone(before, here, after, scatter, floor, gate):
     for i in range(len(here)):
         there, back = here[i] - before[i], after[i] - here[i]
         jump = min(there * there, back * back) if there * back < 0.0 else 0.0
-        if jump > gate * gate * max(scatter[i], floor[i] * floor[i]):
+        back = last[i] - here[i]
+        later = min(there * there, back * back) if there * back < 0.0 else 0.0
+        if max(jump, later) > gate * gate * max(scatter[i], floor[i] * floor[i]):
             lone = True
             scatter[i] *= 1.05  # the usual may have changed
         else:

@@ -1,0 +1,258 @@
+"""Crashes and load, done to live nodes over DDS: the slow part of `make torture`.
+
+    python bench/torture_live.py [kills] [writers] [load] [rate] [--kills N] [--hours H]
+
+Exit status 1 where a bar is missed. docs/trust.md has the figures.
+"""
+
+import argparse
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "test"))
+
+import numpy as np
+from conftest import Vehicle, end_node, start_node
+from rich.console import Console
+from rich.table import Table
+
+from rov_ident import cdr, checkpoint
+from rov_ident import config as configuration
+from rov_ident.nodes.conversions import from_diagnostics
+from rov_ident.online import ESTIMATORS, OnlineEstimator
+from rov_ident.sensors import Suite, dive
+from torture import HEAVY, SECOND, Messages, Row
+
+RELIABLE = "qos.reliability:=reliable"
+
+
+def started(kind: str, *options: str):
+    """A node and the vehicle that it has found."""
+    process = start_node(kind, HEAVY, RELIABLE, *options)
+    vehicle = Vehicle(kind)
+    vehicle.until(vehicle.connected, 300.0)
+    vehicle.until(lambda: vehicle.coefficients, 60.0)
+    return process, vehicle
+
+
+# ------------------------------------------------------------------ kills
+
+
+def kills(options: argparse.Namespace) -> Iterator[Row]:
+    """One dive, the node killed again and again; the dive stands still until the next is there."""
+    for kind in ESTIMATORS:
+        count = options.kills // 2
+        config = configuration.load(HEAVY)
+        messages = dive(config, "steps", 4.0 * count + 60.0, seed=5).messages
+        numbers, done, last, worst, refused, recalled = random.Random(kind), 0, 0, 0.0, 0, 0
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "x.checkpoint"
+            for life in range(count):
+                process, vehicle = started(kind, f"checkpoint_path:={path}", "publish_rate:=50.0")
+                first = from_diagnostics(vehicle.coefficients[0])
+                if life:
+                    worst = max(worst, (last - first.stamp) / SECOND)
+                    recalled += first.stamp > 0
+                done = _play(vehicle, messages, done, numbers.uniform(0.3, 3.5))
+                process.kill()
+                process.wait()
+                refused += "not used" in os.read(process.stderr.fileno(), 1 << 16).decode()
+                process.stderr.close()
+                if vehicle.coefficients:
+                    last = max(last, from_diagnostics(vehicle.coefficients[-1]).stamp)
+                vehicle.close()
+                print(f"  {kind} killed {life + 1} times, {worst:.2f} s lost at most", end="\r",
+                      file=sys.stderr)  # fmt: skip
+            broken = OnlineEstimator(config, kind)
+            assert checkpoint.read(broken, path)
+        unbroken = OnlineEstimator(config, kind)
+        for _, role, m in messages[:done]:
+            unbroken.push(role, m)
+        a, b = broken.report(), unbroken.report()
+        moved = float(np.max(np.abs(a.values - b.values) / b.std))
+        yield Row(f"{count} kills: learning lost by one, at most", kind, worst, "s", 1.0)
+        yield Row("  checkpoints refused", kind, refused, "", 0)
+        yield Row("  lives that began with the prior", kind, count - 1 - recalled, "", 0)
+        yield Row("  in the end apart from an unbroken run", kind, moved, "sigma", 1.0)
+
+
+def _play(vehicle: Vehicle, messages: Messages, done: int, seconds: float) -> int:
+    """Publish this many seconds at their pace; how far it is now."""
+    start, begun = messages[done][0], time.monotonic()
+    while done < len(messages):
+        arrival, role, message = messages[done]
+        due = (arrival - start) * 1e-9
+        if due > seconds:
+            break
+        left = due - (time.monotonic() - begun)
+        if left > 0.0:
+            vehicle.executor.spin_once(timeout_sec=left)
+            continue
+        vehicle.publish(role, cdr.encode(message))
+        done += 1
+    return done
+
+
+def writers(_: argparse.Namespace) -> Iterator[Row]:
+    """A thousand processes that do nothing but write checkpoints, killed within milliseconds."""
+    config = configuration.load(HEAVY)
+    online = OnlineEstimator(config, "ukf")
+    versions = []
+    for _, role, m in dive(config, "steps", 4.0, seed=5).messages:
+        if len(online.push(role, m)) and len(versions) < 4:
+            versions.append(checkpoint.packed(online.memory(), checkpoint.identity(online)))
+    numbers, broken, missed = random.Random(2), 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.checkpoint"
+        checkpoint.write(path, versions[0])
+        for _ in range(1000):
+            pid = os.fork()
+            if pid == 0:
+                try:
+                    while True:
+                        for data in versions:
+                            checkpoint.write(path, data)
+                finally:
+                    os._exit(1)
+            time.sleep(0.01 * numbers.random())
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            missed += not path.exists()
+            broken += path.exists() and path.read_bytes() not in versions
+        spare = len(list(Path(folder).iterdir())) - 1
+        took = []
+        for _ in range(200):
+            begun = time.perf_counter()
+            checkpoint.write(path, versions[0])
+            took.append(time.perf_counter() - begun)
+        begun = time.perf_counter()
+        for _ in range(200):
+            online.memory()
+        held = (time.perf_counter() - begun) / 200
+    yield Row("1000 writers killed: files broken", "-", broken, "", 0)
+    yield Row("  files gone", "-", missed, "", 0)
+    yield Row("  parts left behind", "-", spare, "", 1)
+    yield Row("  size of a checkpoint", "-", len(versions[0]), "B", checkpoint.LARGEST)
+    yield Row("  written and synced in, 99 %", "-", float(np.percentile(took, 99)), "s", 0.5)
+    yield Row("  samples held up by one for", "-", 1e3 * held, "ms", 1.0)
+
+
+# ------------------------------------------------------------------ load
+
+
+def load(options: argparse.Namespace) -> Iterator[Row]:
+    """An hour of 200 Hz on three topics, as fast as the node takes it; its memory all the while."""
+    for kind in ESTIMATORS:
+        yield from _loaded(kind, options.hours * 3600.0, 0.0)
+
+
+def rate(_: argparse.Namespace) -> Iterator[Row]:
+    """5,000 messages a second for half a minute."""
+    for kind in ESTIMATORS:
+        yield from _loaded(kind, 30.0 * 5000.0 / 600.0, 5000.0)
+
+
+def _loaded(kind: str, seconds: float, pace: float) -> Iterator[Row]:
+    """600 messages a second of the vehicle's time; at ``pace`` messages/s, or as fast as can be."""
+    config = configuration.load(HEAVY)
+    suite = Suite(odometry_rate=200.0, imu_rate=200.0, wrench_rate=200.0)
+    once = dive(config, "steps", 60.0, suite=suite, seed=6).messages
+    period = 60 * SECOND
+    with tempfile.TemporaryDirectory() as folder:
+        process, vehicle = started(
+            kind, f"checkpoint_path:={folder}/x", "timeout:=30.0", "publish_rate:=5.0"
+        )
+        sizes, sent, begun, cpu = [], 0, time.monotonic(), _cpu(process.pid)
+        for k in range(max(1, round(seconds / 60.0))):
+            for arrival, role, m in once:
+                if arrival - once[0][0] + k * period > seconds * SECOND:
+                    break
+                vehicle.publish(role, cdr.encode(m._replace(stamp=m.stamp + k * period)))
+                sent += 1
+                if sent % 50 == 0:
+                    if pace:
+                        while time.monotonic() - begun < sent / pace:
+                            vehicle.executor.spin_once(timeout_sec=0.0005)
+                    _catch_up(vehicle, sent)
+            sizes.append(_memory(process.pid))
+            print(f"  {kind} {sent} messages, {sizes[-1]:.1f} MiB", end="\r", file=sys.stderr)
+        vehicle.until(lambda: _taken(vehicle) >= sent, 60.0)
+        lasted, used = time.monotonic() - begun, _cpu(process.pid) - cpu
+        lost = sent - _taken(vehicle)
+        vehicle.close()
+        status, said = end_node(process)
+    assert status == 0, said
+    what = f"{sent} messages at {sent / lasted:.0f}/s"
+    yield Row(f"{what}: not taken", kind, lost, "", 0)
+    if len(sizes) > 12:
+        yield Row("  memory grown after warm-up", kind, max(sizes[10:]) - sizes[10], "MiB", 1.0)
+    yield Row("  processor per message", kind, 1e6 * used / sent, "us", 400.0)
+
+
+def _taken(vehicle: Vehicle) -> int:
+    """Messages that /diagnostics counts as taken; the sampler needs all three."""
+    if not vehicle.diagnostics:
+        return 0
+    values = {v.key: v.value for v in vehicle.diagnostics[-1].status[0].values}
+    del vehicle.diagnostics[:-1]
+    for heard in (vehicle.coefficients, vehicle.values, vehicle.covariance, vehicle.residuals):
+        del heard[:-1]
+    return sum(int(values.get(role, 0)) for role in ("odom", "imu", "wrench"))
+
+
+def _catch_up(vehicle: Vehicle, sent: int) -> None:
+    """Listen; and no more than a queue's depth ahead of what the node has used."""
+    vehicle.executor.spin_once(timeout_sec=0.0)
+    if sent % 2000 == 0:
+        vehicle.until(lambda: _taken(vehicle) > sent - 2500, 60.0)
+
+
+def _memory(pid: int) -> float:
+    """MiB that are the process's own."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("RssAnon:"):
+            return int(line.split()[1]) / 1024.0
+    raise ValueError(pid)
+
+
+def _cpu(pid: int) -> float:
+    """Seconds of processor."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+STUDIES = {"kills": kills, "writers": writers, "load": load, "rate": rate}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], metavar="STUDY")
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--hours", type=float, default=1.0)
+    options = parser.parse_args()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", "97")
+    table = Table("what", "estimator", "value", "bar", "met")
+    missed = 0
+    for name in options.studies or STUDIES:
+        for row in STUDIES[name](options):
+            missed += not row.met
+            table.add_row(
+                row.what, row.estimator, f"{row.value:.3g} {row.unit}",
+                f"<= {row.bar:g}", "yes" if row.met else "NO",
+            )  # fmt: skip
+            print(f"{row.what}: {row.estimator} {row.value:.3g} {row.unit}", file=sys.stderr)
+    Console(width=120).print(table)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
