@@ -398,7 +398,7 @@ class Config:
     imu: ImuSensor = ImuSensor()
     wrench: WrenchNoise = WrenchNoise()
     process_std: Vector = option(
-        (0.0005,) * 6,
+        (0.0001,) * 6,
         "least density of the acceleration that the model does not explain, besides the noise of "
         "the wrench (more is found from the innovations): surge sway heave, roll pitch yaw",
         "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
