@@ -41,7 +41,6 @@ _MOST_PATTERNS = 3
 _PATTERNS_TRIED = 2
 _PATTERN_ROUNDS = 4
 _IMITATION = 0.05  # share of what a named effect explains that a pattern must explain beyond it
-_BEYOND = 2.33  # standard deviations that chance passes once in a hundred
 _CLUSTERS = 8  # windows from which their scatter tells anything
 _SHARE = 0.3  # of the best promise: what promises less is not fitted
 
@@ -317,10 +316,14 @@ class Search:
         return None
 
     def worth(self, now: Fitted, longer: Fitted, best: Fitted) -> float:
-        """What a longer model takes off the cost, also by the scatter of what is new in it."""
+        """What a longer model takes off the cost, also by the scatter of what is new in it.
+
+        An onset does not count for that: all that is known of it comes from one window.
+        """
         gain = self.cost(now, best) - self.cost(longer, best)
         new = [k for k in longer.hypothesis.keys if k not in now.hypothesis.values]
-        own = own_inflation(longer.look, new)
+        dates = onsets(longer.hypothesis)
+        own = own_inflation(longer.look, [k for k in new if k not in dates])
         return min(gain, (now.rss - longer.rss) / max(own, 1e-9) - PRICE * len(new))
 
     def held(self, now: Fitted, longer: Fitted) -> bool:
@@ -335,30 +338,17 @@ class Search:
 
         Comparable between fits of the same noise.
         """
-        return float(self._costs(fitted, best).sum())
-
-    def _costs(self, fitted: Fitted, best: Fitted) -> Array:
-        """The same of each window, (W,)."""
         linear = best.linear
         kappa = inflation(linear, linear.index(best.hypothesis.keys))
         extra = len(fitted.hypothesis.keys) - len(self.given.keys)
-        look = fitted.look
-        if not np.allclose(fitted.noise, best.noise):
-            again = self.evidence.look(fitted.hypothesis, look.starts, best.noise)
-            assert again is not None
-            look = again
-        costs: Array = look.linear.rss / kappa + PRICE * extra / len(linear.rss)
-        return costs
+        scale = (fitted.noise / best.noise) ** 2
+        rss = fitted.rss if np.allclose(scale, 1.0) else self._rescored(fitted, best.noise)
+        return rss / kappa + PRICE * extra
 
-    def beaten(self, rival: Fitted, best: Fitted) -> bool:
-        """Whether a rival is worse beyond doubt: by its cost, and in most of the windows.
-
-        Neither model need be true. Then the difference of their costs is as uncertain as it
-        scatters from window to window (Vuong 1989).
-        """
-        worse = self._costs(rival, best) - self._costs(best, best)
-        scatter = float(worse.std(ddof=1)) * np.sqrt(len(worse)) if len(worse) > 1 else np.inf
-        return bool(worse.sum() >= max(SURE, _BEYOND * scatter))
+    def _rescored(self, fitted: Fitted, noise: Array) -> float:
+        look = self.evidence.look(fitted.hypothesis, fitted.look.starts, noise)
+        assert look is not None
+        return float(look.linear.rss.sum())
 
     def named(self, fitted: Fitted) -> list[str]:
         """The effects (and patterns) that a model has beyond the given one."""

@@ -301,15 +301,26 @@ class Judge:
 
         The windows that reach into the time ``beside`` (from and to [s]) do not count.
         """
+        free, use = np.flatnonzero(~self._guided), self._used(beside)
+        a, b = (self.summed(h)[np.ix_(use, free)] for h in (before, after))
+        return gain_of([VELOCITIES[i] for i in free], a, b, int(use[self._chunk].sum()))
+
+    def _used(self, beside: tuple[float, float] | None) -> NDArray[np.bool_]:
+        """Which chunks count."""
         e, use = self._evidence, np.ones(len(self._number), dtype=bool)
         if beside is not None:
             begin, end = e.steps.t[e.first], e.steps.t[e.last]
             out = (end > beside[0]) & (begin < beside[1])
             use[self._chunk[out[e.window]]] = False
-        use = use if use.any() else ~use
-        free = np.flatnonzero(~self._guided)
-        a, b = (self.summed(h)[np.ix_(use, free)] for h in (before, after))
-        return gain_of([VELOCITIES[i] for i in free], a, b, int(use[self._chunk].sum()))
+        return use if use.any() else ~use
+
+    def better(
+        self, rival: Hypothesis, h: Hypothesis, beside: tuple[float, float] | None = None
+    ) -> bool:
+        """Whether a rival predicts better, all velocities taken together."""
+        free, use = ~self._guided, self._used(beside)
+        a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
+        return bool(_log_ratio(a, b).sum() < 0.0)
 
     def summed(self, h: Hypothesis) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
@@ -431,7 +442,8 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
             separable = separable and search.cost(fitted, final) > best - SURE
             continue
         share = (trial.rest.rss - fitted.rss) / max(explained, 1e-9)
-        if not search.beaten(fitted, final):
+        close = search.cost(fitted, final) - best < SURE
+        if close or judge.better(fitted.hypothesis, final.hypothesis, beside):
             separable = False
             why = _AS_WELL
         else:
