@@ -19,7 +19,7 @@ from rov_ident.coefficients import AXES, parse
 from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
-from rov_ident.evidence import Evidence, Fitted, Look
+from rov_ident.evidence import Evidence, Fitted, Look, onsets
 from rov_ident.hypothesis import COEFFICIENTS, UNKNOWN, Hypothesis, Key, bounds, parameter
 from rov_ident.model import Array
 from rov_ident.patterns import Pattern, patterns
@@ -41,6 +41,7 @@ _MOST_PATTERNS = 3
 _PATTERNS_TRIED = 2
 _PATTERN_ROUNDS = 4
 _IMITATION = 0.05  # share of what a named effect explains that a pattern must explain beyond it
+_CLUSTERS = 8  # windows from which their scatter tells anything
 _SHARE = 0.3  # of the best promise: what promises less is not fitted
 
 
@@ -152,7 +153,7 @@ class Search:
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.rss)
-        worth = [f for f in fits if self.worth(now, f, closest) >= SURE]
+        worth = [f for f in fits if self.worth(now, f, closest) >= SURE and self.held(now, f)]
         plain = [f for f in worth if self.newest(now, f) in PLAIN]
         return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
 
@@ -227,7 +228,7 @@ class Search:
                 now - self.cost(fit, final) > 3.0 * SURE
                 and final.rss - fit.rss > margin * explained
             ):
-                choices.append(fit)
+                choices += [fit] if self.held(trial.rest, fit) else []
         best = min(choices, key=lambda f: self.cost(f, final))
         return best if self.cost(best, final) < now else None
 
@@ -315,11 +316,22 @@ class Search:
         return None
 
     def worth(self, now: Fitted, longer: Fitted, best: Fitted) -> float:
-        """What a longer model takes off the cost, also by the scatter of what is new in it."""
+        """What a longer model takes off the cost, also by the scatter of what is new in it.
+
+        An onset does not count for that: all that is known of it comes from one window.
+        """
         gain = self.cost(now, best) - self.cost(longer, best)
         new = [k for k in longer.hypothesis.keys if k not in now.hypothesis.values]
-        own = own_inflation(longer.look, new)
+        dates = onsets(longer.hypothesis)
+        own = own_inflation(longer.look, [k for k in new if k not in dates])
         return min(gain, (now.rss - longer.rss) / max(own, 1e-9) - PRICE * len(new))
+
+    def held(self, now: Fitted, longer: Fitted) -> bool:
+        """Whether the data, not the bounds, hold the parameters that a longer model has more."""
+        h, wide = longer.hypothesis, covariance(longer)
+        std = dict(zip(longer.linear.keys, np.sqrt(np.maximum(np.diag(wide), 0.0)), strict=True))
+        new = [k for k in h.keys if k not in now.hypothesis.values]
+        return not any(pinned(k, h.values[k], std[k]) for k in new)
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the price of the added parameters.
@@ -602,3 +614,37 @@ def group_of(key: Key) -> str:
     if section != COEFFICIENTS:
         return section
     return next((e.name for e in EFFECTS.values() if name in e.coefficients), "coupled_damping")
+
+
+def covariance(final: Fitted) -> Array:
+    """Covariance (P, P) of the parameters, widened by what coloured residuals take away.
+
+    The mean of two estimates: white residuals times their common inflation, which varies little,
+    and leaving out each window in turn, which knows where each parameter comes from. Onsets, whose
+    residuals are not linear in them, are taken as known (:meth:`Evidence.onset_std`).
+    """
+    linear, keys = final.linear, final.linear.keys
+    at = linear.index(k for k in keys if k not in onsets(final.hypothesis))
+    normal = linear.normal[np.ix_(at, at)]
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+    wide = inflation(linear, at) * inverse / np.outer(size, size)
+    moves = final.look.left_out(at)
+    w = len(moves)
+    if w >= _CLUSTERS:
+        wide = 0.5 * (wide + (w - 1) / w * moves.T @ moves)
+    out = np.zeros((len(keys), len(keys)))
+    out[np.ix_(at, at)] = wide
+    return out
+
+
+def pinned(key: Key, value: float, std: float) -> bool:
+    """Whether a parameter of an effect is held by nothing but what it may be at most: then it
+    stands for something else.
+
+    Zero is a value like others: a thruster may fail altogether.
+    """
+    if key[0] not in EFFECTS or parameter(key).role != "amplitude":
+        return False
+    reach = max(2.0 * std, 1e-3 * abs(value))
+    return any(b != 0.0 and abs(value - b) < reach for b in bounds(key)[1:])

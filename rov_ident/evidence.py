@@ -305,7 +305,8 @@ class Evidence:
 
     def look(self, h: Hypothesis, starts: Array, noise: Array) -> Look | None:
         """Simulate; None where that diverges, or the masses are none."""
-        if np.linalg.eigvalsh(h.model.mass_matrix)[0] <= 0.0:
+        mass = h.model.mass_matrix
+        if not np.isfinite(list(h.values.values())).all() or np.linalg.eigvalsh(mass)[0] <= 0.0:
             return None
         wrench = self.thrust(h.effects)
         for key, value in h.values.items():

@@ -13,10 +13,10 @@ from rov_ident import config as configuration
 from rov_ident import kinematics
 from rov_ident.coefficients import AXES, VELOCITIES, parse
 from rov_ident.config import Config
-from rov_ident.discrepancy import Search, Trial, Trials
+from rov_ident.discrepancy import Search, Trial, Trials, covariance, pinned
 from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
-from rov_ident.evidence import Evidence, Fitted, onsets, within
+from rov_ident.evidence import Evidence, Fitted, within
 from rov_ident.excitation import authority
 from rov_ident.findings import (
     Alternative,
@@ -38,7 +38,6 @@ _WINDOW = 5.0  # s; of the windows of the fit
 _MARGIN = 0.25  # s; cut off beside held-out blocks
 _CHUNK = 2.5  # s; of the bootstrap
 _DRAWS = 2000  # of it
-_CLUSTERS = 8  # windows from which their scatter tells anything
 _WORTH = 0.02  # gain from which an effect has practical weight
 _ALL = 0.98  # share of what a finding explains that counts as all of it
 _EARLY = "the same if it was there before the bag began, which this bag cannot tell"
@@ -302,15 +301,26 @@ class Judge:
 
         The windows that reach into the time ``beside`` (from and to [s]) do not count.
         """
+        free, use = np.flatnonzero(~self._guided), self._used(beside)
+        a, b = (self.summed(h)[np.ix_(use, free)] for h in (before, after))
+        return gain_of([VELOCITIES[i] for i in free], a, b, int(use[self._chunk].sum()))
+
+    def _used(self, beside: tuple[float, float] | None) -> NDArray[np.bool_]:
+        """Which chunks count."""
         e, use = self._evidence, np.ones(len(self._number), dtype=bool)
         if beside is not None:
             begin, end = e.steps.t[e.first], e.steps.t[e.last]
             out = (end > beside[0]) & (begin < beside[1])
             use[self._chunk[out[e.window]]] = False
-        use = use if use.any() else ~use
-        free = np.flatnonzero(~self._guided)
-        a, b = (self.summed(h)[np.ix_(use, free)] for h in (before, after))
-        return gain_of([VELOCITIES[i] for i in free], a, b, int(use[self._chunk].sum()))
+        return use if use.any() else ~use
+
+    def better(
+        self, rival: Hypothesis, h: Hypothesis, beside: tuple[float, float] | None = None
+    ) -> bool:
+        """Whether a rival predicts better, all velocities taken together."""
+        free, use = ~self._guided, self._used(beside)
+        a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
+        return bool(_log_ratio(a, b).sum() < 0.0)
 
     def summed(self, h: Hypothesis) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
@@ -432,7 +442,8 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
             separable = separable and search.cost(fitted, final) > best - SURE
             continue
         share = (trial.rest.rss - fitted.rss) / max(explained, 1e-9)
-        if search.cost(fitted, final) - best < SURE:
+        close = search.cost(fitted, final) - best < SURE
+        if close or judge.better(fitted.hypothesis, final.hypothesis, beside):
             separable = False
             why = _AS_WELL
         else:
@@ -442,7 +453,8 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
         alternatives.append((share, Alternative(rival, why)))
     if not separable:
         alternatives = [a for a in alternatives if a[1].why_not == _AS_WELL]
-    separable = separable and not any(_pinned(k, final.hypothesis.values[k]) for k in keys)
+    stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
+    separable = separable and not any(pinned(k, final.hypothesis.values[k], stds[k]) for k in keys)
     return Finding(
         name,
         _axes(search, final, keys),
@@ -460,16 +472,6 @@ def _certain(search: Search, last: Fitted, name: str) -> bool:
     """Whether all of the data tell an effect from nothing as surely as it takes to join a model."""
     rest = last.look.evidence.fit(last.hypothesis.without(search.keys_of(last, name)), last.look)
     return rest is None or search.worth(rest, last, last) >= SURE
-
-
-def _pinned(key: Key, value: float) -> bool:
-    """Whether a parameter of an effect went as far as it may: then it stands for something else.
-
-    Zero is a value like others: a thruster may fail altogether.
-    """
-    if key[0] not in EFFECTS or parameter(key).role != "amplitude":
-        return False
-    return any(b != 0.0 and abs(value - b) < 1e-3 * abs(b) for b in bounds(key)[1:])
 
 
 def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
@@ -501,28 +503,6 @@ def from_the_start(finding: Finding) -> Finding:
         manoeuvre=manoeuvre(finding.effect),
         alternatives=kept + early,
     )
-
-
-def covariance(final: Fitted) -> Array:
-    """Covariance (P, P) of the parameters, widened by what coloured residuals take away.
-
-    The mean of two estimates: white residuals times their common inflation, which varies little,
-    and leaving out each window in turn, which knows where each parameter comes from. Onsets, whose
-    residuals are not linear in them, are taken as known (:meth:`Evidence.onset_std`).
-    """
-    linear, keys = final.linear, final.linear.keys
-    at = linear.index(k for k in keys if k not in onsets(final.hypothesis))
-    normal = linear.normal[np.ix_(at, at)]
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
-    inverse = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
-    wide = inflation(linear, at) * inverse / np.outer(size, size)
-    moves = final.look.left_out(at)
-    w = len(moves)
-    if w >= _CLUSTERS:
-        wide = 0.5 * (wide + (w - 1) / w * moves.T @ moves)
-    out = np.zeros((len(keys), len(keys)))
-    out[np.ix_(at, at)] = wide
-    return out
 
 
 def parameters_of(final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:

@@ -35,7 +35,7 @@ from rov_ident.config import Config, from_parameters
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
 from rov_ident.estimate import typical
-from rov_ident.evidence import Evidence, Linear
+from rov_ident.evidence import Evidence, Linear, Look
 from rov_ident.excitation import authority
 from rov_ident.hypothesis import COEFFICIENTS, Hypothesis, Key, bounds, centre, parameter
 from rov_ident.messages import Array
@@ -195,9 +195,8 @@ def step(
     look = evidence.look(h, evidence.begin(), state.noise)
     if look is None:
         return state
-    extra = tuple(key for unit in task.units for key in unit)
     force = _columns(task, evidence, h, look.motion)
-    linear = look.having(extra, look.of(force))
+    linear, seen = _levelled(task, look, force)
     theta = np.array(list(h.values.values()))
     b = len(theta)
     through = linear.normal[:, :b] @ theta
@@ -211,9 +210,37 @@ def step(
         np.sum((force / authority(h.model)[:, None]) ** 2, axis=0),
     )
     blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
-    seen = np.sqrt(np.mean(look.clean() ** 2, axis=0))
     noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
     return State((*state.windows[-(MEMORY - 1) :], window), noise)
+
+
+def _levelled(task: Task, look: Look, force: Array) -> tuple[Linear, Array]:
+    """The window with its own tilt eliminated, and the size (6,) of what is left in it.
+
+    A filtered attitude is off by about as much throughout a window, and a vehicle that is lightly
+    damped and weakly righted, such as a slender one in roll, is turned by that for seconds: per
+    window a rotation of unknown size, as large as the attitude's noise, on what is watched, whose
+    ``force`` is (K, 6, C).
+    """
+    evidence, h = look.evidence, look.hypothesis
+    down = evidence.steps.middle[:, 2, :]
+    tilted = np.cross(np.eye(3)[None], down[:, None, :]) @ h.model.body.restoring.T  # (K, 3, 6)
+    columns = look.of(np.concatenate([force, tilted.transpose(0, 2, 1)], axis=2))
+    extra = [key for unit in task.units for key in unit]
+    whole = look.having((*extra, *(("tilt", a) for a in "xyz")), columns)
+    p = len(whole.keys) - 3
+    kept = np.eye(3) / task.config.odometry.attitude_std**2 + whole.normal[p:, p:]
+    onto = np.linalg.solve(kept, whole.normal[p:, :p])
+    turn = np.linalg.solve(kept, whole.gradient[0, p:])
+    left = (look.error - columns[:, -3:] @ turn).reshape(-1, 6) * look.noise
+    linear = Linear(
+        whole.keys[:p],
+        whole.normal[:p, :p] - whole.normal[:p, p:] @ onto,
+        whole.gradient[:, :p] - whole.gradient[:, p:] @ onto,
+        whole.rss - whole.gradient[0, p:] @ turn,
+        whole.count,
+    )
+    return linear, np.sqrt(np.mean(left**2, axis=0))
 
 
 def _label(key: Key) -> str:
@@ -380,6 +407,14 @@ def price(size: int, tried: int) -> float:
     return float(x)
 
 
+class _Trial(NamedTuple):
+    """Watched parameters, estimated from their nulls, and the linear problem with them."""
+
+    unit: tuple[Key, ...]
+    change: Array
+    after: Linear
+
+
 class _Memory:
     """The sum of windows, ready to be solved for any choice of parameters."""
 
@@ -420,33 +455,35 @@ class _Memory:
             amplitudes = [(k, d) for k, d in zip(unit, change, strict=True) if not _is_place(k)]
             matters = np.abs(change / [self.task.sizes[key] for key in unit]).max() > LEAST
             if matters and all(_allowed(key, delta) for key, delta in amplitudes):
-                trials.append((unit, change, after))
+                trials.append(_Trial(unit, change, after))
         if not trials:
             return None
         tried = len(self.task.units)
-        unit, change, after = min(trials, key=lambda t: t[2].rss.sum())
+        several = [*trials, *self._together(chosen, trials)]
+        after = min(several, key=lambda t: t.after.rss.sum()).after
         kappa = inflation(after, np.arange(len(after.keys)))
 
-        def taken(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
-            return rss - float(trial[2].rss.sum())
+        def taken(trial: _Trial) -> float:
+            return rss - float(trial.after.rss.sum())
 
-        def worth(trial: tuple[tuple[Key, ...], Array, Linear]) -> float:
-            return taken(trial) / kappa - price(len(trial[0]), tried)
+        def worth(trial: _Trial) -> float:
+            return taken(trial) / kappa - price(len(trial.unit), tried)
 
         # the plainest of those that explain about as much
-        most = max(trials, key=worth)
-        alike = [t for t in trials if taken(t) >= _ALIKE * taken(most)]
-        best = min(alike, key=lambda t: (len(t[0]), _has_onset(t[0]), -worth(t)))
-        unit, change, after = best
+        most = max(several, key=worth)
+        alike = [t for t in several if taken(t) >= _ALIKE * taken(most)]
+        whole = min(alike, key=lambda t: (len(t.unit), _has_onset(t.unit), -worth(t)))
+        best = max((t for t in trials if set(t.unit) <= set(whole.unit)), key=worth)
+        unit, change = best.unit, best.change
         score, asked = taken(best) / kappa, price(len(unit), tried)
         share = 6.0 * taken(best) / rss
         if score < asked or share < SHARE:
             return None
         rivals = [
-            t[0]
+            t.unit
             for t in trials
-            if _effect(t[0]) != _effect(unit)
-            and (worth(best) - worth(t) < SURE or taken(t) > _AS_GOOD * taken(best))
+            if _effect(t.unit) != _effect(unit)
+            and (worth(whole) - worth(t) < SURE or taken(t) > _AS_GOOD * taken(whole))
         ]
         axes = self._axes(unit, change)
         values = [bounds(key)[0] + d for key, d in zip(unit, change.tolist(), strict=True)]
@@ -464,6 +501,17 @@ class _Memory:
             tuple(dict.fromkeys(_effect(u) for u in rivals)),
             _sentence(unit, axes, rivals),
         )
+
+    def _together(self, chosen: list[Key], trials: Sequence["_Trial"]) -> list["_Trial"]:
+        """All units of an effect that has several, to be compared with effects of one unit."""
+        found = []
+        for effect in dict.fromkeys(_effect(t.unit) for t in trials):
+            own = [t.unit for t in trials if _effect(t.unit) == effect]
+            if len(own) > 1:
+                unit = tuple(key for u in own for key in u)
+                value, after = self.solve([*chosen, *unit])
+                found.append(_Trial(unit, value[-len(unit) :], after))
+        return found
 
     def _promising(
         self, chosen: Sequence[Key], units: Sequence[tuple[Key, ...]], least: float

@@ -20,7 +20,8 @@ from explain import (
     wrong,
 )
 from hidden import EFFECTS, NESTED, Conditions, draw
-from rov_ident.explain import _pinned, explain, from_the_start, thinned, whole
+from rov_ident.discrepancy import pinned
+from rov_ident.explain import explain, from_the_start, thinned, whole
 from rov_ident.findings import Finding, Gain, Value
 from rov_ident.scores import _own
 from rov_ident.streams import gather
@@ -124,17 +125,18 @@ def test_what_was_left_out_is_told():
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "is_pinned"),
+    ("key", "value", "std", "is_pinned"),
     [
-        (("ocean_current", "north"), -3.0, True),
-        (("ocean_current", "north"), -2.9, False),
-        (("thruster_failure", "gain_X"), 0.0, False),  # a thruster may fail altogether
-        (("thruster_gain", "gain_X"), 5.0, True),
-        (("wave", "phase"), 6.3, False),
+        (("ocean_current", "north"), -3.0, 0.0, True),
+        (("ocean_current", "north"), -2.9, 0.01, False),
+        (("ocean_current", "north"), -2.5, 0.9, True),  # the bound alone holds it
+        (("thruster_failure", "gain_X"), 0.0, 0.1, False),  # a thruster may fail altogether
+        (("thruster_gain", "gain_X"), 5.0, 0.1, True),
+        (("wave", "phase"), 6.3, 0.1, False),
     ],
 )
-def test_an_effect_at_the_end_of_its_range_is_known(key, value, is_pinned):
-    assert _pinned(key, value) is is_pinned
+def test_an_effect_at_the_end_of_its_range_is_known(key, value, std, is_pinned):
+    assert pinned(key, value, std) is is_pinned
 
 
 def test_a_noisy_axis_does_not_pass_for_a_cause():
