@@ -11,6 +11,7 @@ const LEVELS = [["✓", "converged"], ["…", "converging, or held"], ["✕", "d
 const HEALTH = ["ok", "warning", "error", "stale"];
 
 const estimators = new Map();          // by full name: the latest state, with history and residuals
+let bridges = {};                      // to controllers: the last status of each
 let chosen = null;                     // namespace
 let built = "";                        // what the present elements were made for
 let updates = [];                      // functions that bring the elements up to date
@@ -217,6 +218,20 @@ function buildHealth(main, names) {
           ". A hint: `rov-ident explain` on a recording is the proof.");
       }
     });
+  });
+}
+
+function buildBridges(main) {
+  const list = element(main, "div");
+  updates.push(() => {
+    list.replaceChildren();
+    for (const [name, status] of Object.entries(bridges)) {
+      if (namespaceOf(name) !== chosen) continue;
+      const note = element(list, "div", status.level ? "note" : "note calm");
+      element(note, "strong", "", `${name} to ${status.values.controller}`);
+      element(note, "p", "", status.message);
+      if (status.values.pending) element(note, "p", "soft", `pending: ${status.values.pending}`);
+    }
   });
 }
 
@@ -455,6 +470,7 @@ function build(namespaces, names, coefficients) {
     return;
   }
   buildHealth(main, names);
+  buildBridges(main);
   if (!coefficients.length) {
     element(main, "p", "empty", "The nodes are there, and have not reported yet: on its first start on a " +
       "computer a node compiles for half a minute.");
@@ -468,6 +484,7 @@ function build(namespaces, names, coefficients) {
 }
 
 function take(message) {
+  bridges = message.bridges;
   for (const [name, state] of Object.entries(message.estimators)) {
     const before = estimators.get(name);
     for (const series of ["history", "residuals"]) {
