@@ -6,7 +6,12 @@ Each vehicle has its topics, and its nodes, in the namespace of its name.
 """
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.actions import (
+    DeclareLaunchArgument,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+)
 from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
@@ -14,28 +19,26 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 
-def estimators(context: LaunchContext) -> list[IncludeLaunchDescription]:
+def estimators(context: LaunchContext) -> list[GroupAction]:
     """Both estimators of each vehicle named in `vehicles`."""
-    source = PythonLaunchDescriptionSource(
-        PathJoinSubstitution([FindPackageShare("rov_ident"), "launch", "identify.launch.py"])
-    )
-    included = []
+    path = PathJoinSubstitution([FindPackageShare("rov_ident"), "launch", "identify.launch.py"])
+    groups = []
     for entry in LaunchConfiguration("vehicles").perform(context).split():
         namespace, equals, config = entry.partition("=")
         if not (namespace and equals and config):
             raise RuntimeError(f"vehicles: {entry!r} must be NAMESPACE=PARAMETER_FILE")
-        included.append(
-            IncludeLaunchDescription(
-                source,
-                launch_arguments={
-                    "namespace": namespace,
-                    "config": config,
-                    "use_sim_time": LaunchConfiguration("use_sim_time"),
-                    "dashboard": "false",
-                }.items(),
-            )
+        included = IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(path),
+            launch_arguments={
+                "namespace": namespace,
+                "config": config,
+                "use_sim_time": LaunchConfiguration("use_sim_time"),
+                "dashboard": "false",
+            }.items(),
         )
-    return included
+        # In a scope of its own: what is given to one is neither the next one's nor ours.
+        groups.append(GroupAction([included]))
+    return groups
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -2,6 +2,7 @@
 
 import contextlib
 import sys
+import time
 
 import rclpy
 from rcl_interfaces.msg import ParameterValue, SetParametersResult
@@ -31,10 +32,11 @@ class Strict(Node):
 
 
 class Sloppy(Node):
-    """Without atomic sets, and it takes of each set only the first parameter."""
+    """Without atomic sets. Of the first set it takes only one parameter, and takes its time."""
 
-    def __init__(self):
+    def __init__(self, delay):
         super().__init__("controller", start_parameter_services=False)
+        self._delay = delay
         self._values = dict(AT_FIRST)
         self.create_service(GetParameters, "~/get_parameters", self._get)
         self.create_service(ListParameters, "~/list_parameters", self._list)
@@ -53,6 +55,7 @@ class Sloppy(Node):
 
     def _set(self, request, response):
         self._sets += 1
+        time.sleep(self._delay if self._sets == 1 else 0.0)
         for i, parameter in enumerate(request.parameters):
             taken = i == 0 or self._sets > 1
             if taken:
@@ -66,7 +69,13 @@ class Sloppy(Node):
 def main():
     rclpy.init()
     mode = sys.argv[1]
-    node = Sloppy() if mode == "sloppy" else Strict(LISTS if mode == "lists" else AT_FIRST)
+    nodes = {
+        "usual": lambda: Strict(AT_FIRST),
+        "lists": lambda: Strict(LISTS),
+        "sloppy": lambda: Sloppy(0.0),
+        "slow": lambda: Sloppy(2.0),
+    }
+    node = nodes[mode]()
     with contextlib.suppress(KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         rclpy.spin(node)
     rclpy.try_shutdown()

@@ -309,16 +309,20 @@ def test_rate_and_lists(start, heavy):
     ]
 
 
-def test_half_a_set(start):
-    """A controller that takes a part of a set gets back what it had."""
-    one = start("sloppy", TWO)
+@pytest.mark.parametrize(
+    "mode, words", [("sloppy", "not this one"), ("slow", "gave no answer within 0.5 s")]
+)
+def test_half_a_set(start, mode, words):
+    """A controller that takes a part of a set gets back what it had, even if it is not heard."""
+    one = start(mode, TWO, "patience:=0.5")
     one.says = GOOD
     one.hears("waiting for ~/approve")
     answer = one.ask("approve")
-    assert not answer.success and "not this one" in answer.message
+    assert not answer.success and words in answer.message
+    one.statuses.clear()
+    one.hears("waiting for ~/approve")
     assert one.held() == [-10.0, -100.0]
     # It is a controller that mends its ways.
-    one.hears("waiting for ~/approve")
     assert one.ask("approve").success
     assert one.held() == [-13.0, -140.0]
 

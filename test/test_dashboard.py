@@ -135,6 +135,12 @@ def test_store(report):
     state, marks = store.changes(marks)
     assert len(state["estimators"]["/rls_node"]["history"]["rows"]) == 1
     assert state["estimators"]["/rls_node"]["gone"]
+    # What goes on to a controller is kept by itself.
+    bridge = Status(0, "waiting for ~/approve", {"controller": "/c", "pending": "X_u"})
+    store.take_status("/controller_bridge", "bridge", bridge)
+    state, _ = store.changes()
+    assert state["bridges"] == {"/controller_bridge": vars(bridge)}
+    assert "/controller_bridge" not in state["estimators"]
     # Others of whom only /diagnostics speaks are no estimators.
     store.take_status("/camera", "inputs", Status(0, "", {}))
     assert "/camera" not in store.changes()[0]["estimators"]
@@ -342,6 +348,10 @@ async def _in_a_browser(report):
             "document.querySelector('[data-coefficient=X_u] .state').innerText.endsWith('s ago')"
         )
         await page.send("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+        bridge = Status(1, "stale", {"controller": "/c", "pending": "X_u"})
+        store.take_status("/rov1/controller_bridge", "bridge", bridge)
+        bridge_note = "[...document.querySelectorAll('.note')].map((n) => n.innerText)"
+        await page.until(f"{bridge_note}.some((t) => t.includes('pending: X_u'))")
         # What a node says is text.
         assert await page.evaluate("document.querySelector('.note').innerText.includes('<b>drag')")
         assert await page.evaluate("document.querySelectorAll('.note b').length") == 0
@@ -433,7 +443,7 @@ def test_two_vehicles(command):
 
     with publishing(dives) as publish:
         asyncio.run(_until_all_are_shown(addresses["page"], expected, publish))
-        lines = command("rov_ident.cli", "watch", "--once", "--json")
+        lines = command("rov_ident.cli", "watch", "--once", "--json", "--wait", "30")
         asyncio.run(_foxglove(addresses["foxglove"]))
     table.send_signal(signal.SIGINT)
     _, shown = table.communicate(timeout=20)

@@ -36,6 +36,7 @@ NAMES = (HOST, "localhost")
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
+PORT = web.AppKey("port", int)
 STORE = web.AppKey("store", Store)
 PAGES: web.AppKey[set[web.WebSocketResponse]] = web.AppKey("pages")
 
@@ -43,7 +44,7 @@ PAGES: web.AppKey[set[web.WebSocketResponse]] = web.AppKey("pages")
 def application(store: Store, port: int) -> web.Application:
     """The page at `/`, the state at `/state.json`, what is new at `/live` (web socket)."""
     app = web.Application(middlewares=[guard(port, _own_origins(port))], client_max_size=_LARGEST)
-    app[STORE] = store
+    app[PORT], app[STORE] = port, store
     app[PAGES] = set()
     app.on_response_prepare.append(_protect)
     app.on_shutdown.append(_hang_up)
@@ -84,7 +85,7 @@ def guard(port: int, may: Callable[[str], bool], cross_site: bool = False) -> An
 
 async def _protect(request: web.Request, response: web.StreamResponse) -> None:
     # Not every browser takes a web socket of the page's own origin for 'self'.
-    sockets = f"ws://{request.headers.get('Host', '')}"
+    sockets = " ".join(f"ws://{name}:{request.app[PORT]}" for name in NAMES)
     response.headers.update(
         {
             "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "

@@ -107,6 +107,7 @@ class Store:
         self._now = now
         self._lock = threading.Lock()
         self._estimators: dict[str, Estimator] = {}
+        self._bridges: dict[str, Status] = {}  # what goes on to controllers
 
     # ---------------------------------------------------------------- in
 
@@ -152,9 +153,11 @@ class Store:
             known.bin.append(residual)
 
     def take_status(self, name: str, kind: str, status: Status) -> None:
-        """`inputs`, `estimation` or `model` of a node that is known already."""
+        """`inputs`, `estimation` or `model` of a node that is known already; `bridge` of any."""
         with self._lock:
-            if name in self._estimators:
+            if kind == "bridge":
+                self._bridges[name] = status
+            elif name in self._estimators:
                 self._estimators[name].statuses[kind] = status
 
     # ---------------------------------------------------------------- out
@@ -205,7 +208,8 @@ class Store:
                     "statuses": {kind: vars(s) for kind, s in known.statuses.items()},
                     **_described(known.report),
                 }
-        return {"estimators": shown}, after
+            bridges = {name: vars(status) for name, status in sorted(self._bridges.items())}
+        return {"estimators": shown, "bridges": bridges}, after
 
 
 def _described(report: Report | None) -> dict[str, Any]:

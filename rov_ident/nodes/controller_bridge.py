@@ -112,7 +112,8 @@ class ControllerBridge(Node):  # type: ignore[misc]
         self._refusal = "no coefficients were heard yet"
 
         self._original: Values | None = None
-        self._open: tuple[Values, Values] | None = None  # before, and a set that is on its way
+        self._open: tuple[Values, Values] | None = None  # before, and a set on its way
+        self._unanswered: tuple[Any, Any] | None = None  # its client and future
         self._pending: Sequence[Change] = ()
         self._enabled = True
         self._sent = 0
@@ -236,6 +237,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
         """
         if self._open is None:
             return
+        self._wait_for_answer(reason)
         before, new = self._open
         after = self._read()
         if any(after[name] != value for name, value in new.items()):
@@ -251,6 +253,15 @@ class ControllerBridge(Node):  # type: ignore[misc]
             self._open = None
             raise UserError(f"{self._controller} refused: {reason or 'it gave no reason'}")
         self._open = None
+
+    def _wait_for_answer(self, reason: str = "") -> None:
+        """Raises UserError while a set is unanswered: it may still be taken, and in part."""
+        if self._unanswered is None:
+            return
+        client, future = self._unanswered
+        if client.service_is_ready() and not future.done():
+            raise UserError(reason or f"{self._controller} has not answered to a set yet")
+        self._unanswered = None  # or it is gone, and its next life knows nothing of it
 
     def _read(self) -> dict[str, bridge.Value]:
         """The parameters that coefficients are in; raises UserError if they cannot be had."""
@@ -297,12 +308,18 @@ class ControllerBridge(Node):  # type: ignore[misc]
     def _call(self, client: Any, request: Any) -> Any:
         if not client.service_is_ready():
             raise UserError(f"{self._controller} is not there")
-        answer = client.call(request, timeout_sec=self._settings["patience"])
-        if answer is None:
+        future = client.call_async(request)
+        answered = threading.Event()
+        future.add_done_callback(lambda _: answered.set())
+        if not answered.wait(self._settings["patience"]):
+            if client in (self._set, self._set_all):
+                self._unanswered = (client, future)
+            else:
+                client.remove_pending_request(future)
             raise UserError(
                 f"{self._controller} gave no answer within {self._settings['patience']:g} s"
             )
-        return answer
+        return future.result()
 
     # ---------------------------------------------------------------- services
 
@@ -325,6 +342,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
         try:
             if self._original is None:
                 raise UserError("the controller was never changed")
+            self._wait_for_answer()
             self._exchange(self._read(), self._original)
             self._say(Level.OK, "the controller has what it had at first; disabled until ~/enable")
         except UserError as error:

@@ -67,10 +67,6 @@ def main() -> int:
     return 0
 
 
-def _declare(node: WatchNode) -> Mapping[str, int]:
-    return parameters.declare_own(node, _PARAMETERS)
-
-
 def _live(
     arguments: list[str] | None,
     settings: Callable[[WatchNode], Mapping[str, int]],

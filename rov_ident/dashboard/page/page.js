@@ -2,6 +2,8 @@
 "use strict";
 
 const BINS = 240;                      // of residuals, as the server keeps them
+const POINTS = 300;                    // of a curve
+const CELL = 12;                       // px; the least in which a name can stand
 const EXCITED = 0.05;                  // share of the prior variance from which a motion shows it
 const AXES = ["X", "Y", "Z", "K", "M", "N"];
 const LEVELS = [["✓", "converged"], ["…", "converging, or held"], ["✕", "diverged, or at a bound"],
@@ -9,6 +11,7 @@ const LEVELS = [["✓", "converged"], ["…", "converging, or held"], ["✕", "d
 const HEALTH = ["ok", "warning", "error", "stale"];
 
 const estimators = new Map();          // by full name: the latest state, with history and residuals
+let bridges = {};                      // to controllers: the last status of each
 let chosen = null;                     // namespace
 let built = "";                        // what the present elements were made for
 let updates = [];                      // functions that bring the elements up to date
@@ -64,8 +67,15 @@ function ticks(low, high) {            // two or three round numbers
   return { found, digits: Math.max(0, -Math.floor(Math.log10(width))) };
 }
 
+const tenths = (number) => Math.round(10 * number) / 10;
+
+function thinned(rows) {               // no more than there are pixels; with the last one
+  const step = Math.ceil(rows.length / POINTS);
+  return step < 2 ? rows : rows.filter((_, i) => (rows.length - 1 - i) % step === 0);
+}
+
 function path(points) {
-  return points.length ? "M" + points.map(([x, y]) => `${x.toFixed(1)},${y.toFixed(1)}`).join("L") : "";
+  return points.length ? "M" + points.map(([x, y]) => `${tenths(x)},${tenths(y)}`).join("L") : "";
 }
 
 function ring(above, below) {
@@ -74,11 +84,19 @@ function ring(above, below) {
 
 // ---------------------------------------------------------------- a picture over time
 
+const widths = new ResizeObserver((entries) => {
+  for (const { target, contentRect } of entries) (target.picture ?? {}).width = contentRect.width || 280;
+  refresh();
+});
+
 class Picture {
   // Bands and curves of all estimators over one time axis; as wide as its card.
   constructor(parent, names, label, height) {
     this.height = height;
     this.svg = drawing(parent, "svg", { role: "img", "aria-label": label, height });
+    this.width = 280;
+    widths.observe(this.svg);          // asking for it while drawing would lay out the page each time
+    this.svg.picture = this;
     this.grid = drawing(this.svg, "path", { class: "axis" });
     this.bands = names.map((_, i) => drawing(this.svg, "path", { class: "band", fill: colour(i) }));
     this.curves = names.map((_, i) => drawing(this.svg, "path",
@@ -98,7 +116,7 @@ class Picture {
 
   // rows: of each estimator [[t, middle, low, high], ...]; low and high may be null
   draw(rows, start, end, low, high) {
-    const width = this.svg.clientWidth || 280, bottom = this.height - 16;
+    const width = this.width, bottom = this.height - 16;
     if (!(high > low)) { const pad = Math.abs(low) * 0.1 || 1; low -= pad; high += pad; }
     const { found, digits } = ticks(low, high);
     const texts = found.map((value) => signed(
@@ -117,7 +135,7 @@ class Picture {
     write(`−${duration(this.span)}`, this.left, this.height - 3, "start");
     write("now", width - 4, this.height - 3, "end");
     rows.forEach((points, i) => {
-      const shown = points.filter(([t, middle]) => t >= start && middle !== null);
+      const shown = thinned(points.filter(([t, middle]) => t >= start && middle !== null));
       this.curves[i].setAttribute("d", path(shown.map(([t, v]) => [x(t), y(v)])));
       const banded = shown.filter(([, , lowest, highest]) => lowest !== null && highest !== null);
       this.bands[i].setAttribute("d", ring(
@@ -200,6 +218,20 @@ function buildHealth(main, names) {
           ". A hint: `rov-ident explain` on a recording is the proof.");
       }
     });
+  });
+}
+
+function buildBridges(main) {
+  const list = element(main, "div");
+  updates.push(() => {
+    list.replaceChildren();
+    for (const [name, status] of Object.entries(bridges)) {
+      if (namespaceOf(name) !== chosen) continue;
+      const note = element(list, "div", status.level ? "note" : "note calm");
+      element(note, "strong", "", `${name} to ${status.values.controller}`);
+      element(note, "p", "", status.message);
+      if (status.values.pending) element(note, "p", "soft", `pending: ${status.values.pending}`);
+    }
   });
 }
 
@@ -327,20 +359,23 @@ function buildCorrelations(main, names) {
     const card = element(maps, "div", "map");
     keyOf(element(card, "h3"), index, shortName(name));
     const worst = element(card, "p", "soft");
-    const svg = drawing(card, "svg", { role: "img", "aria-label": `correlations of ${shortName(name)}` });
+    const frame = element(card, "div", "scroll");
+    const svg = drawing(frame, "svg", { role: "img", "aria-label": `correlations of ${shortName(name)}` });
     let drawn = "";
     updates.push(() => {
       const { correlation, names: of } = estimators.get(name);
       card.hidden = !correlation || correlation.length !== of.length;
-      const state = JSON.stringify(correlation) + svg.clientWidth;
+      const available = frame.clientWidth || 340;
+      const state = JSON.stringify(correlation) + available;
       if (card.hidden || state === drawn) return;
       drawn = state;
-      const n = of.length, width = svg.clientWidth || 340;
-      const room = Math.min(110, 14 + 6.2 * Math.max(...of.map((text) => text.length)));
-      const cell = Math.min(22, (width - room) / n), size = cell * n;
+      const n = of.length, room = 14 + 6 * Math.max(...of.map((text) => text.length));
+      const cell = Math.max(CELL, Math.min(22, (available - room) / n)), size = cell * n;
+      const width = Math.max(available, room + size);
       svg.replaceChildren();
       svg.setAttribute("viewBox", `0 0 ${width} ${size + room}`);
       svg.setAttribute("height", size + room);
+      svg.setAttribute("width", width);
       let most = 0, pair = "";
       of.forEach((row, i) => {
         const y = room + (i + 0.5) * cell + 4;
@@ -415,6 +450,7 @@ function refresh() {
 
 function build(namespaces, names, coefficients) {
   updates = [];
+  widths.disconnect();
   const nav = document.getElementById("vehicles"), main = document.getElementById("main");
   nav.replaceChildren();
   main.replaceChildren();
@@ -434,6 +470,7 @@ function build(namespaces, names, coefficients) {
     return;
   }
   buildHealth(main, names);
+  buildBridges(main);
   if (!coefficients.length) {
     element(main, "p", "empty", "The nodes are there, and have not reported yet: on its first start on a " +
       "computer a node compiles for half a minute.");
@@ -447,6 +484,7 @@ function build(namespaces, names, coefficients) {
 }
 
 function take(message) {
+  bridges = message.bridges;
   for (const [name, state] of Object.entries(message.estimators)) {
     const before = estimators.get(name);
     for (const series of ["history", "residuals"]) {
@@ -477,5 +515,4 @@ function connect() {
   });
 }
 
-addEventListener("resize", refresh);
 connect();
