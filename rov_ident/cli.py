@@ -401,7 +401,7 @@ def _add_live(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
     layouts = commands.add_parser(
         "layouts", help="layouts of this vehicle's topics for Foxglove and PlotJuggler"
     )
-    layouts.add_argument("--config", required=True, type=Path)
+    layouts.add_argument("--config", required=True, type=Path, help=_CONFIG)
     layouts.add_argument("--namespace", default="", help="of the nodes (none)")
     layouts.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
@@ -491,6 +491,7 @@ def _demo(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     from rov_ident.nodes.replay import replay
 
+    _check_outputs([options.json], [options.bag, options.config])
     estimators = options.estimator or LIVE
     with _progress(options) as tell:
         tell("starting the nodes")
@@ -811,7 +812,7 @@ def _read(path: Path, config: configuration.Config, tell: Tell) -> "Record":
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    _check_outputs([options.out], [options.bag, options.config])
+    _check_outputs([options.out, options.json], [options.bag, options.config])
     config = configuration.load(options.config)
     if options.bag:
         _compare(config, options)
@@ -890,7 +891,7 @@ def _compare(config: configuration.Config, options: argparse.Namespace) -> None:
 def _import(options: argparse.Namespace) -> None:
     from rov_ident import ardupilot
 
-    _check_outputs([options.out], [*options.log, options.config])
+    _check_outputs([options.out, options.json], [*options.log, options.config])
     if any(path.suffix.lower() in ardupilot.SUFFIXES for path in options.log):
         _import_ardupilot(options)
     else:
@@ -950,7 +951,7 @@ def _export(options: argparse.Namespace) -> None:
     from rov_ident.fit import write_text
     from rov_ident.formats import export
 
-    _check_outputs([options.out], [options.config])
+    _check_outputs([options.out, options.json], [options.config])
     written = export(configuration.load(options.config), options.format)
     write_text(options.out, written.content)
     for what in written.lost:
@@ -962,7 +963,7 @@ def _export(options: argparse.Namespace) -> None:
 def _import_model(options: argparse.Namespace) -> None:
     from rov_ident.formats import import_model
 
-    _check_outputs([options.out], [options.file, options.config])
+    _check_outputs([options.out, options.json], [options.file, options.config])
     base = configuration.load(options.config) if options.config else None
     config, notes = import_model(options.file, base)
     configuration.dump(config, options.out, comment=f"From {options.file.name}.")
@@ -1050,7 +1051,7 @@ def _steer(options: argparse.Namespace) -> None:
     from rov_ident import autopilot
     from rov_ident.fit import write_text
 
-    _check_outputs([options.out], [options.config])
+    _check_outputs([options.out, options.json], [options.config])
     if not abs(options.angle) <= 180.0:
         raise UserError(f"--angle {options.angle:g}: give degrees from -180 to 180")
     run = autopilot.manoeuvre(
