@@ -64,7 +64,7 @@ def test_every_option_that_is_written_of_exists():
                 assert option in known[name], f"{path.name}: rov-ident {name} has no {option}"
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md"], ids=lambda p: p.name)
 def test_the_configurations_in_the_pages_are_read(path):
     """A block of YAML is a whole parameter file, or settings that go into one."""
     for text in blocks(path, "yaml"):
