@@ -14,7 +14,7 @@ and each sheet has been compared with the ends and the dead band quoted by other
 * 18 V: the ends as published (-45.0 and 59.0 N), the shape of 16 V in between.
 
 Against the maker's whole sheets the curves (14 V: interpolated) are off by 0.1 to 0.3 N rms and
-1.3 N at most from 10 to 16 V, by 1.0 N rms and 3.0 N at most at 18 V (``test_inputs.py``). What the
+1.3 N at most from 10 to 16 V, by 1.2 N rms and 3.0 N at most at 18 V (``test_inputs.py``). What the
 water does to thrust at speed is larger.
 """
 
