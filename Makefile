@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check accuracy bench validate explain-bench torture bag picture clean
+.PHONY: demo test check docs accuracy bench validate explain-bench torture bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -22,6 +22,10 @@ check: .venv/test.stamp
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+
+## the documentation as a site, out/docs/index.html; a broken link is an error
+docs: .venv/docs.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 ## accuracy over seeds, the tables of docs/accuracy.md (a quarter of an hour)
 accuracy: .venv/demo.stamp
@@ -67,6 +71,11 @@ clean:
 .venv/bench.stamp: .venv/demo.stamp
 	@echo "Installing the peers into .venv ..." >&2
 	@$(PIP) --editable '.[wheels,bench]'
+	@touch $@
+
+.venv/docs.stamp: .venv/demo.stamp
+	@echo "Installing mkdocs into .venv ..." >&2
+	@$(PIP) --editable '.[wheels,docs]'
 	@touch $@
 
 .venv/test.stamp: .venv/demo.stamp

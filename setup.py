@@ -32,6 +32,7 @@ setup(
         "rich>=13",
         "matplotlib>=3.6",
         "aiohttp>=3.9",
+        "shtab>=1.7",
     ],
     extras_require={
         # On a ROS 2 machine rclpy and the messages come from apt; these wheels stand in elsewhere.
@@ -44,6 +45,8 @@ setup(
             "pytest-xdist",
             "hypothesis",
             "mcap-ros2-support",
+            "mkdocs-material>=9.5",
+            "pymavlink>=2.4.40",
             "ruff",
             "mypy",
             "types-PyYAML",
@@ -51,6 +54,10 @@ setup(
         "bench": ["padasip>=1.2"],
         # `rov-ident dashboard --foxglove`
         "foxglove": ["foxglove-sdk>=0.14"],
+        # `make docs`
+        "docs": ["mkdocs>=1.6", "mkdocs-material>=9.5"],
+        # `rov-ident import` of ArduSub's logs
+        "ardupilot": ["pymavlink>=2.4.40"],
         # `rov-ident fit --dask`
         "dask": ["distributed>=2024.1"],
     },

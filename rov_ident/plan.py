@@ -59,6 +59,7 @@ class Proposal:
     others: tuple[tuple[str, float], ...]
     """Every candidate's name and the relative standard deviation of its worst coefficient."""
     left_out: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = ()
 
     @property
     def sentence(self) -> str:
@@ -134,7 +135,7 @@ def propose(
     others = [(c.swing.name, s) for c, s in zip(candidates, scores, strict=True)]
     return Proposal(
         candidates[best], worst, before, after, tuple(sorted(others, key=lambda o: o[1])),
-        tuple(left_out),
+        tuple(left_out), tuple(candidates),
     )  # fmt: skip
 
 

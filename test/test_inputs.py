@@ -1,5 +1,8 @@
 """The same dive in every form that vehicles publish it in: the same estimate."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from conftest import HEAVY, Vehicle, end_node, start_node
@@ -19,6 +22,7 @@ from std_msgs.msg import (
     MultiArrayDimension,
     UInt16MultiArray,
 )
+from test_bags import write_mcap
 
 from rov_ident import cdr, config, inputs, t200, thrusters
 from rov_ident.bags import Bag, BagWriter
@@ -32,6 +36,7 @@ from rov_ident.recording import write_messages
 from rov_ident.records import read_record
 from rov_ident.samples import ODOMETRY, WRENCH
 
+DATA = Path(os.environ.get("ROV_IDENT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 C = 0.7071067811865476
 POSITION = [
     [0.156, 0.111, 0.085], [0.156, -0.111, 0.085], [-0.156, 0.111, 0.085],
@@ -204,20 +209,14 @@ def test_stamped_forces_and_channels(tmp_path, by_pulses, reference):
     path = write(tmp_path / "forces.mcap", replaced(messages, WRENCH, forces))
     assert_same(estimate(path, with_wrench("sensor_msgs/JointState")), reference, 1e-9)
 
-    with pytest.raises(UserError, match="is not a message type"):
-        write(tmp_path / "channels.mcap", replaced(messages, WRENCH, channels))
+    # By another writer: ours knows only the types of ROS itself.
+    rows = [
+        (topic, full(type_name), arrival, data if isinstance(data, bytes) else b"")
+        for arrival, topic, type_name, data in replaced(messages, WRENCH, channels)
+    ]
+    path = write_mcap(tmp_path / "channels.mcap", rows)
     settings = with_wrench("mavros_msgs/RCOut", **{"thrusters.channels": order})
-    reader = inputs.Reader(settings)
-    online = OnlineEstimator(settings, "rls")
-    for arrival, role, message in messages:
-        data = cdr.encode(message)
-        if role == WRENCH:
-            ((_, _, data),) = channels(message)
-        for own, taken in reader.read(role, data, arrival):
-            online.push(own, taken)
-    online.flush()
-    assert_same(online.report(), reference)
-    assert not reader.counts
+    assert_same(estimate(path, settings), reference)
 
 
 def test_axes_of_the_file_turn_the_thrusters(matrix):
@@ -271,6 +270,20 @@ def test_the_curve_has_the_published_values():
     at_14 = thrusters.t200(14.0) / t200.KILOGRAM_FORCE
     assert at_14[0] == pytest.approx(-3.52, rel=0.015)
     assert at_14[-1] == pytest.approx(4.52, rel=0.015)
+
+
+def test_the_curve_against_the_whole_sheets():
+    """The maker's measurement, every 4 us; the table in the code has a tenth of it."""
+    path = DATA / "t200" / "t200_bollard.csv"
+    if not path.exists():
+        pytest.skip("the measured curves of the T200 are not here")
+    rows = np.loadtxt(path, delimiter=",", skiprows=2)
+    for voltage, rms, largest in ((10, 0.35, 1.4), (12, 0.35, 1.4), (14, 0.35, 1.4),
+                                  (16, 0.35, 1.4), (18, 1.2, 3.1)):  # fmt: skip
+        sheet = rows[rows[:, 0] == voltage]
+        off = thrusters.t200(voltage)[sheet[:, 1].astype(int) - 1100] - sheet[:, 3]
+        assert np.sqrt(np.mean(off**2)) < rms
+        assert np.abs(off).max() < largest
 
 
 @pytest.mark.parametrize("voltage", [9.9, 24.0, float("nan")])

@@ -57,7 +57,7 @@ def add(commands: Commands) -> None:
 def _import(options: argparse.Namespace) -> None:
     from rov_ident import ardupilot
 
-    check_outputs([options.out], [*options.log, options.config])
+    check_outputs([options.out, options.json], [*options.log, options.config])
     if any(path.suffix.lower() in ardupilot.SUFFIXES for path in options.log):
         _import_ardupilot(options)
     else:

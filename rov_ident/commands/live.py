@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rov_ident import config as configuration
-from rov_ident.commands.common import ERR, OUT, Commands, port, positive
+from rov_ident.commands.common import CONFIG, ERR, OUT, Commands, port, positive
 from rov_ident.errors import UserError
 
 
@@ -39,7 +39,7 @@ def add(commands: Commands) -> None:
     layouts = commands.add_parser(
         "layouts", help="layouts of this vehicle's topics for Foxglove and PlotJuggler"
     )
-    layouts.add_argument("--config", required=True, type=Path)
+    layouts.add_argument("--config", required=True, type=Path, help=CONFIG)
     layouts.add_argument("--namespace", default="", help="of the nodes (none)")
     layouts.add_argument(
         "--out", required=True, type=Path, metavar="DIR",

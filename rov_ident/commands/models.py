@@ -39,7 +39,7 @@ def _export(options: argparse.Namespace) -> None:
     from rov_ident.fit import write_text
     from rov_ident.formats import export
 
-    check_outputs([options.out], [options.config])
+    check_outputs([options.out, options.json], [options.config])
     written = export(configuration.load(options.config), options.format)
     write_text(options.out, written.content)
     for what in written.lost:
@@ -51,7 +51,7 @@ def _export(options: argparse.Namespace) -> None:
 def _import_model(options: argparse.Namespace) -> None:
     from rov_ident.formats import import_model
 
-    check_outputs([options.out], [options.file, options.config])
+    check_outputs([options.out, options.json], [options.file, options.config])
     base = configuration.load(options.config) if options.config else None
     config, notes = import_model(options.file, base)
     configuration.dump(config, options.out, comment=f"From {options.file.name}.")

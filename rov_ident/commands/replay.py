@@ -10,6 +10,7 @@ from rov_ident.commands.common import (
     OUT,
     Commands,
     bag_and_config,
+    check_outputs,
     json_option,
     new_table,
     progress,
@@ -39,6 +40,7 @@ def add(commands: Commands) -> None:
 def _replay(options: argparse.Namespace) -> None:
     from rov_ident.nodes.replay import replay
 
+    check_outputs([options.json], [options.bag, options.config])
     estimators = options.estimator or LIVE
     with progress(options) as tell:
         tell("starting the nodes")

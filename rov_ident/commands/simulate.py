@@ -59,7 +59,7 @@ def add(commands: Commands) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    check_outputs([options.out], [options.bag, options.config])
+    check_outputs([options.out, options.json], [options.bag, options.config])
     config = configuration.load(options.config)
     if options.bag:
         _compare(config, options)

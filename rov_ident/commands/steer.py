@@ -54,7 +54,7 @@ def _steer(options: argparse.Namespace) -> None:
     from rov_ident import autopilot
     from rov_ident.fit import write_text
 
-    check_outputs([options.out], [options.config])
+    check_outputs([options.out, options.json], [options.config])
     if not abs(options.angle) <= 180.0:
         raise UserError(f"--angle {options.angle:g}: give degrees from -180 to 180")
     run = autopilot.manoeuvre(

@@ -1,0 +1,95 @@
+"""The documentation: every command in it runs, every link of the site leads somewhere."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from test_inputs import configured
+
+from rov_ident import config
+from rov_ident.cli import _commands, _parser
+from rov_ident.effects import EFFECTS
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+
+
+def blocks(path, language):
+    """The fenced blocks of a page in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.M | re.S)
+
+
+@pytest.mark.parametrize("name", ["tutorial.md", "tutorial-own-bag.md"])
+def test_every_command_of_a_tutorial_runs(tmp_path, name):
+    """One after the other, as a reader does, where the shipped files are at hand."""
+    for folder in ("bags", "config"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    program = tmp_path / "bin" / "rov-ident"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m rov_ident.cli "$@"\n')
+    program.chmod(0o755)
+    environment = {
+        **os.environ,
+        "PATH": f"{program.parent}:{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+    }
+    commands = blocks(DOCS / name, "sh")
+    assert len(commands) >= 6
+    for command in commands:
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", command],
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        if "R2" in done.stdout and "fitted" in command:
+            scores = [float(x) for x in re.findall(r"│ [uvwpqr] │\s+([\d.-]+) │", done.stdout)]
+            assert min(scores[-6:]) > 0.97
+
+
+def test_every_option_that_is_written_of_exists():
+    """In the fenced blocks and tables of all pages and the README, tested or not."""
+    known = {name: command.format_help() for name, command in _commands(_parser()).items()}
+    for path in [*PAGES, ROOT / "README.md"]:
+        for line in re.findall(r"rov-ident ([^`\n]+)", path.read_text()):
+            name = line.split()[0]
+            if name not in known:
+                assert name in ("COMMAND", "--help") or not line.startswith("-"), f"{path}: {line}"
+                continue
+            for option in re.findall(r"(?<!\S)(--[a-z][a-z-]*)", line):
+                assert option in known[name], f"{path.name}: rov-ident {name} has no {option}"
+
+
+@pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md"], ids=lambda p: p.name)
+def test_the_configurations_in_the_pages_are_read(path):
+    """A block of YAML is a whole parameter file, or settings that go into one."""
+    for text in blocks(path, "yaml"):
+        settings = yaml.safe_load(text) or {}
+        if "/**" in settings:
+            config.from_parameters(settings["/**"]["ros__parameters"])
+        elif set(settings) <= {p.key.split(".")[0] for p in config.PARAMETERS}:
+            configured(**settings)
+
+
+def test_the_site_is_built(tmp_path):
+    """Strictly: a link to nowhere is an error. Every effect and command has its place."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    for name, effect in EFFECTS.items():
+        page = (tmp_path / "effects" / f"{name}.html").read_text()
+        for parameter in effect.parameters:
+            assert f"<code>{parameter.name}</code>" in page
+    commands = (tmp_path / "reference" / "commands.html").read_text()
+    for name in _commands(_parser()):
+        assert f'id="{name}"' in commands
+    keys = (tmp_path / "reference" / "parameters.html").read_text()
+    for p in config.VEHICLE_PARAMETERS + config.PARAMETERS:
+        assert f"<code>{p.key}</code>" in keys
