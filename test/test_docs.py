@@ -1,5 +1,6 @@
 """The documentation: every command in it runs, every link of the site leads somewhere."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -13,6 +14,7 @@ from test_inputs import configured
 from rov_ident import config
 from rov_ident.cli import _commands, _parser
 from rov_ident.effects import EFFECTS
+from rov_ident.inputs import _CHOICES
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -73,6 +75,15 @@ def test_the_configurations_in_the_pages_are_read(path):
             config.from_parameters(settings["/**"]["ros__parameters"])
         elif set(settings) <= {p.key.split(".")[0] for p in config.PARAMETERS}:
             configured(**settings)
+
+
+def test_the_guide_to_inputs_names_every_type():
+    """In full, or after another of its package: `std_msgs/A`, `B`."""
+    text = (DOCS / "inputs.md").read_text()
+    for type_name in (*config.ODOMETRY_TYPES, *_CHOICES["wrench"]):
+        assert type_name in text or f"`{type_name.partition('/')[2]}`" in text
+    for key in (f"`{p.name}`" for p in dataclasses.fields(config.Thrusters)):
+        assert key in text or key.strip("`") + ":" in text
 
 
 def test_the_site_is_built(tmp_path):
