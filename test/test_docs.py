@@ -26,6 +26,7 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.M | re.S)
 
 
+@pytest.mark.timeout(600)  # the first use of anything compiles it
 @pytest.mark.parametrize("name", ["tutorial.md", "tutorial-own-bag.md"])
 def test_every_command_of_a_tutorial_runs(tmp_path, name):
     """One after the other, as a reader does, where the shipped files are at hand."""
@@ -45,7 +46,7 @@ def test_every_command_of_a_tutorial_runs(tmp_path, name):
     for command in commands:
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", command],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240,
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=400,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         if "R2" in done.stdout and "fitted" in command:
