@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rov_ident import cdr
 from rov_ident.bags import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.config import (
@@ -38,6 +40,7 @@ ODOMETRY, IMU, WRENCH, POSE = "odom", "imu", "wrench", "pose"
 _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
 _HELD = 1000  # poses and twists that wait for each other
+_NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
 _FRAME = "base_link"  # of a wrench that comes without a frame: the axes are those of frames.body
 
 _DECODERS: dict[str, Callable[[bytes], Any]] = {
@@ -166,6 +169,9 @@ class Reader:
             if pose is None:
                 self.counts["odom: a twist without a pose around it"] += 1
                 continue
+            variance = twist.variance
+            if not twist.angular.any():  # a velocity log (DVL) that has no rates to say
+                variance = np.concatenate([variance[:3], _NOT_MEASURED])
             odometry = Odometry(
                 twist.stamp,
                 pose.frame_id,
@@ -174,7 +180,7 @@ class Reader:
                 pose.orientation,
                 twist.linear,
                 twist.angular,
-                twist.variance,
+                variance,
             )
             done.append((ODOMETRY, odometry))
         return done

@@ -391,6 +391,29 @@ def test_a_pose_at_other_times_is_interpolated(tmp_path, heavy):
         assert off < 0.0125
 
 
+def test_a_velocity_log_has_no_rates(tmp_path, short_dive):
+    """Zeros in the angular part of a twist are no measurement: the IMU's rates serve, unbiased."""
+    silent = [
+        (a, r, m._replace(angular=np.zeros(3), twist_variance=np.zeros(6)) if r == ODOMETRY else m)
+        for a, r, m in short_dive
+    ]
+    marked = [
+        (a, r, m._replace(twist_variance=np.repeat([0.0, 1e6], 3)) if r == ODOMETRY else m)
+        for a, r, m in silent
+    ]
+    write_messages(tmp_path / "marked.mcap", marked)
+    rows = replaced(silent, ODOMETRY, lambda m: twist_and_pose("plain", m))
+    found = estimate(write(tmp_path / "dvl.mcap", rows), with_twist("plain"))
+    assert_same(found, estimate(tmp_path / "marked.mcap", config.load(HEAVY)))
+    whole = [
+        (a, r, m._replace(twist_variance=np.zeros(6)) if r == ODOMETRY else m)
+        for a, r, m in short_dive
+    ]
+    write_messages(tmp_path / "whole.mcap", whole)
+    usual = estimate(tmp_path / "whole.mcap", config.load(HEAVY))
+    assert np.all(np.abs(found.values - usual.values) < 3.0 * usual.std)
+
+
 def test_twists_without_poses_are_told(tmp_path, short_dive):
     rows = list(replaced(short_dive, ODOMETRY, lambda m: twist_and_pose("plain", m)))
     rows = [r for r in rows if r[1] != "/pose" or r[0] < 3_000_000_000]
