@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rov_ident import cdr
 from rov_ident.bags import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.config import (
@@ -35,8 +37,10 @@ from rov_ident.thrusters import Allocator
 
 ODOMETRY, IMU, WRENCH, POSE = "odom", "imu", "wrench", "pose"
 
+_STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
 _HELD = 1000  # poses and twists that wait for each other
+_NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
 _FRAME = "base_link"  # of a wrench that comes without a frame: the axes are those of frames.body
 
 _DECODERS: dict[str, Callable[[bytes], Any]] = {
@@ -90,7 +94,8 @@ def _wrench_topic(type_name: str) -> str:
 class Reader:
     """Bytes of the configured topics into messages of the core, axes as on the wire.
 
-    ``counts`` holds, by role and reason, what could not be used.
+    ``counts`` holds, by role and reason, what could not be used. ``on_arrival`` tells whether the
+    thrust comes without a stamp.
     """
 
     def __init__(self, config: Config) -> None:
@@ -98,6 +103,7 @@ class Reader:
         self._frames = config.frames
         self._is_twist = config.inputs.is_twist
         self._types = {role: source.type_name for role, source in sources(config.inputs).items()}
+        self.on_arrival = config.inputs.wrench not in _STAMPED
         self._allocator = None
         if config.inputs.is_allocated:
             signal = thruster_signal(config.inputs, config.thrusters)
@@ -127,17 +133,17 @@ class Reader:
 
     def _wrench(self, message: Wrench | Commands, arrival: int) -> list[tuple[str, Message]]:
         if isinstance(message, Wrench):
-            if not self._types[WRENCH].endswith("Stamped"):
+            if self.on_arrival:
                 message = message._replace(stamp=arrival, frame_id=_FRAME)
             return [(WRENCH, message)]
         assert self._allocator is not None
-        stamped = self._types[WRENCH] in ("sensor_msgs/JointState", "mavros_msgs/RCOut")
         try:
             tau = self._allocator.wrench(message.values)
         except ValueError as reason:
             self.counts[f"{WRENCH}: {reason}"] += 1
             return []
-        wrench = Wrench(message.stamp if stamped else arrival, _FRAME, tau[:3], tau[3:])
+        stamp = arrival if self.on_arrival else message.stamp
+        wrench = Wrench(stamp, _FRAME, tau[:3], tau[3:])
         return [(WRENCH, from_core(wrench, self._frames.body, self._frames.world))]
 
     # -------------------------------------------------------------- twist and pose
@@ -163,6 +169,9 @@ class Reader:
             if pose is None:
                 self.counts["odom: a twist without a pose around it"] += 1
                 continue
+            variance = twist.variance
+            if not twist.angular.any():  # a velocity log (DVL) that has no rates to say
+                variance = np.concatenate([variance[:3], _NOT_MEASURED])
             odometry = Odometry(
                 twist.stamp,
                 pose.frame_id,
@@ -171,7 +180,7 @@ class Reader:
                 pose.orientation,
                 twist.linear,
                 twist.angular,
-                twist.variance,
+                variance,
             )
             done.append((ODOMETRY, odometry))
         return done

@@ -708,8 +708,10 @@ def fuse(
     r_angular = (variance[3] + variance[4] + variance[5]) / 3.0
 
     # What is marked as unknown is not used, unless the gyro knows it.
-    has_velocity = has_odometry
+    has_velocity, has_rates = has_odometry, has_odometry
     for i in range(3):
+        if _UNKNOWN <= odometry[13 + i] < np.inf:
+            has_rates = False
         if _UNKNOWN <= odometry[10 + i] < np.inf:
             has_velocity = False
         if _UNKNOWN <= odometry[13 + i] < np.inf and not has_imu:
@@ -871,7 +873,7 @@ def fuse(
             total = k.gyro_bias_variance + r_angular + gyro_variance
             gain, angle_gain = k.gyro_bias_variance / total, k.attitude_bias / total
             # the gyro at the instant of the odometry; without a past it cannot be known
-            if k.inertial and dt > 0.0 and r_angular < _UNKNOWN:
+            if k.inertial and dt > 0.0 and has_rates:
                 change, surprise = np.empty(3), 0.0
                 for i in range(3):
                     then = rate[i] + min(shift / dt, 1.0) * (k.rate[i] - rate[i])

@@ -1,5 +1,6 @@
 """The documentation: every command in it runs, every link of the site leads somewhere."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -13,6 +14,7 @@ from test_inputs import configured
 from rov_ident import config
 from rov_ident.cli import _commands, _parser
 from rov_ident.effects import EFFECTS
+from rov_ident.inputs import _CHOICES
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -24,6 +26,7 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.M | re.S)
 
 
+@pytest.mark.timeout(600)  # the first use of anything compiles it
 @pytest.mark.parametrize("name", ["tutorial.md", "tutorial-own-bag.md"])
 def test_every_command_of_a_tutorial_runs(tmp_path, name):
     """One after the other, as a reader does, where the shipped files are at hand."""
@@ -43,7 +46,7 @@ def test_every_command_of_a_tutorial_runs(tmp_path, name):
     for command in commands:
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", command],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240,
+            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=400,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         if "R2" in done.stdout and "fitted" in command:
@@ -73,6 +76,15 @@ def test_the_configurations_in_the_pages_are_read(path):
             config.from_parameters(settings["/**"]["ros__parameters"])
         elif set(settings) <= {p.key.split(".")[0] for p in config.PARAMETERS}:
             configured(**settings)
+
+
+def test_the_guide_to_inputs_names_every_type():
+    """In full, or after another of its package: `std_msgs/A`, `B`."""
+    text = (DOCS / "inputs.md").read_text()
+    for type_name in (*config.ODOMETRY_TYPES, *_CHOICES["wrench"]):
+        assert type_name in text or f"`{type_name.partition('/')[2]}`" in text
+    for key in (f"`{p.name}`" for p in dataclasses.fields(config.Thrusters)):
+        assert key in text or key.strip("`") + ":" in text
 
 
 def test_the_site_is_built(tmp_path):

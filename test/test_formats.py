@@ -259,7 +259,7 @@ def test_the_matrices_of_mss_make_the_same_wrench(coupled):
         ("a: 1", "hydrodynamics"),
         ("hydrodynamics: {mass: 3}", "hydrodynamics.weight is missing"),
         ("<a", "not valid XML"),
-        ("<robot name='x'/>", "gz sdf -p"),
+        ("<robot name='x'/>", "a robot has one root"),
         ("<!DOCTYPE x><sdf/>", "entities"),
         (STOCK.format("<xU>two</xU>"), "must be numbers"),
         (STOCK.replace("<mass>10</mass>", "").format(""), "mass"),

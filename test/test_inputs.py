@@ -27,14 +27,14 @@ from test_bags import write_mcap
 from rov_ident import cdr, config, inputs, t200, thrusters
 from rov_ident.bags import Bag, BagWriter
 from rov_ident.errors import UserError
-from rov_ident.frames import from_core, to_core
-from rov_ident.messages import Wrench
+from rov_ident.frames import from_core, quaternion_from_euler, to_core
+from rov_ident.messages import Imu, Odometry, Wrench
 from rov_ident.nodes.conversions import to_time
 from rov_ident.nodes.replay import replay
 from rov_ident.online import OnlineEstimator
 from rov_ident.recording import write_messages
 from rov_ident.records import read_record
-from rov_ident.samples import ODOMETRY, WRENCH
+from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler, joined
 
 DATA = Path(os.environ.get("ROV_IDENT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 C = 0.7071067811865476
@@ -389,6 +389,51 @@ def test_a_pose_at_other_times_is_interpolated(tmp_path, heavy):
         np.testing.assert_allclose(odometry.position, message.position, atol=5e-3)
         off = 2.0 * np.arccos(min(1.0, abs(odometry.orientation @ message.orientation)))
         assert off < 0.0125
+
+
+def test_a_velocity_log_has_no_rates(tmp_path, short_dive):
+    """Zeros in the angular part of a twist are no measurement: the IMU's rates serve, unbiased."""
+    silent = [
+        (a, r, m._replace(angular=np.zeros(3), twist_variance=np.zeros(6)) if r == ODOMETRY else m)
+        for a, r, m in short_dive
+    ]
+    marked = [
+        (a, r, m._replace(twist_variance=np.repeat([0.0, 1e6], 3)) if r == ODOMETRY else m)
+        for a, r, m in silent
+    ]
+    write_messages(tmp_path / "marked.mcap", marked)
+    rows = replaced(silent, ODOMETRY, lambda m: twist_and_pose("plain", m))
+    found = estimate(write(tmp_path / "dvl.mcap", rows), with_twist("plain"))
+    assert_same(found, estimate(tmp_path / "marked.mcap", config.load(HEAVY)))
+    whole = [
+        (a, r, m._replace(twist_variance=np.zeros(6)) if r == ODOMETRY else m)
+        for a, r, m in short_dive
+    ]
+    write_messages(tmp_path / "whole.mcap", whole)
+    usual = estimate(tmp_path / "whole.mcap", config.load(HEAVY))
+    assert np.all(np.abs(found.values - usual.values) < 3.0 * usual.std)
+
+
+def test_rates_that_are_not_measured_say_nothing_of_the_gyro(heavy):
+    """A slow turn, which zeros of a velocity log would have for a bias of the gyro."""
+    sampler = Sampler(heavy)
+    zero, rate = np.zeros(3), 0.02
+    parts = []
+    for k in range(1, 1001):
+        stamp = k * 10_000_000
+        sampler.push(WRENCH, Wrench(stamp, "base_link_frd", zero, zero))
+        force = np.array([0.0, 0.0, -heavy.gravity])
+        gyro = np.array([0.0, 0.0, rate])
+        imu = Imu(stamp, "imu_frd", np.zeros(4), gyro, force, zero, zero)
+        parts.append(sampler.push(IMU, imu))
+        if k % 5 == 0:
+            q = quaternion_from_euler(0.0, 0.0, rate * 1e-9 * stamp)
+            variance = np.repeat([0.0, 1e6], 3)
+            odometry = Odometry(stamp, "w_ned", "base_link_frd", zero, q, zero, zero, variance)
+            parts.append(sampler.push(ODOMETRY, odometry))
+    samples = joined([part for part in parts if len(part)])
+    # To a tenth of the noise of the gyro.
+    np.testing.assert_allclose(samples["nu"][-100:, 5], rate, atol=3e-4)
 
 
 def test_twists_without_poses_are_told(tmp_path, short_dive):

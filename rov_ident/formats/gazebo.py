@@ -141,8 +141,7 @@ def read(text: str) -> Read:
             if "hydrodynamics" in plugin.get("name", "").lower() + plugin.get("filename", ""):
                 return _read(root, model, plugin)
     raise UserError(
-        "has no model with the plugin gz::sim::systems::Hydrodynamics (URDF and xacro files must "
-        "be turned into SDFormat first: `gz sdf -p FILE`)"
+        "has no model with the plugin gz::sim::systems::Hydrodynamics: give the file that has it"
     )
 
 

@@ -183,7 +183,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _receive(self, source: str, data: bytes) -> None:
         self._received[source] += 1
         self._silence[source] = 0.0
-        arrival = self.get_clock().now().nanoseconds
+        arrival = self.get_clock().now().nanoseconds if self._reader.on_arrival else 0
         for role, message in self._reader.read(source, data, arrival):
             info = self._online.push(role, message)
             # The sampler keeps to the frame of the first message that it takes.
