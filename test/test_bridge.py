@@ -256,6 +256,12 @@ def test_approval_and_revert(start):
     assert not answer.success and "too much" in answer.message
     assert one.held() == [-13.0, -140.0]
 
+    # What converged beside something of the controller's own that no hull has.
+    assert one.set("controller", hydrodynamics__X_u=5.0).successful
+    one.says = {"X_u": (-14.0, Level.WARN), "X_uu": (-150.0, Level.OK)}
+    one.hears("together with what the controller has: coefficients.X_u is 5.0")
+    assert one.set("controller", hydrodynamics__X_u=-13.0).successful
+
     # Only what is converged goes, and nothing that is old.
     one.says = {"X_u": (-14.0, Level.OK), "X_uu": (-150.0, Level.WARN)}
     one.until(lambda: one.pending and set(one.pending[-1]) == {"X_u"})
