@@ -153,7 +153,11 @@ class Search:
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.rss)
-        worth = [f for f in fits if self.worth(now, f, closest) >= SURE and self.held(now, f)]
+        worth = [
+            f
+            for f in fits
+            if self.worth(now, f, closest) >= asked(self.newest(now, f)) and self.held(now, f)
+        ]
         plain = [f for f in worth if self.newest(now, f) in PLAIN]
         return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
 
@@ -237,7 +241,12 @@ class Search:
 
     def rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
         """What else might explain what ``name`` explains: fits by the name of the rival."""
-        candidates = [c for c in self.screen(rest) if c.name != name]
+        candidates = [
+            c
+            for c in self.screen(rest)
+            if c.name != name
+            and (not self._early(c.name, rest.hypothesis) or EFFECTS[c.name].beyond == name)
+        ]
         firm = any(c.firm and c.promise > 0.0 for c in candidates)
         candidates = [c for c in candidates if c.firm or not firm]
         fits = {self.newest(rest, f): f for f in self.fit_best(rest, candidates)}
@@ -590,6 +599,11 @@ class Search:
             self.evidence.patterns[key] = force[:, :, i]
 
 
+def asked(name: str) -> float:
+    """What an effect must take off the cost: less where every vehicle has it."""
+    return 0.0 if name in PLAIN else SURE
+
+
 def _choice(tried: Sequence[Pattern]) -> float:
     """What the best of so many must explain more than one that was meant from the outset."""
     return 2.0 * float(np.log(max(len(tried), 1)))
@@ -614,6 +628,15 @@ def group_of(key: Key) -> str:
     if section != COEFFICIENTS:
         return section
     return next((e.name for e in EFFECTS.values() if name in e.coefficients), "coupled_damping")
+
+
+def foretold(fitted: Fitted) -> Array:
+    """Squared residuals (6,) by axis, each window's foretold from all the others; its onsets are
+    taken as known."""
+    dates = onsets(fitted.hypothesis)
+    at = fitted.linear.index(k for k in fitted.linear.keys if k not in dates)
+    total: Array = fitted.look.foretold(at).sum(axis=0)
+    return total
 
 
 def covariance(final: Fitted) -> Array:

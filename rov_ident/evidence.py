@@ -163,6 +163,13 @@ class Look:
             moves[w] = np.linalg.solve(rest, gradient[w] / size) / size
         return moves
 
+    def foretold(self, at: Indices) -> Array:
+        """Squared residuals (W, 6) of each window, by axis, as foretold from all the others."""
+        moves = self.left_out(at)
+        window = np.repeat(np.arange(len(moves)), np.diff([*self.first, len(self.columns)]))
+        error = self.error + np.einsum("rp,rp->r", self.columns[:, at], moves[window])
+        return np.add.reduceat(error.reshape(-1, 6) ** 2, self._rows)
+
     def starts_after(self, change: Array) -> Array:
         """The starts (W, 6) that suit a change (P,) of the parameters."""
         moves = [

@@ -13,7 +13,7 @@ from rov_ident import config as configuration
 from rov_ident import kinematics
 from rov_ident.coefficients import AXES, VELOCITIES, parse
 from rov_ident.config import Config
-from rov_ident.discrepancy import Search, Trial, Trials, covariance, pinned
+from rov_ident.discrepancy import Search, Trial, Trials, asked, covariance, foretold, pinned
 from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
 from rov_ident.evidence import Evidence, Fitted, within
@@ -471,7 +471,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
 def _certain(search: Search, last: Fitted, name: str) -> bool:
     """Whether all of the data tell an effect from nothing as surely as it takes to join a model."""
     rest = last.look.evidence.fit(last.hypothesis.without(search.keys_of(last, name)), last.look)
-    return rest is None or search.worth(rest, last, last) >= SURE
+    return rest is None or search.worth(rest, last, last) >= asked(name)
 
 
 def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
@@ -559,14 +559,17 @@ _MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll", "pitch", "yaw
 
 
 def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:
-    """What the patterns in a model say: where something is left that has no name."""
+    """What the patterns in a model say: where something is left that has no name.
+
+    The share is foretold: each window's, with the parameters that the others give.
+    """
     found = []
     for name, trial in trials.items():
         if not name.startswith(UNKNOWN):
             continue
         axis, depends_on, frequency = name.removeprefix(f"{UNKNOWN} ").split("|")
         i = AXES.index(axis)
-        before, after = (np.sum(f.look.clean()[:, i] ** 2) for f in (trial.rest, final))
+        before, after = (foretold(f)[i] for f in (trial.rest, final))
         share = float(1.0 - after / before)
         if share >= _WORTH:
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
