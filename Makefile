@@ -1,6 +1,7 @@
 # Everything runs in .venv, built here on first use; again when setup.py changes.
 PYTHON ?= python3
 BIN := .venv/bin
+VERSION := $(shell $(PYTHON) -c 'import sys; print("py%d%d" % sys.version_info[:2])')
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pep517
 
 # A shell that has sourced a ROS workspace, or runs inside another venv, must not leak into .venv.
@@ -47,20 +48,24 @@ torture: .venv/test.stamp
 	$(BIN)/python bench/torture_live.py
 
 ## known faults of the dependencies, and suspicious places in the source; needs the network
-audit:
-	@$(PYTHON) -m venv .venv/audit
-	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check bandit pip-audit
+audit: .venv/audit.stamp
 	.venv/audit/bin/bandit --quiet --configfile pyproject.toml --recursive rov_ident
-	.venv/audit/bin/pip-audit --strict --disable-pip --no-deps --requirement $(LOCK)
+	.venv/audit/bin/pip-audit --strict --disable-pip --no-deps --requirement requirements/test-$(VERSION).txt
 
-## the versions and hashes of all that `make demo` and `make test` install, anew, for this Python
-lock:
-	@$(PYTHON) -m venv .venv/audit
-	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check pip-tools
+## the versions and hashes of what `make demo` and `make test` install, anew, for this Python
+lock: .venv/audit.stamp
 	@mkdir -p requirements
-	.venv/audit/bin/pip-compile --quiet --no-header --generate-hashes --allow-unsafe --strip-extras \
-	  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host \
-	  --extra wheels --extra test --output-file $(LOCK) setup.py
+	$(COMPILE) --extra wheels --extra test --output-file requirements/test-$(VERSION).txt setup.py
+	$(COMPILE) --extra wheels --constraint requirements/test-$(VERSION).txt \
+	  --output-file requirements/demo-$(VERSION).txt setup.py
+
+COMPILE := .venv/audit/bin/pip-compile --quiet --no-header --generate-hashes --allow-unsafe --upgrade \
+  --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
+
+.venv/audit.stamp:
+	@$(PYTHON) -m venv .venv/audit
+	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check bandit pip-audit pip-tools
+	@touch $@
 
 ## how often explain finds what is hidden, the tables of docs/explain-bench.md (many hours; it may be
 ## stopped and goes on where it was)
@@ -78,11 +83,20 @@ picture: .venv/demo.stamp
 clean:
 	rm -rf .venv build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 
+# Locked versions, with their hashes, where there is a lock for this Python; else what setup.py allows.
+define install
+if [ -f requirements/$(1)-$(VERSION).txt ]; then \
+  $(PIP) --require-hashes --requirement requirements/$(1)-$(VERSION).txt && \
+  $(PIP) --no-deps --no-build-isolation --editable .; \
+else $(PIP) --editable '.[$(2)$(if $(3),$(comma)$(3))]'; fi
+endef
+comma := ,
+
 # The stamps are written last: an interrupted installation is taken up again.
 .venv/demo.stamp: setup.py
 	@echo "Installing rov_ident into .venv (about a minute, 1 GB) ..." >&2
 	@$(PYTHON) -m venv .venv
-	@$(PIP) --editable '.[wheels]'
+	@$(call install,demo,wheels)
 	@touch $@
 
 .venv/bench.stamp: .venv/demo.stamp
@@ -97,5 +111,5 @@ clean:
 
 .venv/test.stamp: .venv/demo.stamp
 	@echo "Installing the test tools into .venv ..." >&2
-	@$(PIP) --editable '.[wheels,test]'
+	@$(call install,test,wheels,test)
 	@touch $@

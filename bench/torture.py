@@ -269,7 +269,8 @@ TEXTS = ("", "map", "rov/map", "base_link_ned", "x" * 300, "\0", "\n\x1b[31m", "
 
 # Counted besides the message that brought it about.
 NOT_OF_A_MESSAGE = (
-    " gap, odometry alone", " velocity repeated", " outlier, or marked as not measured",
+    " gap, odometry alone",
+    " outlier between its neighbours", " velocity repeated", " outlier, or marked as not measured",
 )  # fmt: skip
 
 

@@ -471,8 +471,9 @@ def _declared(section: type, prefix: str = "") -> tuple[Parameter, ...]:
     for item in dataclasses.fields(section):
         if item.metadata:
             parameters.append(Parameter(key=prefix + item.name, type=item.type, **item.metadata))
-        elif isinstance(item.type, type) and item.default is not dataclasses.MISSING:
-            parameters.extend(_declared(item.type, f"{prefix}{item.name}."))
+        elif dataclasses.is_dataclass(item.type) and item.default is not dataclasses.MISSING:
+            inner: Any = item.type
+            parameters.extend(_declared(inner, f"{prefix}{item.name}."))
     return tuple(parameters)
 
 

@@ -757,6 +757,7 @@ def _update(task, state, work, sample, side, info):
         wild = wild or info.ratio[i] > _WILD**2
         if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
             interrupt(state.adaptation[i])
+            c.surprise[i] += min(since / _SURPRISE_TIME, 1.0) * (1.0 - c.surprise[i])
             continue
         blend = min(since / _SURPRISE_TIME, 1.0)
         c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])

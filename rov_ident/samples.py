@@ -199,6 +199,7 @@ class Sampler:
             WRENCH: deque(),
         }
         self._newest: dict[str, float] = {}
+        self._before_newest: dict[str, float] = {}
         self._first = math.nan
         self._previous = math.nan  # time of the last sample
         self._seen_imu = -math.inf
@@ -282,6 +283,7 @@ class Sampler:
         if math.isnan(self._first):
             self._first = t
         self.counts[role] += 1
+        self._before_newest[role] = self._newest.get(role, t)
         self._newest[role] = t
         if isinstance(message, Odometry):
             message = self._marked(message)
@@ -407,8 +409,7 @@ class Sampler:
         here = _numbers(queue[0][1])
         if before is not None and len(queue) > 1:
             after = _numbers(queue[1][1])
-            # the one after that, as outliers may come in pairs; a wrench is not waited for so long
-            last = _numbers(queue[2][1]) if role == IMU and len(queue) > 2 else after
+            last = _numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
             scatter, floor = self._scatter[role], self._floors[role]
             if is_lone(before, here, after, last, scatter, floor, _LONE):
                 queue.popleft()
@@ -423,7 +424,8 @@ class Sampler:
             return True
         grace = max(self._grace, self._late)
         for role in (ODOMETRY, IMU, WRENCH):
-            newest = self._newest.get(role)
+            # of demands one more, which tells with the others whether one is an outlier
+            newest = (self._before_newest if role == WRENCH else self._newest).get(role)
             if newest is None:
                 if t - self._first <= grace:
                     return False

@@ -699,9 +699,11 @@ def _update(task, state, work, sample, side, out):
         if c.refused > _LOST:
             _restart(state, p, sample)
             return
+    blend = min(sample.dt / _SURPRISE_TIME, 1.0)
     if count > 0:
-        blend = min(sample.dt / _SURPRISE_TIME, 1.0)
         c.surprise += blend * (surprise / count - c.surprise)
+    elif moving == 0:
+        c.surprise += blend * (1.0 - c.surprise)
 
 
 @inlined

@@ -53,7 +53,7 @@ from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
 _OWN_PARAMETERS = ("save_path", "checkpoint_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
 _DIAGNOSTICS_PERIOD = 1.0  # s
-_CHECKPOINT_PERIOD = 0.5  # s; with the time to write it a crash costs less than a second
+_CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
 _LATE = 2.0  # s; a checkpoint that is older is worth a warning
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
