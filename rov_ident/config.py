@@ -231,19 +231,19 @@ class Thrusters:
         choices=("auto", *thrusters.SIGNALS),
     )
     position: Vector = option(
-        (), "of each thruster from the body origin: x y z of the first, the second ...", "m",
+        (), "of each thruster from the body origin: x y z of the first, the second and so on", "m",
         size=ANY,
     )  # fmt: skip
     direction: Vector = option(
         (),
         "in which each thruster pushes the vehicle at a positive command (a pulse above 1500 us): "
-        "x y z of the first, the second ...; any length",
+        "x y z of the first, the second and so on; any length",
         size=ANY,
     )
     allocation: Vector = option(
         (),
         "in place of position and direction: X Y Z K M N per newton of the first thruster, the "
-        "second ...",
+        "second and so on",
         "1, m",
         size=ANY,
     )

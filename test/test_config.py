@@ -551,7 +551,7 @@ def test_every_parameter_is_declared_in_full():
     for parameter in VEHICLE_PARAMETERS + PARAMETERS:
         assert parameter.description
         assert not parameter.description.endswith(".")
-        assert parameter.type in (float, int, str, Vector, Names)
+        assert parameter.type in (float, int, bool, str, Vector, Names)
         assert (parameter.type is Vector) == (parameter.size != 0)
         if parameter.type is not Vector and parameter.default is not None:
             assert type(parameter.default) is (tuple if parameter.type is Names else parameter.type)
