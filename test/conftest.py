@@ -33,22 +33,36 @@ for _ in range(os.getpid() % 90):
     next(_DOMAINS)
 
 
+_COMPILE = f"""
+from rov_ident import config, watch
+from rov_ident.nodes.estimator_node import warm_up
+for estimator in ("rls", "ukf"):
+    warm_up(config.load({str(HEAVY)!r}), estimator)
+watch.compile_all()
+"""
+
+
 @pytest.fixture(scope="session")
 def compiled():
-    """All that a node runs is compiled, once for all workers.
+    """All that a node runs is compiled, once for all workers, before the first test.
 
     How long that takes depends on what else the computer does: no test of a node waits for it.
     """
+
+
+def pytest_collection_finish(session):
+    """Compile in a process of its own: kernels that a process has just compiled differ in their
+    last bits from the same ones read from the cache, which is what nodes run."""
+    wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
+    if not wanted or session.config.option.collectonly:
+        return
     import numba
 
-    from rov_ident import watch
-    from rov_ident.nodes.estimator_node import warm_up
+    from rov_ident import jit  # noqa: F401 - says where the cache is
 
     with open(Path(numba.config.CACHE_DIR) / "lock", "a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        for estimator in ("rls", "ukf"):
-            warm_up(config.load(HEAVY), estimator)
-        watch.compile_all()
+        subprocess.run([sys.executable, "-c", _COMPILE], check=True)
 
 
 @pytest.fixture
