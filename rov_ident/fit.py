@@ -21,6 +21,7 @@ from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator
 from rov_ident.records import HORIZON, Record, numbers, score
 from rov_ident.result import Result, provenance
 from rov_ident.samples import Sampler
+from rov_ident.warm import warm_up
 
 IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
@@ -69,6 +70,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     """
     if kind not in ESTIMATORS:
         raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")
+    warm_up(config, kind)
     estimator = OnlineEstimator(config, kind)
     for record in records:
         estimator.sampler = Sampler(config)

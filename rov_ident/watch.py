@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.coefficients import ABSOLUTE, AXES, NEGATIVE, ONE, VELOCITIES, parse
-from rov_ident.config import Config, from_parameters
+from rov_ident.config import Config
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
 from rov_ident.estimate import typical
@@ -44,6 +44,7 @@ from rov_ident.samples import SAMPLE, joined
 from rov_ident.scores import SURE, inflation
 from rov_ident.shooting import Motion
 from rov_ident.streams import Streams
+from rov_ident.warm import any_vehicle
 
 WINDOW = 5.0  # s
 MEMORY = 36  # windows
@@ -354,9 +355,7 @@ def is_compiled() -> bool:
 
 def compile_all() -> None:
     """Compile all kernels on a vehicle at rest, or fetch them compiled."""
-    vehicle = {"name": "any", "frame": "frd", "mass": 10.0, "buoyancy": 98.1, "cog": [0.0] * 3}
-    vehicle |= {"cob": [0.0] * 3, "inertia": [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]}
-    config = from_parameters({"vehicle": vehicle, "coefficients": {"X_u": -1.0}})
+    config = any_vehicle()
     rest = np.zeros(101, dtype=SAMPLE)
     rest["t"] = np.linspace(0.0, WINDOW, len(rest))
     rest["measured"], rest["orientation"][:, 0], rest["down"][:, 2] = True, 1.0, 1.0

@@ -35,7 +35,7 @@ for _ in range(os.getpid() % 90):
 
 _COMPILE = f"""
 from rov_ident import config, watch
-from rov_ident.nodes.estimator_node import warm_up
+from rov_ident.warm import warm_up
 for estimator in ("rls", "ukf"):
     warm_up(config.load({str(HEAVY)!r}), estimator)
 watch.compile_all()
@@ -51,8 +51,7 @@ def compiled():
 
 
 def pytest_collection_finish(session):
-    """Compile in a process of its own: kernels that a process has just compiled differ in their
-    last bits from the same ones read from the cache, which is what nodes run."""
+    """Compile what nodes run before the workers start; rov_ident/warm.py says why not in them."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
     if not wanted or session.config.option.collectonly:
         return

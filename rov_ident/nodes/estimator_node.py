@@ -43,12 +43,13 @@ from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.frames import from_core
 from rov_ident.inputs import Reader
-from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.messages import Wrench
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, STREAM, Executor, subscribed
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
 from rov_ident.online import Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
+from rov_ident.warm import warm_up
 
 _OWN_PARAMETERS = ("save_path", "checkpoint_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
@@ -524,19 +525,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._publish_timer = self.create_timer(
             1.0 / self._config.publish_rate, self._publish_in_time, clock=self._steady
         )
-
-
-def warm_up(config: Config, kind: Kind) -> None:
-    """Compile all kernels, or fetch them compiled, on two seconds of a vehicle at rest."""
-    online = OnlineEstimator(config, kind)
-    level, zero, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(6)
-    for stamp in range(50_000_000, 2_000_000_000, 50_000_000):
-        online.push(WRENCH, Wrench(stamp, "", zero, zero))
-        gravity = np.array([0.0, 0.0, config.gravity])
-        online.push(IMU, Imu(stamp, "", level, zero, gravity, zero, zero))
-        online.push(ODOMETRY, Odometry(stamp, "", "", zero, level, zero, zero, none))
-    online.flush()
-    online.report()
 
 
 def run(kind: Kind) -> int:
