@@ -33,6 +33,7 @@ PLAIN = ("quadratic_damping", "linear_damping")
 
 PLAINLY = 0.0  # what such a term must take off the cost; of others: SURE
 _LIKELIER = 0.5  # share of what a plain term explains that a rival must explain beyond it
+_OWN = 0.5  # of what a hull has of such a term that must stay its own beside one like it
 _FITTED = 6  # candidates that are fitted in full at each step
 _HOPEFUL = 3  # and of those that promise most if what they leave is white
 _MOST = 6  # effects at most
@@ -334,7 +335,14 @@ class Search:
         h, wide = longer.hypothesis, covariance(longer)
         std = dict(zip(longer.linear.keys, np.sqrt(np.maximum(np.diag(wide), 0.0)), strict=True))
         new = [k for k in h.keys if k not in now.hypothesis.values]
-        return not any(pinned(k, h.values[k], std[k]) for k in new)
+        name = self.newest(now, longer)
+        plainer = EFFECTS[name].beyond if name in EFFECTS else ""
+        own = [(COEFFICIENTS, c) for c in EFFECTS[plainer].coefficients] if plainer else []
+        # what takes over most of the hull's own drag is that drag
+        taken = any(
+            abs(h.values[k]) < _OWN * abs(now.hypothesis.values[k]) for k in own if k in h.values
+        )
+        return not taken and not any(pinned(k, h.values[k], std[k]) for k in new)
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the price of the added parameters.
