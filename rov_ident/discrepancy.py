@@ -31,8 +31,11 @@ Progress = Callable[[str], None]
 PLAIN = ("quadratic_damping", "linear_damping")
 """Terms that every hull has: what a model lacks of them is the first thing to suspect."""
 
+PLAINLY = 0.0  # what such a term must take off the cost; of others: SURE
 _LIKELIER = 0.5  # share of what a plain term explains that a rival must explain beyond it
+_OWN = 0.5  # of what a hull has of such a term that must stay its own beside one like it
 _FITTED = 6  # candidates that are fitted in full at each step
+_HOPEFUL = 3  # and of those that promise most if what they leave is white
 _MOST = 6  # effects at most
 _BOLD = 3.0  # typical sizes: the farthest from null that a fit begins for what is not linear
 _SCORED = 10  # patterns that are scored properly
@@ -49,15 +52,15 @@ _SHARE = 0.3  # of the best promise: what promises less is not fitted
 class Candidate:
     """Something that might be there: parameters to add, where to start, what is promised.
 
-    ``promise`` is what it takes off the scaled squared residuals beyond its price. A candidate that
-    is not ``firm`` promises that only if what is left were white: where a model is so far off that
-    a linear view of it leaves colour, only a fit shows what there is.
+    ``promise`` is what it takes off the scaled squared residuals beyond its price, ``hope`` the
+    same if what is left were white: where a model is so far off that a linear view of it leaves
+    colour, only a fit shows what there is.
     """
 
     name: str
     start: Mapping[Key, float]
     promise: float
-    firm: bool = True
+    hope: float
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,9 @@ class Scanned(NamedTuple):
     """The best shape {parameter: value} of an effect, its linear amplitudes, and their promise."""
 
     promise: float
+    hope: float
     shape: Mapping[str, float]
     change: Mapping[Key, float]
-    firm: bool
 
 
 class Search:
@@ -138,26 +141,20 @@ class Search:
         candidates = [c for c in self.screen(now) if not self._early(c.name, now.hypothesis)]
         if progress is not None:
             progress(", ".join(f"{c.name} {c.promise:.0f}" for c in candidates[:5]))
-        firm = [c for c in candidates if c.firm]
-        best = self._best(now, self.fit_best(now, firm))
+        fits = self.fit_best(now, candidates)
+        best = self._best(now, fits) or self._ahead(now, candidates)
         if best is None:
-            best = self._ahead(now, firm)
-        if best is None:
-            best = self._best(now, self.fit_best(now, [c for c in candidates if not c.firm]))
+            best = self._best(now, [f for f in fits if self.newest(now, f) in PLAIN], PLAINLY)
         if best is None:
             return None
         return self.evidence.fit(best.hypothesis, best.look, update_noise=True) or best
 
-    def _best(self, now: Fitted, fits: Sequence[Fitted]) -> Fitted | None:
+    def _best(self, now: Fitted, fits: Sequence[Fitted], asked: float = SURE) -> Fitted | None:
         """The fit that is worth most, if any is; a plain term first."""
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.rss)
-        worth = [
-            f
-            for f in fits
-            if self.worth(now, f, closest) >= asked(self.newest(now, f)) and self.held(now, f)
-        ]
+        worth = [f for f in fits if self.worth(now, f, closest) >= asked and self.held(now, f)]
         plain = [f for f in worth if self.newest(now, f) in PLAIN]
         return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
 
@@ -247,8 +244,6 @@ class Search:
             if c.name != name
             and (not self._early(c.name, rest.hypothesis) or EFFECTS[c.name].beyond == name)
         ]
-        firm = any(c.firm and c.promise > 0.0 for c in candidates)
-        candidates = [c for c in candidates if c.firm or not firm]
         fits = {self.newest(rest, f): f for f in self.fit_best(rest, candidates)}
         for candidate, pattern in self.screen_patterns(rest)[:_PATTERNS_TRIED]:
             fit = self.fit_pattern(rest, candidate, pattern)
@@ -283,10 +278,8 @@ class Search:
             return [], [], 0.0
         scores = scores_of(look, keys, look.of(pattern.force()[:, :, columns]))
         units = [keys] if pattern.frequency else [(k,) for k in keys]
-        chosen, change, _, _ = _chosen(scores, units)
-        reached = scores.solve(chosen, bounds)[1]
-        promise = reached / scores.variance(reached, len(chosen)) - PRICE * len(chosen)
-        return chosen, change.tolist(), promise - (PRICE if pattern.frequency else 0.0)
+        chosen, change, _, hope = _chosen(scores, units)
+        return chosen, change.tolist(), hope - (PRICE if pattern.frequency else 0.0)
 
     def newest(self, rest: Fitted, longer: Fitted) -> str:
         old = set(rest.hypothesis.keys)
@@ -298,6 +291,8 @@ class Search:
         fits = []
         least = max(_SHARE * candidates[0].promise, 0.0) if candidates else 0.0
         chosen = [c for c in candidates[:_FITTED] if c.promise >= least]
+        hopeful = sorted((c for c in candidates if c.hope > 0.0), key=lambda c: -c.hope)
+        chosen += [c for c in hopeful[:_HOPEFUL] if c not in chosen]
         for candidate in chosen + [c for c in candidates if c.name in PLAIN and c not in chosen]:
             there = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
             if there is not None and candidate.name in PLAIN:
@@ -340,7 +335,14 @@ class Search:
         h, wide = longer.hypothesis, covariance(longer)
         std = dict(zip(longer.linear.keys, np.sqrt(np.maximum(np.diag(wide), 0.0)), strict=True))
         new = [k for k in h.keys if k not in now.hypothesis.values]
-        return not any(pinned(k, h.values[k], std[k]) for k in new)
+        name = self.newest(now, longer)
+        plainer = EFFECTS[name].beyond if name in EFFECTS else ""
+        own = [(COEFFICIENTS, c) for c in EFFECTS[plainer].coefficients] if plainer else []
+        # what takes over most of the hull's own drag is that drag
+        taken = any(
+            abs(h.values[k]) < _OWN * abs(now.hypothesis.values[k]) for k in own if k in h.values
+        )
+        return not taken and not any(pinned(k, h.values[k], std[k]) for k in new)
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the price of the added parameters.
@@ -389,13 +391,13 @@ class Search:
         scores = scores_of(look, extra, columns)
         candidates = []
         for name, units in plain.items():
-            chosen, change, promise, firm = _chosen(scores, units, name in PLAIN)
-            if units and name in PLAIN and not (chosen and firm):
-                chosen, firm = [k for unit in units for k in unit], True
-                change, promise = scores.solve(chosen, bounds)[0], -np.inf
+            chosen, change, promise, hope = _chosen(scores, units, name in PLAIN)
+            if units and name in PLAIN and promise == -np.inf:
+                chosen = [k for unit in units for k in unit]
+                change = scores.solve(chosen, bounds)[0]
             if chosen:
                 start = self._start(dict(zip(chosen, change.tolist(), strict=True)))
-                candidates.append(Candidate(name, start, promise, firm))
+                candidates.append(Candidate(name, start, promise, hope))
         for effect in EFFECTS.values():
             roles = {p.role for p in effect.parameters}
             if effect.name in h.effects:
@@ -406,7 +408,7 @@ class Search:
                 candidates += self._attached(now, effect)
             elif "frequency" in roles:
                 candidates += self._oscillating(now, effect)
-        return sorted(candidates, key=lambda c: (not c.firm, -c.promise))
+        return sorted(candidates, key=lambda c: (-c.promise, -c.hope))
 
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
         """Parameters of an effect that h lacks, in the groups in which they may join."""
@@ -424,9 +426,11 @@ class Search:
         return [] if effect.name in h.effects else [tuple(mine)]
 
     def _early(self, name: str, h: Hypothesis) -> bool:
-        """Whether an effect is not to be looked for before another that every vehicle has."""
+        """Whether an effect is not to be looked for before another that every vehicle has, along
+        each axis that is simulated."""
         plainer = EFFECTS[name].beyond if name in EFFECTS else ""
-        return bool(plainer) and not set(EFFECTS[plainer].coefficients[:3]) & set(h.coefficients)
+        own = EFFECTS[plainer].coefficients[:3] if plainer else ()
+        return any(c not in h.coefficients and self._simulated(parse(c).row) for c in own)
 
     def _simulated(self, axis: int) -> bool:
         return not self.streams.guided[axis]
@@ -490,8 +494,8 @@ class Search:
             mine = look.of(np.concatenate([at_origin, *moved], axis=2))
             scores = scores_of(look, [*keys, *moments], mine)
             units = [(*keys, *moments)] if moments else [(k,) for k in keys]
-            chosen, change, promise, firm = _chosen(scores, units)
-            if chosen and (best is None or (firm, promise) > (best.firm, best.promise)):
+            chosen, change, promise, hope = _chosen(scores, units)
+            if chosen and (best is None or (promise, hope) > (best.promise, best.hope)):
                 found = dict(zip(chosen, change.tolist(), strict=True))
                 there = {
                     p.name: float(
@@ -500,7 +504,7 @@ class Search:
                     for p, m in zip(places, moments, strict=True)
                 }
                 change_of = {k: found[k] for k in keys if k in found}
-                best = Scanned(promise, {**shape, **there}, change_of, firm)
+                best = Scanned(promise, hope, {**shape, **there}, change_of)
         return best
 
     def _scanned(self, effect: Effect, best: "Scanned") -> Candidate:
@@ -510,7 +514,7 @@ class Search:
             for p in effect.parameters
             if p.role in ("onset", "place")
         }
-        return Candidate(effect.name, start, best.promise - PRICE, best.firm)
+        return Candidate(effect.name, start, best.promise - PRICE, best.hope - PRICE)
 
     def _oscillating(self, now: Fitted, effect: Effect) -> list[Candidate]:
         """Sinusoidal forces in the world: the spectrum of the adjoint shows their frequency."""
@@ -535,11 +539,11 @@ class Search:
             start = dict(zip(keys, amplitude.tolist(), strict=True))
             start[effect.name, "frequency"] = frequency
             start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
-            promise = gain / scores.scatter(labels, change) - PRICE * len(start)
-            firm = promise > 0.0
-            if not firm:
-                promise = gain / scores.variance(gain, len(labels)) - PRICE * len(start)
-            candidates.append(Candidate(effect.name, start, promise, firm))
+            promise, hope = (
+                gain / spread - PRICE * len(start)
+                for spread in (scores.scatter(labels, change), scores.variance(gain, len(labels)))
+            )
+            candidates.append(Candidate(effect.name, start, promise, hope))
         return sorted(candidates, key=lambda c: -c.promise)[:1]
 
     # -------------------------------------------------------------- patterns
@@ -558,7 +562,8 @@ class Search:
             chosen, start, promise = self._score(now, pattern)
             if chosen and promise > price:
                 values = dict(zip(chosen, start, strict=True))
-                found.append((Candidate(group_of(chosen[0]), values, promise - price), pattern))
+                rest = promise - price
+                found.append((Candidate(group_of(chosen[0]), values, rest, rest), pattern))
         return sorted(found, key=lambda f: -f[0].promise)
 
     def _reach(self, look: Look, pattern: Pattern) -> float:
@@ -599,11 +604,6 @@ class Search:
             self.evidence.patterns[key] = force[:, :, i]
 
 
-def asked(name: str) -> float:
-    """What an effect must take off the cost: less where every vehicle has it."""
-    return 0.0 if name in PLAIN else SURE
-
-
 def _choice(tried: Sequence[Pattern]) -> float:
     """What the best of so many must explain more than one that was meant from the outset."""
     return 2.0 * float(np.log(max(len(tried), 1)))
@@ -611,13 +611,17 @@ def _choice(tried: Sequence[Pattern]) -> float:
 
 def _chosen(
     scores: Scores, units: Iterable[Sequence[Key]], together: bool = False
-) -> tuple[list[Key], Array, float, bool]:
-    """The parameters worth having, what they promise, and whether that is firm."""
+) -> tuple[list[Key], Array, float, float]:
+    """The parameters worth having, by the scatter that they leave or else as if that were white,
+    what they promise, and what if it is."""
     units = list(units)
-    found = scores.best(units, bounds, together)
-    if found[0]:
-        return *found, True
-    return *scores.best(units, bounds, together, white=True), False
+    chosen, change, promise = scores.best(units, bounds, together)
+    if not chosen:
+        chosen, change, hope = scores.best(units, bounds, together, white=True)
+        return chosen, change, -np.inf, hope
+    reached = scores.solve(chosen, bounds)[1]
+    hope = reached / scores.variance(reached, len(chosen)) - PRICE * len(chosen)
+    return chosen, change, promise, hope
 
 
 def group_of(key: Key) -> str:

@@ -13,7 +13,16 @@ from rov_ident import config as configuration
 from rov_ident import kinematics
 from rov_ident.coefficients import AXES, VELOCITIES, parse
 from rov_ident.config import Config
-from rov_ident.discrepancy import Search, Trial, Trials, asked, covariance, foretold, pinned
+from rov_ident.discrepancy import (
+    PLAIN,
+    PLAINLY,
+    Search,
+    Trial,
+    Trials,
+    covariance,
+    foretold,
+    pinned,
+)
 from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
 from rov_ident.evidence import Evidence, Fitted, within
@@ -471,7 +480,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
 def _certain(search: Search, last: Fitted, name: str) -> bool:
     """Whether all of the data tell an effect from nothing as surely as it takes to join a model."""
     rest = last.look.evidence.fit(last.hypothesis.without(search.keys_of(last, name)), last.look)
-    return rest is None or search.worth(rest, last, last) >= asked(name)
+    return rest is None or search.worth(rest, last, last) >= (PLAINLY if name in PLAIN else SURE)
 
 
 def _with_parameters(search: Search, last: Fitted, finding: Finding) -> Finding:
