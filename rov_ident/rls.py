@@ -95,7 +95,8 @@ _REACH = 10.0  # prior standard deviations; the observer's coefficients are neve
 _NOISIEST = 100.0  # times the declared variance; a measurement is never taken for worse
 _FASTEST = 50.0  # m/s, rad/s; the observer of a sane model never gets there
 _WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
-_PATIENCE = 1.5  # lesser outliers in short order from which the vehicle has changed
+_PATIENCE = 2.5  # lesser outliers in short order from which the vehicle has changed
+_LONE = 1.5  # outliers in short order from which the observer begins anew
 _PATIENCE_TIME = 3.0  # s; over which that is counted
 _STEADY = 4.0  # a squared innovation counts for at most this often its variance in the noise
 _STEADY_MEAN = 0.92  # what that is in the mean, of a normal distribution
@@ -772,7 +773,7 @@ def _update(task, state, work, sample, side, info):
         c.refused += 1.0
         # One alone is the sensor's. If it was the wrench, the next measurement is off, too, and the
         # observer would be wrong for long.
-        c.started = c.refused < _PATIENCE
+        c.started = c.refused < _LONE
         info.reason = GATED
         return
     _absorb(state, work, n)
