@@ -128,10 +128,12 @@ def test_wild_messages_to_a_live_node(live, heavy, short_dive):
         for value in status.values:
             role, _, reason = value.key.partition(":")
             if role in sent and reason not in torture.NOT_OF_A_MESSAGE:
-                found[role] += int(value.value)
+                late = role == WRENCH and reason == " too late"  # and taken all the same
+                found[role] += 0 if late else int(value.value)
         return found
 
-    vehicle.until(lambda: vehicle.diagnostics and counted() == sent)
+    vehicle.until(lambda: vehicle.diagnostics and sum(counted().values()) >= sum(sent.values()))
+    assert counted() == sent
     vehicle.coefficients.clear()
     vehicle.until(lambda: len(vehicle.coefficients) > 2)
     for message in vehicle.values + vehicle.covariance:
