@@ -57,6 +57,7 @@ LEAST = 0.2
 """The least size of an effect, over one that matters: less is what the attitude is off by."""
 
 _SPACING = 0.045  # s; measurements closer than that add cost, hardly information
+_GAP = 0.5  # s without samples: no window reaches across
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed
 _MOST = 3  # effects named at once
 _AS_GOOD = 0.8  # of what the best explains: what explains more may be it, beyond first order
@@ -324,8 +325,11 @@ class Watcher:
         self._demands += demands
         demands.clear()
         t = float(samples["t"][-1])
-        if samples["restart"].any():
-            self._samples.clear()
+        if samples["restart"].any() and self._samples:
+            # a lone outlier restarts the estimator's observer, but breaks no window
+            steps = np.diff(samples["t"], prepend=self._samples[-1]["t"][-1])
+            if not (steps[samples["restart"]] <= _GAP).all() or steps.min() < 0.0:
+                self._samples.clear()
         if not self._samples:
             self._begin = float(samples["t"][0])
         self._samples.append(samples)

@@ -21,7 +21,7 @@ from explain import (
 )
 from hidden import EFFECTS, NESTED, Conditions, draw
 from rov_ident.discrepancy import pinned
-from rov_ident.explain import explain, from_the_start, thinned, whole
+from rov_ident.explain import explain, from_the_start, gain_of, thinned, whole
 from rov_ident.findings import Finding, Gain, Value
 from rov_ident.scores import _own
 from rov_ident.streams import gather
@@ -148,6 +148,27 @@ def test_a_noisy_axis_does_not_pass_for_a_cause():
     white = rng.standard_normal(windows * rows)
     assert _own(column, white, first) < 2.0
     assert _own(column, white + push * column[:, 0], first) > 20.0
+
+
+def test_a_gain_is_of_a_velocity_that_surely_gains():
+    """One window in which the vehicle is unstable can pretend any gain."""
+    rng, chunks = np.random.default_rng(0), 20
+    before = 4.0 + rng.random((chunks, 2))
+    after = before * [0.25, 1.05]
+    before[3, 1] = 1000.0
+    gain = gain_of(["u", "v"], before, after, chunks)
+    assert gain.component == "u" and gain.percent == pytest.approx(50.0)
+    assert gain.low > 0.0
+    alone = gain_of(["v"], before[:, 1:], after[:, 1:], chunks)
+    assert alone.percent > 50.0 and alone.low < 0.0
+
+
+def test_the_best_of_six_that_do_nothing_does_not_surely_gain():
+    rng, sure = np.random.default_rng(1), 0
+    for _ in range(200):
+        squares = rng.exponential(1.0, (2, 30, 6)) + 1.0
+        sure += gain_of(list("uvwpqr"), *squares, 30).low > 0.0
+    assert sure <= 12  # 2.5 % at one end, and what 30 chunks lack
 
 
 def test_a_fit_takes_no_more_data_than_it_needs():

@@ -60,6 +60,13 @@ def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
     assert not any(play(watching(case.config, kind), case.messages))
 
 
+def test_a_tilt_of_the_attitude_is_not_taken_for_a_cause():
+    """A milliradian turns a slender vehicle at 0.03 rad/s within a window."""
+    slender = hidden.Conditions(duration=80.0, family="auv")
+    case = hidden.draw(502, conditions=slender)
+    assert not any(play(watching(case.config), case.messages))
+
+
 def test_what_ends_is_forgotten(heavy):
     """Pulled by something for a minute, then let go."""
     pulled = dataclasses.replace(
