@@ -454,18 +454,21 @@ def test_a_gap_is_a_restart_of_the_velocity_alone(heavy, noisy):
 
 
 def test_intervals_and_bias_over_seeds(heavy, dives):
-    z, prior = [], prior_of(heavy)
+    z, leaning, prior = [], [], prior_of(heavy)
     for config, samples in dives:
         estimate, state, info = result(config, samples)
         assert definite(state.p)
         assert (info["reason"] == ukf.GATED).mean() < 0.01
         z.append((estimate.values - heavy.model.theta) / estimate.std)
+        leaning.append(textbook.attenuation(heavy.model, heavy.wrench.relative_std) / estimate.std)
     z = np.array(z)
     told = dict(zip(prior.names, zip(z.mean(0).round(2), z.std(0).round(2), strict=True)))
     covered = np.mean(np.abs(z) < 1.96)
     assert covered >= 0.80, f"{covered:.2f} {told}"
     assert 0.5 < z.std() < 1.6, told
-    assert np.abs(z.mean(axis=0)).max() < 3.0 / np.sqrt(len(z)) * max(1.0, z.std()), told
+    chance = 3.0 / np.sqrt(len(z)) * max(1.0, z.std())
+    assert (np.abs(z.mean(axis=0)) < chance + np.mean(leaning, axis=0)).all(), told
+    assert np.mean(leaning) < 0.3  # of a standard deviation: bias is not what limits the estimate
 
 
 def test_errors_are_small_after_ninety_seconds(heavy, dives):

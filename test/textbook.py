@@ -270,3 +270,19 @@ def prior_and_samples(config, seeds, duration):
         factors = np.clip(1.0 + 0.2 * rng.standard_normal(len(config.model.theta)), 0.4, 1.6)
         out.append((off(config, factors), np.concatenate(parts)))
     return out
+
+
+def attenuation(model, relative_std):
+    """The most by which errors in variables can move each coefficient (n,).
+
+    The noise of a wrench is in the acceleration that a mass is learnt from, and in its error. Where
+    each message counts for itself, that takes the square of the relative noise off what one newton
+    is seen to move: the whole inertia comes out larger by as much (Fuller 1987, sec. 1.1). Where
+    many messages of one sign add up, as in the slow axes, it takes less.
+    """
+    inertia = np.diag(model.mass_matrix)
+    sizes = [
+        inertia[c.row] if c.is_added_mass else abs(value)
+        for c, value in zip(model.coefficients, model.theta, strict=True)
+    ]
+    return relative_std**2 * np.array(sizes)
