@@ -10,7 +10,8 @@ import fossen
 import hidden
 from hidden import EFFECTS, EXCITATIONS, FAMILIES, TIERS, UNKNOWN, Conditions, draw
 from rov_ident import effects as library
-from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident import inputs
+from rov_ident.bags import Bag
 from rov_ident.config import from_parameters, to_parameters
 from rov_ident.effects.base import Reading
 from rov_ident.recording import write_messages
@@ -331,8 +332,7 @@ def test_messages_make_a_bag(tmp_path):
     write_messages(path, case.messages)
     bag = Bag(path)
     sampler = Sampler(case.config)
-    for role, message in read_messages(bag, select_topics(bag, vars(case.config.topics))):
-        assert message is not None
+    for role, message in inputs.messages(bag, inputs.select(bag, case.config), case.config):
         sampler.push(role, message)
     sampler.flush()
     assert sampler.counts["odom"] == 400 and sampler.counts["imu"] == 2000

@@ -120,7 +120,10 @@ def progress(options: argparse.Namespace) -> Iterator[Tell]:
 
         def tell(what: str, share: float | None = None) -> None:
             total = None if share is None else 1.0
-            progress.update(bar, description=what, completed=share or 0.0, total=total)
+            # At once: what is done quickly should be seen, too.
+            progress.update(
+                bar, description=what, completed=share or 0.0, total=total, refresh=True
+            )
 
         yield tell
 
