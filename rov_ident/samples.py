@@ -88,7 +88,7 @@ _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
 _LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
 _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
-_PUSH = 0.1  # of the working wrench; of which a demand may. Less, and coarse demands are thinned
+_PUSH = 0.1  # of the working wrench; of which a demand may: less would thin coarse demands
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
