@@ -122,9 +122,9 @@ TRUTH = {
 def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
     """Configured 20 to 40 % off, the coefficients 8 %; three standard deviations at most.
 
-    A tether's drag and the arm of it multiply each other: what is learnt in the first seconds, about
-    wrong values of both, is kept, and the error of k reaches five standard deviations in one dive
-    of six. It must come nearer, and the arm stay within five centimetres (docs/live.md).
+    A tether's drag and the arm of it multiply each other: what is learnt in the first seconds,
+    about wrong values of both, is kept, and the error of k reaches five standard deviations in one
+    dive of six. It must come nearer, the arm stay within five centimetres (docs/live.md).
     """
     world = having(heavy, {effect: TRUTH[effect]})
     config = having(heavy, {effect: GIVEN[effect]})
