@@ -7,8 +7,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -85,7 +85,10 @@ def replay(
             configuration.dump(settings, parameters)
             nodes.append(stack.enter_context(_Process(name, parameters)))
 
+        raise_interrupt = stack.enter_context(_noted_interrupts())
+
         def check() -> None:
+            raise_interrupt()
             for node in nodes:
                 node.check()
 
@@ -103,6 +106,26 @@ def replay(
             time.monotonic() - started,
             None if out is None else Path(out),
         )
+
+
+@contextmanager
+def _noted_interrupts() -> Iterator[Callable[[], None]]:
+    """A function that raises KeyboardInterrupt if there was one: within a callback of rclpy's it
+    would be lost."""
+    noted = threading.Event()
+
+    def raise_interrupt() -> None:
+        if noted.is_set():
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # who gets none
+        yield raise_interrupt
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: noted.set())
+    try:
+        yield raise_interrupt
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Process:
