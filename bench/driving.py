@@ -4,6 +4,7 @@ Predicted standard deviations relative to the value, from the information along 
 a BlueROV2 Heavy, whose coefficients are taken as known to 50 % before.
 """
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ def table(head: str, names: tuple[str, ...], rows: dict[str, list[str]]) -> None
 def measured(settings: Config, name: str, duration: float, suite: Suite) -> np.ndarray:
     run = dive(settings, name, duration, suite, seed=1)
     samples = np.concatenate(list(samples_of(settings, run)))
-    record = Record(Path(name), samples, counts={}, notes=(), sha256="")  # type: ignore[arg-type]
+    record = Record(Path(name), samples, Counter(), (), "")
     return predicted_information(archive.of_records([record]), settings)
 
 

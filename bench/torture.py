@@ -26,7 +26,7 @@ from rov_ident.config import Config
 from rov_ident.estimate import prior_of
 from rov_ident.excitation import manoeuvre
 from rov_ident.messages import Imu, Message, Odometry, Wrench
-from rov_ident.online import ESTIMATORS, OnlineEstimator, Report
+from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
 from rov_ident.sensors import START, Suite, dive, measure
 
@@ -93,9 +93,9 @@ class Run:
         return math.inf
 
 
-def run(config: Config, kind: str, messages: Messages) -> Run:
+def run(config: Config, kind: Kind, messages: Messages) -> Run:
     """All messages in the order of their arrival."""
-    online = OnlineEstimator(config, kind)  # type: ignore[arg-type]
+    online = OnlineEstimator(config, kind)
     refusals = ESTIMATORS[kind].REFUSALS
     times, used, count, begin = [], [], 0, messages[0][0]
     for arrival, role, message in messages:
@@ -213,7 +213,7 @@ def faults(seeds: int, only: str) -> Iterator[Row]:
 
 
 @cache
-def undisturbed(seed: int, kind: str) -> Run:
+def undisturbed(seed: int, kind: Kind) -> Run:
     return run(started(seed), kind, dived(seed))
 
 
@@ -312,7 +312,7 @@ def garbage(_: int, only: str, count: int = 1_000_000) -> Iterator[Row]:
             print(f"    {n:8d}  {name}", file=sys.stderr)
 
 
-def abused(config: Config, kind: str, good: Messages, count: int, seed: int) -> Abuse:
+def abused(config: Config, kind: Kind, good: Messages, count: int, seed: int) -> Abuse:
     """An estimator that was given wild messages, as bytes."""
     done = Abuse(OnlineEstimator(config, kind))  # type: ignore[arg-type]
     rng = np.random.default_rng(seed)
@@ -433,7 +433,7 @@ def rest(_: int, only: str, count: int = 10_000_000) -> Iterator[Row]:
                 continue
             # Not quite trimmed it would be held by something at rest, and heave in surge.
             config = started(0) if what == "at rest" else _neutral(started(0))
-            online = OnlineEstimator(config, kind)  # type: ignore[arg-type]
+            online = OnlineEstimator(config, kind)
             task, prior = module.problem(config), online.prior
             blocks = [make(config, seed) for seed in range(3)]
             state, done, bounded, definite, uneven = online.state, 0, 0.0, True, 0.0

@@ -33,7 +33,7 @@ def here() -> dict[str, object]:
     end = messages[0][1].stamp + SECONDS * 1e9
     found = {}
     for kind in ESTIMATORS:
-        online = OnlineEstimator(config, kind)  # type: ignore[arg-type]
+        online = OnlineEstimator(config, kind)
         for role, message in messages:
             if message.stamp < end:
                 online.push(role, message)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rov_ident.watch import Watcher
 
 Kind = Literal["rls", "ukf"]
-ESTIMATORS: dict[str, ModuleType] = {"rls": rls, "ukf": ukf}
+ESTIMATORS: dict[Kind, ModuleType] = {"rls": rls, "ukf": ukf}
 
 CENTRING_TIME = 1.0  # s; the sampler takes over the estimated parameters of effects this often
 EXCITATION_TIME = 20.0  # s; the present excitation is that of this window and of the one before

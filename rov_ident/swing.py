@@ -53,9 +53,9 @@ class Swing:
     """
 
     name: str
-    amplitude: tuple[float, float, float, float]
-    period: tuple[float, float, float, float]
-    torque: tuple[float, float] = (0.0, 0.0)
+    amplitude: tuple[float, ...]
+    period: tuple[float, ...]
+    torque: tuple[float, ...] = (0.0, 0.0)
 
     def target(self, t: float) -> Array:
         """Position [m] and heading [rad] (4,) aimed at."""
@@ -64,9 +64,8 @@ class Swing:
         return target
 
     def scaled(self, factor: float) -> "Swing":
-        a, b, c, d = (factor * x for x in self.amplitude)
-        e, f = (factor * x for x in self.torque)
-        return Swing(self.name, (a, b, c, d), self.period, (e, f))
+        amplitude, torque = (tuple(factor * x for x in of) for of in (self.amplitude, self.torque))
+        return Swing(self.name, amplitude, self.period, torque)
 
     def waypoints(self, duration: float) -> list[dict[str, float]]:
         """Each new target with its time."""
@@ -90,7 +89,7 @@ class Course:
 
     name: str
     legs: tuple[tuple[float, float, float], ...]
-    torque: tuple[float, float] = (0.0, 0.0)
+    torque: tuple[float, ...] = (0.0, 0.0)
 
     def target(self, t: float) -> Array:
         """Position [m] and heading [rad] (4,) aimed at; at the end of the last leg it stays."""
@@ -191,10 +190,10 @@ def library(limits: Limits) -> list[Swing]:
     p = [max(2.0, 2.2 * x / WORKING_SPEED[0] ** 0.5) for x in (a, b, c)]
     still = (9.0, 9.0, 9.0, 9.0)
 
-    def of(name: str, amplitude: tuple[float, ...], torque: tuple[float, float]) -> Swing:
+    def of(name: str, amplitude: tuple[float, ...], torque: tuple[float, ...]) -> Swing:
         period = (p[0], 1.13 * p[1], 1.31 * p[2], 2.7)
         used = tuple(x if y else z for x, y, z in zip(period, amplitude, still, strict=True))
-        return Swing(name, tuple(amplitude), used, torque)  # type: ignore[arg-type]
+        return Swing(name, amplitude, used, torque)
 
     none, both = (0.0, 0.0), (0.7, 0.7)
     return [
