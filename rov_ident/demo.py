@@ -51,7 +51,7 @@ def demo(out: Path, rate: float, err: Console, console: Console) -> None:
         f"Playing {bag.name} over DDS at {rate:g} x into rls_node and ukf_node, which start from "
         f"{start.name}: coefficients off by up to 50 %."
     )
-    with Live(console=err, refresh_per_second=4) as live:
+    with Live(console=err, refresh_per_second=4, transient=True) as live:
 
         def show(name: str, state: Report) -> None:
             if state.stamp:
@@ -81,7 +81,7 @@ def demo(out: Path, rate: float, err: Console, console: Console) -> None:
 
 
 def _table(config: Config, truth: dict[str, float], seen: dict[str, list[Report]]) -> Table:
-    table = Table()
+    table = Table(pad_edge=False)  # or it does not fit into 80 columns
     table.add_column("")
     for column in ("truth", "start", *ESTIMATORS, "unit"):
         table.add_column(column, justify="left" if column == "unit" else "right")

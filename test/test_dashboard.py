@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import math
 import re
 import signal
 import socket
@@ -17,8 +18,9 @@ import aiohttp
 import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
-from conftest import HEAVY
+from conftest import HEAVY, in_pace
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message
 
 from rov_ident import config, layouts, sensors
@@ -463,35 +465,49 @@ def test_two_vehicles(command):
 
 @contextlib.contextmanager
 def publishing(dives):
-    """Gives what publishes the dives."""
+    """Gives what publishes the dives, as fast as all nodes can use them."""
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
     from rov_ident import cdr
-    from rov_ident.nodes.common import INPUTS, STREAM
+    from rov_ident.nodes.common import INPUTS, STREAM, Executor
+    from rov_ident.nodes.conversions import from_time
 
     context = rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("drivers", context=context)
+    executor = Executor(context=context)
+    executor.add_node(node)
     publishers = {
         (vehicle, role): node.create_publisher(type_, f"/{vehicle}/{topic}", STREAM)
         for vehicle in dives
         for role, (topic, type_) in INPUTS.items()
     }
-    everything = sorted(
-        ((vehicle, *entry) for vehicle, messages in dives.items() for entry in messages),
-        key=lambda message: message[1],  # its arrival
+    used = dict.fromkeys(NODES, -math.inf)
+    for name in NODES:
+
+        def take(residual, name=name):
+            used[name] = from_time(residual.header.stamp)
+
+        node.create_subscription(WrenchStamped, f"{name}/wrench_residual", take, STREAM)
+    messages = sorted(
+        (
+            (arrival, (vehicle, role), message)
+            for vehicle, dive in dives.items()
+            for arrival, role, message in dive
+        ),
+        key=lambda entry: entry[0],
     )
-    waiting = [(publishers[vehicle, role], message) for vehicle, _, role, message in everything]
 
     def publish():
-        """Everything, about ten times as fast as life."""
-        for k, (publisher, message) in enumerate(waiting):
-            publisher.publish(cdr.encode(message))
-            if k % 50 == 0:
-                time.sleep(0.01)
+        def listen(seconds):
+            executor.spin_once(timeout_sec=seconds)
+
+        for _, to, message in in_pace(messages, lambda: min(used.values()), listen):
+            publishers[to].publish(cdr.encode(message))
 
     yield publish
+    executor.shutdown()
     node.destroy_node()
     rclpy.try_shutdown(context=context)
 
