@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check docs accuracy bench validate explain-bench torture audit lock bag picture clean
+.PHONY: demo test check docs accuracy bench validate sdf explain-bench torture audit lock bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
@@ -41,6 +41,15 @@ validate: .venv/demo.stamp
 	$(BIN)/python bench/validate.py
 	$(BIN)/python bench/validate_nomoto.py
 	$(BIN)/python bench/validate_forces.py
+
+## exported Gazebo models, read by libsdformat; needs the network
+sdf: .venv/drake.stamp
+	PYTHONPATH=.venv/drake $(BIN)/python bench/sdf.py
+
+# Apart from the rest, and without what it depends on: it is for this alone.
+.venv/drake.stamp: .venv/demo.stamp
+	@$(PIP) --no-deps --target .venv/drake drake
+	@touch $@
 
 ## what goes wrong at sea, done to both estimators and to live nodes: docs/trust.md (some hours)
 torture: .venv/test.stamp

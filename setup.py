@@ -44,6 +44,7 @@ setup(
             "pytest-timeout",
             "pytest-xdist",
             "hypothesis",
+            "lxml>=5",
             "mcap-ros2-support",
             "mkdocs-material>=9.5",
             "pymavlink>=2.4.40",

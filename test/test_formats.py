@@ -1,14 +1,23 @@
 """Models in other programs' files: what they do there, and that nothing is lost in silence."""
 
+import dataclasses
+import re
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lxml import etree
 from test_cli import refused, run
 
 from rov_ident import config as configuration
+from rov_ident.coefficients import catalogue, fin_catalogue, parse
+from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
-from rov_ident.formats import READERS, export, import_model
+from rov_ident.formats import READERS, WRITERS, export, import_model
+from rov_ident.model import GRAVITY
 from rov_ident.simulate import simulate
 
 COUPLED = {
@@ -120,6 +129,33 @@ def gazebo_acceleration(sdf, nu, down):
     return np.linalg.solve(m, force)
 
 
+@pytest.fixture(scope="session")
+def schema():
+    return etree.XMLSchema(etree.parse(Path(__file__).with_name("sdf.xsd")))
+
+
+# The tags of the plugin's documentation: linear, quadratic and absolute stability derivatives.
+_DERIVATIVE = re.compile("[xyzkmn][UVWPQR]((abs)?[UVWPQR])?")
+
+
+def test_the_schema_of_sdformat_takes_the_file(coupled, heavy, schema):
+    for config in (coupled, heavy):
+        content = export(config, "gazebo").content
+        document = etree.fromstring(content.encode())
+        schema.assertValid(document)
+        for child in document.find("model/plugin"):
+            known = ("link_name", "disable_added_mass", "disable_coriolis")
+            assert child.tag in known or _DERIVATIVE.fullmatch(child.tag), child.tag
+        for wrong in (
+            content.replace("<mass>", "<maas>").replace("</mass>", "</maas>"),
+            re.sub("<size>(\\S+) ", "<size>", content),
+            re.sub("<rr>.*</rr>", "", content),
+            content.replace("<ixx>", "<ixx>-"),
+        ):
+            assert wrong != content
+            assert not schema.validate(etree.fromstring(wrong.encode()))
+
+
 def test_gazebo_computes_the_same_acceleration(coupled):
     content = export(coupled, "gazebo").content
     flip = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
@@ -141,8 +177,9 @@ def test_gazebo_names_what_it_cannot_hold(heavy):
     }
     config = configuration.from_parameters(plain)
     content, lost = export(config, "gazebo").content, export(config, "gazebo").lost
-    assert len(lost) == 3
+    assert len(lost) == 4
     assert any("thruster_lag" in what and "current" not in what for what in lost)
+    assert any("ocean_current does to the added mass" in what for what in lost)
     assert any("Z_ww_neg" in what for what in lost)
     assert any("130 N" in what for what in lost)
     model = ET.fromstring(content).find("model")
@@ -231,14 +268,21 @@ def test_the_matrices_of_mss_make_the_same_wrench(coupled):
     assert "Y_r" in held
     plain = configuration.to_parameters(coupled) | {"coefficients": held}
     model = configuration.from_parameters(plain).model
+    rng = np.random.default_rng(6)
+    motion = rng.normal(size=6), rng.normal(size=6), np.array([0.6, 0.0, 0.8])
+    np.testing.assert_allclose(
+        mss_wrench(out.content, *motion), model.wrench(*motion), rtol=1e-12, atol=1e-12
+    )
+
+
+def mss_wrench(content, nu, nu_dot, down):
+    """The formula in the file's comment, with the file's matrices."""
     fields = {}
-    for line in out.content.splitlines():
+    for line in content.splitlines():
         if line.startswith("vehicle."):
             key, text = line.removeprefix("vehicle.").rstrip(";").split(" = ")
             rows = text.strip("[]").split("; ")
             fields[key] = np.array([[float(x) for x in row.split()] for row in rows])
-    rng = np.random.default_rng(6)
-    nu, nu_dot, down = rng.normal(size=6), rng.normal(size=6), np.array([0.6, 0.0, 0.8])
     m = fields["MRB"] + fields["MA"]
     p = m @ nu
     tau = m @ nu_dot + (fields["D"] + fields["Dn"] @ np.diag(np.abs(nu))) @ nu
@@ -246,8 +290,123 @@ def test_the_matrices_of_mss_make_the_same_wrench(coupled):
     tau[3:] += np.cross(nu[3:], p[3:]) + np.cross(nu[:3], p[:3])
     weight, buoyancy = fields["W"].item(), fields["B"].item()
     lever = weight * fields["rg"].ravel() - buoyancy * fields["rb"].ravel()
-    tau -= np.concatenate([(weight - buoyancy) * down, np.cross(lever, down)])
-    np.testing.assert_allclose(tau, model.wrench(nu, nu_dot, down), rtol=1e-12, atol=1e-12)
+    return tau - np.concatenate([(weight - buoyancy) * down, np.cross(lever, down)])
+
+
+# ------------------------------------------------------------------ nothing is lost in silence
+
+
+@st.composite
+def vehicles(draw, heavy):
+    """Any body with any coefficients and any effects."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    names = [c.name for c in catalogue()]
+    values = {}
+    for c in map(parse, draw(st.lists(st.sampled_from(names), max_size=12, unique=True))):
+        size = rng.uniform(0.001, 0.02) if c.is_added_mass else rng.uniform(0.5, 5.0)
+        hull = c.is_diagonal or c.is_one_sided
+        values[c.name] = float(size * (-1.0 if hull else rng.choice([-1.0, 1.0])))
+    fins = [c.name for c in fin_catalogue()]
+    for name in draw(st.lists(st.sampled_from(fins), max_size=2, unique=True)):
+        values[name] = float(rng.normal())
+    plain = parameters(heavy, values)
+    if draw(st.booleans()):
+        plain["vehicle"]["cog"] = rng.uniform(-0.05, 0.05, 3).tolist()
+    if draw(st.booleans()):
+        plain["vehicle"]["inertia"] = [0.3, 0.28, 0.4, *rng.uniform(-0.03, 0.03, 3).tolist()]
+    plain["gravity"] = draw(st.sampled_from([GRAVITY, 9.8]))
+    plain["vehicle"]["weight"] = plain["gravity"] * 13.5 + draw(st.sampled_from([0.0, 1.5]))
+    those = sorted(name for name, effect in EFFECTS.items() if effect.parameters)
+    chosen = draw(st.lists(st.sampled_from(those), max_size=4, unique=True))
+    plain["effects"] = {
+        name: {p.name: p.null + 0.1 * p.typical for p in EFFECTS[name].parameters}
+        for name in chosen
+    }
+    if draw(st.booleans()):
+        plain["imu"] = {"position": [0.1, 0.0, 0.0], "rotation": [0.0, 0.0, 0.1]}
+        plain["thrusters"] = {"allocation": [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]}
+    return configuration.from_parameters(plain)
+
+
+def without(config, lost):
+    """The model and the effects outside the body, less all that ``lost`` names."""
+    words = " ".join(lost)
+    kind = r"the (?:coefficients of fins|coefficients|effects|settings) ([\w., ]+)"
+    lists = [match[1] for what in lost if (match := re.match(kind, what))]
+    named = set(re.split(", | ", " ".join(lists)))
+    for name, there in (
+        ("imu.position", any(config.imu.position)),
+        ("imu.rotation", any(config.imu.rotation)),
+        ("thrusters", config.thrusters.allocation),
+    ):
+        assert (name in named) == bool(there)
+    plain = configuration.to_parameters(config)
+    plain["coefficients"] = {n: x for n, x in plain["coefficients"].items() if n not in named}
+    plain["effects"] = {n: x for n, x in plain.get("effects", {}).items() if n not in named}
+    plain["estimate"] = []
+    left = configuration.from_parameters(plain)
+    assert not left.model.fins
+    model = left.dynamics
+    body = model.body
+    if "products of inertia" in words:
+        body = dataclasses.replace(body, inertia=np.diag(np.diag(body.inertia)))
+    if "a weight of" in words:
+        heavier = config.gravity * body.mass - body.weight
+        body = dataclasses.replace(
+            body, weight=body.weight + heavier, buoyancy=body.buoyancy + heavier
+        )
+    if "a gravity of" in words:
+        share = GRAVITY / config.gravity
+        body = dataclasses.replace(body, weight=share * body.weight, buoyancy=share * body.buoyancy)
+    outside = {n: x for n, x in left.effects.items() if EFFECTS[n].body is None}
+    return dataclasses.replace(model, body=body), outside
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_what_a_file_does_not_say_is_named(name, heavy, tmp_path, data):
+    """Whatever the vehicle: the file and the list of what is lost make it up."""
+    config = data.draw(vehicles(heavy))
+    out = export(config, name)
+    model, effects = without(config, out.lost)
+    rng = np.random.default_rng(7)
+    motion = rng.normal(size=6), rng.normal(size=6), np.array([0.6, 0.0, 0.8])
+    if name in READERS:
+        (tmp_path / "file").write_text(out.content)
+        again, notes = import_model(tmp_path / "file")
+        assert notes == ()
+        assert again.effects == effects
+        wrench = again.dynamics.wrench(*motion)
+    else:
+        assert not effects
+        wrench = mss_wrench(out.content, *motion)
+    np.testing.assert_allclose(wrench, model.wrench(*motion), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_coefficient_and_effect_is_held_or_named(name, heavy, tmp_path):
+    """One by one: what the file has not is among the words."""
+    base = export(heavy, name)
+    assert base.lost == ()
+    for coefficient in (*catalogue(), *fin_catalogue()):
+        value = (
+            -0.01
+            if coefficient.name not in heavy.model.names
+            else heavy.value(coefficient.name) - 1.0
+        )
+        out = export(
+            configuration.from_parameters(parameters(heavy, {coefficient.name: value})), name
+        )
+        assert (out.content != base.content) != any(coefficient.name in what for what in out.lost)
+    for effect in EFFECTS.values():
+        if effect.parameters:
+            plain = parameters(heavy)
+            plain["effects"] = {
+                effect.name: {p.name: p.null + 0.1 * p.typical for p in effect.parameters}
+            }
+            out = export(configuration.from_parameters(plain), name)
+            assert out.content != base.content or any(effect.name in what for what in out.lost)
 
 
 # ------------------------------------------------------------------ bad input, the commands

@@ -14,7 +14,7 @@ from rov_ident.formats.base import (
     Read,
     Written,
     diagonal,
-    lost_effects,
+    lost_besides,
     lost_terms,
     not_zero,
     plain,
@@ -53,7 +53,7 @@ def write(config: Config) -> Written:
         "quadratic_damping": plain(diagonal(values, "quadratic")),
     }
     lost = lost_terms(model.coefficients, sum(DIAGONAL.values(), ()))
-    lost += lost_effects(config)
+    lost += lost_besides(config)
     if np.any(body.cog):
         lost.append(
             f"the centre of gravity {plain(body.cog)} m turns the vehicle by its weight, but its "

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rov_ident.coefficients import AXES, VELOCITIES, Coefficient
-from rov_ident.config import Config
+from rov_ident.config import Config, Thrusters
 from rov_ident.effects import EFFECTS
 
 DIAGONAL = {
@@ -55,11 +55,28 @@ def lost_terms(coefficients: Iterable[Coefficient], held: Iterable[str]) -> list
     return [f"the coefficients {', '.join(names)} have no place in it"] if names else []
 
 
-def lost_effects(config: Config, held: Iterable[str] = ()) -> list[str]:
-    """One sentence naming the effects that act outside the rigid body and are not in ``held``."""
+def lost_besides(config: Config, held: Iterable[str] = ()) -> list[str]:
+    """What else no format has a place for: the coefficients of fins; the effects that act outside
+    the rigid body and are not in ``held``; where sensors and thrusters sit."""
     held = set(held)
-    names = [name for name in config.effects if EFFECTS[name].body is None and name not in held]
-    return [f"the effects {', '.join(names)} have no place in it"] if names else []
+    mounted = {
+        "odometry.position": np.any(config.odometry.position),
+        "imu.position": np.any(config.imu.position),
+        "imu.rotation": np.any(config.imu.rotation),
+        "thrusters": config.thrusters != Thrusters(),
+    }
+    kinds = {
+        "coefficients of fins": list(config.model.fins),
+        "effects": [
+            name for name in config.effects if EFFECTS[name].body is None and name not in held
+        ],
+        "settings": [name for name, there in mounted.items() if there],
+    }
+    return [
+        f"the {kind} {', '.join(names)} have no place in it"
+        for kind, names in kinds.items()
+        if names
+    ]
 
 
 def not_zero(names: Iterable[str], numbers: Iterable[float]) -> dict[str, float]:

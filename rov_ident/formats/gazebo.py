@@ -19,7 +19,7 @@ import numpy as np
 from rov_ident.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficient, parse
 from rov_ident.config import Config
 from rov_ident.errors import UserError
-from rov_ident.formats.base import Read, Written, lost_effects, plain, values_of
+from rov_ident.formats.base import Read, Written, lost_besides, plain, values_of
 from rov_ident.frames import (
     FLIP_BODY,
     FLIP_WORLD,
@@ -45,13 +45,19 @@ def write(config: Config) -> Written:
     """A model with one link `base_link`; the world needs Gazebo's Buoyancy plugin."""
     model, body = config.model, config.dynamics.body
     gravity = config.gravity
-    lost = lost_effects(config, held=("ocean_current",))
+    lost = lost_besides(config, held=("ocean_current",))
     # The net force is what floats or sinks the vehicle: it is kept where the weight cannot be.
     buoyancy = body.buoyancy + (gravity * body.mass - body.weight)
     if abs(gravity * body.mass - body.weight) > 1e-9 * body.weight:
         lost.append(
             f"a weight of {body.weight:g} N (Gazebo takes mass times gravity, "
             f"{gravity * body.mass:g} N): the buoyancy is changed by the same amount"
+        )
+    if gravity != GRAVITY:
+        lost.append(f"a gravity of {gravity:g} m/s2: it belongs to the world, not to the model")
+    if "ocean_current" in config.effects and np.any(model.added_mass):
+        lost.append(
+            "what ocean_current does to the added mass: in Gazebo it changes the damping alone"
         )
 
     sdf = ET.Element("sdf", version="1.10")

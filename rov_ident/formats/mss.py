@@ -10,7 +10,7 @@ import numpy as np
 
 from rov_ident.coefficients import ONE
 from rov_ident.config import Config
-from rov_ident.formats.base import DIAGONAL, Written, diagonal, lost_effects, lost_terms, values_of
+from rov_ident.formats.base import DIAGONAL, Written, diagonal, lost_besides, lost_terms, values_of
 
 SUFFIX = ".m"
 
@@ -25,7 +25,7 @@ def write(config: Config) -> Written:
         damping[c.row, c.velocity] = -values[c.name]
     held = {c.name for c in linear} | {c.name for c in model.coefficients if c.is_added_mass}
     lost = lost_terms(model.coefficients, held | set(DIAGONAL["quadratic"]))
-    lost += lost_effects(config)
+    lost += lost_besides(config)
     name = re.sub(r"\W", "_", config.name)
     name = name if name[:1].isalpha() else f"vehicle_{name}"
     fields = {
