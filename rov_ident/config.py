@@ -13,7 +13,7 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -489,11 +489,11 @@ _BY_KEY = {p.key: p for p in VEHICLE_PARAMETERS + PARAMETERS}
 # ------------------------------------------------------------------ reading
 
 
-def load(path: str | os.PathLike[str], node: str = "") -> Config:
+def load(path: str | os.PathLike[str], node: str = "", own: Collection[str] = ()) -> Config:
     """Read a parameter file.
 
     The section ``/**`` is taken, overridden by that of ``node`` where there is one; a file without
-    either must have a single section.
+    either must have a single section. ``own`` are parameters of the node that are not ours.
 
     Raises
     ------
@@ -502,7 +502,11 @@ def load(path: str | os.PathLike[str], node: str = "") -> Config:
     """
     path = Path(path)
     try:
-        return from_parameters(_section(_parse(path), node))
+        section = _section(_parse(path), node)
+        theirs = {name.partition(".")[0] for name in own}
+        return from_parameters(
+            {k: v for k, v in section.items() if k.partition(".")[0] not in theirs}
+        )
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
 

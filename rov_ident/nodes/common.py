@@ -1,12 +1,23 @@
-"""What estimator nodes and the player must agree on: topics and their quality of service."""
+"""What nodes share: how one lives and ends; topics and their quality of service."""
 
+import signal
+import sys
+import threading
+from collections.abc import Callable, Collection
 from importlib import import_module
+from itertools import pairwise
+from typing import Any, TypeVar
 
+import rclpy
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
+from rov_ident import config as configuration
 from rov_ident.config import Inputs
 from rov_ident.errors import UserError
 from rov_ident.inputs import sources
@@ -17,7 +28,10 @@ try:  # half the cost of the other, and it keeps the order of arrival across top
 except ImportError:
     from rclpy.executors import SingleThreadedExecutor as Executor
 
-__all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "subscribed"]
+__all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "live", "subscribed"]
+
+AnyNode = TypeVar("AnyNode", bound=Node)
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 INPUTS = {
     ODOMETRY: ("odom", Odometry),
@@ -52,3 +66,69 @@ def subscribed(inputs: Inputs) -> dict[str, tuple[str, type]]:
                 "that has it, or republish its numbers as std_msgs/UInt16MultiArray"
             ) from error
     return found
+
+
+def live(
+    name: str,
+    make: Callable[[], AnyNode],
+    own: Collection[str],
+    executor: Callable[[], Any] = Executor,
+    leave: Callable[[AnyNode], None] = lambda node: None,
+) -> int:
+    """A node's whole life, until interrupted or shut down by itself, as the program's exit status.
+
+    It is 0 then, and 2 with one sentence where the user can mend what is wrong. ``own`` are the
+    node's parameters that are no part of a configuration; ``leave`` is called once the node no
+    longer hears anything, but may still publish.
+    """
+    # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
+    # as it is for parting words.
+    for number in _INTERRUPTS:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy gives its RCLError no public name
+        return _refused(name, _why_unreadable(name, own, error))
+    try:
+        _spin(make(), executor(), leave)
+    except UserError as error:
+        return _refused(name, str(error))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+def _spin(node: AnyNode, executor: Any, leave: Callable[[AnyNode], None]) -> None:
+    executor.add_node(node)
+    # From here on an interrupt waits for the end of a callback.
+    interrupted = threading.Event()
+    for number in _INTERRUPTS:
+        signal.signal(number, lambda *_: interrupted.set())
+    try:
+        # EventsExecutor.spin() never comes back from an interrupt.
+        while rclpy.ok() and not interrupted.is_set():
+            executor.spin_once(timeout_sec=0.5)
+    finally:
+        leave(node)
+        executor.shutdown()
+        node.destroy_node()
+
+
+def _refused(name: str, sentence: str) -> int:
+    print(f"{name}: {sentence}", file=sys.stderr)
+    return 2
+
+
+def _why_unreadable(name: str, own: Collection[str], error: Exception) -> str:
+    """What is wrong with the parameter file that rclpy could not read."""
+    for option, path in pairwise(sys.argv):
+        if option == "--params-file":
+            try:
+                configuration.load(path, name, own)
+            except UserError as reason:
+                return str(reason)
+    if "same type" in str(error):
+        return "ROS 2 wants the numbers of a list written alike: [0.0, 0.02, 1.0], not [0, 0.02, 1]"
+    return str(error).partition(", at ")[0]

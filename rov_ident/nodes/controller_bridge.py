@@ -11,7 +11,6 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue, SetParametersResult
@@ -23,7 +22,7 @@ from rcl_interfaces.srv import (
 )
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
@@ -34,7 +33,7 @@ from rov_ident.config import Names, own
 from rov_ident.consumer import HydrodynamicModel
 from rov_ident.errors import UserError
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED
+from rov_ident.nodes.common import LATCHED, live
 from rov_ident.nodes.conversions import from_diagnostics, to_status
 from rov_ident.online import Level
 
@@ -431,33 +430,12 @@ def _to_message(value: bridge.Value) -> ParameterValue:
 
 
 def main() -> int:
-    """The node's whole life; 0 after an interrupt, 2 for a bad configuration."""
-    try:
-        rclpy.init()
-    except Exception as error:  # rclpy gives its RCLError no public name
-        return _refused(str(error).partition(", at ")[0])
-    try:
-        node = ControllerBridge()
-        executor = MultiThreadedExecutor(_THREADS)
-        executor.add_node(node)
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=0.5)
-    except UserError as error:
-        return _refused(str(error))
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        # An interrupt takes the context away under a constructor or a callback.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
-    return 0
-
-
-def _refused(sentence: str) -> int:
-    print(f"controller_bridge: {sentence}", file=sys.stderr)
-    return 2
+    return live(
+        "controller_bridge",
+        ControllerBridge,
+        own=[p.key for p in _OWN],
+        executor=lambda: MultiThreadedExecutor(_THREADS),
+    )
 
 
 if __name__ == "__main__":

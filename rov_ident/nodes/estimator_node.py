@@ -7,7 +7,6 @@ Nothing here computes a coefficient. Timers run on the steady clock, so that a n
 import contextlib
 import gc
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -17,22 +16,18 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
 
@@ -45,7 +40,7 @@ from rov_ident.frames import from_core
 from rov_ident.inputs import Reader
 from rov_ident.messages import Wrench
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, STREAM, Executor, subscribed
+from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
 from rov_ident.online import Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
@@ -60,7 +55,6 @@ _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
 _SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
 _LOG_PERIOD = 10.0  # s; between two equal complaints
-_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 # Not worth a warning: the consequence of something that is named itself.
 _NO_COMPLAINT = {
     "sample: no odometry yet",
@@ -533,61 +527,15 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
 def run(kind: Kind) -> int:
     """A node's whole life; its exit status: 0 after an interrupt, 2 for a bad configuration."""
-    # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
-    # as it is for parting words.
-    for number in _INTERRUPTS:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rclpy gives its RCLError no public name
-        return _refused(kind, _why_unreadable(kind, error))
-    try:
-        _live(kind)
-    except UserError as error:
-        return _refused(kind, str(error))
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return live(
+        f"{kind}_node", lambda: _ready(kind), _OWN_PARAMETERS, leave=EstimatorNode.take_leave
+    )
 
 
-def _live(kind: Kind) -> None:
-    """Until interrupted, or shut down by the node itself."""
+def _ready(kind: Kind) -> EstimatorNode:
     node = EstimatorNode(kind)
     # What is there now stays: looking through it again and again would hold up samples.
     gc.collect()
     gc.freeze()
     sys.setswitchinterval(_SWITCHING)
-    executor = Executor()
-    executor.add_node(node)
-    # From here on an interrupt waits for the end of a callback.
-    interrupted = threading.Event()
-    for number in _INTERRUPTS:
-        signal.signal(number, lambda *_: interrupted.set())
-    try:
-        # EventsExecutor.spin() never comes back from an interrupt.
-        while rclpy.ok() and not interrupted.is_set():
-            executor.spin_once(timeout_sec=0.5)
-    finally:
-        node.take_leave()
-        executor.shutdown()
-        node.destroy_node()
-
-
-def _refused(kind: Kind, sentence: str) -> int:
-    print(f"{kind}_node: {sentence}", file=sys.stderr)
-    return 2
-
-
-def _why_unreadable(kind: Kind, error: Exception) -> str:
-    """What is wrong with the parameter file that rclpy could not read."""
-    for option, path in pairwise(sys.argv):
-        if option == "--params-file":
-            try:
-                configuration.load(path, f"{kind}_node")
-            except UserError as reason:
-                return str(reason)
-    if "same type" in str(error):
-        return "ROS 2 wants the numbers of a list written alike: [0.0, 0.02, 1.0], not [0, 0.02, 1]"
-    return str(error).partition(", at ")[0]
+    return node

@@ -10,13 +10,11 @@ import sys
 import time
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, WrenchStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -33,7 +31,7 @@ from rov_ident.frames import (
 )
 from rov_ident.messages import Array, Wrench
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, Executor
+from rov_ident.nodes.common import LATCHED, live
 
 _LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _RATE = 50.0  # Hz
@@ -145,34 +143,7 @@ class ExampleController(Node):  # type: ignore[misc]
 
 
 def main() -> int:
-    """The node's whole life; 0 after an interrupt, 2 for a bad configuration."""
-    try:
-        rclpy.init()
-    except Exception as error:  # rclpy gives its RCLError no public name
-        return _refused(str(error).partition(", at ")[0])
-    try:
-        node = ExampleController()
-        executor = Executor()
-        executor.add_node(node)
-        # EventsExecutor.spin() never comes back from an interrupt.
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=0.5)
-    except UserError as error:
-        return _refused(str(error))
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        # An interrupt takes the context away under a constructor or a callback.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
-    return 0
-
-
-def _refused(sentence: str) -> int:
-    print(f"example_controller: {sentence}", file=sys.stderr)
-    return 2
+    return live("example_controller", ExampleController, own=_OWN_PARAMETERS)
 
 
 if __name__ == "__main__":
