@@ -142,6 +142,16 @@ def decode_multi_array(data: bytes, kind: str) -> Commands:
     return Commands(0, values)
 
 
+def decode_voltage(data: bytes) -> float:
+    """The voltage [V] of a sensor_msgs/msg/BatteryState. ValueError on malformed bytes."""
+    _, offset = _read_stamp(data)
+    _, offset = _read_string(data, offset)
+    offset += -(offset - 4) % 4
+    if len(data) < offset + 4:
+        raise ValueError("a message cut short")
+    return float(np.frombuffer(data, "<f4", 1, offset)[0])
+
+
 DECODERS: dict[str, Callable[[bytes], Message]] = {
     ODOMETRY_TYPE: decode_odometry,
     IMU_TYPE: decode_imu,

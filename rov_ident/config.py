@@ -175,6 +175,7 @@ class Topics:
     imu: str = option("", "sensor_msgs/Imu topic in a bag")
     wrench: str = option("", "topic in a bag of the type inputs.wrench")
     pose: str = option("", "topic in a bag of the type inputs.pose, where inputs.odom is a twist")
+    battery: str = option("", "topic in a bag of the type inputs.battery")
 
 
 ODOMETRY_TYPES = (
@@ -185,6 +186,7 @@ ODOMETRY_TYPES = (
 POSE_TYPES = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")
 WRENCH_TYPES = ("geometry_msgs/WrenchStamped", "geometry_msgs/Wrench")
 FORCE_TYPES = ("sensor_msgs/JointState", "std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
+BATTERY_TYPE = "sensor_msgs/BatteryState"
 PULSE_TYPES = ("std_msgs/UInt16MultiArray", "std_msgs/Int16MultiArray", "mavros_msgs/RCOut")
 
 
@@ -208,6 +210,11 @@ class Inputs:
         "type of the thrust: a wrench, or an array of thruster commands that `thrusters` turns "
         "into one; a type without a header is stamped on arrival",
         choices=WRENCH_TYPES + FORCE_TYPES + PULSE_TYPES,
+    )
+    battery: str = option(
+        "none",
+        "type of the supply of the thrusters, for the curve of the T200; none: thrusters.voltage",
+        choices=("none", BATTERY_TYPE),
     )
 
     @property
@@ -251,7 +258,10 @@ class Thrusters:
         (), "which element of the array is each thruster, from 1; empty: the first ones", size=ANY
     )
     voltage: float = option(
-        16.0, "supply of the thrusters, for the curve of the T200", "V", lower=POSITIVE
+        16.0,
+        "supply of the thrusters, for the curve of the T200; with inputs.battery until it is heard",
+        "V",
+        lower=POSITIVE,
     )
     curve_pwm: Vector = option(
         (), "pulse widths of another thruster's curve of thrust; empty: the T200's", "us", size=ANY
@@ -544,6 +554,14 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
     if inputs.is_allocated:
         chosen = settings.get("thrusters", Thrusters())
         thrusters.check(chosen, thruster_signal(inputs, chosen))
+    if inputs.battery != "none":
+        chosen = settings.get("thrusters", Thrusters())
+        signal = thruster_signal(inputs, chosen) if inputs.is_allocated else thrusters.FORCE
+        if signal == thrusters.FORCE or chosen.curve_pwm:
+            raise UserError(
+                f"inputs.battery is {inputs.battery}, but only the curve of the T200 depends on "
+                "it, from pulses to forces: leave it out"
+            )
     if "prior" in settings:
         prior = settings["prior"]
         std = {_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}

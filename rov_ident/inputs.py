@@ -5,14 +5,15 @@ what the sampler takes:
 
 * a wrench as it is; one without a stamp, and any array without a header, is stamped on arrival (in
   a bag: its log time), which presumes that the computer's clock is that of the sensors;
-* commands of single thrusters through :class:`rov_ident.thrusters.Allocator`;
+* commands of single thrusters through :class:`rov_ident.thrusters.Allocator`, pulses at the
+  voltage of the battery that was last heard;
 * a twist and the poses around it joined into odometry at the stamp of the twist: the position
   straight in between, the attitude along the shortest rotation.
 """
 
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ import numpy as np
 from rov_ident import cdr
 from rov_ident.bags import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.config import (
+    BATTERY_TYPE,
     FORCE_TYPES,
     ODOMETRY_TYPES,
     POSE_TYPES,
@@ -33,9 +35,9 @@ from rov_ident.config import (
 from rov_ident.errors import UserError
 from rov_ident.frames import from_core, quaternion_between
 from rov_ident.messages import Commands, Message, Odometry, Pose, Twist, Wrench
-from rov_ident.thrusters import Allocator
+from rov_ident.thrusters import Allocator, knows
 
-ODOMETRY, IMU, WRENCH, POSE = "odom", "imu", "wrench", "pose"
+ODOMETRY, IMU, WRENCH, POSE, BATTERY = "odom", "imu", "wrench", "pose", "battery"
 
 _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
@@ -58,6 +60,7 @@ _DECODERS: dict[str, Callable[[bytes], Any]] = {
     "std_msgs/UInt16MultiArray": partial(cdr.decode_multi_array, kind="<u2"),
     "std_msgs/Int16MultiArray": partial(cdr.decode_multi_array, kind="<i2"),
     "mavros_msgs/RCOut": cdr.decode_channels,
+    BATTERY_TYPE: cdr.decode_voltage,
 }
 _CHOICES = {
     ODOMETRY: ODOMETRY_TYPES,
@@ -74,7 +77,8 @@ class Source(NamedTuple):
 
 
 def sources(inputs: Inputs) -> dict[str, Source]:
-    """The topics by role: `odom`, `imu`, `wrench`, and `pose` where the motion is a twist."""
+    """The topics by role: `odom`, `imu`, `wrench`; `pose` where the motion is a twist; `battery`
+    where there is one."""
     found = {
         ODOMETRY: Source("velocity" if inputs.is_twist else ROLE_NAMES[ODOMETRY], inputs.odom),
         IMU: Source(ROLE_NAMES[IMU], "sensor_msgs/Imu"),
@@ -82,6 +86,8 @@ def sources(inputs: Inputs) -> dict[str, Source]:
     }
     if inputs.is_twist:
         found[POSE] = Source("pose", inputs.pose)
+    if inputs.battery != "none":
+        found[BATTERY] = Source("battery", inputs.battery)
     return found
 
 
@@ -108,6 +114,7 @@ class Reader:
         if config.inputs.is_allocated:
             signal = thruster_signal(config.inputs, config.thrusters)
             self._allocator = Allocator(config.thrusters, signal)
+        self._voltage = config.thrusters.voltage
         self._poses: deque[Pose] = deque(maxlen=_HELD)
         self._twists: deque[Twist] = deque()
 
@@ -118,6 +125,12 @@ class Reader:
             message = _DECODERS[type_name](data)
         except ValueError:
             self.counts[f"{role}: bytes that are no {_full(type_name)}"] += 1
+            return []
+        if role == BATTERY:
+            if knows(message):
+                self._voltage = message
+            else:
+                self.counts["battery: a voltage for which the T200 has no curve"] += 1
             return []
         if role == WRENCH:
             return self._wrench(message, arrival)
@@ -138,7 +151,7 @@ class Reader:
             return [(WRENCH, message)]
         assert self._allocator is not None
         try:
-            tau = self._allocator.wrench(message.values)
+            tau = self._allocator.wrench(message.values, self._voltage)
         except ValueError as reason:
             self.counts[f"{WRENCH}: {reason}"] += 1
             return []
@@ -205,8 +218,8 @@ class Reader:
 # ------------------------------------------------------------------ bags
 
 
-def select(bag: Bag, config: Config) -> dict[str, str]:
-    """The topic of each role that the bag has.
+def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, str]:
+    """The topic of each role that the bag has; given ``roles``, of these alone.
 
     Raises
     ------
@@ -216,6 +229,8 @@ def select(bag: Bag, config: Config) -> dict[str, str]:
     wanted = vars(config.topics)
     chosen = {}
     for role, (name, type_name) in sources(config.inputs).items():
+        if roles and role not in roles:
+            continue
         try:
             topic = select_topic(bag, role, name, _full(type_name), wanted[role])
         except UserError as error:

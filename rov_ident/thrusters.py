@@ -28,6 +28,11 @@ _PLAUSIBLE = (500.0, 2500.0)  # us; a pulse outside is not one
 _LARGEST_FORCE = 1e5  # N, of one thruster
 
 
+def knows(voltage: float) -> bool:
+    """Whether :func:`t200` has a curve for it [V]."""
+    return min(CURVES) <= voltage <= max(CURVES)
+
+
 def t200(voltage: float) -> Array:
     """Thrust [N] of a T200 (801,) at the pulses 1100, 1101 ... 1900 us; linear in the voltage.
 
@@ -37,7 +42,7 @@ def t200(voltage: float) -> Array:
         If the voltage is outside the table.
     """
     known = sorted(CURVES)
-    if not known[0] <= voltage <= known[-1]:
+    if not knows(voltage):
         raise UserError(
             f"thrusters.voltage is {voltage:g} V, but the curve of the T200 is known from "
             f"{known[0]:g} to {known[-1]:g} V: give thrusters.curve_pwm and thrusters.curve_force"

@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.bags import Bag, read_messages, select_topics
+from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.frames import FrameDefaults, quaternion_to_euler, to_core
+from rov_ident.inputs import ODOMETRY, POSE, WRENCH, messages, select
 from rov_ident.messages import Array, Odometry, Wrench
 from rov_ident.tables import CsvTable, read_csv
 
@@ -98,15 +100,18 @@ class Zigzag:
         )
 
 
-def read(path: Path) -> Zigzag:
+def read(path: Path, config: Config | None = None) -> Zigzag:
     """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
+
+    ``config`` says which types and axes a bag has that are not the usual ones.
 
     Raises
     ------
     UserError
         If it cannot be read, lacks a column or topic, or is in other units than it says.
     """
-    return from_bag(path) if path.is_dir() or path.suffix == ".mcap" else from_csv(path)
+    is_bag = path.is_dir() or path.suffix == ".mcap"
+    return from_bag(path, config) if is_bag else from_csv(path)
 
 
 def from_csv(path: Path) -> Zigzag:
@@ -164,7 +169,7 @@ def _angle(table: CsvTable, name: str, blank: bool) -> Array:
     return np.radians(values)
 
 
-def from_bag(path: Path) -> Zigzag:
+def from_bag(path: Path, config: Config | None = None) -> Zigzag:
     """Heading of the odometry; the rudder from a std_msgs/Float64 (or 32) topic [rad] whose name
     ends in `rudder`, stamped as recorded, or without one the yaw moment of the thruster wrench."""
     bag = Bag(path)
@@ -175,13 +180,17 @@ def from_bag(path: Path) -> Zigzag:
     ]
     if len(steered) > 1:
         raise UserError(f"{path} has several rudders, {', '.join(steered)}: keep one")
-    roles = select_topics(bag, roles=("odom",) if steered else ("odom", "wrench"))
-    defaults = FrameDefaults()
-    times: dict[str, list[float]] = {"odom": [], "wrench": []}
-    values: dict[str, list[float]] = {"odom": [], "wrench": []}
-    for role, message in read_messages(bag, roles):
+    roles = (ODOMETRY,) if steered else (ODOMETRY, WRENCH)
+    if config is None:
+        frames, stream = FrameDefaults(), read_messages(bag, select_topics(bag, roles=roles))
+    else:
+        frames = config.frames
+        stream = messages(bag, select(bag, config, (*roles, POSE)), config)
+    times: dict[str, list[float]] = {ODOMETRY: [], WRENCH: []}
+    values: dict[str, list[float]] = {ODOMETRY: [], WRENCH: []}
+    for role, message in stream:
         if isinstance(message, Odometry | Wrench):
-            core = to_core(message, defaults)
+            core = to_core(message, frames)
             if isinstance(core, Odometry):
                 value = float(np.asarray(quaternion_to_euler(core.orientation))[..., 2])
             else:
@@ -189,7 +198,7 @@ def from_bag(path: Path) -> Zigzag:
             if np.isfinite(value):
                 times[role].append(1e-9 * core.stamp)
                 values[role].append(value)
-    at, steering = np.array(times["wrench"]), np.array(values["wrench"])
+    at, steering = np.array(times[WRENCH]), np.array(values[WRENCH])
     if steered:
         raw = list(bag.iter_raw(steered))
         kind = _RUDDER_TYPES[bag.topics[steered[0]].type_name]
@@ -198,11 +207,11 @@ def from_bag(path: Path) -> Zigzag:
             [np.frombuffer(m.data, ("<" if m.data[1] else ">") + kind, 1, 4)[0] for m in raw],
             dtype=float,
         )
-    t, first = np.unique(np.array(times["odom"]), return_index=True)
+    t, first = np.unique(np.array(times[ODOMETRY]), return_index=True)
     at, once = np.unique(at, return_index=True)
     if len(t) < 2 or len(at) < 1:
         raise UserError(f"{path} has too few messages of heading or rudder: record a longer run")
-    heading = np.unwrap(np.array(values["odom"])[first])
+    heading = np.unwrap(np.array(values[ODOMETRY])[first])
     # Heading and input on the instants of either, so that a step of the input keeps its time.
     both = np.unique(np.concatenate([t, at[(at > t[0]) & (at < t[-1])]]))
     index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)

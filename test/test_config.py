@@ -18,6 +18,7 @@ from rov_ident.config import (
     LARGEST,
     PARAMETERS,
     VEHICLE_PARAMETERS,
+    PULSE_TYPES,
     WRENCH_TYPES,
     Config,
     Names,
@@ -415,6 +416,8 @@ def configurations(draw: Any) -> Config:
         columns = [draw(FINITE) for _ in range(6 * draw(st.integers(1, 3)))]
         parameters = {k: v for k, v in parameters.items() if not k.startswith("thrusters.")}
         parameters["thrusters.allocation"] = columns
+    if parameters.get("inputs.wrench") not in PULSE_TYPES:
+        parameters.pop("inputs.battery", None)
     positive = st.floats(1e-3, 1e6)
     coefficient = st.floats(-1e6, 0.0)
     return from_parameters(

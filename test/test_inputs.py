@@ -14,7 +14,7 @@ from geometry_msgs.msg import (
 )
 from geometry_msgs.msg import Wrench as RosWrench
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import (
     Float32MultiArray,
     Float64MultiArray,
@@ -292,6 +292,76 @@ def test_a_voltage_outside_the_table_is_refused(voltage):
         thrusters.t200(voltage)
 
 
+def battery(voltage):
+    return serialize_message(BatteryState(voltage=voltage))
+
+
+def by_battery(**more):
+    return with_wrench("mavros_msgs/RCOut", **{"inputs.battery": config.BATTERY_TYPE}, **more)
+
+
+def test_pulses_at_the_voltage_of_the_battery():
+    """From the message that says it on; what cannot be is counted, and changes nothing."""
+    settings = by_battery(**{"thrusters.voltage": 12.0})
+    allocator = thrusters.Allocator(settings.thrusters, thrusters.PWM)
+    reader = inputs.Reader(settings)
+    pulses = np.array([1900, 1800, 1700, 1600, 1400, 1300, 1200, 1100], dtype="<u2")
+    header = serialize_message(JointState())[: 4 + 8 + 4 + 4]
+    data = header + b"\x08\0\0\0" + pulses.tobytes()
+
+    def force_at(voltage):
+        ((_, wrench),) = reader.read(WRENCH, data, 0)
+        expected = allocator.wrench(pulses, voltage)
+        core = to_core(wrench, settings.frames)
+        np.testing.assert_allclose(np.concatenate([core.force, core.torque]), expected)
+
+    force_at(12.0)
+    for voltage in (15.25, 10.5):
+        assert reader.read("battery", battery(voltage), 0) == []
+        force_at(voltage)
+    for voltage in (float("nan"), 5.0, 24.0):
+        assert reader.read("battery", battery(voltage), 0) == []
+        force_at(10.5)
+    assert reader.counts == {"battery: a voltage for which the T200 has no curve": 3}
+
+
+def test_a_bag_with_a_battery(tmp_path, by_pulses, reference):
+    """Full until the end, with thrusters.voltage of another: the dive at 16 V."""
+    messages, pulses = by_pulses
+
+    def rows():
+        yield messages[0][0], "/battery", config.BATTERY_TYPE, battery(16.0)
+        for arrival, role, message in messages:
+            if role == WRENCH:
+                array = UInt16MultiArray(data=pulses[message.stamp].tolist())
+                yield message.stamp, "/thruster_pwm", "std_msgs/UInt16MultiArray", array
+            else:
+                yield arrival, *standard(role), cdr.encode(message)
+
+    settings = with_wrench(
+        "std_msgs/UInt16MultiArray",
+        **{"inputs.battery": config.BATTERY_TYPE, "thrusters.voltage": 12.0},
+    )
+    assert_same(estimate(write(tmp_path / "dive.mcap", rows()), settings), reference)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"inputs.wrench": "sensor_msgs/JointState"},
+        {
+            "inputs.wrench": "mavros_msgs/RCOut",
+            "thrusters.curve_pwm": [1100.0, 1900.0],
+            "thrusters.curve_force": [-40.0, 50.0],
+        },
+    ],
+)
+def test_a_battery_that_nothing_depends_on_is_refused(changes):
+    with pytest.raises(UserError, match=r"inputs\.battery .* leave it out"):
+        configured(**{"inputs.battery": config.BATTERY_TYPE}, **GEOMETRY, **changes)
+
+
 def test_an_output_that_is_off_pushes_nothing():
     settings = with_wrench("std_msgs/UInt16MultiArray")
     allocator = thrusters.Allocator(settings.thrusters, thrusters.PWM)
@@ -515,9 +585,13 @@ def test_bytes_that_are_no_message(type_name, data):
         if "Pose" in type_name
         else "odom"
         if type_name in config.ODOMETRY_TYPES
+        else "battery"
+        if type_name == config.BATTERY_TYPE
         else "wrench"
     )
     changes = {f"inputs.{role}": type_name}
+    if role == "battery":
+        changes["inputs.wrench"] = "std_msgs/UInt16MultiArray"
     if role == "pose":
         changes["inputs.odom"] = "geometry_msgs/TwistStamped"
     reader = inputs.Reader(configured(**changes, **GEOMETRY))

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from test_inputs import twist_and_pose, with_twist
+from test_inputs import write as write_rows
 
 from rov_ident import autopilot, config, nomoto
 from rov_ident.bags import BagWriter
@@ -401,6 +403,33 @@ def test_bag_with_a_rudder_topic(short, tmp_path):
     np.testing.assert_allclose(run.heading, short.heading, atol=1e-9)
     np.testing.assert_allclose(run.rudder, short.rudder)
     assert run.unit == "rad" and run.held
+
+
+def test_bag_of_other_types(short, tmp_path):
+    """The configuration says the types, as to the other commands."""
+    zeros = np.zeros(3)
+    rows = []
+    for t, heading, rudder in zip(short.t, short.heading, short.rudder):
+        stamp = 1_000_000_000 + round(1e9 * t)
+        q = quaternion_from_euler(0.0, 0.0, heading)
+        odometry = Odometry(
+            stamp, "world_ned", "base_link_frd", zeros, q, zeros, zeros, np.zeros(6)
+        )
+        rows += [(stamp, *row) for row in twist_and_pose("plain", odometry)]
+        rudder_bytes = struct.pack("<4Bd", 0, 1, 0, 0, rudder)
+        rows.append((stamp, "/rudder", "std_msgs/Float64", rudder_bytes))
+    path = write_rows(tmp_path / "run.mcap", rows)
+    with pytest.raises(UserError, match="nav_msgs/msg/Odometry"):
+        read(path)
+    run = read(path, with_twist("plain"))
+    known = np.isfinite(run.heading)
+    np.testing.assert_allclose(run.heading[known], short.heading, atol=1e-9)
+    np.testing.assert_allclose(run.rudder[known], short.rudder)
+    config.dump(with_twist("plain"), tmp_path / "twist.yaml")
+    result = tmp_path / "result.json"
+    words = ["nomoto", str(path), "--config", str(tmp_path / "twist.yaml"), "--json", str(result)]
+    assert main(words) == 0
+    assert json.loads(result.read_text())["K"]["unit"] == "1/s"
 
 
 def test_bag_without_rudder_takes_the_yaw_moment():

@@ -21,6 +21,9 @@ def add(commands: Commands) -> None:
         "files", nargs="+", type=Path, metavar="FILE",
         help="CSV (t_s, heading_rad or heading_deg, rudder_rad or rudder_deg) or bag",
     )  # fmt: skip
+    nomoto.add_argument(
+        "--config", type=Path, help="says the types, topics and axes of a bag (inputs, frames)"
+    )
     nomoto.add_argument("--order", type=int, choices=(1, 2), default=1, help="of the model (1)")
     nomoto.add_argument("--nonlinear", action="store_true", help="with Norrbin's cubic term")
     nomoto.add_argument(
@@ -42,12 +45,16 @@ def add(commands: Commands) -> None:
 
 
 def _nomoto(options: argparse.Namespace) -> None:
+    from rov_ident import config as configuration
     from rov_ident import nomoto, zigzag
     from rov_ident.fit import write_text
 
-    check_outputs([options.json, options.report], [*options.files, options.validate])
-    runs = [zigzag.read(path) for path in options.files]
-    judge = zigzag.read(options.validate) if options.validate else None
+    check_outputs(
+        [options.json, options.report], [*options.files, options.validate, options.config]
+    )
+    config = configuration.load(options.config) if options.config else None
+    runs = [zigzag.read(path, config) for path in options.files]
+    judge = zigzag.read(options.validate, config) if options.validate else None
     with progress(options) as tell:
         tell("fitting")
         model = nomoto.fit(

@@ -37,7 +37,7 @@ from rov_ident.cdr import encode
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.frames import from_core
-from rov_ident.inputs import Reader
+from rov_ident.inputs import BATTERY, Reader
 from rov_ident.messages import Wrench
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
@@ -55,6 +55,7 @@ _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
 _SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
 _LOG_PERIOD = 10.0  # s; between two equal complaints
+_SLOW = {BATTERY: 10.0}  # s; what may be silent for longer than timeout
 # Not worth a warning: the consequence of something that is named itself.
 _NO_COMPLAINT = {
     "sample: no odometry yet",
@@ -361,7 +362,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             self._publish()
 
     def _missing(self, role: str) -> bool:
-        return self._silence[role] > self._config.timeout
+        return self._silence[role] > max(self._config.timeout, _SLOW.get(role, 0.0))
 
     def _complaints(self) -> list[str]:
         """What keeps the inputs from being used, in words."""
