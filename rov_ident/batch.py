@@ -208,10 +208,10 @@ def _stage(
             notes.append(
                 f"{n}: the data ask for {raw:.4g}, which no passive hull has; {held:.4g} is kept"
             )
-    if base.unidentified and not settings.stages:
-        notes.append(
-            "the motion does not tell apart or does not show: " + ", ".join(base.unidentified)
-        )
+    identifiable = dict(zip(names, removed > IDENTIFIABLE, strict=True))
+    unknown = [n for n in base.unidentified if not identifiable[n]]
+    if unknown and not settings.stages:
+        notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
     return _Stage(names, values, covariance, removed > IDENTIFIABLE, more)
 
 

@@ -35,7 +35,10 @@ def of_check(found: Check, config: Config) -> str:
         for p in found.prospects
     ]
     table = report.table(["", "configured", "std", "unit", "known"], numbers, text=(3, 4))
+    said = [(r.level, f"{r.level}: {r.subject}: {r.text}") for r in remarks]
+    doubts = [text for level, text in said if level != GOOD]
     sections = [
+        *([report.bullets(doubts)] if doubts else []),
         report.heading("What a fit of it would tell"),
         report.beside([_precision(shares, found.prospects)], [table]),
         report.heading("Excitation"),
@@ -44,8 +47,8 @@ def of_check(found: Check, config: Config) -> str:
         _motion(found, config),
         report.heading("Pauses between messages"),
         _pauses(found),
-        report.heading("All that was looked at"),
-        report.bullets([f"{r.level}: {r.subject}: {r.text}" for r in remarks]),
+        report.heading("What is as it should be"),
+        report.bullets([text for level, text in said if level == GOOD]),
     ]
     footer = f"rov_ident {version('rov_ident')}; {found.bag} {found.record.sha256[:12]}"
     return report.page(f"Check of {found.bag} for {config.name}", lead, sections, footer)
@@ -70,8 +73,8 @@ def of_plan(found: Proposal, config: Config) -> str:
         _way(dive.truth.position, best.limits.tank),
         report.heading("Manoeuvres compared"),
         report.paragraph(
-            "By the standard deviation, relative to its value, of the coefficient known worst "
-            "afterwards."
+            "By the standard deviation of the coefficient known worst afterwards, relative to its "
+            "value or, where that is small, to a fifth of what is usual."
         ),
         report.table(["manoeuvre", "worst"], others),
     ]

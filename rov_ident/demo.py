@@ -143,7 +143,9 @@ def _page(
                 "Published values over the time of the bag with their 95 % intervals; dashed: the "
                 "coefficients the bag was simulated with.",
             ),
-            report.table(["", "truth", *histories, "unit"], coefficients),
+            report.table(
+                ["", "truth", *histories, "unit"], coefficients, text=[2 + len(histories)]
+            ),
             report.heading("What it means for a simulation"),
             report.figure(
                 plots.to_svg(

@@ -39,6 +39,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right;
   white-space: nowrap; }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
+@media screen and (max-width: 600px) { th, td { padding: .2rem .3rem; font-size: .8rem; } }
 @media print { body { margin: 0; max-width: none; font-size: 10pt; }
   figure.one, .panels > svg, .card, pre, tr { break-inside: avoid; } h2 { break-after: avoid; }
   .panels, .panels.wide, .beside { grid-template-columns: 1fr 1fr; }

@@ -31,10 +31,16 @@ def steering(
     others: Mapping[str, Nomoto] | None = None,
 ) -> str:
     """The page of a Nomoto fit; ``others`` are fits by other methods, for comparison."""
-    sections = [
-        report.paragraph(f"{_EQUATIONS[model.order, model.nonlinear]}, r = d(heading)/dt"),
-        report.paragraph(f"Fitted by {_METHODS[model.estimator]}."),
+    sections = [_run(model, run, "fitted", f"run{i}-") for i, run in enumerate(runs)]
+    if judge is not None:
+        sections.append(report.heading("On a run not used for the fit"))
+        sections.append(_run(model, judge, "predicted", "judge-"))
+    sections += [
         report.heading("Parameters"),
+        report.paragraph(
+            f"{_EQUATIONS[model.order, model.nonlinear]}, r = d(heading)/dt; fitted by "
+            f"{_METHODS[model.estimator]}."
+        ),
         report.numbers(model),
     ]
     sections += [report.bullets(model.notes)] if model.notes else []
@@ -50,13 +56,7 @@ def steering(
         sections.append(
             report.paragraph("± is half of the 95 % interval, coloured noise allowed for.")
         )
-    sections.append(report.heading("Simulation against the record"))
-    for i, run in enumerate(runs):
-        sections.append(_run(model, run, "fitted", f"run{i}-"))
-    if judge is not None:
-        sections.append(report.heading("On a run not used for the fit"))
-        sections.append(_run(model, judge, "predicted", "judge-"))
-    lead = f"heading RMSE {np.degrees(model.rmse):.3g} deg on what was fitted"
+    lead = f"Heading RMSE {np.degrees(model.rmse):.3g} deg on what was fitted"
     if judge is not None:
         lead += f", {np.degrees(nomoto.predict(model, judge)[1]):.3g} deg on {judge.name}"
     names = ", ".join(run.name for run in runs)
@@ -89,8 +89,6 @@ def forces(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) ->
         chosen = [set(c.terms) for c in f.candidates].index(set(f.names))
         sections += [
             report.heading(f"{axis}: R2 {f.r2:.4f}, residual {f.rmse:.3g} {unit}"),
-            report.numbers(f),
-            report.paragraph(f"Chosen because: {f.why}."),
             report.panels(
                 [
                     plots.to_svg(plots.parity(f.measured, f.fitted, axis, unit), f"fit-{axis}-"),
@@ -101,6 +99,8 @@ def forces(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) ->
                 ],
                 "Left: every row of the table. Right: the best structures that were tried.",
             ),
+            report.numbers(f),
+            report.paragraph(f"Chosen because: {f.why}."),
             report.table(["structure", f"cross-validated error [{unit}]"], tried),
         ]
     lead = ", ".join(f"{axis}: {' '.join(f.names)}" for axis, f in fits.items())
