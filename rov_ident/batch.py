@@ -36,6 +36,7 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
+_COLOURED = 2.0  # times the Cramer-Rao bound, from which intervals say that a cause is missing
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
 _POINTS = 1500  # of a curve in a picture
 
@@ -198,6 +199,13 @@ def _stage(
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
         more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
+        wider = float(np.median(np.sqrt(np.diag(covariance)) / bound))
+        if wider > _COLOURED:
+            notes.append(
+                f"{name + ': ' if settings.stages else ''}what remains is no white noise, so that "
+                f"intervals are {wider:.1f} times as wide as they could be: rov-ident explain "
+                "looks for what the model lacks"
+            )
         if not likelihood.converged:
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     removed = 1.0 - np.diag(covariance) / prior.std**2

@@ -2,9 +2,12 @@
 
 import json
 import re
-from dataclasses import replace
+import types
+from dataclasses import fields, replace
+from typing import Literal, Union, get_args, get_origin, get_type_hints
 from xml.etree import ElementTree
 
+import foxglove.layouts as sdk
 import pytest
 from conftest import HEAVY
 from geometry_msgs.msg import WrenchStamped
@@ -86,6 +89,49 @@ def test_foxglove(with_effects, namespace):
     assert statuses == [f"{above}rls_node: model", f"{above}ukf_node: model"]
 
 
+CONFIGS = {
+    "Plot": sdk.PlotConfig,
+    "DiagnosticSummary": sdk.DiagnosticsSummaryConfig,
+    "DiagnosticStatusPanel": sdk.DiagnosticsDetailConfig,
+}
+
+
+def is_one_of(value, hint):
+    """Whether a value out of JSON is what a type of the SDK allows."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return any(is_one_of(value, each) for each in get_args(hint))
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if get_origin(hint) is list:
+        return all(is_one_of(each, get_args(hint)[0]) for each in value)
+    if isinstance(value, dict):
+        return hint in (sdk.PlotSeries,) and understood(value, hint)
+    return type(value) is hint or (hint is float and type(value) is int)
+
+
+def understood(settings, kind):
+    """Whether Foxglove's SDK has all these settings of a panel or a series, and of these types."""
+    hints = get_type_hints(kind, vars(sdk))
+    keys = dict(zip(kind()._to_dict(), (f.name for f in fields(kind)), strict=True))
+    own = set(keys) | {"foxglovePanelTitle"}
+    return set(settings) <= own and all(
+        is_one_of(value, hints[keys[key]]) for key, value in settings.items() if key in keys
+    )
+
+
+def test_the_sdk_of_foxglove_knows_every_setting(with_effects):
+    panels = json.loads(layouts.foxglove(with_effects))["configById"]
+    kinds = {identity: identity.partition("!")[0] for identity in panels}
+    assert set(kinds.values()) == {*CONFIGS, "Tab"}
+    for identity, settings in panels.items():
+        if kinds[identity] != "Tab":
+            kind = CONFIGS[kinds[identity]]
+            assert understood(settings, kind), identity
+            assert not understood({**settings, "showLegends": True}, kind)
+            key = next(k for k in settings if k != "foxglovePanelTitle")
+            assert not understood({**settings, key: {"no": 1}}, kind)
+
+
 def series(messages):
     """The names that PlotJuggler gives to the numbers of these messages."""
     for topic, message in messages.items():
@@ -105,6 +151,11 @@ def test_plotjuggler(with_effects, namespace):
     assert len(curves) == len(set(curves)) == 2 * (3 * (len(with_effects.estimate) + 1) + 6)
     for splitter in root.iter("DockSplitter"):
         assert len(splitter) == int(splitter.get("count")) == len(splitter.get("sizes").split(";"))
+        assert splitter.get("orientation") in ("|", "-")
+        assert {child.tag for child in splitter} <= {"DockSplitter", "DockArea"}
+    for area in root.iter("DockArea"):
+        assert [child.tag for child in area] == ["plot"]
+        assert area.find("plot").get("mode") == "TimeSeries"
     streamer = root.find("previouslyLoaded_Streamer").get("name")
     plugin = root.find(f"Plugins/plugin[@ID='{streamer}']")
     assert set(plugin.find("selected_topics").get("value").split(";")) == set(messages)

@@ -7,7 +7,7 @@ const CELL = 12;                       // px; the least in which a name can stan
 const EXCITED = 0.05;                  // share of the prior variance from which a motion shows it
 const AXES = ["X", "Y", "Z", "K", "M", "N"];
 const LEVELS = [["✓", "converged"], ["…", "converging, or held"], ["✕", "diverged, or at a bound"],
-                ["○", "inputs stopped"]];
+                ["○", "held: inputs stopped"]];
 const HEALTH = ["ok", "warning", "error", "stale"];
 
 const estimators = new Map();          // by full name: the latest state, with history and residuals
