@@ -132,14 +132,22 @@ def _page(
         + [history.units[i]]
         for i, name in enumerate(history.names)
     ]
+    colours = [plots.css(colour) for colour in plots.COLOURS]
     return report.page(
         f"{config.name}: coefficients identified live",
         f"Both nodes started from coefficients off by up to 50 % and saw {record.duration:.0f} s "
         "of simulated odometry, IMU and thruster wrench, replayed over DDS.",
         [
             report.heading("Coefficients converging to the simulator's truth"),
-            report.figure(
-                plots.to_svg(plots.convergence(histories, truth)),
+            report.legend(
+                {n: (c, "", 1.0) for n, c in zip(histories, colours)}
+                | {"truth": ("currentColor", "6,4", 1.0)}
+            ),
+            report.panels(
+                [
+                    plots.to_svg(plots.history(histories, truth, i), f"history{i}")
+                    for i in range(len(config.estimate))
+                ],
                 "Published values over the time of the bag with their 95 % intervals; dashed: the "
                 "coefficients the bag was simulated with.",
             ),
@@ -147,18 +155,26 @@ def _page(
                 ["", "truth", *histories, "unit"], coefficients, text=[2 + len(histories)]
             ),
             report.heading("What it means for a simulation"),
-            report.figure(
-                plots.to_svg(
-                    plots.open_loop(
-                        samples["t"][stretch],
-                        samples["nu"][stretch],
-                        {label: run[stretch] for label, run in runs.items()},
-                        VELOCITIES,
-                        UNITS,
+            report.legend(
+                {"measured": ("currentColor", "", 0.35)}
+                | {label: (c, "", 1.0) for label, c in zip(runs, colours[1:])}
+            ),
+            report.panels(
+                [
+                    plots.to_svg(
+                        plots.motion(
+                            samples["t"][stretch],
+                            samples["nu"][stretch, i],
+                            {label: run[stretch, i] for label, run in runs.items()},
+                            f"{name} [{unit}]",
+                        ),
+                        f"motion{i}",
                     )
-                ),
+                    for i, (name, unit) in enumerate(zip(VELOCITIES, UNITS))
+                ],
                 "The first minute: open-loop simulation from the first state, driven by the "
                 "recorded wrench alone, before and after.",
+                wide=True,
             ),
             report.paragraph(f"Root mean square error over open-loop windows of {HORIZON:g} s:"),
             report.table(["", *(f"{n} [{u}]" for n, u in zip(VELOCITIES, UNITS))], rows),

@@ -9,7 +9,6 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from rov_ident.messages import Array
 
@@ -60,19 +59,8 @@ def convergence(histories: Mapping[str, History], truth: Mapping[str, float]) ->
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for ax in axes.flat[len(first.names) :]:
         ax.axis("off")
-    for i, (ax, name) in enumerate(zip(axes.flat, first.names)):
-        for colour, (label, history) in zip(COLOURS, histories.items()):
-            value, half = history.values[:, i], 1.96 * history.std[:, i]
-            ax.fill_between(history.t, value - half, value + half, color=colour, alpha=0.18, lw=0)
-            ax.plot(history.t, value, color=colour, lw=1.4, label=label)
-        shown = np.concatenate([h.values[:, i] for h in histories.values()])
-        if name in truth:
-            ax.axhline(truth[name], color="black", lw=1.0, ls="--", label="truth")
-            shown = np.append(shown, truth[name])
-        middle, reach = 0.5 * (shown.min() + shown.max()), 0.75 * np.ptp(shown)
-        if reach > 0:
-            ax.set_ylim(middle - reach, middle + reach)
-        ax.set_title(f"{name}  [{first.units[i]}]", loc="left", fontsize=9)
+    for i, ax in enumerate(axes.flat[: len(first.names)]):
+        _draw_history(ax, histories, truth, i)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
@@ -80,24 +68,38 @@ def convergence(histories: Mapping[str, History], truth: Mapping[str, float]) ->
     return figure
 
 
-def open_loop(
-    t: Array,
-    measured: Array,
-    simulated: Mapping[str, Array],
-    components: Sequence[str],
-    units: Sequence[str],
-) -> Figure:
-    """Measured velocities (k, 6) beside simulated ones, one panel a component."""
-    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
-    axes: NDArray[np.object_] = figure.subplots(len(components), 1, sharex=True)
-    for i, (ax, name, unit) in enumerate(zip(axes, components, units)):
-        ax.plot(t, measured[:, i], color="black", lw=1.6, alpha=0.55, label="measured")
-        for colour, (label, run) in zip(COLOURS[1:], simulated.items()):
-            ax.plot(t, run[:, i], color=colour, lw=1.0, label=label)
-        ax.set_ylabel(f"{name} [{unit}]")
-    axes[-1].set_xlabel("time [s]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=len(labels))
+def history(histories: Mapping[str, History], truth: Mapping[str, float], i: int) -> Figure:
+    """One panel of :func:`convergence`: the coefficient number i."""
+    figure, ax = panel("", "time [s]", "")
+    _draw_history(ax, histories, truth, i)
+    return figure
+
+
+def _draw_history(
+    ax: Axes, histories: Mapping[str, History], truth: Mapping[str, float], i: int
+) -> None:
+    first = next(iter(histories.values()))
+    name = first.names[i]
+    for colour, (label, history) in zip(COLOURS, histories.items()):
+        value, half = history.values[:, i], 1.96 * history.std[:, i]
+        ax.fill_between(history.t, value - half, value + half, color=colour, alpha=0.18, lw=0)
+        ax.plot(history.t, value, color=colour, lw=1.4, label=label)
+    shown = np.concatenate([h.values[:, i] for h in histories.values()])
+    if name in truth:
+        ax.axhline(truth[name], color=INK, lw=1.0, ls="--", label="truth")
+        shown = np.append(shown, truth[name])
+    middle, reach = 0.5 * (shown.min() + shown.max()), 0.75 * np.ptp(shown)
+    if reach > 0:
+        ax.set_ylim(middle - reach, middle + reach)
+    ax.set_title(f"{name}  [{first.units[i]}]", loc="left", fontsize=9)
+
+
+def motion(t: Array, measured: Array, simulated: Mapping[str, Array], y_label: str) -> Figure:
+    """One panel: a measured velocity (k,) behind simulated ones, in the order of COLOURS[1:]."""
+    figure, ax = panel("", "time [s]", y_label)
+    ax.plot(t, measured, color=INK, lw=3.2, alpha=0.35)
+    for colour, run in zip(COLOURS[1:], simulated.values()):
+        ax.plot(t, run, color=colour, lw=1.1)
     return figure
 
 
@@ -175,7 +177,7 @@ def steering(
     units: tuple[str, str] = ("deg", "deg"),
 ) -> Figure:
     """Heading (k,) measured and simulated above, their difference and the rudder below."""
-    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     upper, middle, lower = figure.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.0, 1.0))
     known = np.isfinite(heading)
     upper.plot(t[known], heading[known], color=INK, lw=3.2, alpha=0.35, label=MEASURED)

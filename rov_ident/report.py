@@ -21,7 +21,7 @@ p.lead { font-size: 1.15rem; } p, figcaption, li { max-width: 48rem; } ul { padd
 figcaption, footer, .soft { color: var(--soft); } footer { margin-top: 3rem; font-size: .85rem;
   overflow-wrap: anywhere; }
 figure { margin: .5rem 0 1rem; } figure svg { width: 100%; height: auto; display: block; }
-figure text { fill: currentColor; }
+figure > svg { max-width: 60rem; } figure text { fill: currentColor; }
 .panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(21rem, 100%), 1fr));
   gap: .6rem 1.2rem; }
 .panels.wide { grid-template-columns: repeat(auto-fit, minmax(min(29rem, 100%), 1fr)); }
@@ -39,7 +39,8 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right;
   white-space: nowrap; }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
-@media screen and (max-width: 600px) { th, td { padding: .2rem .3rem; font-size: .8rem; } }
+@media screen and (max-width: 600px) { th, td { padding: .2rem .3rem; font-size: .8rem; }
+  th, td:first-child { white-space: normal; } td:first-child { min-width: 5rem; } }
 @media print { body { margin: 0; max-width: none; font-size: 10pt; }
   figure.one, .panels > svg, .card, pre, tr { break-inside: avoid; } h2 { break-after: avoid; }
   .panels, .panels.wide, .beside { grid-template-columns: 1fr 1fr; }
