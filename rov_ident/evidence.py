@@ -48,6 +48,7 @@ from rov_ident.streams import Streams, orientation_at
 
 _MAX_STEP = 0.05  # s
 _MAX_GAP = 0.5  # s without odometry: no window reaches across
+_LEAST = 8  # odometry messages in a window
 _ITERATIONS = 15
 _ONSET_STEP = 0.2  # s; of the difference quotient
 _NEARBY = 14.0  # s; in which a better onset is looked for
@@ -250,7 +251,13 @@ class Evidence:
     """The windows of one or more bags on which hypotheses are fitted."""
 
     def __init__(self, streams: Streams, spans: Sequence[tuple[float, float]]) -> None:
-        """``spans``: from and to [s] of each window."""
+        """``spans``: from and to [s] of each window.
+
+        Raises
+        ------
+        UserError
+            If there is not enough odometry in any of them.
+        """
         self.streams = streams
         keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
         keep &= within(spans, streams.t)
@@ -274,9 +281,14 @@ class Evidence:
         for begin, end in spans:
             inside = np.flatnonzero((t >= begin) & (t < end))
             for run in np.split(inside, np.flatnonzero(np.diff(t[inside]) > _MAX_GAP) + 1):
-                if len(run) >= 8:
+                if len(run) >= _LEAST:
                     first.append(at[run[0]])
                     last.append(at[run[-1]])
+        if not first:
+            raise UserError(
+                f"odometry with a wrench comes nowhere for {_LEAST} messages without a gap of more "
+                f"than {_MAX_GAP} s where it is needed: record it at 4 Hz or more, in a longer bag"
+            )
         self.first, self.last = np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
         window = np.searchsorted(self.first, at, side="right") - 1
         inside = (window >= 0) & (at <= self.last[np.maximum(window, 0)])

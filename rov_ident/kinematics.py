@@ -34,7 +34,9 @@ from rov_ident.streams import Streams, orientation_at
 
 _GAINS = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.95)
 _OUTLIER = 6.0
-_SMOOTHING = 0.2  # s
+_SMOOTHING = 0.2  # s; of angular rates
+_DRIFT = 1.0  # s; from which the pose tells velocity better than the IMU
+_STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
 _ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
 _MAX_GAP = 0.5  # s
 
@@ -96,11 +98,24 @@ def blocks(
         return Reading(*((b - a) / step for a, b in zip(reading, moved, strict=True)))
 
     r = quaternion_to_matrix(streams.orientation)
-    # A regressor made of the very readings that it explains shares their noise: smoothed, it hardly
-    # does.
+    fallen = None
+    if len(streams.imu_t) > 8:
+        q = orientation_at(streams, streams.imu_t)
+        r_imu = quaternion_to_matrix(_followed(q, streams.imu_t, there.gyro, rate_at))
+
+        def gained(f: Array) -> Array:
+            total = _integral(streams.imu_t, np.einsum("kij,kj->ki", r_imu, f))
+            return _interpolated(streams.imu_t, total, streams.t)
+
+        origin = _at_origin(streams.imu_t, there, np.array(config.imu.position))
+        fallen = gained(origin) + np.outer(streams.t, [0.0, 0.0, config.gravity])
+
+    # A regressor made of the very readings that it explains shares their noise: what the velocity
+    # sensor's errors are made of is taken from the other sensors where there are any.
     width = _SMOOTHING / float(np.median(np.diff(streams.t)))
-    smooth = Reading(*(gaussian_filter1d(x, width, axis=0) for x in here))
-    moved = [change(smooth, key) for key in keys]
+    turning, gyrating = (gaussian_filter1d(x, width, axis=0) for x in (here.angular, here.gyro))
+    moving = np.einsum("kji,kj->ki", r, _travelling(streams, r, here.linear, fallen))
+    moved = [change(Reading(moving, turning, gyrating, here.specific_force), key) for key in keys]
     made: list[tuple[str, Array, Array, list[Array]]] = []
     if streams.has_pose:
 
@@ -110,23 +125,13 @@ def blocks(
         y = streams.position - travelled(here.linear)
         columns = [-travelled(m.linear) for m in moved]
         made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
-    if len(streams.imu_t) > 8:
-        q = orientation_at(streams, streams.imu_t)
-        r_imu = quaternion_to_matrix(_followed(q, streams.imu_t, there.gyro, rate_at))
-        origin = _at_origin(streams.imu_t, there, np.array(config.imu.position))
+    if fallen is not None:
         shift = [change(there, key) for key in keys]
         inside = (streams.t >= streams.imu_t[0]) & (streams.t <= streams.imu_t[-1])
         t = streams.t[inside]
-
-        def gained(f: Array) -> Array:
-            total = _integral(streams.imu_t, np.einsum("kij,kj->ki", r_imu, f))
-            return _interpolated(streams.imu_t, total, t)
-
-        world = np.einsum("kij,kj->ki", r, here.linear)[inside]
-        fall = np.outer(t, [0.0, 0.0, config.gravity])
-        y = world - gained(origin) - fall
+        y = (np.einsum("kij,kj->ki", r, here.linear) - fallen)[inside]
         columns = [
-            np.einsum("kij,kj->ki", r, m.linear)[inside] - gained(s.specific_force)
+            (np.einsum("kij,kj->ki", r, m.linear) - gained(s.specific_force))[inside]
             for m, s in zip(moved, shift, strict=True)
         ]
         held = np.clip(np.searchsorted(streams.demand_t, t, side="right") - 1, 0, None)
@@ -141,6 +146,22 @@ def blocks(
         for name, t, y, columns in made
         if len(t) > 20
     ]
+
+
+def _travelling(streams: Streams, r: Array, measured: Array, fallen: Array | None) -> Array:
+    """Velocity (N, 3) in the world: long term from the pose, short term from the IMU, ``fallen``
+    (N, 3), whose integral drifts. What is missing of them the velocity sensor stands in for."""
+    t = streams.t
+    inertial = np.zeros_like(measured) if fallen is None else fallen
+    even = np.arange(t[0], t[-1], float(np.median(np.diff(t))))
+    width = (_STEADY if fallen is None else _DRIFT) / (even[1] - even[0])
+    if streams.has_pose:
+        drifted = _interpolated(t, streams.position - _integral(t, inertial), even)
+        correction = gaussian_filter1d(drifted, width, axis=0, order=1) / (even[1] - even[0])
+    else:
+        drifted = np.einsum("kij,kj->ki", r, measured) - inertial
+        correction = gaussian_filter1d(_interpolated(t, drifted, even), width, axis=0)
+    return inertial + _interpolated(even, correction, t)
 
 
 def _followed(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:

@@ -82,11 +82,11 @@ _MAX_GAP = 0.5  # s without a measurement: restart rather than bridge
 _MAX_JUMP = 10.0  # s; a stamp this far ahead, or 1 s back, is another clock (a bag starting over)
 _LATEST = 1.0  # s; a topic that is later than this is not waited for
 _LATER = 1.25  # times as late as a topic was is how long it is waited for from then on
-_LOST = 3.0  # times the longest interval between demands of late: another one is missing
+LOST = 3.0  # times the longest interval between demands of late: another one is missing
 _QUEUED = 10.0  # s; of demands that are kept while nothing else comes
 _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
-_LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
+LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
 _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
 _PUSH = 0.1  # of the working wrench; of which a demand may: less would thin coarse demands
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
@@ -304,7 +304,7 @@ class Sampler:
         if velocity == before:
             if self._fine:
                 variance = message.twist_variance.copy()
-                variance[:3] = _REPEATED
+                variance[:3] = REPEATED
                 return message._replace(twist_variance=variance)
         else:
             steps = message.linear / _GRID
@@ -406,12 +406,12 @@ class Sampler:
     def _is_lone(self, role: str) -> bool:
         """Whether the next message is an outlier between its neighbours; then it is dropped."""
         queue, before = self._queues[role], self._before.get(role)
-        here = _numbers(queue[0][1])
+        here = numbers(queue[0][1])
         if before is not None and len(queue) > 1:
-            after = _numbers(queue[1][1])
-            last = _numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
+            after = numbers(queue[1][1])
+            last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
             scatter, floor = self._scatter[role], self._floors[role]
-            if is_lone(before, here, after, last, scatter, floor, _LONE):
+            if is_lone(before, here, after, last, scatter, floor, LONE):
                 queue.popleft()
                 self.counts[f"{role}: outlier between its neighbours"] += 1
                 return True
@@ -471,7 +471,7 @@ class Sampler:
             mean, slope, pose is not None, shift, odometry, inertial, gyro, gyro_variance, specific,
         )  # fmt: skip
         if pose is not None and not taken:
-            repeated = odometry[10] == _REPEATED
+            repeated = odometry[10] == REPEATED
             why = "velocity repeated" if repeated else "outlier, or marked as not measured"
             self.counts[f"odom: {why}"] += 1
         if wrench is None or not known:
@@ -507,7 +507,7 @@ class Sampler:
             self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
             if self.demands is not None:
                 self.demands.append((at, self._demand))
-        hold = min(self._hold, _LOST * max(self._intervals, default=math.inf))
+        hold = min(self._hold, LOST * max(self._intervals, default=math.inf))
         if self._demand is None or end - self._demand_time > hold:
             self._demand = None
             self._memory = memory()
@@ -547,7 +547,7 @@ def _shown(frames: tuple[str, ...]) -> str:
     return ", ".join(repr(frame if len(frame) <= 40 else f"{frame[:37]}...") for frame in frames)
 
 
-def _numbers(message: Message) -> Array:
+def numbers(message: Message) -> Array:
     """(6,) of what an IMU or a wrench message measures."""
     if isinstance(message, Imu):
         return np.concatenate([message.angular_velocity, message.linear_acceleration])
@@ -623,7 +623,7 @@ _ZERO_WRENCH = np.zeros(6)
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
 _UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
 _SUREST = 1e-4  # of the configured variance; no message is believed to be surer than that
-_REPEATED = 2e3  # ours, of a velocity that is not measured again
+REPEATED = 2e3  # ours, of a velocity that is not measured again
 _POWER_TIME = 5.0  # s; over which it is judged whether a component of nu moves
 _MOVING = 4.0  # mean square over noise variance from which it does; at rest it is 1. Higher values
 # hold coefficients that still act, and their error goes into the others.

@@ -4,6 +4,7 @@ The estimators see samples (``samples.py``), in which odometry and IMU are alrea
 one sensor contradicts another shows only before that.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -13,9 +14,20 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.errors import UserError
-from rov_ident.messages import Array, Message
-from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler, describe
+from rov_ident.messages import Array, Message, Odometry
+from rov_ident.samples import (
+    IMU,
+    LONE,
+    LOST,
+    ODOMETRY,
+    REPEATED,
+    WRENCH,
+    Sampler,
+    describe,
+    numbers,
+)
 
+_USUAL = 2.0  # times what 99 % of the messages keep to
 _PAUSE = 60.0  # s between two bags that are searched as one
 
 
@@ -71,7 +83,8 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
     recorder = _Recorder(config)
     for role, message in messages:
         recorder.push(role, message)
-    odometry, imu, wrench = (recorder.taken[role] for role in (ODOMETRY, IMU, WRENCH))
+    odometry, imu, wrench = recorder.taken[ODOMETRY], recorder.tamed(IMU), recorder.tamed(WRENCH)
+    odometry = _driven(odometry, [t for t, _ in wrench], config.timeout, recorder.counts)
     for name, found in (("odometry", odometry), ("wrench", wrench)):
         if len(found) < 2:
             raise UserError(f"the bag holds no usable {name} messages")
@@ -110,6 +123,21 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     return Streams(**shifted, **others, notes=notes), begins
 
 
+def _driven(
+    odometry: list[tuple[float, Any]], demanded: list[float], hold: float, counts: Counter[str]
+) -> list[tuple[float, Any]]:
+    """The messages at times when a demand is there: one that has been held for longer than ``hold``
+    [s], or several times as long as is usual, says nothing of what the thrusters do."""
+    if len(demanded) > 1:
+        hold = min(hold, LOST * float(np.quantile(np.diff(demanded), 0.99)))
+    times = np.array([t for t, _ in odometry])
+    given = np.array([-np.inf, *demanded])
+    age = times - given[np.searchsorted(given, times, side="right") - 1]
+    silent = np.isfinite(age) & (age > hold)
+    counts["odom: no wrench at that time"] += int(silent.sum())
+    return [message for message, drop in zip(odometry, silent, strict=True) if not drop]
+
+
 class _Recorder(Sampler):
     """Refuses and converts as the estimators do, but keeps the messages instead of merging them."""
 
@@ -119,9 +147,35 @@ class _Recorder(Sampler):
 
     def _complete(self, final: bool) -> NDArray[np.void]:
         for role, queue in self._queues.items():
-            self.taken[role].extend(queue)
+            for t, message in queue:
+                if isinstance(message, Odometry) and message.twist_variance[0] == REPEATED:
+                    self.counts["odom: velocity repeated, not measured anew"] += 1
+                else:
+                    self.taken[role].append((t, message))
             queue.clear()
-        return super()._complete(final)
+        return self._none
+
+    def tamed(self, role: str) -> list[tuple[float, Any]]:
+        """The messages without one or two in a row that hold what no others do.
+
+        Live, an outlier is what jumps there and back; here the whole bag tells what is usual, and
+        a controller that chatters keeps its demands.
+        """
+        taken = self.taken[role]
+        if len(taken) < 2:
+            return taken
+        x = np.array([numbers(m) for _, m in taken])
+        x = np.abs(x - np.median(x, axis=0))
+        usual = np.maximum(_USUAL * np.quantile(x, 0.99, axis=0), LONE * self._floors[role])
+        edges = np.flatnonzero(np.diff((x > usual).any(axis=1), prepend=False, append=False))
+        wild = {
+            i
+            for begin, end in edges.reshape(-1, 2).tolist()
+            if end - begin <= 2
+            for i in range(begin, end)
+        }
+        self.counts[f"{role}: outlier"] += len(wild)
+        return [taken[i] for i in range(len(taken)) if i not in wild]
 
 
 def _continuous(q: Array) -> Array:

@@ -1,9 +1,11 @@
 """Explain names what is hidden in a bag: a sample; `make explain-bench` is the whole."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from explain import (
     RULES,
@@ -20,7 +22,9 @@ from explain import (
     wrong,
 )
 from hidden import EFFECTS, NESTED, Conditions, draw
+from rov_ident import kinematics
 from rov_ident.discrepancy import pinned
+from rov_ident.errors import UserError
 from rov_ident.explain import explain, from_the_start, gain_of, thinned, whole
 from rov_ident.findings import Finding, Gain, Value
 from rov_ident.scores import _own
@@ -122,6 +126,84 @@ def test_what_was_left_out_is_told():
     notes = gather([messages[0], twice, twice, *messages[1:]], case.config).notes
     assert any("odom" in note and "stamp" in note for note in notes)
     assert gather(messages, case.config).notes == ()
+
+
+@pytest.fixture(scope="module")
+def dive():
+    """The messages of a minute in which nothing is hidden, and their configuration."""
+    case = draw(3, conditions=PLACES["a minute"])
+    return [(role, m) for _, role, m in case.messages], case.config
+
+
+def test_a_wild_demand_is_left_out_and_told(dive):
+    messages, config = dive
+    at = [i for i, (role, _) in enumerate(messages) if role == "wrench"]
+    for i in (at[100], at[1500], at[1501]):
+        messages = [*messages]
+        wild = messages[i][1]
+        messages[i] = "wrench", wild._replace(force=wild.force + [1e4, 0.0, 0.0])
+    streams = gather(messages, config)
+    assert len(streams.demand) == len(at) - 3 and np.abs(streams.demand).max() < 1e3
+    assert streams.notes == ("left out: wrench: outlier (3)",)
+
+
+def test_a_demand_that_chatters_is_kept(dive):
+    messages, config = dive
+    signs = iter(np.random.default_rng(0).choice([-30.0, 30.0], len(messages)))
+    given = [
+        (role, m._replace(force=m.force + [next(signs), 0.0, 0.0]) if role == "wrench" else m)
+        for role, m in messages
+    ]
+    assert gather(given, config).notes == ()
+
+
+def test_where_no_demand_is_known_nothing_is_judged(dive):
+    messages, config = dive
+    first = messages[0][1].stamp
+    silent = [
+        (role, m)
+        for role, m in messages
+        if role != "wrench" or not 20.0 < (m.stamp - first) * 1e-9 < 28.0
+    ]
+    streams = gather(silent, config)
+    inside = (streams.t > 20.0) & (streams.t < 28.0)
+    assert 0 < inside.sum() < 4
+    assert any("no wrench" in note for note in streams.notes)
+
+
+def test_a_velocity_that_is_repeated_was_not_measured(dive):
+    """A DVL at 5 Hz in odometry at 20 Hz would look late."""
+    messages, config = dive
+    given, latest = [], None
+    count = 0
+    for role, m in messages:
+        if role == "odom":
+            latest = m.linear if count % 4 == 0 else latest
+            count += 1
+            m = m._replace(linear=latest)
+        given.append((role, m))
+    assert len(gather(given, config).t) == pytest.approx(count / 4, abs=1)
+
+
+def test_too_few_velocities_are_refused(dive):
+    messages, config = dive
+    odometry = [m for role, m in messages if role == "odom"]
+    seldom = {m.stamp for m in odometry[::20]}
+    given = [(role, m) for role, m in messages if role != "odom" or m.stamp in seldom]
+    with pytest.raises(UserError, match="record it at 4 Hz"):
+        explain([gather(given, config)], config)
+
+
+@pytest.mark.parametrize("imu_rate", [0.0, 100.0])
+def test_coloured_noise_of_a_velocity_is_not_taken_for_a_scale(imu_rate):
+    """Regressors made of the readings that they explain share their errors, which bias them."""
+    case = draw(3, conditions=dataclasses.replace(PLACES["a minute"], imu_rate=imu_rate))
+    streams = streams_of(case)
+    colour = lfilter([0.5], [1.0, -0.87], np.random.default_rng(0).normal(size=streams.nu.shape), 0)
+    noise = colour / colour.std(axis=0) * 0.25 * streams.nu.std(axis=0)
+    noise[:, 3:] = 0.0
+    noisy = dataclasses.replace(streams, nu=streams.nu + noise)
+    assert kinematics.search(noisy, case.config, lambda t: t > 0.0)[0] == {}
 
 
 @pytest.mark.parametrize(
