@@ -318,7 +318,10 @@ class WrenchNoise:
 
     relative_std: float = option(0.01, "standard deviation relative to the wrench", lower=0.0)
     correlation_time: float = option(
-        0.02, "how long an error of the wrench lasts: the period of its topic", "s", lower=POSITIVE
+        0.02,
+        "how long an error of the wrench lasts; at least until the next message",
+        "s",
+        lower=POSITIVE,
     )
     floor_std: Vector = option(
         (0.0,) * 6, "standard deviation at zero wrench: X Y Z, K M N", "N, N m", lower=0.0

@@ -57,7 +57,7 @@ class Noise:
 
     ``measurement`` (6,) multiplies the variances that the samples state; ``floor`` (6,) is the
     density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
-    relative to itself, an error of which lasts ``correlation_time`` s.
+    relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
     """
 
     measurement: Array
@@ -65,9 +65,10 @@ class Noise:
     relative: float
     correlation_time: float
 
-    def process(self, wrench: Array) -> Array:
-        """Density (..., 6) of the wrench's error."""
-        density: Array = self.floor + self.correlation_time * (self.relative * wrench) ** 2
+    def process(self, samples: Samples) -> Array:
+        """Density (k, 6) of the wrench's error."""
+        lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
+        density: Array = self.floor + lasting * (self.relative * samples["wrench"]) ** 2
         return density
 
 
@@ -155,7 +156,7 @@ def one_pass(
     information, score, scatter, sums = np.zeros((n, n)), np.zeros(n), np.zeros((n, n)), np.zeros(3)
     none = np.zeros((0, 6))
     _filter(
-        _equations(model, estimated, free), samples, noise.process(samples["wrench"]),
+        _equations(model, estimated, free), samples, noise.process(samples),
         noise.measurement, gate, True, information, score, scatter, sums, none, none, none,
     )  # fmt: skip
     return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
@@ -184,7 +185,7 @@ def innovations(
     empty = np.zeros((0, 0))
     _filter(
         _equations(model, np.zeros(0, dtype=np.int64), free), samples,
-        noise.process(samples["wrench"]), noise.measurement, gate, False,
+        noise.process(samples), noise.measurement, gate, False,
         empty, np.zeros(0), empty, np.zeros(3), *out,
     )  # fmt: skip
     return out

@@ -19,10 +19,7 @@ from rov_ident.jit import inlined
 
 FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
 SUM_TIME = 1.0  # s; over which innovations are added up
-FIRST_TIME, TIME = (
-    1.0,
-    20.0,
-)  # s; in which the density doubles with twice the power: at first, later
+FIRST_TIME, TIME = 1.0, 20.0  # s; in which twice the power doubles the density: at first, later
 STEADY = 4.0  # a squared sum counts for at most this often its variance
 LARGEST = 3.0  # standard deviations that a single innovation counts for: outliers are no motion
 
@@ -30,8 +27,9 @@ PROCESS = np.dtype(
     [
         ("first", "f8", (6,)),  # variance density of the unexplained acceleration to begin with
         ("floor", "f8", (6,)),  # and its least
-        ("wrench", "f8"),  # relative variance of the wrench times its correlation time
-        ("wrench_floor", "f8", (6,)),  # variance density of the wrench at zero wrench
+        ("relative", "f8"),  # variance of the wrench relative to its square
+        ("least", "f8", (6,)),  # its variance at zero wrench
+        ("lasting", "f8"),  # s; how long an error of it lasts, at least
     ],
     align=True,
 )
@@ -58,9 +56,18 @@ def process(config: Config) -> NDArray[np.void]:
     # the acceleration of a force that lasts a second has this density
     out["first"] = np.square(FIRST_FORCE * authority(model) / np.diag(model.mass_matrix))
     out["floor"] = np.square(config.process_std)
-    out["wrench"] = wrench.relative_std**2 * wrench.correlation_time
-    out["wrench_floor"] = np.square(wrench.floor_std) * wrench.correlation_time
+    out["relative"] = wrench.relative_std**2
+    out["least"] = np.square(wrench.floor_std)
+    out["lasting"] = wrench.correlation_time
     return out
+
+
+@inlined
+def wrench_noise(constants, sample, out):
+    """out (6,): variance density [N2 s, (N m)2 s] of the wrench; an error lasts as long as it."""
+    lasting = max(constants.lasting, sample.hold)
+    for i in range(6):
+        out[i] = lasting * (constants.relative * sample.wrench[i] ** 2 + constants.least[i])
 
 
 def first_adaptation(constants: NDArray[np.void]) -> NDArray[np.void]:

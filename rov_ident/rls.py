@@ -58,7 +58,20 @@ from rov_ident.model import (
     generalized_force,
     in_motion,
 )
-from rov_ident.process_noise import adapt, first_adaptation, interrupt, process
+from rov_ident.process_noise import adapt, first_adaptation, interrupt, process, wrench_noise
+from rov_ident.recursion import (
+    FASTEST,
+    INFO,
+    LAG,
+    LIGHTEST,
+    MAX_STEP,
+    RELEARNING_TIME,
+    SURPRISE_TIME,
+    add_score,
+    begin,
+    copy,
+    is_finite,
+)
 from rov_ident.residual import filtered_residual
 from rov_ident.samples import parts
 
@@ -76,24 +89,9 @@ REASONS = (
 
 REFUSALS = (GATED, NOT_FINITE, UNPREDICTABLE)
 
-INFO = np.dtype(
-    [
-        ("t", "f8"),
-        ("reason", "i8"),  # index into REASONS
-        ("residual", "f8", (6,)),  # N, N m: filtered wrench, measured minus model
-        ("ratio", "f8", (6,)),  # squared innovation over its predicted variance
-        ("forgetting", "f8"),
-        ("condition", "f8"),  # as of condition(), before the sample; NaN: not looked at
-    ],
-    align=True,
-)
-
-_MAX_STEP = 0.05  # s; of one step of the observer
 _PERIOD = 0.1  # s; the observer takes over the present coefficients this often
-_LIGHTEST = 0.2  # of the rigid body's own inertia: the observer is never lighter
 _REACH = 10.0  # prior standard deviations; the observer's coefficients are never further off
 _NOISIEST = 100.0  # times the declared variance; a measurement is never taken for worse
-_FASTEST = 50.0  # m/s, rad/s; the observer of a sane model never gets there
 _WILD = 100.0  # sigma; an outlier that no change of the vehicle can be
 _PATIENCE = 2.5  # lesser outliers in short order from which the vehicle has changed
 _LONE = 1.5  # outliers in short order from which the observer begins anew
@@ -102,13 +100,10 @@ _STEADY = 4.0  # a squared innovation counts for at most this often its variance
 _STEADY_MEAN = 0.92  # what that is in the mean, of a normal distribution
 _NOISE_TIME = 20.0  # s; over which the variance of a measurement is averaged; less at first
 _ROOM = 1.2  # of the process noise: see process_noise.adapt (docs/accuracy.md)
-_SURPRISE_TIME = 2.0  # s; over which the normalised innovation is averaged
 _SURPRISING = 3.0  # its value from which the vehicle has changed; 1 is expected
-_RELEARNING_TIME = 20.0  # s; in which the suspects then become as uncertain as at first
 _PEAK_TIME = 5.0  # s; over which a peak of a velocity is remembered
 _MOVING = 4.0  # that peak's square over the noise variance from which the component moves
 _NOISE_PEAK = 16.0  # variances; no square of a noise is larger in a minute
-_LAG = 4.0  # s; of the window over the score's correlation
 _EXCITED = 0.01  # a row with less information than this, relative to the prior, excites nothing
 _SHIFT = 1e-6  # m/s, rad/s; of a velocity, for the Jacobian
 
@@ -350,19 +345,11 @@ def _work(task, state):
         np.zeros((2, 6, columns)),
         np.empty(1, dtype=_SCRATCH),
     )
-    _copy(state.root, work.root)
-    _copy(state.score, work.score)
-    _copy(state.sensitivity, work.sensitivity)
+    copy(state.root, work.root)
+    copy(state.score, work.score)
+    copy(state.sensitivity, work.sensitivity)
     _name_columns(task, state, work)
     return work
-
-
-@inner
-def _copy(a, b):
-    """Into matrix b from a, as far as both go. (``b[:] = a`` takes a second to compile.)"""
-    for i in range(min(len(a), len(b))):
-        for j in range(min(a.shape[1], b.shape[1])):
-            b[i, j] = a[i, j]
 
 
 @inner
@@ -378,20 +365,15 @@ def _fold(task, state, samples, sides, info):
     _take_over(task, state, work)
     for k in range(len(samples)):
         _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
-    _copy(work.root, state.root)
-    _copy(work.score, state.score)
-    _copy(work.sensitivity, state.sensitivity)
+    copy(work.root, state.root)
+    copy(work.score, state.score)
+    copy(work.sensitivity, state.sensitivity)
 
 
 @inlined
 def _step(task, state, work, sample, side, info):
     s, c = task.settings[0], state.scalars[0]
-    info.t = sample.t
-    info.forgetting = 1.0
-    info.condition = np.nan
-    for i in range(6):
-        info.residual[i] = np.nan
-        info.ratio[i] = np.nan
+    begin(info, sample.t)
     if not is_finite(sample):
         info.reason = NOT_FINITE
         return
@@ -479,7 +461,7 @@ def _take_over(task, state, work):
             s.one_mass[i, j, 0] = task.rigid_body[i, j]
     add_added_mass(task.structure, work.one_theta, s.one_mass)
     for i in range(6):
-        least = _LIGHTEST * task.rigid_body[i, i]
+        least = LIGHTEST * task.rigid_body[i, i]
         s.one_mass[i, i, 0] = max(s.one_mass[i, i, 0], least)
     for i in range(6):
         for j in range(6):
@@ -489,7 +471,7 @@ def _take_over(task, state, work):
                 s.mass[i, j, k] = s.one_mass[i, j, 0]
     # Gauss and Jordan; positive definite, or made so
     for c in range(6):
-        f = 1.0 / max(s.product[c, c], _LIGHTEST * task.rigid_body[c, c])
+        f = 1.0 / max(s.product[c, c], LIGHTEST * task.rigid_body[c, c])
         for j in range(6):
             s.product[c, j] *= f
             s.inverse[c, j] *= f
@@ -504,7 +486,7 @@ def _take_over(task, state, work):
 def _predict(task, state, work, sample, side):
     """Velocities, covariance, sensitivities to the sample's time; False if out of all reason."""
     s, nu, p, sensitivity = work.scratch[0], state.nu, state.p, work.sensitivity
-    noise, inverse, constants = s.noise, s.inverse, task.process[0]
+    noise, inverse = s.noise, s.inverse
     n, free = len(work.scale), state.scalars[0].free
     for i in range(6):
         s.force[i], s.slope[i] = s.wrench[i], sample.wrench_slope[i]
@@ -512,7 +494,7 @@ def _predict(task, state, work, sample, side):
             middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
             s.force[i] += task.restoring[i, j] * middle
             s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
-        s.middle[i] = constants.wrench * sample.wrench[i] ** 2 + constants.wrench_floor[i]
+    wrench_noise(task.process[0], sample, s.middle)
     for i in range(6):
         for j in range(i + 1):
             total = 0.0
@@ -523,7 +505,7 @@ def _predict(task, state, work, sample, side):
         state.adaptation[i].since += sample.dt
         noise[i, i] += state.adaptation[i].density
         state.adaptation[i].acting = noise[i, i]
-    steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
+    steps = max(1, int(np.ceil(sample.dt / MAX_STEP - 1e-9)))
     dt = sample.dt / steps
     for step in range(steps):
         _linearise(task, work, nu, step * dt - 0.5 * sample.dt, dt)
@@ -555,7 +537,7 @@ def _predict(task, state, work, sample, side):
     fastest = 0.0
     for i in range(6):
         fastest += nu[i] * nu[i]
-    return fastest < _FASTEST**2  # not so with NaN
+    return fastest < FASTEST**2  # not so with NaN
 
 
 @inlined
@@ -684,7 +666,7 @@ def _sort(task, state, work):
                 at += 1
     order, lagged, deviation = state.order.copy(), state.lagged.copy(), state.deviation.copy()
     solution = state.solution.copy()
-    _copy(work.score, work.spare)
+    copy(work.score, work.spare)
     for a in range(n):
         state.order[a] = order[place[a]]
         state.lagged[a] = lagged[place[a]]
@@ -692,13 +674,13 @@ def _sort(task, state, work):
         state.solution[a] = solution[place[a]]
         for b in range(n):
             work.score[a, b] = work.spare[place[a], place[b]]
-    _copy(work.sensitivity, work.drive)
+    copy(work.sensitivity, work.drive)
     for a in range(n):
         for i in range(6):
             work.sensitivity[i, a] = work.drive[i, place[a]]
     _name_columns(task, state, work)
     # a root of the permuted information: the old one's rows, stacked below nothing
-    _copy(work.root, work.spare)
+    copy(work.root, work.spare)
     for a in range(n):
         for b in range(n + 1):
             work.root[a, b] = 0.0
@@ -739,7 +721,7 @@ def _update(task, state, work, sample, side, info):
         info.reason = WAITING
         return
     # what an innovation owes to coefficients still to be learnt is no surprise
-    _whiten(work.root, rows, n, count, scratch.product)
+    _whiten(work.root, rows, n, count, c.free, scratch.product)
     count, moving = 0, 0
     for i in range(6):
         moving += work.moving[i]
@@ -758,9 +740,9 @@ def _update(task, state, work, sample, side, info):
         wild = wild or info.ratio[i] > _WILD**2
         if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
             interrupt(state.adaptation[i])
-            c.surprise[i] += min(since / _SURPRISE_TIME, 1.0) * (1.0 - c.surprise[i])
+            c.surprise[i] += min(since / SURPRISE_TIME, 1.0) * (1.0 - c.surprise[i])
             continue
-        blend = min(since / _SURPRISE_TIME, 1.0)
+        blend = min(since / SURPRISE_TIME, 1.0)
         c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
         # as far as it is the noise, and not the prediction, that an innovation shows
         averaging = min(1.0 + 0.25 * state.adaptation[i].seen, _NOISE_TIME)
@@ -781,23 +763,31 @@ def _update(task, state, work, sample, side, info):
 
 
 @reordered
-def _whiten(root, rows, n, count, squares):
-    """rows (count, columns) -> [w | -w z], w = phi R^-1; squares[0] (count,) of w: phi P phi'."""
+def _whiten(root, rows, n, count, free, squares):
+    """rows (count, columns) -> [w | -w z], w = phi R^-1; squares[0] (count,) of w: phi P phi'.
+
+    squares[1] (count,) is the part of it that the columns after the free ones add.
+    """
     columns = root.shape[1]
     for i in range(count):
-        total = 0.0
+        total, held = 0.0, 0.0
         rows[i, n] = 0.0
         for a in range(n):
             f = rows[i, a] / root[a, a]
             total += f * f
+            held += f * f if a >= free else 0.0
             for k in range(columns):
                 rows[i, k] -= f * root[a, k]
-        squares[0, i] = total
+        squares[0, i], squares[1, i] = total, held
 
 
 @reordered
 def _absorb(state, work, n):
-    """Take in the measured velocities, one after the other; their rows (6, columns) of the root."""
+    """Take in the measured velocities, one after the other; their rows (6, columns) of the root.
+
+    What a row owes to coefficients that are held is noise to it: at its full weight it would tie
+    the free ones to them, and undo what is known of the free ones.
+    """
     s, nu, p = work.scratch[0], state.nu, state.p
     sensitivity, rows = work.sensitivity, work.rows
     columns, q = rows.shape[1], 0
@@ -805,7 +795,7 @@ def _absorb(state, work, n):
         if s.z[i] != s.z[i]:
             continue
         total = p[i, i] + s.r[i]
-        weight, e = 1.0 / np.sqrt(total), s.z[i] - nu[i]
+        weight, e = 1.0 / np.sqrt(total + s.product[1, q]), s.z[i] - nu[i]
         goal = e
         for k in range(columns):
             rows[q, k] = sensitivity[i, k] + work.direct[i, k]
@@ -836,13 +826,13 @@ def _learn(task, state, work, info):
     s, c, n = task.settings[0], state.scalars[0], len(state.order)
     _invert(work.root, work.inverse)
     info.condition = _norm(work.root, n, work.line) * _norm(work.inverse, n, work.line)
-    _add_up(task, state, work, np.exp(-c.since_update / _LAG))
+    _add_up(task, state, work, np.exp(-c.since_update / LAG))
     _take_over(task, state, work)
     if not s.variable and s.forgetting_factor < 1.0:
         info.forgetting = s.forgetting_factor
         _forget(task, state, work, s.forgetting_factor)
     elif s.variable and _suspect(state, work):
-        share = min(c.since_update / _RELEARNING_TIME, 1.0)
+        share = min(c.since_update / RELEARNING_TIME, 1.0)
         info.forgetting = 1.0 - share
         _loosen(state, work, share)
     c.since_update = 0.0
@@ -874,25 +864,7 @@ def _add_up(task, state, work, decay):
             moved += root[a, b] * change[b]
         for b in range(a, n):
             gradient[b] += root[a, b] * moved
-    lagged = state.lagged
-    for a in range(n):
-        lagged[a] *= decay
-    for a in range(n):
-        for b in range(n):
-            work.score[a, b] += gradient[a] * (gradient[b] + lagged[b]) + lagged[a] * gradient[b]
-    for a in range(n):
-        lagged[a] += gradient[a]
-
-
-@kernel
-def is_finite(sample):
-    """Whether nothing in a sample would spoil a state; NaN where not measured is no harm."""
-    total = sample.t + sample.dt
-    for i in range(6):
-        total += sample.nu[i] + sample.wrench[i] + sample.wrench_slope[i]
-    for i in range(3):
-        total += sample.down[i] + sample.down_slope[i]
-    return np.isfinite(total)
+    add_score(gradient, state.lagged, work.score, decay)
 
 
 # ---------------------------------------------------------------- triangular
@@ -915,7 +887,7 @@ def inverse_of(root):
     n = len(root)
     columns = _WIDTH * ((n + 2) // _WIDTH + 1)
     padded, inverse = np.zeros((n + 2, columns)), np.zeros((n + 2, columns))
-    _copy(root, padded)
+    copy(root, padded)
     _invert(padded, inverse)
     return inverse[:n, :n].copy()
 

@@ -60,11 +60,8 @@ SAMPLE = np.dtype(
         ("down_slope", "f8", (3,)),  # per s, over the interval
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
-        (
-            "surroundings",
-            "f8",
-            (6,),
-        ),  # part of the wrench: of the wrench effects at the measured motion
+        ("hold", "f8"),  # s: how long a demand acts, of late; 0: not known yet
+        ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
         ("surroundings_slope", "f8", (6,)),
         ("odometry", "f8", (6,)),  # as nu; NaN: not measured
         ("odometry_variance", "f8", (6,)),
@@ -83,6 +80,7 @@ _MAX_JUMP = 10.0  # s; a stamp this far ahead, or 1 s back, is another clock (a 
 _LATEST = 1.0  # s; a topic that is later than this is not waited for
 _LATER = 1.25  # times as late as a topic was is how long it is waited for from then on
 LOST = 3.0  # times the longest interval between demands of late: another one is missing
+_BLEND = 0.05  # of one interval between demands in what is usual
 _QUEUED = 10.0  # s; of demands that are kept while nothing else comes
 _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
@@ -208,6 +206,7 @@ class Sampler:
         self._demand: Array | None = None
         self._demand_time = -math.inf
         self._intervals: deque[float] = deque(maxlen=50)  # s; between demands
+        self._period = 0.0  # s; as is usual
         self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
         self._before: dict[str, Array] = {}  # the last message's numbers
         self._scatter = {role: floor**2 for role, floor in self._floors.items()}
@@ -442,6 +441,7 @@ class Sampler:
         self._previous = t
         mean, slope = (_ZERO_WRENCH, _ZERO_WRENCH) if wrench is None else wrench
         sample = np.zeros(1, dtype=SAMPLE)
+        sample["hold"] = self._period
         odometry, shift = _ABSENT, 0.0
         if self._sensitivity is not None:
             known = self._kinematics[0]
@@ -504,6 +504,7 @@ class Sampler:
                 start = now = max(at, start)
             if self._demand_time > -math.inf:
                 self._intervals.append(at - self._demand_time)
+                self._follow_period(self._intervals[-1])
             self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
             if self.demands is not None:
                 self.demands.append((at, self._demand))
@@ -530,6 +531,11 @@ class Sampler:
                 slope,
             )
         return mean, slope
+
+    def _follow_period(self, interval: float) -> None:
+        """The usual time between demands, of which a gap is no part."""
+        usual = self._period or interval
+        self._period = usual + _BLEND * (min(interval, LOST * usual) - usual)
 
     def _act(self, t: float, dt: float) -> Array:
         """The wrench (6,) that acts, in the mean from t to t + dt, when the demand is held."""

@@ -50,9 +50,21 @@ from rov_ident.model import (
     in_motion,
     symmetric_product,
 )
-from rov_ident.process_noise import adapt, first_adaptation, interrupt, process
+from rov_ident.process_noise import adapt, first_adaptation, interrupt, process, wrench_noise
+from rov_ident.recursion import (
+    FASTEST,
+    INFO,
+    LAG,
+    LIGHTEST,
+    MAX_STEP,
+    RELEARNING_TIME,
+    SURPRISE_TIME,
+    add_score,
+    begin,
+    copy,
+    is_finite,
+)
 from rov_ident.residual import filtered_residual
-from rov_ident.rls import INFO, is_finite
 from rov_ident.samples import parts
 
 Array = NDArray[np.float64]
@@ -70,15 +82,9 @@ REASONS = (
 REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 
 LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
-_MAX_STEP = 0.05  # s; of one Runge-Kutta step
-_LIGHTEST = 0.2  # of the rigid body's own inertia: no sigma point is lighter
 _PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
-_LAG = 4.0  # s; of the window over the correlation of that influence
 _ROOM = 1.5  # of the process noise: see process_noise.adapt (docs/accuracy.md)
 _LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
-_SURPRISE_TIME = 2.0  # s; over which the normalised innovation squared is averaged
-_RELEARNING_TIME = 20.0  # s; in which the coefficients then become as uncertain as at first
-_FASTEST = 50.0  # m/s, rad/s; no sigma point of a sane model gets there
 
 _SETTINGS = np.dtype(
     [
@@ -157,7 +163,7 @@ def problem(config: Config) -> Problem:
         model.body.mass_matrix,
         model.body.restoring,
         # so that no hull with positive added mass is touched
-        _LIGHTEST * np.diag(np.linalg.cholesky(model.body.mass_matrix)) ** 2,
+        LIGHTEST * np.diag(np.linalg.cholesky(model.body.mass_matrix)) ** 2,
     )
 
 
@@ -282,7 +288,7 @@ def _work(task, state):
         np.empty((m, 1)),
         np.empty(1, dtype=_SCRATCH),
     )
-    _copy(state.p, work.p)
+    copy(state.p, work.p)
     for j in range(m):
         work.mean[j, 0] = task.theta[j]
         for k in range(LANES):
@@ -295,30 +301,17 @@ def _work(task, state):
     return work
 
 
-@inner
-def _copy(a, b):
-    """Into matrix b from a, as far as both go. (``b[:] = a`` takes a second to compile.)"""
-    for i in range(len(b)):
-        for j in range(min(a.shape[1], b.shape[1])):
-            b[i, j] = a[i, j]
-
-
 @kernel
 def _fold(task, state, samples, sides, info):
     work = _work(task, state)
     for k in range(len(samples)):
         _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
-    _copy(work.p, state.p)
+    copy(work.p, state.p)
 
 
 @inlined
 def _step(task, state, work, sample, side, out):
-    out.t = sample.t
-    out.forgetting = 1.0
-    out.condition = np.nan
-    for i in range(6):
-        out.residual[i] = np.nan
-        out.ratio[i] = np.nan
+    begin(out, sample.t)
     if not is_finite(sample):
         out.reason = NOT_FINITE
         return
@@ -387,7 +380,7 @@ def _cholesky(p, upper, root):
     Three rows of the upper root at a time, so that a row below is loaded a third as often.
     """
     size, columns = p.shape
-    _copy(p, upper)
+    copy(p, upper)
     for first in range(0, size, 3):
         end = min(first + 3, size)
         for j in range(first, end):
@@ -422,7 +415,7 @@ def _move(task, x, work, sample, side):
             middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
             s.force[i] += task.restoring[i, j] * middle
             s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
-    steps = max(1, int(np.ceil(sample.dt / _MAX_STEP - 1e-9)))
+    steps = max(1, int(np.ceil(sample.dt / MAX_STEP - 1e-9)))
     dt = sample.dt / steps
     for sign in range(2):
         for first in range(0, columns, LANES):
@@ -514,9 +507,10 @@ def _collect(task, state, work, sample):
 
     False where the model takes a point out of all reason.
     """
-    s, c, q = work.scratch[0], task.settings[0], task.process[0]
+    s, c = work.scratch[0], task.settings[0]
     x, p, root, plus, minus = state.x, work.p, work.root, work.moved[0], work.moved[1]
     size, columns = p.shape
+    wrench_noise(task.process[0], sample, s.strength)
     speed = 0.0
     for i in range(6):
         total = 0.0
@@ -526,8 +520,7 @@ def _collect(task, state, work, sample):
             minus[i, k] -= s.centre[i]
             total += plus[i, k] + minus[i, k]
         s.shift[i] = c.weight * total
-        s.strength[i] = q.wrench * sample.wrench[i] ** 2 + q.wrench_floor[i]
-    if not speed < 2 * columns * _FASTEST**2:  # NaN too
+    if not speed < 2 * columns * FASTEST**2:  # NaN too
         return False
     for i in range(6):
         x[i] = s.centre[i] + s.shift[i]
@@ -699,7 +692,7 @@ def _update(task, state, work, sample, side, out):
         if c.refused > _LOST:
             _restart(state, p, sample)
             return
-    blend = min(sample.dt / _SURPRISE_TIME, 1.0)
+    blend = min(sample.dt / SURPRISE_TIME, 1.0)
     if count > 0:
         c.surprise += blend * (surprise / count - c.surprise)
     elif moving == 0:
@@ -773,7 +766,7 @@ def _look_back(task, state, work, dt):
     c.since += dt
     if c.since < _PERIOD:
         return
-    _sum_up(state, work, np.exp(-c.since / _LAG))
+    _sum_up(state, work, np.exp(-c.since / LAG))
     _walk(task, state, work, c.surprise > task.settings[0].changed, c.since)
     c.since = 0.0
 
@@ -788,18 +781,12 @@ def _sum_up(state, work, decay):
             matrix[j, k] = p[6 + j, 6 + k]
     if not _cholesky(matrix, upper, root):
         return
-    g, lagged, score = work.gain[0], state.lagged, state.score
+    g = work.gain[0]
     for j in range(n):
         g[j] = state.x[6 + j] - state.before[j]
         state.before[j] = state.x[6 + j]
     _solve(root, n, g)
-    for j in range(n):
-        lagged[j] *= decay
-    for j in range(n):
-        for k in range(n):
-            score[j, k] += g[j] * (g[k] + lagged[k]) + lagged[j] * g[k]
-    for j in range(n):
-        lagged[j] += g[j]
+    add_score(g, state.lagged, state.score, decay)
 
 
 @reordered
@@ -814,7 +801,7 @@ def _walk(task, state, work, changed, elapsed):
     for j in range(n):
         walk = task.walk[j]
         if changed:
-            walk = max(walk, 1.0 / _RELEARNING_TIME)
+            walk = max(walk, 1.0 / RELEARNING_TIME)
         grown[j] = elapsed * walk * max(1.0 - p[6 + j, 6 + j], 0.0)
         most = max(most, grown[j])
     if most == 0.0:

@@ -90,6 +90,25 @@ def test_stamp_is_the_last_sample_s(trained, messages):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_errors_of_a_slow_wrench_are_not_taken_for_many(heavy, kind):
+    """At 10 Hz one lasts five times as long as configured: the intervals know."""
+    noisy = textbook.with_section(heavy, "wrench", relative_std=0.03)
+    suite = sensors.Suite(wrench_rate=10.0, wrench_std=0.03)
+    scores = []
+    for seed in range(6):
+        dive = sensors.dive(heavy, "steps", 60.0, suite, seed)
+        report = fed(OnlineEstimator(noisy, kind), [(r, m) for _, r, m in dive.messages]).report()
+        truth = dict(zip(heavy.model.names, heavy.model.theta.tolist(), strict=True))
+        scores.append(
+            [
+                (v - truth[n]) / s
+                for n, v, s in zip(report.names, report.values, report.std, strict=True)
+            ]
+        )
+    # Taken for errors of 20 ms it is 1.35, with 90 errors that are not quite independent.
+    assert 0.75 < np.sqrt(np.mean(np.square(scores))) < 1.2
+
+
 def test_words_change_from_converging_to_converged(wrong, messages, kind):
     estimator = OnlineEstimator(wrong, kind)
     i = estimator.prior.names.index("X_u")

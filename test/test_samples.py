@@ -58,6 +58,23 @@ def moments(t, demand, begin, end):
 # ------------------------------------------------------------------ truth
 
 
+@pytest.mark.parametrize("rate", [10.0, 50.0])
+def test_how_long_a_demand_holds(heavy, rate):
+    """As the messages come, of which a gap is no part."""
+    dive = clean(heavy, wrench_rate=rate)
+    begin = sensors.START + 3 * SECOND
+    kept = [
+        (role, m)
+        for role, m in without_arrival(dive)
+        if role != WRENCH or not begin < m.stamp < begin + 2 * SECOND
+    ]
+    for messages in (without_arrival(dive), kept):
+        samples, _ = taken(heavy, messages)
+        np.testing.assert_allclose(
+            samples["hold"][samples["t"] > 2.0 / rate], 1.0 / rate, rtol=0.11
+        )
+
+
 @pytest.mark.parametrize(
     "odometry_rate, imu_rate, wrench_rate",
     [
