@@ -42,11 +42,13 @@ th:first-child, td:first-child, td.text, th.text { text-align: left; }
 @media screen and (max-width: 600px) { th, td { padding: .2rem .3rem; font-size: .8rem; }
   th, td:first-child { white-space: normal; } td:first-child { min-width: 5rem; } }
 @media print { body { margin: 0; max-width: none; font-size: 10pt; }
-  figure.one, .panels > svg, .card, pre, tr { break-inside: avoid; } h2 { break-after: avoid; }
+  figure.one, .panels > svg, .card, pre, tr { break-inside: avoid; }
+  h2, .legend { break-after: avoid; }
   .panels, .panels.wide, .beside { grid-template-columns: 1fr 1fr; }
   .beside .panels { grid-template-columns: 1fr; }
   th, td { padding: .15rem .4rem; font-size: 8.5pt; }
-  .scroll, pre { overflow: visible; } pre { white-space: pre-wrap; } }
+  footer { margin-top: 1rem; } .scroll, pre { overflow: visible; }
+  pre { white-space: pre-wrap; font-size: 7.5pt; } }
 """
 
 

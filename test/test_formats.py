@@ -59,9 +59,13 @@ def diagonal(heavy):
 def trajectory(config):
     """Twenty seconds under wrenches that turn every axis."""
     t = np.arange(0.0, 20.0, 0.02)
+    return simulate(config.dynamics, t, wrench_over(t)).nu
+
+
+def wrench_over(t):
     phase = np.arange(6.0)
     wrench = np.sin(0.7 * t[:, None] * (1.0 + 0.3 * phase) + phase)
-    return simulate(config.dynamics, t, wrench * [20.0, 20.0, 20.0, 1.0, 1.0, 2.0]).nu
+    return wrench * [20.0, 20.0, 20.0, 1.0, 1.0, 2.0]
 
 
 def written(config, name, tmp_path):
@@ -87,8 +91,11 @@ def number(parent, path):
     return [float(x) for x in parent.find(path).text.split()]
 
 
-def gazebo_acceleration(sdf, nu, down):
-    """What Gazebo makes of the file: forward-left-up, from its documents, in textbook matrices."""
+def gazebo(sdf):
+    """What Gazebo makes of the file: forward-left-up, from its documents, in textbook matrices.
+
+    Gives ``acceleration(nu, down, tau)``.
+    """
     model = ET.fromstring(sdf).find("model")
     link, plugin = model.find("link"), model.find("plugin")
     inertial = link.find("inertial")
@@ -107,26 +114,28 @@ def gazebo_acceleration(sdf, nu, down):
                 m[i, j] += value
                 if i != j:
                     m[j, i] += value
-    force = np.zeros(6)
+    linear, absolute, product = np.zeros((6, 6)), np.zeros((6, 6, 6)), np.zeros((6, 6, 6))
     for i, a in enumerate("xyzkmn"):
         for j, b in enumerate("UVWPQR"):
-            if (e := plugin.find(a + b)) is not None:
-                force[i] += float(e.text) * nu[j]
+            linear[i, j] = float(plugin.findtext(a + b, "0"))
             for k, d in enumerate("UVWPQR"):
-                if (e := plugin.find(f"{a}{b}abs{d}")) is not None:
-                    force[i] += float(e.text) * nu[j] * abs(nu[k])
-                if (e := plugin.find(a + b + d)) is not None:
-                    force[i] += float(e.text) * nu[j] * nu[k]
-    p = m @ nu
-    v, omega = nu[:3], nu[3:]
-    force[:3] -= np.cross(omega, p[:3])
-    force[3:] -= np.cross(omega, p[3:]) + np.cross(v, p[:3])
+                absolute[i, j, k] = float(plugin.findtext(f"{a}{b}abs{d}", "0"))
+                product[i, j, k] = float(plugin.findtext(a + b + d, "0"))
     volume = np.prod(number(link, "collision/geometry/box/size"))
     centre = np.array(number(link, "collision/pose")[:3])
-    weight, lift = mass * 9.81 * down, -volume * 1000.0 * 9.81 * down
-    force[:3] += weight + lift
-    force[3:] += np.cross(c, weight) + np.cross(centre, lift)
-    return np.linalg.solve(m, force)
+
+    def acceleration(nu, down, tau):
+        force = tau + linear @ nu + absolute @ abs(nu) @ nu + product @ nu @ nu
+        p = m @ nu
+        v, omega = nu[:3], nu[3:]
+        force[:3] -= np.cross(omega, p[:3])
+        force[3:] -= np.cross(omega, p[3:]) + np.cross(v, p[:3])
+        weight, lift = mass * 9.81 * down, -volume * 1000.0 * 9.81 * down
+        force[:3] += weight + lift
+        force[3:] += np.cross(c, weight) + np.cross(centre, lift)
+        return np.linalg.solve(m, force)
+
+    return acceleration
 
 
 @pytest.fixture(scope="session")
@@ -157,15 +166,38 @@ def test_the_schema_of_sdformat_takes_the_file(coupled, heavy, schema):
 
 
 def test_gazebo_computes_the_same_acceleration(coupled):
-    content = export(coupled, "gazebo").content
+    there = gazebo(export(coupled, "gazebo").content)
     flip = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
     rng = np.random.default_rng(5)
     for _ in range(20):
         nu, down = rng.normal(size=6), rng.normal(size=3)
         down /= np.linalg.norm(down)
         expected = coupled.dynamics.acceleration(nu, np.zeros(6), down)
-        there = gazebo_acceleration(content, flip * nu, flip[:3] * down)
-        np.testing.assert_allclose(flip * there, expected, rtol=1e-9, atol=1e-9)
+        found = there(flip * nu, flip[:3] * down, np.zeros(6))
+        np.testing.assert_allclose(flip * found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_gazebo_moves_as_the_vehicle_does(coupled):
+    """The exported file in open loop, integrated here: ten seconds, forward-left-up."""
+    there = gazebo(export(coupled, "gazebo").content)
+    flip = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+    dt, wrenches = 0.02, wrench_over(np.arange(0.0, 10.0, 0.02))
+
+    def slope(x, tau):
+        nu, down = x[:6], x[6:]
+        return np.concatenate([there(nu, down, tau), -np.cross(nu[3:], down)])
+
+    x = np.array([0.0] * 8 + [-1.0])  # at rest and level: down is -z
+    moved = [x[:6]]
+    for tau in flip * wrenches[:-1]:
+        a = slope(x, tau)
+        b = slope(x + 0.5 * dt * a, tau)
+        c = slope(x + 0.5 * dt * b, tau)
+        x = x + dt / 6.0 * (a + 2.0 * b + 2.0 * c + slope(x + dt * c, tau))
+        moved.append(x[:6])
+    expected = trajectory(coupled)[: len(moved)]
+    assert np.abs(expected).max() > 0.3
+    np.testing.assert_allclose(flip * moved, expected, rtol=0, atol=1e-6)
 
 
 def test_gazebo_names_what_it_cannot_hold(heavy):

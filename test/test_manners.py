@@ -1,5 +1,6 @@
 """What every command does alike: quiet, progress, machine-readable results, completion."""
 
+import asyncio
 import json
 import os
 import pty
@@ -8,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browser import CHROMIUM, chromium
 from conftest import HEAVY
 
 from rov_ident import cli
@@ -114,6 +116,61 @@ def test_pages_of_check_and_plan(tmp_path, capsys):
     for outside in ("http:", "https:", "<script", "src=", "@import"):
         assert outside not in text.replace("http://www.w3.org", "")
     capsys.readouterr()
+
+
+TABLE = """U_mps,beta_deg,X,Y,N
+0.5,-10,-41.2,1.61,0.03
+0.5,0,-42.1,0.0,0.0
+0.5,10,-41.3,-1.63,-0.03
+1.0,-10,-151.0,6.54,0.13
+1.0,0,-154.7,0.01,0.0
+1.0,10,-151.2,-6.55,-0.13
+1.5,-10,-329.0,14.7,0.29
+1.5,0,-337.8,0.0,0.0
+1.5,10,-329.3,-14.7,-0.29
+"""
+SMALLEST = """
+Math.min(...[...document.querySelectorAll("figure text")].map(
+  text => text.getBoundingClientRect().height).filter(height => height > 0))
+"""
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_pages_in_a_browser(tmp_path, capsys):
+    """As wide as a screen and a telephone, light and dark, and on paper."""
+    (tmp_path / "table.csv").write_text(TABLE)
+    bag, zigzag = tmp_path / "dive.mcap", tmp_path / "zigzag.csv"
+    remus = SHIPPED / "config" / "remus100.yaml"
+    for command in (
+        ["simulate", "--config", HEAVY, "--manoeuvre", "steps", "--duration", 20, "--out", bag],
+        ["steer", "--config", remus, "--manoeuvre", "zigzag", "--duration", 40, "--out", zigzag],
+        ["check", bag, "--config", HEAVY, "--report", tmp_path / "check.html"],
+        ["fit", bag, "--config", HEAVY, "--estimator", "ls", "--report", tmp_path / "fit.html"],
+        ["plan", "--config", HEAVY, "--duration", 10, "--report", tmp_path / "plan.html"],
+        ["nomoto", zigzag, "--report", tmp_path / "nomoto.html"],
+        ["forces", tmp_path / "table.csv", "--report", tmp_path / "forces.html"],
+    ):
+        assert main([*map(str, command)]) == 0
+    capsys.readouterr()
+    pages = sorted(tmp_path.glob("*.html"))
+    assert len(pages) == 5
+    asyncio.run(_look_at(pages))
+
+
+async def _look_at(pages):
+    async with chromium() as browser:
+        for path in pages:
+            for width, dark in ((1440, False), (1440, True), (390, False), (390, True)):
+                await browser.open(path.as_uri(), width, dark)
+                await browser.until("document.readyState == 'complete'")
+                assert await browser.evaluate("document.title"), path.name
+                assert browser.complaints == []
+                assert await browser.evaluate("document.documentElement.scrollWidth") <= width
+                assert await browser.evaluate(SMALLEST) > 6.0, (path.name, width)
+                paper = await browser.evaluate("getComputedStyle(document.body).backgroundColor")
+                assert (paper == "rgb(255, 255, 255)") != dark
+            printed = await browser.send("Page.printToPDF")
+            assert printed["data"].startswith("JVBERi")  # %PDF
 
 
 COMPLETE = """

@@ -2,6 +2,8 @@
 
 import math
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -252,6 +254,27 @@ def test_terminate(domain, heavy_path):
     status, said = end_node(process, signal.SIGTERM)
     assert status == 0, said
     assert "ended: 0 samples used" in said
+
+
+def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
+    """They end well by either signal, and say in one sentence what is wrong with their file."""
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(heavy_path.read_text().replace("cog: [0.0, 0.0", "cog: [0, 0.0", 1))
+    for name, number in (
+        ("controller_bridge", signal.SIGTERM), ("example_controller", signal.SIGINT),
+    ):  # fmt: skip
+        command = [sys.executable, "-m", f"rov_ident.nodes.{name}", "--ros-args"]
+        command += ["-p", "controller:=/nobody"] * (name == "controller_bridge")
+        command.append("--params-file")
+        done = subprocess.run([*command, wrong], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 2, done.stderr
+        last = done.stderr.strip().splitlines()[-1]
+        assert last.startswith(f"{name}: ") and "written alike" in last
+        process = subprocess.Popen([*command, heavy_path], stderr=subprocess.PIPE, text=True)
+        assert process.stderr.readline()  # its first words: it is up
+        status, said = end_node(process, number)
+        assert status == 0, said
+        assert "Traceback" not in said
 
 
 def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):

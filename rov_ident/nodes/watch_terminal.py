@@ -28,7 +28,7 @@ Heard = Mapping[str, tuple[Estimator, float]]
 """By the full name of a node: what it said, and how long ago it did [s]."""
 
 _REFRESH = 4.0  # Hz
-_SETTLING = 2.0  # s; without news: /diagnostics come once a second
+_SETTLING = 3.5  # s; without news: who was missed at first announces itself every 3 s
 _COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "dim"}
 _WORDS = {Level.OK: "ok", Level.WARN: "warn", Level.ERROR: "error", Level.STALE: "stale"}
 
