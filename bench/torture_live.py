@@ -21,7 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "test"))
 
 import numpy as np
-from conftest import Dive, Vehicle, end_node, start_connected
+from conftest import Dive, Vehicle, compile_all, end_node, start_connected
 from rich.console import Console
 from rich.table import Table
 
@@ -272,6 +272,7 @@ def main() -> int:
     options = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "97")
+    compile_all()
     table = Table("what", "estimator", "value", "bar", "met")
     missed = 0
     for name in options.studies or STUDIES:

@@ -59,8 +59,12 @@ def compiled():
 def pytest_collection_finish(session):
     """Compile what nodes run before the workers start; rov_ident/warm.py says why not in them."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
-    if not wanted or session.config.option.collectonly:
-        return
+    if wanted and not session.config.option.collectonly:
+        compile_all()
+
+
+def compile_all():
+    """All that a node runs, once for all who ask for it."""
     import numba
 
     from rov_ident import jit  # noqa: F401 - says where the cache is
