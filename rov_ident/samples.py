@@ -800,8 +800,8 @@ def fuse(
                 k.gyro_bias_variance -= bias_gain * k.attitude_bias
                 k.attitude_bias *= 1.0 - gain
                 k.attitude_variance *= 1.0 - gain
-            else:
-                k.attitude_variance += 0.2 * k.attitude_variance + s.attitude_variance
+            else:  # a lone one must not open the gate, nor give the next more weight
+                k.attitude_variance *= 1.3
         if credible:
             _set(out.attitude, q)
     _set(out.orientation, k.q)
