@@ -11,7 +11,7 @@ import math
 import struct
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -27,7 +27,7 @@ from rov_ident.estimate import prior_of
 from rov_ident.excitation import manoeuvre
 from rov_ident.messages import Imu, Message, Odometry, Wrench
 from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator, Report
-from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
+from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler, joined
 from rov_ident.sensors import START, Suite, dive, measure
 
 HEAVY = Path(__file__).parents[1] / "config" / "bluerov2_heavy.yaml"
@@ -81,9 +81,21 @@ def during(message: Message, begin: float = FAULT[0], end: float = FAULT[1]) -> 
 class Run:
     """The reports of one second each, by the time of the input."""
 
-    final: Report
-    times: list[float]
-    used: list[int]  # samples so far
+    kind: Kind
+    final: Report | None = None
+    times: list[float] = field(default_factory=list)
+    used: list[int] = field(default_factory=list)  # samples so far
+
+    def look(self, online: OnlineEstimator, t: float, samples: list[np.ndarray]) -> None:
+        """Take these samples, the last ones before t; the report must be fit to be published."""
+        reasons = online.take(joined(samples))["reason"] if samples else np.zeros(0)
+        count = int(np.count_nonzero(~np.isin(reasons, ESTIMATORS[self.kind].REFUSALS)))
+        self.used.append((self.used[-1] if self.used else 0) + count)
+        self.times.append(t)
+        self.final = report = online.report()
+        assert all(np.isfinite(x).all() for x in (report.values, report.std))
+        scaled = report.covariance / np.outer(report.std, report.std)
+        assert np.linalg.eigvalsh(scaled)[0] > 0.0, f"covariance at {t} s"
 
     def recovery(self, since: float, rate: float) -> float:
         """Seconds from ``since`` until samples are used at half their usual rate again."""
@@ -93,27 +105,31 @@ class Run:
         return math.inf
 
 
-def run(config: Config, kind: Kind, messages: Messages) -> Run:
-    """All messages in the order of their arrival."""
-    online = OnlineEstimator(config, kind)
-    refusals = ESTIMATORS[kind].REFUSALS
-    times, used, count, begin = [], [], 0, messages[0][0]
+def run(config: Config, messages: Messages) -> dict[Kind, Run]:
+    """All messages in the order of their arrival; both estimators see the samples of one sampler.
+
+    The state does not depend on how many samples are folded at a time: a second's at once.
+    """
+    sampler, begin, second = Sampler(config), messages[0][0], 0
+    runs = [(OnlineEstimator(config, kind), Run(kind)) for kind in ESTIMATORS]
+    waiting = []
     for arrival, role, message in messages:
-        reasons = online.push(role, message)["reason"]
-        count += int(np.count_nonzero(~np.isin(reasons, refusals)))
-        if arrival - begin >= SECOND * len(times):
-            times.append((arrival - begin) / SECOND)
-            used.append(count)
-            report = online.report()
-            assert all(np.isfinite(x).all() for x in (report.values, report.std))
-            scaled = report.covariance / np.outer(report.std, report.std)
-            assert np.linalg.eigvalsh(scaled)[0] > 0.0, f"covariance at {times[-1]} s"
-    online.flush()
-    return Run(online.report(), times, used)
+        samples = sampler.push(role, message)
+        if len(samples):
+            waiting.append(samples)
+        if arrival - begin >= SECOND * second:
+            for online, done in runs:
+                done.look(online, (arrival - begin) / SECOND, waiting)
+            waiting, second = [], second + 1
+    waiting.append(sampler.flush())
+    for online, done in runs:
+        done.look(online, math.inf, waiting)
+    return {done.kind: done for _, done in runs}
 
 
 def shift(a: Run, b: Run) -> float:
     """The largest change of a coefficient, in standard deviations of the undisturbed run."""
+    assert a.final and b.final
     return float(np.max(np.abs(a.final.values - b.final.values) / b.final.std))
 
 
@@ -201,20 +217,17 @@ def faults(seeds: int, only: str) -> Iterator[Row]:
     for what, fault in FAULTS.items():
         if only not in what:
             continue
+        pairs = [(run(started(k), fault(dived(k))), undisturbed(k)) for k in range(seeds)]
         for kind in ESTIMATORS:
-            moved, slowest = 0.0, 0.0
-            for seed in range(seeds):
-                config, messages = started(seed), dived(seed)
-                done = run(config, kind, fault(messages))
-                moved = max(moved, shift(done, undisturbed(seed, kind)))
-                slowest = max(slowest, done.recovery(FAULT[1], 50.0))
+            moved = max(shift(done[kind], without[kind]) for done, without in pairs)
+            slowest = max(done[kind].recovery(FAULT[1], 50.0) for done, _ in pairs)
             yield Row(f"{what}: moved", kind, moved, "sigma", 1.0)
             yield Row(f"{what}: used again after", kind, slowest, "s", 10.0)
 
 
 @cache
-def undisturbed(seed: int, kind: Kind) -> Run:
-    return run(started(seed), kind, dived(seed))
+def undisturbed(seed: int) -> dict[Kind, Run]:
+    return run(started(seed), dived(seed))
 
 
 # ------------------------------------------------------------------ outliers
@@ -229,32 +242,31 @@ CHANNELS = {
 def outliers(seeds: int, only: str) -> Iterator[Row]:
     """Five per cent of one channel's numbers replaced by something up to ``size``."""
     for role, fields in CHANNELS.items():
-        for field, letters, size in fields:
+        for name, letters, size in fields:
             for index, letter in enumerate(letters):
-                if only not in f"{role} {field} {letter}":
+                what = f"{role} {name} {letter}"
+                if only not in what:
                     continue
+                pairs = [
+                    (run(started(k), spoilt(k, role, name, index, size)), undisturbed(k))
+                    for k in range(seeds)
+                ]
                 for kind in ESTIMATORS:
-                    moved = max(
-                        shift(
-                            run(started(seed), kind, spoilt(seed, role, field, index, size)),
-                            undisturbed(seed, kind),
-                        )
-                        for seed in range(seeds)
-                    )
-                    yield Row(f"5 % outliers, {role} {field} {letter}", kind, moved, "sigma", 1.0)
+                    moved = max(shift(done[kind], without[kind]) for done, without in pairs)
+                    yield Row(f"5 % outliers, {what}", kind, moved, "sigma", 1.0)
 
 
-def spoilt(seed: int, role: str, field: str, index: int, size: float) -> Messages:
-    rng = np.random.default_rng([seed, index, len(field)])
+def spoilt(seed: int, role: str, name: str, index: int, size: float) -> Messages:
+    rng = np.random.default_rng([seed, index, len(name)])
     out = []
-    for arrival, name, m in dived(seed):
-        if name == role and rng.random() < 0.05:
-            values = getattr(m, field).copy()
+    for arrival, topic, m in dived(seed):
+        if topic == role and rng.random() < 0.05:
+            values = getattr(m, name).copy()
             values[index] = rng.uniform(-size, size)
-            if field == "orientation":
+            if name == "orientation":
                 values /= np.linalg.norm(values)
-            m = m._replace(**{field: values})
-        out.append((arrival, name, m))
+            m = m._replace(**{name: values})
+        out.append((arrival, topic, m))
     return out
 
 

@@ -86,7 +86,10 @@ _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
 LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
 _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
-_PUSH = 0.1  # of the working wrench; of which a demand may: less would thin coarse demands
+_PUSH = 0.005  # of the working wrench; of which a brief demand may
+_COARSE = 0.03  # of the demand itself; of which it may: less would thin the noise of coarse ones
+_MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
+_BRIEF, _LASTING = 0.02, 0.1  # s; what is brief, and what lasts
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
@@ -170,7 +173,7 @@ class Sampler:
         self._settings = _settings(config)
         self._floors = {
             IMU: np.repeat([config.imu.gyro_std, _SHAKE], 3),
-            WRENCH: _PUSH * authority(config.dynamics),
+            WRENCH: authority(config.dynamics),
         }
 
     def recentre(self, config: Config) -> None:
@@ -205,11 +208,12 @@ class Sampler:
         self._kinematics["gyro_bias_variance"] = self._settings["gyro_bias_variance"]
         self._demand: Array | None = None
         self._demand_time = -math.inf
+        self._guessed = False  # the present demand: whether it is known
         self._intervals: deque[float] = deque(maxlen=50)  # s; between demands
         self._period = 0.0  # s; as is usual
         self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
         self._before: dict[str, Array] = {}  # the last message's numbers
-        self._scatter = {role: floor**2 for role, floor in self._floors.items()}
+        self._scatter = {role: np.zeros(6) for role in self._floors}
         self._memory = memory()
         if self._sensitivity is not None:
             self._sensitivity.forget()
@@ -387,7 +391,8 @@ class Sampler:
                 break
             if take_imu and len(imu) < 3 and not (final or self._waited(t)):
                 break  # its successors tell whether it is an outlier
-            if take_imu and self._is_lone(IMU):
+            if take_imu and self._mended(IMU)[1] != _SOUND:
+                imu.popleft()  # of an IMU the others tell enough, and a guess would not do
                 continue
             message = imu.popleft()[1] if take_imu else None
             pose = odometry.popleft() if merged or not take_imu else None
@@ -402,20 +407,28 @@ class Sampler:
         """Whether the newest stamp is so far ahead of t that nothing more is waited for."""
         return max(self._newest.values()) - t > max(self._grace, self._late)
 
-    def _is_lone(self, role: str) -> bool:
-        """Whether the next message is an outlier between its neighbours; then it is dropped."""
+    def _mended(self, role: str) -> tuple[Array, int]:
+        """Numbers (6,) of the next message without its outliers, and what :func:`mend` says.
+
+        They are mended, each by itself: a step of another axis is not to come late for them.
+        """
         queue, before = self._queues[role], self._before.get(role)
-        here = numbers(queue[0][1])
+        here, found = numbers(queue[0][1]), _SOUND
         if before is not None and len(queue) > 1:
             after = numbers(queue[1][1])
             last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
-            scatter, floor = self._scatter[role], self._floors[role]
-            if is_lone(before, here, after, last, scatter, floor, LONE):
-                queue.popleft()
-                self.counts[f"{role}: outlier between its neighbours"] += 1
-                return True
-        self._before[role] = here
-        return False
+            floor, coarse = self._floors[role], 0.0
+            if role == WRENCH:
+                lasts = (queue[1][0] - queue[0][0] - _BRIEF) / (_LASTING - _BRIEF)
+                lasts = min(max(lasts, 0.0), 1.0)
+                floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor
+                coarse = _COARSE + lasts * (_MEANT - _COARSE)
+            found = mend(before, here, after, last, self._scatter[role], floor, coarse, LONE)
+        if found != _SOUND:
+            self.counts[f"{role}: outlier between its neighbours"] += 1
+        if role == WRENCH or found == _SOUND:
+            self._before[role] = here
+        return here, found
 
     def _reached(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t, or it is not worth waiting."""
@@ -439,7 +452,7 @@ class Sampler:
         restart = not 0.0 < dt <= _MAX_GAP
         wrench = self._mean_wrench(self._previous if not restart else t, t)
         self._previous = t
-        mean, slope = (_ZERO_WRENCH, _ZERO_WRENCH) if wrench is None else wrench
+        mean, slope, guessed = wrench or (_ZERO_WRENCH, _ZERO_WRENCH, False)
         sample = np.zeros(1, dtype=SAMPLE)
         sample["hold"] = self._period
         odometry, shift = _ABSENT, 0.0
@@ -478,6 +491,8 @@ class Sampler:
             self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
             self._previous = math.nan
             return None
+        if guessed:
+            sample["restart"] = True
         if self._surrounded:
             _surround(self._acting, sample, self._around)
         if self._sensitivity is not None:
@@ -485,18 +500,21 @@ class Sampler:
             return np.frombuffer(bytearray(sample.tobytes() + sides.tobytes()), self._none.dtype)
         return sample
 
-    def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array] | None:
-        """Mean and slope (6,) of the acting wrench; None where no demand is known."""
+    def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array, bool] | None:
+        """Mean and slope (6,) of the acting wrench, and whether some of it had to be guessed.
+
+        None where no demand is known.
+        """
         queue = self._queues[WRENCH]
         pieces: list[tuple[float, float, Array]] = []
-        now = start
+        now, guessed = start, self._guessed
         while queue and queue[0][0] <= end:
             if len(queue) == 1 and queue[0][0] == end and self._demand is not None:
                 break  # it does not act yet, and its successor tells whether it is an outlier
-            if self._is_lone(WRENCH):
-                continue
-            at, message = queue.popleft()
-            assert isinstance(message, Wrench)
+            demand, found = self._mended(WRENCH)
+            at, _ = queue.popleft()
+            self._guessed = found == _GUESSED
+            guessed = guessed or (self._guessed and at < end)
             if self._demand is not None and at > now:
                 pieces.append((now, at, self._act(now, at - now)))
                 now = at
@@ -505,7 +523,7 @@ class Sampler:
             if self._demand_time > -math.inf:
                 self._intervals.append(at - self._demand_time)
                 self._follow_period(self._intervals[-1])
-            self._demand, self._demand_time = np.concatenate([message.force, message.torque]), at
+            self._demand, self._demand_time = demand, at
             if self.demands is not None:
                 self.demands.append((at, self._demand))
         hold = min(self._hold, LOST * max(self._intervals, default=math.inf))
@@ -517,7 +535,7 @@ class Sampler:
             return None
         acting = self._act(now, end - now)
         if not pieces:
-            return acting, _ZERO_WRENCH
+            return acting, _ZERO_WRENCH, guessed
         pieces.append((now, end, acting))
         length, middle = end - start, 0.5 * (start + end)
         mean, slope = np.zeros(6), np.zeros(6)
@@ -530,7 +548,7 @@ class Sampler:
                 mean,
                 slope,
             )
-        return mean, slope
+        return mean, slope, guessed
 
     def _follow_period(self, interval: float) -> None:
         """The usual time between demands, of which a gap is no part."""
@@ -649,27 +667,37 @@ def _average(ratio, i, surprise):
     ratio[i] += 0.05 * (min(surprise, 1e3) - ratio[i])
 
 
-@kernel
-def is_lone(before, here, after, last, scatter, floor, gate):
-    """Whether some number (n,) jumps there and back between messages by more than is usual.
+_SOUND, _MENDED, _GUESSED = range(3)
 
-    Back it may be only with the ``last`` message.
+
+@kernel
+def mend(before, here, after, last, scatter, floor, coarse, gate):
+    """Mend the numbers (n,) that jump there and back between messages by more than is usual.
+
+    Back it may be only with the ``last`` message. A step, or a ramp, goes there and does not come
+    back; and what is there again two messages on is not lone, whatever stands between. What is,
+    becomes what was before. Where that does not come again either, the step was at the outlier or
+    right behind it, nobody knows which: _GUESSED, else _MENDED, or _SOUND.
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
-    ``floor`` (n,) is always usual. A step, or a ramp, goes there and does not come back.
+    ``floor`` (n,), and less than ``coarse`` of the number itself, is always usual.
     """
-    lone = False
+    found = _SOUND
     for i in range(len(here)):
-        there, back = here[i] - before[i], after[i] - here[i]
-        jump = min(there * there, back * back) if there * back < 0.0 else 0.0
-        back = last[i] - here[i]
-        later = min(there * there, back * back) if there * back < 0.0 else 0.0
-        if max(jump, later) > gate * gate * max(scatter[i], floor[i] * floor[i]):
-            lone = True
+        there, back, later = here[i] - before[i], after[i] - here[i], last[i] - here[i]
+        jump = 0.0
+        if there * back < 0.0 or there * later < 0.0:
+            jump = min(there * there, back * back, later * later)
+        usual = max(floor[i], coarse * min(abs(before[i]), abs(after[i])))
+        most = gate * gate * max(scatter[i], usual * usual)
+        if jump > most:
             scatter[i] *= 1.05  # the usual may have changed
+            again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
+            found = max(found, _MENDED if again else _GUESSED)
+            here[i] = before[i] if again else 0.5 * (before[i] + last[i])
         else:
             scatter[i] += 0.02 * (jump - scatter[i])
-    return lone
+    return found
 
 
 @kernel
@@ -778,8 +806,8 @@ def fuse(
                 k.gyro_bias_variance -= bias_gain * k.attitude_bias
                 k.attitude_bias *= 1.0 - gain
                 k.attitude_variance *= 1.0 - gain
-            else:
-                k.attitude_variance += 0.2 * k.attitude_variance + s.attitude_variance
+            else:  # a lone one must not open the gate, nor give the next more weight
+                k.attitude_variance *= 1.3
         if credible:
             _set(out.attitude, q)
     _set(out.orientation, k.q)

@@ -84,7 +84,7 @@ REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
 _PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
 _ROOM = 1.5  # of the process noise: see process_noise.adapt (docs/accuracy.md)
-_LOST = 1.0  # s of nothing but outliers after which the velocity is begun anew
+_LOST = 2  # outliers in a row, of linear or of angular velocity, after which it is begun anew
 
 _SETTINGS = np.dtype(
     [
@@ -102,7 +102,7 @@ _SCALARS = np.dtype(
     [
         ("t", "f8"),
         ("surprise", "f8"),  # normalised innovations squared, averaged: 1 when all is well
-        ("refused", "f8"),  # s of nothing but outliers
+        ("refused", "i8", (2,)),  # outliers in a row, of linear and of angular velocity
         ("since", "f8"),  # s since the coefficients walked
         ("started", "?"),
     ],
@@ -319,6 +319,7 @@ def _step(task, state, work, sample, side, out):
     out.reason = USED
     if sample.restart or not state.scalars[0].started or not sample.dt > 0.0:
         _restart(state, work.p, sample)
+        state.scalars[0].surprise = 1.0
         out.reason = RESTARTED
     else:
         _take_root(task, work, out)
@@ -349,7 +350,7 @@ def _restart(state, p, sample):
         p[i, i] = variance if variance < 1.0 else 1.0
         interrupt(state.adaptation[i])
     c = state.scalars[0]
-    c.started, c.surprise, c.refused = True, 1.0, 0.0
+    c.started, c.refused[0], c.refused[1] = True, 0, 0
 
 
 # ---------------------------------------------------------------- prediction
@@ -684,14 +685,13 @@ def _update(task, state, work, sample, side, out):
             adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, innovation)
         if worst > s.gate**2:
             out.reason = GATED
+            c.refused[first // 3] += 1
             continue
-        c.refused = 0.0
+        c.refused[first // 3] = 0
         _absorb(task, x, work, side, first)
-    if out.reason == GATED:
-        c.refused += sample.dt
-        if c.refused > _LOST:
-            _restart(state, p, sample)
-            return
+    # One alone is the sensor's. After two it was the wrench, and the velocity is lost.
+    if c.refused[0] >= _LOST or c.refused[1] >= _LOST:
+        _restart(state, p, sample)
     blend = min(sample.dt / SURPRISE_TIME, 1.0)
     if count > 0:
         c.surprise += blend * (surprise / count - c.surprise)

@@ -59,8 +59,12 @@ def compiled():
 def pytest_collection_finish(session):
     """Compile what nodes run before the workers start; rov_ident/warm.py says why not in them."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
-    if not wanted or session.config.option.collectonly:
-        return
+    if wanted and not session.config.option.collectonly:
+        compile_all()
+
+
+def compile_all():
+    """All that a node runs, once for all who ask for it."""
     import numba
 
     from rov_ident import jit  # noqa: F401 - says where the cache is
@@ -225,16 +229,49 @@ def end_node(process, number=signal.SIGINT):
     return process.returncode, said
 
 
+def start_connected(estimator, *options, parameters=HEAVY, **kwargs):
+    """The process of a node that loses nothing, and a vehicle; both have found each other."""
+    process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
+    try:
+        vehicle = Vehicle(estimator, **kwargs)
+        vehicle.until(vehicle.connected, 120.0)
+    except BaseException:
+        process.kill()
+        raise
+    return process, vehicle
+
+
+class Dive:
+    """A dive played to a node at the pace of the clock, which stands still while nobody listens."""
+
+    def __init__(self, messages):
+        self.messages = messages
+        self.done = 0
+
+    def play(self, vehicle, seconds):
+        """Publish this many seconds of it."""
+        from rov_ident import cdr
+
+        start, begun = self.messages[self.done][0], time.monotonic()
+        while self.done < len(self.messages):
+            arrival, role, message = self.messages[self.done]
+            due = (arrival - start) * 1e-9
+            if due > seconds:
+                return
+            vehicle.executor.spin_once(timeout_sec=max(due - (time.monotonic() - begun), 0.0))
+            if time.monotonic() - begun >= due:
+                vehicle.publish(role, cdr.encode(message))
+                self.done += 1
+
+
 @pytest.fixture
 def live(domain):
     """Starts a node; gives the vehicle that is connected to it. In the end both must end well."""
     started = []
 
     def start(*options, estimator="rls", parameters=HEAVY, **kwargs):
-        process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
-        vehicle = Vehicle(estimator, **kwargs)
-        started.append((process, vehicle))
-        vehicle.until(vehicle.connected)
+        started.append(start_connected(estimator, *options, parameters=parameters, **kwargs))
+        vehicle = started[-1][1]
         vehicle.diagnostics.clear()
         return vehicle
 

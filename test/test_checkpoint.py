@@ -1,21 +1,19 @@
 """Checkpoints: what is learnt outlives the process, and nothing else is taken for it."""
 
 import json
-import os
 import random
 import resource
-import signal
-import time
 
 import numpy as np
 import pytest
-from conftest import Vehicle, end_node, start_node
+from conftest import Dive, end_node, start_connected
 from std_srvs.srv import Trigger
 
-from rov_ident import cdr, checkpoint, config, sensors
+from rov_ident import checkpoint, config, sensors
 from rov_ident.errors import UserError
 from rov_ident.nodes.conversions import from_diagnostics
 from rov_ident.online import OnlineEstimator
+from torture_live import kill_writers, lives
 
 KINDS = ["rls", "ukf"]
 SECOND = 1_000_000_000
@@ -171,25 +169,11 @@ def test_only_the_same_configuration_and_estimator(heavy, learnt, data, tmp_path
 
 def test_a_writer_killed_at_any_time_leaves_a_whole_file(heavy, short_dive, tmp_path):
     """Forty processes that do nothing but write, killed after some milliseconds."""
-    path = tmp_path / "x.checkpoint"
     online = OnlineEstimator(heavy, "rls")
     versions = [contents(online), contents(fed(online, short_dive[:500]))]
-    checkpoint.write(path, versions[0])
-    numbers = random.Random(5)
-    for _ in range(40):
-        pid = os.fork()
-        if pid == 0:
-            try:
-                while True:
-                    for data in versions:
-                        checkpoint.write(path, data)
-            finally:
-                os._exit(1)
-        time.sleep(0.005 * numbers.random())
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-        assert path.read_bytes() in versions
-    assert len(list(tmp_path.iterdir())) <= 2  # at most a single part is left behind
+    broken, missed, spare = kill_writers(tmp_path / "x.checkpoint", versions, 40)
+    assert broken == missed == 0
+    assert spare <= 1  # a single part, at most
 
 
 def test_a_place_that_cannot_be_written(heavy, learnt, tmp_path):
@@ -204,78 +188,40 @@ def test_a_place_that_cannot_be_written(heavy, learnt, tmp_path):
 # ------------------------------------------------------------------ nodes
 
 
-class Dive:
-    """A dive played to a node at the pace of the clock, which stands still while nobody listens."""
-
-    def __init__(self, messages):
-        self.messages = messages
-        self.done = 0
-
-    def play(self, vehicle, seconds):
-        """Publish this many seconds of it."""
-        start, begun = self.messages[self.done][0], time.monotonic()
-        while self.done < len(self.messages):
-            arrival, role, message = self.messages[self.done]
-            due = (arrival - start) * 1e-9
-            if due > seconds:
-                return
-            vehicle.executor.spin_once(timeout_sec=max(due - (time.monotonic() - begun), 0.0))
-            if time.monotonic() - begun >= due:
-                vehicle.publish(role, cdr.encode(message))
-                self.done += 1
-
-
-@pytest.fixture
-def begun(domain, heavy_path):
-    """Starts a node with a checkpoint; gives it and the vehicle that it has found."""
-    processes = []
-
-    def begin(path, kind):
-        options = [f"checkpoint_path:={path}", "publish_rate:=50.0", "qos.reliability:=reliable"]
-        processes.append(start_node(kind, heavy_path, *options))
-        vehicle = Vehicle(kind)
-        vehicle.until(vehicle.connected, 120.0)
-        vehicle.until(lambda: vehicle.coefficients)
-        return processes[-1], vehicle
-
-    yield begin
-    for process in processes:
-        process.kill()  # where the test has failed
-        process.wait()
-
-
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_node_killed_goes_on_within_a_second(begun, heavy, tmp_path, kind):
+def test_a_node_killed_goes_on_within_a_second(domain, heavy, tmp_path, kind):
     """kill -9 at random times; what comes back is what an unbroken estimator had at that stamp."""
-    path = tmp_path / "folder" / "x.checkpoint"
     dive = Dive(sensors.dive(heavy, duration=20.0, seed=4).messages)
     reference = OnlineEstimator(heavy, kind)
     known = {}  # values by stamp, of the first life
     for _, role, message in dive.messages:
         if len(reference.push(role, message)):
             known[reference.stamp] = reference.report().values
-    numbers = random.Random(kind)
-    last = 0
-    for life in range(2):
-        process, vehicle = begun(path, kind)
-        first = from_diagnostics(vehicle.coefficients[0])
-        assert last - first.stamp < SECOND
-        if life == 1:
-            assert first.stamp > 0
-            np.testing.assert_array_equal(first.values, known[first.stamp])
-        dive.play(vehicle, 2.0 + 2.0 * numbers.random())
-        if life == 0:  # so much later that something has been learnt, however busy the computer is
-            vehicle.until(lambda v=vehicle: v.coefficients[-1].header.stamp.sec > 0)
-            vehicle.until(path.exists)
-        process.kill()
-        process.wait(20)
-        said = os.read(process.stderr.fileno(), 1 << 16).decode()  # a child may hold it open
-        process.stderr.close()
-        last = from_diagnostics(vehicle.coefficients[-1]).stamp
-        vehicle.close()
-        assert last > first.stamp
-        assert ("going on from" in said) == (life == 1)
-        assert "not used" not in said
+    one, other = lives(kind, tmp_path / "folder" / "x.checkpoint", dive, 2, 2.0, 4.0)
+    assert one.first.stamp == 0
+    assert one.last.stamp - SECOND < other.first.stamp < other.last.stamp
+    assert other.first.stamp > 0
+    np.testing.assert_array_equal(other.first.values, known[other.first.stamp])
+    assert "going on from" not in one.said and "going on from" in other.said
+    assert "not used" not in one.said + other.said
+
+
+@pytest.fixture
+def begun(domain):
+    """Starts a node with a checkpoint; gives it and the vehicle that it has found."""
+    processes = []
+
+    def begin(path, kind):
+        options = [f"checkpoint_path:={path}", "publish_rate:=50.0"]
+        process, vehicle = start_connected(kind, *options)
+        processes.append(process)
+        vehicle.until(lambda: vehicle.coefficients)
+        return process, vehicle
+
+    yield begin
+    for process in processes:
+        process.kill()  # where the test has failed
+        process.wait()
 
 
 def test_a_damaged_checkpoint_and_a_full_disk(begun, heavy, tmp_path):

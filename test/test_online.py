@@ -109,6 +109,7 @@ def test_errors_of_a_slow_wrench_are_not_taken_for_many(heavy, kind):
     assert 0.75 < np.sqrt(np.mean(np.square(scores))) < 1.2
 
 
+@pytest.mark.parametrize("kind", KINDS)
 def test_words_change_from_converging_to_converged(wrong, messages, kind):
     estimator = OnlineEstimator(wrong, kind)
     i = estimator.prior.names.index("X_u")

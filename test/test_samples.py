@@ -655,6 +655,70 @@ def test_velocity_outliers_against_the_imu(heavy):
     assert np.abs(error).max() < 0.05
 
 
+def pushed(heavy, demands, rate=50.0):
+    """Samples and sampler of a vehicle at rest under demands (N, 6) at this rate."""
+    other = [(role, m) for role, m in steady(1.0, 1.0 + len(demands) / rate) if role != WRENCH]
+    wrenches = [
+        (WRENCH, Wrench(SECOND + round(k / rate * SECOND), "base_link_frd", d[:3], d[3:]))
+        for k, d in enumerate(demands)
+    ]
+    return taken(heavy, sorted(other + wrenches, key=lambda m: m[1].stamp))
+
+
+def steps(count):
+    """Demands (count, 6) on all axes that step at times of their own; most are full."""
+    k = np.arange(count)
+    return np.stack([20.0 * (1 + i % 3) * (-1.0) ** (k // (37 + 5 * i)) for i in range(6)], axis=1)
+
+
+LONE = "wrench: outlier between its neighbours"
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03, 0.05])
+def test_ordinary_demands_pass_as_they_came(heavy, noise):
+    """Steps on all axes, and noise of some percent: next to nothing looks like an outlier."""
+    rng = np.random.default_rng(1)
+    demands = steps(2000)
+    demands *= 1.0 + noise * rng.standard_normal(demands.shape)
+    _, sampler = pushed(heavy, demands)
+    assert sampler.counts[LONE] <= (0 if noise < 0.05 else 20)
+
+
+def test_slow_pulses_are_meant(heavy):
+    """A pilot's tap on the stick, a tenth of a second long, is no outlier."""
+    demands = np.zeros((200, 6))
+    demands[20::20, 0] = 20.0
+    samples, sampler = pushed(heavy, demands, rate=10.0)
+    assert sampler.counts[LONE] == 0
+    assert samples["wrench"][:, 0].max() == pytest.approx(20.0)
+
+
+def test_an_outlier_of_one_axis_keeps_no_step_of_another(heavy):
+    """At the very message where all others step, one number is wild: only that one is mended."""
+    demands = steps(400)
+    demands[:, 5] = 1.0
+    clean, _ = pushed(heavy, demands)
+    k = 37 * 3  # here the first axis steps
+    demands[[k, k + 100, k + 101], 5] = [40.0, -30.0, 25.0]  # and two in a row
+    samples, sampler = pushed(heavy, demands)
+    assert sampler.counts[LONE] == 3
+    np.testing.assert_array_equal(samples["wrench"], clean["wrench"])
+    assert samples["restart"].sum() == 1
+
+
+@pytest.mark.parametrize("where", [-1, 0])
+def test_an_outlier_at_a_step_makes_the_interval_unknown(heavy, where):
+    """Whether the step was there or one message on cannot be told: filters begin anew."""
+    demands = np.zeros((400, 6))
+    demands[200:, 0] = 20.0
+    demands[200 + where, 0] = -60.0
+    samples, sampler = pushed(heavy, demands)
+    assert sampler.counts[LONE] == 1
+    again = samples["t"][samples["restart"]][1:] - (200 + where) / 50.0
+    assert len(again) and (again > 0.0).all() and (again < 0.08).all()
+    assert np.abs(samples["wrench"][:, 0]).max() == pytest.approx(20.0)
+
+
 def test_a_gate_that_was_wrong_opens_again(heavy):
     """The velocity has jumped for good (a lost lock): refused, then believed."""
     messages = [

@@ -1,20 +1,26 @@
 """Nothing that is read is run, nothing is written elsewhere, nodes do what their policy says."""
 
 import ast
+import contextlib
 import math
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
+import rclpy.node
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from rov_ident import config
 from rov_ident.config import PARAMETERS
 from rov_ident.errors import UserError
+from rov_ident.nodes.common import LATCHED
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "rov_ident").rglob("*.py")) + sorted((ROOT / "launch").glob("*.py"))
@@ -196,24 +202,74 @@ def policy(node):
     return allowed
 
 
+def done_by(graph, name):
+    """What a node does, as ``graph``, another node, sees it: {kind: full names}."""
+    found = {
+        "subscribe": graph.get_subscriber_names_and_types_by_node(name, "/"),
+        "publish": graph.get_publisher_names_and_types_by_node(name, "/"),
+        "reply": graph.get_service_names_and_types_by_node(name, "/"),
+        "request": graph.get_client_names_and_types_by_node(name, "/"),
+    }
+    return {way: {topic for topic, _ in names} for way, names in found.items()}
+
+
+OTHERS = {
+    "controller_bridge": ["rov_ident.nodes.controller_bridge", "--ros-args", "--params-file",
+                          str(ROOT / "config" / "bluerov2_heavy.yaml"), "-p",
+                          "controller:=/controller", "-r", "coefficients:=/ukf_node/coefficients"],
+    "example_controller": ["rov_ident.nodes.example_controller", "--ros-args", "--params-file",
+                           str(ROOT / "config" / "bluerov2_heavy.yaml"),
+                           "-r", "coefficients:=/ukf_node/coefficients"],
+    "dashboard": ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=0",
+                  "-p", "foxglove_port:=0"],
+    "rov_ident_watch": ["rov_ident.cli", "watch"],
+}  # fmt: skip
+
+
+def test_every_node_has_a_policy():
+    tree = ET.parse(ROOT / "config" / "security_policy.xml")
+    names = {profile.get("node") for profile in tree.iter("profile")}
+    assert names == {"rls_node", "ukf_node", *OTHERS}
+    assert {enclave.get("path") for enclave in tree.iter("enclave")} == {f"/{n}" for n in names}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_another_node_does_what_its_policy_says(domain, name):
+    """The bridge, the controller, the page and the terminal, beside two estimators."""
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    graph = rclpy.create_node("graph", context=context)
+    for estimator in ("rls", "ukf"):
+        graph.create_publisher(DiagnosticArray, f"/{estimator}_node/coefficients", LATCHED)
+    process = subprocess.Popen(
+        [sys.executable, "-m", *OTHERS[name]], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    allowed = {"request": set(), **policy(name)}
+    end, done = time.monotonic() + 60.0, {}
+    try:
+        while done != allowed and time.monotonic() < end:
+            time.sleep(0.2)
+            assert process.poll() is None
+            with contextlib.suppress(rclpy.node.NodeNameNonExistentError):
+                done = done_by(graph, name)
+        assert done == allowed
+        time.sleep(1.0)  # nor does it begin anything else
+        assert done_by(graph, name) == allowed
+    finally:
+        process.terminate()
+        process.wait(20)
+        graph.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
 @pytest.mark.parametrize("estimator", ["rls", "ukf"])
 def test_a_node_does_what_its_policy_says(live, estimator):
     """Exactly these topics and services; and no parameter takes a value out of its range."""
     vehicle = live(estimator=estimator)
     name = f"{estimator}_node"
-    graph = vehicle.node
-
-    def found():
-        return {
-            "subscribe": graph.get_subscriber_names_and_types_by_node(name, "/"),
-            "publish": graph.get_publisher_names_and_types_by_node(name, "/"),
-            "reply": graph.get_service_names_and_types_by_node(name, "/"),
-            "request": graph.get_client_names_and_types_by_node(name, "/"),
-        }
-
     allowed = {"request": set(), **policy(name)}
-    vehicle.until(lambda: len(found()["reply"]) >= len(allowed["reply"]))
-    assert {way: {topic for topic, _ in names} for way, names in found().items()} == allowed
+    vehicle.until(lambda: len(done_by(vehicle.node, name)["reply"]) >= len(allowed["reply"]))
+    assert done_by(vehicle.node, name) == allowed
 
     changes = [(p.key, value) for p in PARAMETERS if p.live for value in outside(p)]
     assert len(changes) > 15

@@ -190,6 +190,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
             if len(info):
                 self._idle = 0.0
                 self._show(info)
+                # A queue that is worked off is learnt from faster than time goes.
+                if self._keeper and self._online.stamp - self._kept > _CHECKPOINT_PERIOD * 1e9:
+                    self._keep()
         count = self._received.total()
         if self._lockstep and count % _ACKNOWLEDGED_TOGETHER == 0:  # the rest by _watch
             self._acknowledge.publish(UInt64(data=count))

@@ -1,0 +1,32 @@
+"""The short form of `make torture`: faults and outliers of a dive, to both estimators."""
+
+import pytest
+
+import torture
+
+
+@pytest.mark.parametrize("what", ["IMU gone", "velocity frozen", "wrench 300 ms late", "hour back"])
+def test_faults_in_time(what):
+    """Held, used again within seconds, and the coefficients end where they would have."""
+    missed = [row for row in torture.faults(1, what) if not row.met]
+    assert missed == []
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [
+        "odom linear u", "odom angular r", "odom orientation y", "imu angular_velocity x",
+        "imu linear_acceleration z", "wrench force X", "wrench torque N",
+    ],
+)  # fmt: skip
+def test_outliers(channel):
+    """Five per cent gross ones move no coefficient by more than a standard deviation."""
+    rows = list(torture.outliers(1, channel))
+    assert len(rows) == 2
+    assert [row for row in rows if not row.met] == []
+
+
+def test_no_excitation():
+    """The covariance stays positive definite and bounded, and what is learnt later is the same."""
+    missed = [row for row in torture.rest(1, "", 20_000) if not row.met]
+    assert missed == []
