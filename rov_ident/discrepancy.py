@@ -31,6 +31,9 @@ Progress = Callable[[str], None]
 PLAIN = ("quadratic_damping", "linear_damping")
 """Terms that every hull has: what a model lacks of them is the first thing to suspect."""
 
+LATE = ("thruster_lag", "actuation_delay")
+"""What every thruster has a little of."""
+
 PLAINLY = 0.0  # what such a term must take off the cost; of others: SURE
 _LIKELIER = 0.5  # share of what a plain term explains that a rival must explain beyond it
 _OWN = 0.5  # of what a hull has of such a term that must stay its own beside one like it
@@ -159,16 +162,30 @@ class Search:
         return min(plain or worth, key=lambda f: self.cost(f, closest), default=None)
 
     def _ahead(self, now: Fitted, candidates: Sequence[Candidate]) -> Fitted | None:
-        """A plain term with one effect more, where neither shows without the other."""
+        """A plain term with one effect more, where neither shows without the other.
+
+        What comes late is tried whatever it promises: a model without drag makes up for it by added
+        mass, and from there a linear view sees nothing of it.
+        """
         for candidate in candidates:
             if candidate.name not in PLAIN:
                 continue
-            first = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
+            start = dict.fromkeys(
+                (k for u in self.units(EFFECTS[candidate.name], now.hypothesis) for k in u), 0.0
+            )
+            first = self.evidence.fit(now.hypothesis.having({**start, **candidate.start}), now.look)
             if first is None:
                 continue
             others = [c for c in self.screen(first) if not self._early(c.name, now.hypothesis)]
-            fits = [self.pruned(f, now) for f in self.fit_best(first, others)]
-            both = [f for f in fits if f and set(candidate.start) & set(f.hypothesis.keys)]
+            fits = self.fit_best(first, others)
+            for name in LATE:
+                if name not in now.hypothesis.effects:
+                    (p,) = EFFECTS[name].parameters
+                    late = {(name, p.name): p.null + _BOLD * p.typical}
+                    there = self.evidence.fit(first.hypothesis.having(late), first.look)
+                    fits += [there] if there is not None else []
+            pruned = [self.pruned(f, now) for f in fits]
+            both = [f for f in pruned if f and set(start) & set(f.hypothesis.keys)]
             best = self._best(now, both)
             if best is not None:
                 return best

@@ -160,8 +160,8 @@ def explain(
     say("judging on held-out data", 0.9)
     judge = Judge(Evidence(judge_streams, judge_spans))
     retuned = path[0].hypothesis
-    final, found = _judged(search, judge, final, trials)
-    minor = [f for f in found if not weighty(f)]
+    final, found, borne = _judged(search, judge, final, trials)
+    minor = [f for f in found if not weighty(f) and f.effect not in borne]
     slight = [k for f in minor for k in search.keys_of(final, f.effect)]
     patterns = [k for k in final.hypothesis.keys if k[0] == UNKNOWN]
     if slight or patterns:
@@ -171,7 +171,7 @@ def explain(
     everything = Evidence(streams, thinned(halves))
     last = everything.fit(final.hypothesis, None) or final
     last = everything.dated(last)
-    for f in [f for f in found if weighty(f) and not _certain(search, last, f.effect)]:
+    for f in [f for f in found if f not in minor and not _certain(search, last, f.effect)]:
         minor.append(f)
         gone = search.keys_of(final, f.effect)
         final = search.evidence.fit(final.hypothesis.without(gone), final.look) or final
@@ -180,7 +180,7 @@ def explain(
     findings = sorted(
         [
             *(f for f in sensor_findings if weighty(f)),
-            *(_with_parameters(search, last, f) for f in found if weighty(f)),
+            *(_with_parameters(search, last, f) for f in found),
         ],
         key=lambda f: -f.gain.percent,
     )
@@ -228,8 +228,9 @@ def explain(
 
 def _judged(
     search: Search, judge: "Judge", final: Fitted, trials: Trials
-) -> tuple[Fitted, list[Finding]]:
-    """The findings of a model, without those that others can stand in for.
+) -> tuple[Fitted, list[Finding], set[str]]:
+    """The findings of a model, without those that others can stand in for, and the names of those
+    that others need.
 
     Two effects that do the same on the held-out data gain nothing beside each other, and all
     together: the slightest leaves, and the rest is judged anew.
@@ -238,11 +239,33 @@ def _judged(
         known = {n: t for n, t in trials.items() if not n.startswith(UNKNOWN)}
         found = [_finding(search, judge, final, name, trial) for name, trial in known.items()]
         slight = [f for f in found if not weighty(f)]
+        borne = {f.effect for f in slight if _bears(search, judge, final, known, f.effect)}
+        slight = [f for f in slight if f.effect not in borne]
         if len(slight) < 2:
-            return final, found
+            return final, found, borne
         least = min(slight, key=lambda f: f.gain.percent)
         rest = known[least.effect].rest
         final, trials = rest, search.trials(rest)
+
+
+def _bears(search: Search, judge: "Judge", final: Fitted, trials: Trials, name: str) -> bool:
+    """Whether a term that every hull has is what makes another effect show.
+
+    By itself such a term may surely gain nothing where what it bears is worth nothing without it:
+    then it counts what both gain.
+    """
+    rest = trials[name].rest
+    for other in trials if name in PLAIN else ():
+        if other == name:
+            continue
+        keys = [k for n in (name, other) for k in search.keys_of(final, n)]
+        neither = search.evidence.fit(final.hypothesis.without(keys), final.look)
+        if neither is None or search.worth(neither, rest, final) >= SURE:
+            continue
+        gain = judge.gain(neither.hypothesis, final.hypothesis)
+        if gain.low > 0.0 and gain.percent >= 100.0 * _WORTH:
+            return True
+    return False
 
 
 def weighty(finding: Finding) -> bool:
