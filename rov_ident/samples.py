@@ -104,6 +104,7 @@ _KINEMATICS = np.dtype(
         ("q", "f8", (4,)),
         ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2
+        ("refused", "i8"),  # attitudes in a row
         ("v", "f8", (3,)),
         ("power", "f8", (6,)),  # of nu, of late
         ("rate", "f8", (3,)),  # rad/s, bias removed
@@ -806,8 +807,11 @@ def fuse(
                 k.gyro_bias_variance -= bias_gain * k.attitude_bias
                 k.attitude_bias *= 1.0 - gain
                 k.attitude_variance *= 1.0 - gain
-            else:  # a lone one must not open the gate, nor give the next more weight
-                k.attitude_variance *= 1.3
+                k.refused = 0
+            else:
+                k.refused += 1
+                if k.refused > 1:  # a lone one must not open the gate, nor give the next weight
+                    k.attitude_variance += 0.2 * k.attitude_variance + s.attitude_variance
         if credible:
             _set(out.attitude, q)
     _set(out.orientation, k.q)

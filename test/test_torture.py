@@ -28,5 +28,5 @@ def test_outliers(channel):
 
 def test_no_excitation():
     """The covariance stays positive definite and bounded, and what is learnt later is the same."""
-    missed = [row for row in torture.rest(1, "", 20_000) if not row.met]
+    missed = [row for row in torture.rest(1, "at rest", 20_000) if not row.met]
     assert missed == []
