@@ -6,6 +6,7 @@ Exit status 1 where a bar is missed. docs/trust.md has the figures.
 """
 
 import argparse
+import math
 import multiprocessing
 import os
 import random
@@ -21,16 +22,17 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "test"))
 
 import numpy as np
-from conftest import Dive, Vehicle, compile_all, end_node, start_connected
+from conftest import Dive, Vehicle, compile_all, end_node, in_pace, start_connected
 from rich.console import Console
 from rich.table import Table
 
 from rov_ident import cdr, checkpoint
 from rov_ident import config as configuration
+from rov_ident.messages import Message
 from rov_ident.nodes.conversions import from_diagnostics
 from rov_ident.online import ESTIMATORS, Kind, OnlineEstimator, Report
 from rov_ident.sensors import Suite, dive
-from torture import HEAVY, SECOND, Row
+from torture import HEAVY, SECOND, Messages, Row
 
 # ------------------------------------------------------------------ kills
 
@@ -196,25 +198,24 @@ def _loaded(kind: str, seconds: float, pace: float) -> Iterator[Row]:
     config = configuration.load(HEAVY)
     suite = Suite(odometry_rate=200.0, imu_rate=200.0, wrench_rate=200.0)
     once = dive(config, "steps", 60.0, suite=suite, seed=6).messages
-    period = 60 * SECOND
     with tempfile.TemporaryDirectory() as folder:
         process, vehicle = start_connected(
             kind, f"checkpoint_path:={folder}/x", "timeout:=30.0", "publish_rate:=5.0"
         )
         sizes, sent, begun, cpu = [], 0, time.monotonic(), _cpu(process.pid)
-        for k in range(max(1, round(seconds / 60.0))):
-            for arrival, role, m in once:
-                if arrival - once[0][0] + k * period > seconds * SECOND:
-                    break
-                vehicle.publish(role, cdr.encode(m._replace(stamp=m.stamp + k * period)))
-                sent += 1
-                if sent % 50 == 0:
-                    if pace:
-                        while time.monotonic() - begun < sent / pace:
-                            vehicle.executor.spin_once(timeout_sec=0.0005)
-                    _catch_up(vehicle, sent)
-            sizes.append(_memory(process.pid))
-            print(f"  {kind} {sent} messages, {sizes[-1]:.1f} MiB", end="\r", file=sys.stderr)
+        messages = _repeated(once, seconds)
+        # So many in advance are 300 messages: Fast DDS has room for 512.
+        for _, role, m in in_pace(messages, vehicle.used, vehicle.listen, 0.5, 30.0):
+            vehicle.publish(role, cdr.encode(m))
+            sent += 1
+            if sent % 50 == 0:
+                vehicle.executor.spin_once(timeout_sec=0.0)
+                while pace and time.monotonic() - begun < sent / pace:
+                    vehicle.executor.spin_once(timeout_sec=0.0005)
+            if sent % _MINUTE == 0:
+                _taken(vehicle)
+                sizes.append(_memory(process.pid))
+                print(f"  {kind} {sent} messages, {sizes[-1]:.1f} MiB", end="\r", file=sys.stderr)
         vehicle.until(lambda: _taken(vehicle) >= sent, 60.0)
         lasted, used = time.monotonic() - begun, _cpu(process.pid) - cpu
         lost = sent - _taken(vehicle)
@@ -239,11 +240,17 @@ def _taken(vehicle: Vehicle) -> int:
     return sum(int(values.get(role, 0)) for role in ("odom", "imu", "wrench"))
 
 
-def _catch_up(vehicle: Vehicle, sent: int) -> None:
-    """Listen; and no more than a queue's depth ahead of what the node has used."""
-    vehicle.executor.spin_once(timeout_sec=0.0)
-    if sent % 2000 == 0:
-        vehicle.until(lambda: _taken(vehicle) > sent - 2500, 60.0)
+_MINUTE = 36000  # messages of the vehicle's
+
+
+def _repeated(once: Messages, seconds: float) -> Iterator[tuple[int, str, Message]]:
+    """So many seconds of a minute's messages, over and over."""
+    for k in range(math.ceil(seconds / 60.0)):
+        later = k * 60 * SECOND
+        for arrival, role, m in once:
+            if arrival - once[0][0] + later > seconds * SECOND:
+                return
+            yield arrival + later, role, m._replace(stamp=m.stamp + later)
 
 
 def _memory(pid: int) -> float:

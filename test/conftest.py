@@ -101,7 +101,7 @@ _AHEAD = 1.0  # s; that the messages published may be ahead of the samples used
 _PATIENCE = 0.2  # s a chunk; not all messages make samples
 
 
-def in_pace(messages, used, listen):
+def in_pace(messages, used, listen, ahead=_AHEAD, patience=_PATIENCE):
     """The (arrival, role, message), never many more than the nodes have used.
 
     Fast DDS has 512 messages in shared memory for a process that has no processor for a while. What
@@ -112,8 +112,8 @@ def in_pace(messages, used, listen):
     for k, (arrival, role, message) in enumerate(messages, 1):
         yield arrival, role, message
         if k % _CHUNK == 0:
-            end = time.monotonic() + _PATIENCE
-            while message.stamp - used() > _AHEAD * 1e9 and time.monotonic() < end:
+            end = time.monotonic() + patience
+            while message.stamp - used() > ahead * 1e9 and time.monotonic() < end:
                 listen(0.01)
 
 
