@@ -587,7 +587,9 @@ def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
     return f"{EFFECTS[name].summary} {values}. The {what} improves by {gain.percent:.0f} %."
 
 
-_MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll", "pitch", "yaw"), strict=True))
+_MOTIONS = dict(
+    zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate"), strict=True)
+)
 
 
 def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:

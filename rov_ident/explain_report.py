@@ -128,8 +128,10 @@ def _named(effects: Sequence[Finding]) -> str:
     others = [brief(f) for f in effects if EFFECTS[f.effect].sense is None]
     parts = [f"The simulation lacks {listed(others)}"] if others else []
     parts += [f"{'the' if others else 'The'} sensors show {listed(sensors)}"] if sensors else []
-    gains = listed([_gained(f.gain) for f in effects])
-    return f"{'; '.join(parts)}. With {'it' if len(effects) == 1 else 'these'}, {gains}."
+    if len(effects) == 1:
+        return f"{'; '.join(parts)}. With it, {_gained(effects[0].gain)}."
+    gains = listed([f"{_gained(f.gain)} with {called(f.effect)}" for f in effects])
+    return f"{'; '.join(parts)}. {gains[0].upper() + gains[1:]}."
 
 
 def brief(finding: Finding) -> str:
@@ -150,7 +152,8 @@ def brief(finding: Finding) -> str:
         for name, v in finding.parameters.items()
         if name in told
     ]
-    doubt = "" if finding.separable else "; this run cannot tell it from others"
+    others = listed([called(a.effect) for a in finding.alternatives]) or "others"
+    doubt = "" if finding.separable else f"; this run cannot tell it from {others}"
     return f"{called(finding.effect)} ({', '.join(values)}{doubt})"
 
 
@@ -520,8 +523,13 @@ def _retuned(f: Findings) -> list[str]:
         report.heading("Retuned coefficients"),
         report.paragraph(
             "What refitting the coefficients that the simulation already has makes of them, "
-            "before any effect is added. The values in extended.yaml were refitted together with "
-            "the effects and may differ."
+            "before any effect is added."
+            + (
+                " Where an effect is missing they bend to make up for it: the values to use are "
+                "those of extended.yaml, refitted together with the effects."
+                if f.effects
+                else " extended.yaml has them."
+            )
         ),
         report.table(["", "from", "to", "std", "unit", "off by [std]", "meaning"], rows, (4, 6)),
     ]

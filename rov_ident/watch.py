@@ -395,7 +395,8 @@ def suspicions(task: Task, state: State) -> list[Suspicion]:
         chosen += [_key(best.effect, name) for name in best.parameters]
         # The remainder of an effect looks like others, to second order: only its own axes follow.
         units = [u for u in units if _effect(u) == best.effect and not set(u) & set(chosen)]
-    return found
+    own = [[_key(s.effect, name) for name in s.parameters] for s in found]
+    return [s for s, keys in zip(found, own, strict=True) if memory.stands(keys, chosen)]
 
 
 def price(size: int, tried: int) -> float:
@@ -478,7 +479,8 @@ class _Memory:
         whole = min(alike, key=lambda t: (len(t.unit), _has_onset(t.unit), -worth(t)))
         best = max((t for t in trials if set(t.unit) <= set(whole.unit)), key=worth)
         unit, change = best.unit, best.change
-        score, asked = taken(best) / kappa, price(len(unit), tried)
+        score = taken(best) / kappa
+        asked = price(len(unit), tried)
         share = 6.0 * taken(best) / rss
         if score < asked or share < SHARE:
             return None
@@ -504,6 +506,19 @@ class _Memory:
             tuple(dict.fromkeys(_effect(u) for u in rivals)),
             _sentence(unit, axes, rivals),
         )
+
+    def stands(self, keys: Sequence[Key], chosen: Sequence[Key]) -> bool:
+        """Whether parameters pass their price without the window that speaks most for them, all
+        the others that are ``chosen`` in place: a gust or a knock fills one window, and anything
+        may fit it.
+        """
+        rest = [k for k in chosen if k not in keys]
+        _, before = self.solve(rest)
+        _, after = self.solve([*rest, *keys])
+        taken = before.rss - after.rss
+        kappa = inflation(after, np.arange(len(after.keys)))
+        asked = price(len(keys), len(self.task.units))
+        return bool(taken.sum() - taken.max() > asked * kappa)
 
     def _together(self, chosen: list[Key], trials: Sequence["_Trial"]) -> list["_Trial"]:
         """All units of an effect that has several, to be compared with effects of one unit."""

@@ -276,8 +276,9 @@ def test_verdicts_in_words():
     assert told.verdict(findings("explained", [lag, drag, bias])) == (
         "The simulation lacks thruster lag (time constant 0.24 s) and quadratic damping "
         "(Y_vv -210 N s2/m2; this run cannot tell it from others); the sensors show IMU bias "
-        "(ax 0.10 m/s2). With these, the 10 s prediction of surge improves by 50 %, the 10 s "
-        "prediction of sway improves by 50 % and the agreement of the sensors improves by 50 %."
+        "(ax 0.10 m/s2). The 10 s prediction of surge improves by 50 % with thruster lag, the 10 s "
+        "prediction of sway improves by 50 % with quadratic damping and the agreement of the "
+        "sensors improves by 50 % with IMU bias."
     )
     assert told.verdict(findings("unexplained", [], [noise])) == (
         "Something is left that no effect of the library explains: a moment N that depends on "

@@ -1,4 +1,4 @@
-"""The measured tank record through both live nodes, where that data is at hand.
+"""The measured tank record through both live nodes and explain, where that data is at hand.
 
 It belongs to others and is no part of the project: set ROV_IDENT_DATA to its folder.
 """
@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 
 from rov_ident import config as configuration
+from rov_ident import inputs
+from rov_ident.bags import Bag
+from rov_ident.explain import explain
 from rov_ident.importer import import_csv
 from rov_ident.nodes.replay import replay
 from rov_ident.records import read_record, score
+from rov_ident.streams import gather
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))
@@ -40,3 +44,22 @@ def test_nodes_identify_the_measured_vehicle(tmp_path: Path) -> None:
         values = dict(zip(report.names, report.values.tolist(), strict=True))
         r2 = score(config.model.with_values(values), tried.samples, math.inf, CHANNELS).r2[:3]
         assert (r2 > AXIS_BY_AXIS[name.removesuffix("_node")]).all(), (name, r2)
+
+
+@pytest.mark.skipif(not TANK.is_dir(), reason="the measured tank record is not here")
+@pytest.mark.parametrize("y_v", [None, 0.0, -20.0])
+def test_what_a_linear_model_lacks_is_named(y_v: float | None, tmp_path: Path) -> None:
+    """Whatever linear drag it begins with: quadratic drag, and a lag of the thrusters."""
+    document = configuration.to_parameters(configuration.load(CONFIG))
+    linear = {n: v for n, v in document["coefficients"].items() if len(n.split("_")[1]) != 2}
+    linear.pop("Y_v")
+    document["coefficients"] = linear | ({} if y_v is None else {"Y_v": y_v})
+    config = configuration.from_parameters(
+        {key: document[key] for key in ("vehicle", "coefficients")}
+    )
+    path = tmp_path / "tank.mcap"
+    import_csv([TANK / "11_57_50_3dof.csv"], path, mask_rates_above=1.5, wrench_timing="bin")
+    bag = Bag(path)
+    streams = gather(inputs.messages(bag, inputs.select(bag, config), config), config)
+    named = {f.effect for f in explain([streams], config).findings.effects}
+    assert {"quadratic_damping", "thruster_lag"} <= named

@@ -60,6 +60,24 @@ def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
     assert not any(play(watching(case.config, kind), case.messages))
 
 
+@pytest.mark.parametrize("every", [True, False])
+def test_what_a_single_window_says_proves_nothing(every):
+    """A knock or a gust fills one window, and something always fits that."""
+    case = hidden.draw(102, conditions=hidden.Conditions(duration=85.0))
+    watcher = (online := watching(case.config)).watcher
+    play(online, case.messages)
+    task, state = watcher._task, watcher._state
+    at = [*task.base, *(key for unit in task.units for key in unit)].index(("buoyancy", "delta"))
+    windows, lacking = list(state.windows), 20.0 if every else 80.0  # N
+    for i in range(len(windows)) if every else [7]:
+        old = windows[i]
+        more = lacking * old.normal[at]
+        power = old.power + 2.0 * lacking * old.moment[at] + lacking * more[at]
+        windows[i] = old._replace(moment=old.moment + more, power=power)
+    found = watch.suspicions(task, state._replace(windows=windows))
+    assert bool(found) == every
+
+
 def test_a_tilt_of_the_attitude_is_not_taken_for_a_cause():
     """A milliradian turns a slender vehicle at 0.03 rad/s within a window."""
     slender = hidden.Conditions(duration=80.0, family="auv")
