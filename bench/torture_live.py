@@ -61,17 +61,21 @@ def lives(
         # vehicle has a process of its own, which is left without closing anything.
         ours, theirs = multiprocessing.Pipe()
         seconds = numbers.uniform(shortest, longest)
-        child = _FORK.Process(target=_live, args=(theirs, kind, path, dive, seconds, life == 0))
+        child = _ANEW.Process(target=_live, args=(theirs, kind, path, dive, seconds, life == 0))
         child.start()
         theirs.close()
         try:
+            if not ours.poll(_PATIENCE):
+                raise TimeoutError(f"the vehicle of life {life} has not come back")
             first, last, said, dive.done = ours.recv()
         finally:
+            child.kill()  # it may be stuck; else it has left
             child.join()
         yield Life(first, last, said)
 
 
-_FORK = multiprocessing.get_context("fork")
+_ANEW = multiprocessing.get_context("spawn")  # a fork would inherit locks, not who holds them
+_PATIENCE = 200.0  # s
 
 
 def _live(
