@@ -86,11 +86,13 @@ _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
 LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
 _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
-_PUSH = 0.005  # of the working wrench; of which a brief demand may
+_PUSH = 0.03  # of the working wrench; of which a brief demand may
+_GROSS = 0.5  # of the working wrench: no turn of what is demanded, there and back at once
 _COARSE = 0.03  # of the demand itself; of which it may: less would thin the noise of coarse ones
 _MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
 _BRIEF, _LASTING = 0.02, 0.1  # s; what is brief, and what lasts
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
+_NOTHING = np.zeros(6)
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
 _VELOCITY, _RATE, _ATTITUDE = range(3)
@@ -418,13 +420,14 @@ class Sampler:
         if before is not None and len(queue) > 1:
             after = numbers(queue[1][1])
             last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
-            floor, coarse = self._floors[role], 0.0
+            floor, coarse, gross = self._floors[role], 0.0, _NOTHING
             if role == WRENCH:
+                gross = _GROSS * floor
                 lasts = (queue[1][0] - queue[0][0] - _BRIEF) / (_LASTING - _BRIEF)
                 lasts = min(max(lasts, 0.0), 1.0)
                 floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor
                 coarse = _COARSE + lasts * (_MEANT - _COARSE)
-            found = mend(before, here, after, last, self._scatter[role], floor, coarse, LONE)
+            found = mend(before, here, after, last, self._scatter[role], floor, coarse, gross, LONE)
         if found != _SOUND:
             self.counts[f"{role}: outlier between its neighbours"] += 1
         if role == WRENCH or found == _SOUND:
@@ -672,13 +675,14 @@ _SOUND, _MENDED, _GUESSED = range(3)
 
 
 @kernel
-def mend(before, here, after, last, scatter, floor, coarse, gate):
+def mend(before, here, after, last, scatter, floor, coarse, gross, gate):
     """Mend the numbers (n,) that jump there and back between messages by more than is usual.
 
     Back it may be only with the ``last`` message. A step, or a ramp, goes there and does not come
     back; and what is there again two messages on is not lone, whatever stands between. What is,
-    becomes what was before. Where that does not come again either, the step was at the outlier or
-    right behind it, nobody knows which: _GUESSED, else _MENDED, or _SOUND.
+    becomes what was before. Where that does not come again either, what is demanded has turned;
+    but if the jump is ``gross`` (n,) a step was at the outlier or right behind it, nobody knows
+    which. _GUESSED, else _MENDED, or _SOUND.
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
     ``floor`` (n,), and less than ``coarse`` of the number itself, is always usual.
@@ -691,13 +695,13 @@ def mend(before, here, after, last, scatter, floor, coarse, gate):
             jump = min(there * there, back * back, later * later)
         usual = max(floor[i], coarse * min(abs(before[i]), abs(after[i])))
         most = gate * gate * max(scatter[i], usual * usual)
-        if jump > most:
+        again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
+        if jump > most and (again or jump > gross[i] * gross[i]):
             scatter[i] *= 1.05  # the usual may have changed
-            again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
             found = max(found, _MENDED if again else _GUESSED)
             here[i] = before[i] if again else 0.5 * (before[i] + last[i])
         else:
-            scatter[i] += 0.02 * (jump - scatter[i])
+            scatter[i] += 0.02 * (min(jump, most) - scatter[i])
     return found
 
 
