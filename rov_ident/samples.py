@@ -87,7 +87,7 @@ _REASONS = 100  # names of refusals; what else is wrong is counted together
 LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
 _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
 _PUSH = 0.03  # of the working wrench; of which a brief demand may
-_GROSS = 0.5  # of the working wrench: no turn of what is demanded, there and back at once
+GROSS = 0.5  # of the working wrench: no turn of what is demanded, there and back at once
 _COARSE = 0.03  # of the demand itself; of which it may: less would thin the noise of coarse ones
 _MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
 _BRIEF, _LASTING = 0.02, 0.1  # s; what is brief, and what lasts
@@ -422,7 +422,7 @@ class Sampler:
             last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
             floor, coarse, gross = self._floors[role], 0.0, _NOTHING
             if role == WRENCH:
-                gross = _GROSS * floor
+                gross = GROSS * floor
                 lasts = (queue[1][0] - queue[0][0] - _BRIEF) / (_LASTING - _BRIEF)
                 lasts = min(max(lasts, 0.0), 1.0)
                 floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor

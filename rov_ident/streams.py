@@ -17,6 +17,7 @@ from rov_ident.errors import UserError
 from rov_ident.messages import Array, Message, Odometry
 from rov_ident.samples import (
     IMU,
+    GROSS,
     LONE,
     LOST,
     ODOMETRY,
@@ -166,7 +167,8 @@ class _Recorder(Sampler):
             return taken
         x = np.array([numbers(m) for _, m in taken])
         x = np.abs(x - np.median(x, axis=0))
-        usual = np.maximum(_USUAL * np.quantile(x, 0.99, axis=0), LONE * self._floors[role])
+        least = (GROSS if role == WRENCH else LONE) * self._floors[role]
+        usual = np.maximum(_USUAL * np.quantile(x, 0.99, axis=0), least)
         edges = np.flatnonzero(np.diff((x > usual).any(axis=1), prepend=False, append=False))
         wild = {
             i
