@@ -16,8 +16,8 @@ from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.messages import Array, Message, Odometry
 from rov_ident.samples import (
-    IMU,
     GROSS,
+    IMU,
     LONE,
     LOST,
     ODOMETRY,
