@@ -6,6 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -81,7 +82,8 @@ def demo(out: Path, rate: float, err: Console, console: Console) -> None:
 
 
 def _table(config: Config, truth: dict[str, float], seen: dict[str, list[Report]]) -> Table:
-    table = Table(pad_edge=False)  # or it does not fit into 80 columns
+    # Lines between the columns would need more than 80 characters.
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
     for column in ("truth", "start", *ESTIMATORS, "unit"):
         table.add_column(column, justify="left" if column == "unit" else "right")
