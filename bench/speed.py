@@ -37,8 +37,10 @@ from rov_ident.cdr import encode
 from rov_ident.coefficients import ABSOLUTE, EXTENDED_SIZE, NEGATIVE, ONE, PLAIN
 from rov_ident.config import Config
 from rov_ident.demo import shipped
+from rov_ident.inputs import Reader
 from rov_ident.model import Model
 from rov_ident.recording import write_messages
+from rov_ident.samples import Sampler
 from rov_ident.simulate import simulate
 
 DT = 0.02  # s; of a sample
@@ -515,22 +517,16 @@ def latencies(
 ) -> list[float]:
     """Seconds from the message that completes a sample to its residual, both ways over DDS.
 
-    A sample is complete when every topic has reached its stamp.
+    Which one that is the sampler tells: it waits for the neighbours by which it knows outliers.
     """
-    stamps: dict[str, list[tuple[int, float]]] = {"odom": [], "imu": [], "wrench": []}
+    config = configuration.load(shipped("config/bluerov2_heavy.yaml"))
+    reader, sampler, complete = Reader(config), Sampler(config), {}
     for (_, role, data), at in zip(messages, sent, strict=True):
-        stamps[role].append((_stamp(data), at))
-    out, places = [], dict.fromkeys(stamps, 0)
-    for at, data in residuals:
-        stamp, complete = _stamp(data), 0.0
-        for role, line in stamps.items():
-            while places[role] < len(line) and line[places[role]][0] < stamp:
-                places[role] += 1
-            if places[role] == len(line):
-                return out
-            complete = max(complete, line[places[role]][1])
-        out.append(at - complete)
-    return out
+        for own, message in reader.read(role, data, 0):
+            for t in sampler.push(own, message)["t"].tolist():
+                complete[(sampler.origin or 0) + round(t * 1e9)] = at
+    heard = ((at, complete.get(_stamp(data))) for at, data in residuals)
+    return [at - begun for at, begun in heard if begun is not None]
 
 
 def _stamp(data: bytes) -> int:
