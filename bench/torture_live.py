@@ -121,13 +121,12 @@ def kills(options: argparse.Namespace) -> Iterator[Row]:
         for _, role, m in played.messages[: played.done]:
             unbroken.push(role, m)
         a, b = broken.report(), unbroken.report()
-        moved = float(np.max(np.abs(a.values - b.values) / a.std))
+        moved = float(np.max(np.abs(a.values - b.values) / b.std))
         yield Row(f"{count} kills: learning lost by one, at most", kind, max(lost), "s", 1.0)
         yield Row("  by half of them, at most", kind, float(np.median(lost)), "s", 1.0)
         yield Row("  checkpoints refused", kind, refused, "", 0)
         yield Row("  lives that began with the prior", kind, count - 1 - recalled, "", 0)
-        # Of its own: what it lost of the dive makes it less sure than the unbroken one.
-        yield Row("  in the end apart from an unbroken run", kind, moved, "sigma", 3.0)
+        yield Row("  in the end apart from an unbroken run", kind, moved, "sigma", 1.0)
 
 
 def kill_writers(path: Path, versions: Sequence[bytes], count: int) -> tuple[int, int, int]:
