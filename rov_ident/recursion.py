@@ -25,20 +25,18 @@ INFO = np.dtype(
 """What happened to a sample."""
 
 
-@inlined
-def begin(info, t):
-    """Nothing has happened yet to the sample at t."""
-    info.t = t
+@kernel
+def begin(info, sample):
+    """Nothing has happened yet to the sample: whether nothing in it would spoil a state.
+
+    NaN where not measured is no harm.
+    """
+    info.t = sample.t
     info.forgetting = 1.0
     info.condition = np.nan
     for i in range(6):
         info.residual[i] = np.nan
         info.ratio[i] = np.nan
-
-
-@kernel
-def is_finite(sample):
-    """Whether nothing in a sample would spoil a state; NaN where not measured is no harm."""
     total = sample.t + sample.dt
     for i in range(6):
         total += sample.nu[i] + sample.wrench[i] + sample.wrench_slope[i]
@@ -48,13 +46,25 @@ def is_finite(sample):
 
 
 @inlined
-def add_score(g, lagged, score, decay):
+def steps_of(dt):
+    """Into how many steps an interval is divided."""
+    return max(1, int(np.ceil(dt / MAX_STEP - 1e-9)))
+
+
+@inlined
+def blend_of(dt):
+    """Of an innovation, so long after the last one, in the average of surprise."""
+    return min(dt / SURPRISE_TIME, 1.0)
+
+
+@inlined
+def add_score(g, lagged, score, since):
     """Add g (n,) to the covariance (n, n) of the summed score, its correlation in time included.
 
     With an exponential lag window (Newey and West 1987), of which ``lagged`` (n,) holds the past;
-    ``decay`` is that of the window since the last g.
+    the last g was ``since`` seconds ago.
     """
-    n = len(lagged)
+    n, decay = len(lagged), np.exp(-since / LAG)
     for a in range(n):
         lagged[a] *= decay
     for a in range(n):

@@ -62,15 +62,13 @@ from rov_ident.process_noise import adapt, first_adaptation, interrupt, process,
 from rov_ident.recursion import (
     FASTEST,
     INFO,
-    LAG,
     LIGHTEST,
-    MAX_STEP,
     RELEARNING_TIME,
-    SURPRISE_TIME,
     add_score,
     begin,
+    blend_of,
     copy,
-    is_finite,
+    steps_of,
 )
 from rov_ident.residual import filtered_residual
 from rov_ident.samples import parts
@@ -373,8 +371,7 @@ def _fold(task, state, samples, sides, info):
 @inlined
 def _step(task, state, work, sample, side, info):
     s, c = task.settings[0], state.scalars[0]
-    begin(info, sample.t)
-    if not is_finite(sample):
+    if not begin(info, sample):
         info.reason = NOT_FINITE
         return
     c.t = sample.t
@@ -505,7 +502,7 @@ def _predict(task, state, work, sample, side):
         state.adaptation[i].since += sample.dt
         noise[i, i] += state.adaptation[i].density
         state.adaptation[i].acting = noise[i, i]
-    steps = max(1, int(np.ceil(sample.dt / MAX_STEP - 1e-9)))
+    steps = steps_of(sample.dt)
     dt = sample.dt / steps
     for step in range(steps):
         _linearise(task, work, nu, step * dt - 0.5 * sample.dt, dt)
@@ -740,9 +737,9 @@ def _update(task, state, work, sample, side, info):
         wild = wild or info.ratio[i] > _WILD**2
         if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
             interrupt(state.adaptation[i])
-            c.surprise[i] += min(since / SURPRISE_TIME, 1.0) * (1.0 - c.surprise[i])
+            c.surprise[i] += blend_of(since) * (1.0 - c.surprise[i])
             continue
-        blend = min(since / SURPRISE_TIME, 1.0)
+        blend = blend_of(since)
         c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
         # as far as it is the noise, and not the prediction, that an innovation shows
         averaging = min(1.0 + 0.25 * state.adaptation[i].seen, _NOISE_TIME)
@@ -826,7 +823,7 @@ def _learn(task, state, work, info):
     s, c, n = task.settings[0], state.scalars[0], len(state.order)
     _invert(work.root, work.inverse)
     info.condition = _norm(work.root, n, work.line) * _norm(work.inverse, n, work.line)
-    _add_up(task, state, work, np.exp(-c.since_update / LAG))
+    _add_up(task, state, work, c.since_update)
     _take_over(task, state, work)
     if not s.variable and s.forgetting_factor < 1.0:
         info.forgetting = s.forgetting_factor
@@ -839,7 +836,7 @@ def _learn(task, state, work, info):
 
 
 @reordered
-def _add_up(task, state, work, decay):
+def _add_up(task, state, work, since):
     """The change of the solution, the observer's with it, and the score ``g = R'R change``."""
     n, root, change, gradient = len(state.order), work.root, work.change, work.gradient
     _solve(root, gradient)
@@ -864,7 +861,7 @@ def _add_up(task, state, work, decay):
             moved += root[a, b] * change[b]
         for b in range(a, n):
             gradient[b] += root[a, b] * moved
-    add_score(gradient, state.lagged, work.score, decay)
+    add_score(gradient, state.lagged, work.score, since)
 
 
 # ---------------------------------------------------------------- triangular

@@ -54,15 +54,13 @@ from rov_ident.process_noise import adapt, first_adaptation, interrupt, process,
 from rov_ident.recursion import (
     FASTEST,
     INFO,
-    LAG,
     LIGHTEST,
-    MAX_STEP,
     RELEARNING_TIME,
-    SURPRISE_TIME,
     add_score,
     begin,
+    blend_of,
     copy,
-    is_finite,
+    steps_of,
 )
 from rov_ident.residual import filtered_residual
 from rov_ident.samples import parts
@@ -311,8 +309,7 @@ def _fold(task, state, samples, sides, info):
 
 @inlined
 def _step(task, state, work, sample, side, out):
-    begin(out, sample.t)
-    if not is_finite(sample):
+    if not begin(out, sample):
         out.reason = NOT_FINITE
         return
     state.scalars[0].t = sample.t
@@ -416,7 +413,7 @@ def _move(task, x, work, sample, side):
             middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
             s.force[i] += task.restoring[i, j] * middle
             s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
-    steps = max(1, int(np.ceil(sample.dt / MAX_STEP - 1e-9)))
+    steps = steps_of(sample.dt)
     dt = sample.dt / steps
     for sign in range(2):
         for first in range(0, columns, LANES):
@@ -692,7 +689,7 @@ def _update(task, state, work, sample, side, out):
     # One alone is the sensor's. After two it was the wrench, and the velocity is lost.
     if c.refused[0] >= _LOST or c.refused[1] >= _LOST:
         _restart(state, p, sample)
-    blend = min(sample.dt / SURPRISE_TIME, 1.0)
+    blend = blend_of(sample.dt)
     if count > 0:
         c.surprise += blend * (surprise / count - c.surprise)
     elif moving == 0:
@@ -766,13 +763,13 @@ def _look_back(task, state, work, dt):
     c.since += dt
     if c.since < _PERIOD:
         return
-    _sum_up(state, work, np.exp(-c.since / LAG))
+    _sum_up(state, work, c.since)
     _walk(task, state, work, c.surprise > task.settings[0].changed, c.since)
     c.since = 0.0
 
 
 @reordered
-def _sum_up(state, work, decay):
+def _sum_up(state, work, since):
     """With ``change = P g``, g is what innovations have added to the information's right side."""
     n, p = len(state.before), work.p
     matrix, upper, root = work.block[0], work.block[1], work.block[2]
@@ -786,7 +783,7 @@ def _sum_up(state, work, decay):
         g[j] = state.x[6 + j] - state.before[j]
         state.before[j] = state.x[6 + j]
     _solve(root, n, g)
-    add_score(g, state.lagged, state.score, decay)
+    add_score(g, state.lagged, state.score, since)
 
 
 @reordered
