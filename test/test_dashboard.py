@@ -360,10 +360,10 @@ async def _in_a_browser(report):
         for width in (1440, 390):
             for dark in (False, True):
                 await page.show(width, dark)
-                await page.until(f"innerWidth == {width}")
                 wide = "Math.max(...[...document.querySelectorAll('main *')]"
                 wide += ".map((e) => e.getBoundingClientRect().right))"
-                assert await page.evaluate(wide) <= width
+                # The pictures take the new width with the next frame, not with innerWidth.
+                await page.until(f"innerWidth == {width} && {wide} <= {width}")
                 ink, paper = await page.evaluate(
                     "[getComputedStyle(document.body).color, "
                     "getComputedStyle(document.body).backgroundColor]"
