@@ -448,10 +448,11 @@ def rest(_: int, only: str, count: int = 10_000_000) -> Iterator[Row]:
             online = OnlineEstimator(config, kind)
             task, prior = module.problem(config), online.prior
             blocks = [make(config, seed) for seed in range(3)]
+            rng = np.random.default_rng(5)
             state, done, bounded, definite, uneven = online.state, 0, 0.0, True, 0.0
             before = module.estimate(task, state, prior)
             while done < count:
-                samples = blocks[(done // 1000) % len(blocks)]
+                samples = _noisy(*blocks[(done // 1000) % len(blocks)], rng)
                 state, _ = module.fold(task, state, samples)
                 done += len(samples)
                 if done % 100_000 < len(samples) or done >= count:
@@ -460,7 +461,6 @@ def rest(_: int, only: str, count: int = 10_000_000) -> Iterator[Row]:
                     scaled = now.covariance / np.outer(now.std, now.std)
                     uneven = max(uneven, float(np.abs(scaled - scaled.T).max()))
                     definite &= bool(np.linalg.eigvalsh(scaled)[0] > 0.0)
-            # What surge excites has been learnt a thousand times over, with the same noise.
             still = np.array([what == "at rest" or name[0] != "X" for name in prior.names])
             moved = np.max((np.abs(now.values - before.values) / before.std)[still])
             yield Row(f"{count} samples {what}: moved", kind, float(moved), "sigma", 0.1)
@@ -494,22 +494,46 @@ def _a_minute(
     return estimate.values, np.sqrt(module.variance(task, state))
 
 
-def _resting(config: Config, seed: int) -> np.ndarray:
+def _resting(config: Config, seed: int) -> tuple[np.ndarray, Suite]:
     """Forty seconds of samples of a vehicle that lies on the ground, its thrusters off."""
     rng, sampler = np.random.default_rng([2, seed]), Sampler(config)
     messages = [(role, m) for _, role, m in dived(0) if at(m) < 40.0]
     parts = [sampler.push(role, still(m, rng)) for role, m in messages]
-    return np.concatenate([*parts, sampler.flush()])
+    return np.concatenate([*parts, sampler.flush()]), Suite().scaled(0.0)
 
 
-def _surging(config: Config, seed: int) -> np.ndarray:
-    """A minute of samples of a vehicle that is driven forward and back, and no other way."""
-    true = _neutral(configuration.load(HEAVY))
+def _surging(config: Config, seed: int) -> tuple[np.ndarray, Suite]:
+    """A minute of samples of a vehicle that is driven forward and back, and no other way.
+
+    Without the noise of velocities and wrench, which is the suite's and to be added anew each time:
+    a minute that comes again with the same noise would be learnt as if there were none.
+    """
+    true, suite = _neutral(configuration.load(HEAVY)), Suite()
     t = np.arange(0.0, 60.0, 0.02)
     wrench = manoeuvre("steps", true.model, t, np.random.default_rng([3, seed]))
     wrench[:, 1:] = 0.0
-    rng = np.random.default_rng([4, seed])
-    return _sampled(config, measure(true, t, wrench, 60.0, Suite(), rng).messages)
+    noisy, quiet = (
+        _sampled(
+            config,
+            measure(true, t, wrench, 60.0, s, np.random.default_rng([4, seed])).messages,
+        )
+        for s in (suite, suite.scaled(0.0))
+    )
+    quiet["moving"] = noisy["moving"]  # noise now and then passes for motion, as in a dive
+    return quiet, suite
+
+
+def _noisy(samples: np.ndarray, suite: Suite, rng: np.random.Generator) -> np.ndarray:
+    """Samples with fresh noise of velocities, and of a wrench that is a mean of some messages."""
+    samples, n = samples.copy(), len(samples)
+    linear, angular, gyro = rng.standard_normal((3, n, 3))
+    samples["odometry"] += np.hstack([suite.linear_std * linear, suite.angular_std * angular])
+    samples["gyro"] += suite.gyro_std * gyro
+    samples["nu"] += np.hstack([suite.linear_std * linear, suite.gyro_std * gyro])
+    several = np.maximum(samples["dt"] * suite.wrench_rate, 1.0)
+    relative = suite.wrench_std / np.sqrt(several)
+    samples["wrench"] *= 1.0 + relative[:, None] * rng.standard_normal((n, 6))
+    return samples
 
 
 def _driving(config: Config, before: str) -> np.ndarray:
