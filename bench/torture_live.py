@@ -187,17 +187,20 @@ def writers(_: argparse.Namespace) -> Iterator[Row]:
 def load(options: argparse.Namespace) -> Iterator[Row]:
     """An hour of 200 Hz on three topics, as fast as the node takes it; its memory all the while."""
     for kind in ESTIMATORS:
-        yield from _loaded(kind, options.hours * 3600.0, 0.0)
+        yield from loaded(kind, options.hours * 3600.0)
 
 
 def rate(_: argparse.Namespace) -> Iterator[Row]:
     """5,000 messages a second for half a minute."""
     for kind in ESTIMATORS:
-        yield from _loaded(kind, 30.0 * 5000.0 / 600.0, 5000.0)
+        yield from loaded(kind, 30.0 * 5000.0 / 600.0, 5000.0)
 
 
-def _loaded(kind: str, seconds: float, pace: float) -> Iterator[Row]:
-    """600 messages a second of the vehicle's time; at ``pace`` messages/s, or as fast as can be."""
+def loaded(kind: str, seconds: float, pace: float = 0.0, warm: int = 10) -> Iterator[Row]:
+    """600 messages a second of the vehicle's time; at ``pace`` messages/s, or as fast as can be.
+
+    A node has warmed up after so many minutes, which its buffers take to fill.
+    """
     config = configuration.load(HEAVY)
     suite = Suite(odometry_rate=200.0, imu_rate=200.0, wrench_rate=200.0)
     once = dive(config, "steps", 60.0, suite=suite, seed=6).messages
@@ -227,8 +230,9 @@ def _loaded(kind: str, seconds: float, pace: float) -> Iterator[Row]:
     assert status == 0, said
     what = f"{sent} messages at {sent / lasted:.0f}/s"
     yield Row(f"{what}: not taken", kind, lost, "", 0)
-    if len(sizes) > 12:
-        yield Row("  memory grown after warm-up", kind, max(sizes[10:]) - sizes[10], "MiB", 1.0)
+    if len(sizes) > warm + 1:
+        grown = max(sizes[warm:]) - sizes[warm]
+        yield Row("  memory grown after warm-up", kind, grown, "MiB", 1.0)
     yield Row("  processor per message", kind, 1e6 * used / sent, "us", 400.0)
 
 

@@ -1,0 +1,12 @@
+"""200 Hz on three topics: nothing is lost and memory stays; `make torture` has the whole hour."""
+
+import pytest
+
+import torture_live
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_five_minutes(kind, domain):
+    rows = list(torture_live.loaded(kind, 305.0, warm=3))  # buffers take four minutes to fill
+    lost, grown, _ = rows
+    assert lost.met and grown.met, rows
