@@ -282,6 +282,23 @@ def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
         assert "Traceback" not in said
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_while_loading(domain, number):
+    """A launch file that is stopped at once does not show where in which module each node was."""
+    program = "from rov_ident.nodes import programs; import sys; print(flush=True); "
+    for name in ("rls_node", "dashboard_node"):
+        for delay in (0.2, 0.6):  # s
+            command = [sys.executable, "-c", f"{program} sys.exit(programs.{name}())"]
+            process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            assert process.stdout.readline()
+            time.sleep(delay)
+            status, said = end_node(process, number)
+            assert status == 0, said
+            assert "Traceback" not in said
+
+
 def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
     monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
