@@ -69,11 +69,11 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "rls_node = rov_ident.nodes.rls_node:main",
-            "ukf_node = rov_ident.nodes.ukf_node:main",
-            "example_controller = rov_ident.nodes.example_controller:main",
-            "controller_bridge = rov_ident.nodes.controller_bridge:main",
-            "dashboard_node = rov_ident.nodes.dashboard_node:main",
+            "rls_node = rov_ident.nodes.programs:rls_node",
+            "ukf_node = rov_ident.nodes.programs:ukf_node",
+            "example_controller = rov_ident.nodes.programs:example_controller",
+            "controller_bridge = rov_ident.nodes.programs:controller_bridge",
+            "dashboard_node = rov_ident.nodes.programs:dashboard_node",
             "rov-ident = rov_ident.cli:main",
         ],
     },

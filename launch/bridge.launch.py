@@ -6,12 +6,21 @@ ros2 launch rov_ident bridge.launch.py controller:=/rov/velocity_controller name
 Nothing is sent before somebody calls /rov/controller_bridge/approve, unless approval:=false.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+import os
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+
+def check(context: LaunchContext) -> None:
+    """Without its file the node would say that it is given no vehicle, and not why."""
+    path = LaunchConfiguration("config").perform(context)
+    if not os.path.isfile(path):
+        raise RuntimeError(f"config: there is no file {path!r}")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -34,7 +43,10 @@ def generate_launch_description() -> LaunchDescription:
             description="none, or a controller whose parameters are known: auv_controllers",
         ),
         DeclareLaunchArgument(
-            "approval", default_value="true", description="send only what ~/approve was called for"
+            "approval",
+            default_value="true",
+            choices=["true", "false", "True", "False"],
+            description="send only what ~/approve was called for",
         ),
     ]
     bridge = Node(
@@ -54,4 +66,4 @@ def generate_launch_description() -> LaunchDescription:
         remappings=[("coefficients", [LaunchConfiguration("estimator"), "/coefficients"])],
         output="screen",
     )
-    return LaunchDescription([*arguments, bridge])
+    return LaunchDescription([*arguments, OpaqueFunction(function=check), bridge])

@@ -7,7 +7,6 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -27,10 +26,9 @@ def generate_launch_description() -> LaunchDescription:
         name="dashboard",
         parameters=[
             {
-                "port": ParameterValue(LaunchConfiguration("port"), value_type=int),
-                "foxglove_port": ParameterValue(
-                    LaunchConfiguration("foxglove_port"), value_type=int
-                ),
+                # Of no type: of text the node says which of the two it is.
+                "port": LaunchConfiguration("port"),
+                "foxglove_port": LaunchConfiguration("foxglove_port"),
             }
         ],
         output="screen",

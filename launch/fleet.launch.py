@@ -5,6 +5,8 @@ ros2 launch rov_ident fleet.launch.py vehicles:="rov1=rov1.yaml rov2=rov2.yaml"
 Each vehicle has its topics, and its nodes, in the namespace of its name.
 """
 
+import os
+
 from launch import LaunchContext, LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
@@ -17,16 +19,35 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
+from rclpy.validate_namespace import validate_namespace
+
+# Anything else is refused before a node starts. Refused later, nodes would be left behind.
+SWITCH = ["true", "false", "True", "False"]
+
+
+def fleet(text: str) -> dict[str, str]:
+    """The parameter file of every namespace: all is checked before the first node starts."""
+    found: dict[str, str] = {}
+    for entry in text.split():
+        name, equals, config = entry.partition("=")
+        if not (name.strip("/") and equals and config):
+            raise RuntimeError(f"vehicles: {entry!r} must be NAMESPACE=PARAMETER_FILE")
+        validate_namespace("/" + name.strip("/"))
+        if name.strip("/") in (known.strip("/") for known in found):
+            raise RuntimeError(f"vehicles: {name} is there twice")
+        if not os.path.isfile(config):
+            raise RuntimeError(f"vehicles: there is no file {config!r}")
+        found[name] = config
+    if not found:
+        raise RuntimeError("vehicles: there is none; give NAMESPACE=PARAMETER_FILE of each")
+    return found
 
 
 def estimators(context: LaunchContext) -> list[GroupAction]:
     """Both estimators of each vehicle named in `vehicles`."""
     path = PathJoinSubstitution([FindPackageShare("rov_ident"), "launch", "identify.launch.py"])
     groups = []
-    for entry in LaunchConfiguration("vehicles").perform(context).split():
-        namespace, equals, config = entry.partition("=")
-        if not (namespace and equals and config):
-            raise RuntimeError(f"vehicles: {entry!r} must be NAMESPACE=PARAMETER_FILE")
+    for namespace, config in fleet(LaunchConfiguration("vehicles").perform(context)).items():
         included = IncludeLaunchDescription(
             PythonLaunchDescriptionSource(path),
             launch_arguments={
@@ -45,11 +66,15 @@ def generate_launch_description() -> LaunchDescription:
     arguments = [
         DeclareLaunchArgument("vehicles", description="NAMESPACE=PARAMETER_FILE, with blanks"),
         DeclareLaunchArgument(
-            "use_sim_time", default_value="false", description="take time from /clock"
+            "use_sim_time",
+            default_value="false",
+            choices=SWITCH,
+            description="take time from /clock",
         ),
         DeclareLaunchArgument(
             "dashboard",
             default_value="true",
+            choices=SWITCH,
             description="serve the live page, at http://127.0.0.1:8050/",
         ),
     ]

@@ -5,13 +5,25 @@ ros2 launch rov_ident identify.launch.py namespace:=rov config:=my_vehicle.yaml 
 The input topics are relative to the namespace: odom, imu/data, thruster_wrench.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+import os
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+# Anything else is refused before a node starts. Refused later, nodes would be left behind.
+SWITCH = ["true", "false", "True", "False"]
+
+
+def check(context: LaunchContext) -> None:
+    """Without its file a node would say that it is given no vehicle, and not why."""
+    path = LaunchConfiguration("config").perform(context)
+    if not os.path.isfile(path):
+        raise RuntimeError(f"config: there is no file {path!r}")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -20,11 +32,15 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the topics"),
         DeclareLaunchArgument("config", default_value=shipped, description="parameter file"),
         DeclareLaunchArgument(
-            "use_sim_time", default_value="false", description="take time from /clock"
+            "use_sim_time",
+            default_value="false",
+            choices=SWITCH,
+            description="take time from /clock",
         ),
         DeclareLaunchArgument(
             "dashboard",
             default_value="false",
+            choices=SWITCH,
             description="serve the live page, at http://127.0.0.1:8050/",
         ),
     ]
@@ -56,4 +72,4 @@ def generate_launch_description() -> LaunchDescription:
             condition=IfCondition(LaunchConfiguration("dashboard")),
         ),
     ]
-    return LaunchDescription([*arguments, *nodes])
+    return LaunchDescription([*arguments, OpaqueFunction(function=check), *nodes])

@@ -5,11 +5,25 @@ ros2 launch rov_ident replay.launch.py bag:=dive.mcap config:=my_vehicle.yaml da
 The nodes stay up when the bag has ended, so that their results can be read and saved.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription
+import os
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+)
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
+
+
+def check(context: LaunchContext) -> None:
+    """Otherwise the nodes would wait for a player that has given up."""
+    path = LaunchConfiguration("bag").perform(context)
+    if not os.path.exists(path):
+        raise RuntimeError(f"bag: there is no {path!r}")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -24,12 +38,15 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "dashboard",
             default_value="false",
+            choices=["true", "false", "True", "False"],
             description="serve the live page, at http://127.0.0.1:8050/",
         ),
         DeclareLaunchArgument("rate", default_value="1.0", description="speed of the replay"),
-        # On their first start the nodes compile for this computer.
         DeclareLaunchArgument(
-            "delay", default_value="10.0", description="seconds for the nodes to come up"
+            "delay",
+            default_value="10.0",
+            description="seconds for the nodes to come up; when first started on a computer they "
+            "compile for half a minute, and miss what is played",
         ),
     ]
     nodes = IncludeLaunchDescription(
@@ -51,4 +68,4 @@ def generate_launch_description() -> LaunchDescription:
         ],
         output="screen",
     )
-    return LaunchDescription([*arguments, nodes, play])
+    return LaunchDescription([*arguments, OpaqueFunction(function=check), nodes, play])

@@ -8,12 +8,12 @@ import time
 
 import numpy as np
 import pytest
-from conftest import Vehicle, end_node, start_node
+from conftest import Vehicle, end_node, start_connected, start_node
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from rov_ident import cdr, config
+from rov_ident import cdr, config, rls
 from rov_ident.frames import FLIP_BODY, from_core
 from rov_ident.messages import Odometry, Wrench
 from rov_ident.nodes.conversions import from_diagnostics, from_time
@@ -245,15 +245,20 @@ def test_bad_configuration(domain, heavy_path, tmp_path, old, new, sentence):
     assert "Traceback" not in said
 
 
-def test_terminate(domain, heavy_path):
-    """SIGTERM, too, is a way to end well; with parting words."""
-    process = start_node("rls", heavy_path)
-    vehicle = Vehicle()
-    vehicle.until(vehicle.connected)
-    vehicle.close()
-    status, said = end_node(process, signal.SIGTERM)
+def test_terminate(domain, heavy, heavy_path, short_dive):
+    """SIGTERM, too, is a way to end well; with parting words, which are true."""
+    online = OnlineEstimator(heavy, "rls")
+    infos = [online.push(role, message) for _, role, message in short_dive]
+    used = np.count_nonzero(np.concatenate([*infos, online.flush()])["reason"] == rls.USED)
+    process, vehicle = start_connected("rls", parameters=heavy_path)
+    try:
+        vehicle.drive(short_dive)
+        vehicle.until(lambda: is_stale(vehicle))
+    finally:
+        vehicle.close()
+        status, said = end_node(process, signal.SIGTERM)
     assert status == 0, said
-    assert "ended: 0 samples used" in said
+    assert used > 100 and f"ended: {used} samples used" in said
 
 
 def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
@@ -275,6 +280,23 @@ def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
         status, said = end_node(process, number)
         assert status == 0, said
         assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_while_loading(domain, number):
+    """A launch file that is stopped at once does not show where in which module each node was."""
+    program = "from rov_ident.nodes import programs; import sys; print(flush=True); "
+    for name in ("rls_node", "dashboard_node"):
+        for delay in (0.2, 0.6):  # s
+            command = [sys.executable, "-c", f"{program} sys.exit(programs.{name}())"]
+            process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            assert process.stdout.readline()
+            time.sleep(delay)
+            status, said = end_node(process, number)
+            assert status == 0, said
+            assert "Traceback" not in said
 
 
 def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):

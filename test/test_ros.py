@@ -9,6 +9,7 @@ import importlib
 import re
 import sys
 from functools import partial
+from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
@@ -71,6 +72,65 @@ def test_launch_file(path):
     assert named and set(named) <= set(file.arguments)
     for parts in file.paths:
         assert ROOT.joinpath(*parts).exists(), parts
+
+
+@pytest.mark.parametrize("path", LAUNCH, ids=lambda path: path.name)
+def test_switches_are_refused_in_time(path):
+    """An error after the first node has started would leave it behind."""
+    given = LaunchFile(path).arguments.values()
+    switches = [
+        keys
+        for keys in given
+        if getattr(keys.get("default_value"), "value", None) in ("true", "false")
+    ]
+    assert all("choices" in keys for keys in switches)
+
+
+def functions_of(path, monkeypatch):
+    """A launch file as a module; what it takes from `launch` and `launch_ros` does nothing."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("launch"):
+            stand_in = ModuleType(node.module)
+            for alias in node.names:
+                setattr(stand_in, alias.name, lambda *args, **kwargs: (args, kwargs))
+            monkeypatch.setitem(sys.modules, node.module, stand_in)
+    module = ModuleType("launch_file")
+    exec(compile(path.read_text(), path.name, "exec"), module.__dict__)
+    return module
+
+
+def test_fleet_is_checked_as_a_whole(monkeypatch, tmp_path):
+    fleet = functions_of(ROOT / "launch" / "fleet.launch.py", monkeypatch).fleet
+    assert fleet(f"rov1={HEAVY}  /sea/rov2={HEAVY}") == {
+        "rov1": str(HEAVY),
+        "/sea/rov2": str(HEAVY),
+    }
+    for text, sentence in (
+        ("  ", "there is none"),
+        ("rov1", "'rov1' must be NAMESPACE=PARAMETER_FILE"),
+        (f"={HEAVY}", "must be NAMESPACE=PARAMETER_FILE"),
+        (f"/={HEAVY}", "must be NAMESPACE=PARAMETER_FILE"),
+        (f"rov1={HEAVY} rov2={tmp_path}", "there is no file"),
+        (f"rov1={HEAVY} /rov1/={HEAVY}", "/rov1/ is there twice"),
+        (f"rov1={HEAVY} 2rov={HEAVY}", "must not have a token that starts with a number"),
+    ):
+        with pytest.raises(Exception, match=re.escape(sentence)):
+            fleet(text)
+
+
+@pytest.mark.parametrize(
+    "name, argument", [("identify", "config"), ("bridge", "config"), ("replay", "bag")]
+)
+def test_files_are_looked_for_in_time(name, argument, monkeypatch):
+    launched = functions_of(ROOT / "launch" / f"{name}.launch.py", monkeypatch)
+    for path in (HEAVY, HEAVY / "not_there"):
+        given = {argument: SimpleNamespace(perform=lambda _, path=path: str(path))}
+        monkeypatch.setattr(launched, "LaunchConfiguration", given.__getitem__)
+        if path.exists():
+            launched.check(None)
+        else:
+            with pytest.raises(RuntimeError, match=f"{argument}: there is no .*not_there"):
+                launched.check(None)
 
 
 @pytest.mark.parametrize("path", LAUNCH, ids=lambda path: path.name)

@@ -120,6 +120,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
         self._level, self._words = Level.WARN, "waiting for the controller"
         self._logged = ""
 
+        self._leaving = threading.Event()
         # A callback that waits for the controller must not keep its answer from being heard.
         answers, looks = ReentrantCallbackGroup(), MutuallyExclusiveCallbackGroup()
         self._list = self._client(ListParameters, "list_parameters", answers)
@@ -310,15 +311,23 @@ class ControllerBridge(Node):  # type: ignore[misc]
         future = client.call_async(request)
         answered = threading.Event()
         future.add_done_callback(lambda _: answered.set())
-        if not answered.wait(self._settings["patience"]):
+        patience = self._settings["patience"]
+        until, step = time.monotonic() + patience, min(0.1, patience)
+        while not answered.wait(step) and time.monotonic() < until and not self._leaving.is_set():
+            pass
+        if not answered.is_set():
             if client in (self._set, self._set_all):
                 self._unanswered = (client, future)
             else:
                 client.remove_pending_request(future)
-            raise UserError(
-                f"{self._controller} gave no answer within {self._settings['patience']:g} s"
-            )
+            if self._leaving.is_set():
+                raise UserError(f"{self._controller} had not answered yet when this node ended")
+            raise UserError(f"{self._controller} gave no answer within {patience:g} s")
         return future.result()
+
+    def leave(self) -> None:
+        """Wait for no more answers: nobody hears them."""
+        self._leaving.set()
 
     # ---------------------------------------------------------------- services
 
@@ -429,12 +438,20 @@ def _to_message(value: bridge.Value) -> ParameterValue:
     return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
 
 
+class _Executor(MultiThreadedExecutor):  # type: ignore[misc]
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        # rclpy's own does not wait for callbacks, and each then says what it could not do.
+        self._executor.shutdown()
+        return bool(super().shutdown(timeout_sec))
+
+
 def main() -> int:
     return live(
         "controller_bridge",
         ControllerBridge,
         own=[p.key for p in _OWN],
-        executor=lambda: MultiThreadedExecutor(_THREADS),
+        executor=lambda: _Executor(_THREADS),
+        leave=ControllerBridge.leave,
     )
 
 

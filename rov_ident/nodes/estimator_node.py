@@ -42,7 +42,7 @@ from rov_ident.messages import Wrench
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
-from rov_ident.online import Kind, Level, OnlineEstimator, Report
+from rov_ident.online import ESTIMATORS, Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
 from rov_ident.warm import warm_up
 
@@ -105,6 +105,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._idle = 0.0  # s since the last sample
         self._stopped = ""  # why there are no samples
         self._wrench_frame: str | None = None
+        self._used = 0  # samples
         self._ratios: list[NDArray[np.float64]] = []  # (k, 6) since the last diagnostics
         self._published_stamp = 0  # ns
         self._kept = self._online.stamp  # ns; of the last checkpoint asked for
@@ -201,6 +202,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         """Publish the residuals of samples, and what is due by their time."""
         if len(info) == 0:
             return
+        self._used += int(np.count_nonzero(info["reason"] == ESTIMATORS[self._online.kind].USED))
         self._ratios.append(info["ratio"])
         origin = self._online.sampler.origin or 0
         residuals = info["residual"]
@@ -508,8 +510,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             self._keeper.close()
         if self._compiling is not None:
             self._compiling.terminate()
-        used = self._online.counts["sample: used"]
-        self.get_logger().info(f"ended: {used} samples used")
+        self.get_logger().info(f"ended: {self._used} samples used")
 
     # ---------------------------------------------------------------- parameters
 
