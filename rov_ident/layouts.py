@@ -56,7 +56,7 @@ def foxglove(config: Config, namespace: str = "") -> str:
     panels: dict[str, Any] = {}
     tabs = []
     for title, names in _tabs(config).items():
-        plots = []
+        plots: list[str] = []
         for name in names:
             paths = [
                 _path(
@@ -67,38 +67,35 @@ def foxglove(config: Config, namespace: str = "") -> str:
                 for short, node in nodes.items()
                 for key in _KEYS
             ]
-            plots.append(_panel(panels, f"Plot!{name}", _plot(name, paths)))
+            plots.append(_panel(panels, f"Plot!{name}", _plot(name, paths, legend=not plots)))
         tabs.append({"title": title, "layout": _grid(plots)})
-    residuals = []
+    residuals: list[str] = []
     for axis, sname in zip(AXES, "XYZKMN"):
         paths = [
             _path(f"{node}/wrench_residual.wrench.{axis}", short, _COLOURS[short])
             for short, node in nodes.items()
         ]
-        plot = _plot(f"residual {sname}, in the axes of thruster_wrench", paths)
+        title = f"residual {sname}, in the axes of thruster_wrench"
+        plot = _plot(title, paths, legend=not residuals)
         residuals.append(_panel(panels, f"Plot!residual_{sname}", plot))
     tabs.append({"title": "Residual", "layout": _grid(residuals)})
-    health = [
-        _panel(
-            panels,
-            "DiagnosticSummary!all",
-            {
-                "minLevel": 0,
-                "pinnedIds": [],
-                "hardwareIdFilter": config.name,
-                "topicToRender": "/diagnostics",
-                "sortByLevel": True,
-            },
-        )
-    ]
+    summary = {
+        "minLevel": 0,
+        "pinnedIds": [],
+        "hardwareIdFilter": config.name,
+        "topicToRender": "/diagnostics",
+        "sortByLevel": True,
+    }
+    details = []
     for short, node in nodes.items():
         status = {
             "selectedHardwareId": config.name,
             "selectedName": f"{node.lstrip('/')}: model",
             "topicToRender": "/diagnostics",
         }
-        health.append(_panel(panels, f"DiagnosticStatusPanel!{short}", status))
-    tabs.append({"title": "Health", "layout": _grid(health)})
+        details.append(_panel(panels, f"DiagnosticStatusPanel!{short}", status))
+    health = [_panel(panels, "DiagnosticSummary!all", summary), _split(details, "row")]
+    tabs.append({"title": "Health", "layout": _split(health, "column")})
     panels["Tab!rov_ident"] = {"activeTabIdx": 0, "tabs": tabs}
     layout = {
         "configById": panels,
@@ -117,17 +114,20 @@ def _panel(panels: dict[str, Any], identity: str, settings: dict[str, Any]) -> s
 
 
 def _path(value: str, label: str, colour: str) -> dict[str, Any]:
+    """A series over the time of reception: the stamps of a bag that is played into the nodes are
+    far from the clock of a live connection, and so would be the plot."""
     return {
         "value": value,
         "label": label,
         "color": colour,
         "enabled": True,
-        "timestampMethod": "headerStamp",
+        "timestampMethod": "receiveTime",
         "showLine": True,
     }
 
 
-def _plot(title: str, paths: list[dict[str, Any]]) -> dict[str, Any]:
+def _plot(title: str, paths: list[dict[str, Any]], legend: bool) -> dict[str, Any]:
+    """A plot with or without the legend open, which covers a good part of a small one."""
     return {
         "foxglovePanelTitle": title,
         "paths": paths,
@@ -135,8 +135,9 @@ def _plot(title: str, paths: list[dict[str, Any]]) -> dict[str, Any]:
         "isSynced": True,
         "showXAxisLabels": True,
         "showYAxisLabels": True,
-        "showLegend": True,
+        "showLegend": legend,
         "legendDisplay": "floating",
+        "floatingLegendPosition": "top-right",
         "showPlotValuesInLegend": False,
         "sidebarDimension": 240,
     }
@@ -227,6 +228,19 @@ def _tab(window: ElementTree.Element, title: str, plots: dict[str, list[tuple[st
             _add(plot, "limitY")
             for curve, colour in plots[name]:
                 _add(plot, "curve", name=curve, color=colour)
+    _expect(tab, [curve for curves in plots.values() for curve, _ in curves])
+
+
+def _expect(tab: ElementTree.Element, curves: list[str]) -> None:
+    """Names the curves of a tab where PlotJuggler 3 looks for those to await from a stream.
+
+    It looks one splitter deep, and drops from plots further down what has not been received by
+    then. A splitter without a direction is looked through, but not shown.
+    """
+    hidden = _add(_add(tab, "Container"), "DockSplitter", orientation="", count="0", sizes="")
+    plot = _add(_add(hidden, "DockArea"), "plot", mode="TimeSeries")
+    for curve in curves:
+        _add(plot, "curve", name=curve)
 
 
 def _splitter(parent: ElementTree.Element, orientation: str, count: int) -> ElementTree.Element:

@@ -328,8 +328,12 @@ class Watcher:
         if samples["restart"].any() and self._samples:
             # a lone outlier restarts the estimator's observer, but breaks no window
             steps = np.diff(samples["t"], prepend=self._samples[-1]["t"][-1])
-            if not (steps[samples["restart"]] <= _GAP).all() or steps.min() < 0.0:
+            back = np.flatnonzero(steps < 0.0)
+            if len(back) or not (steps[samples["restart"]] <= _GAP).all():
                 self._samples.clear()
+            if len(back):  # a bag that starts again, say: what was before is of another time
+                samples = samples[back[-1] :]
+                self._demands = _latest(self._demands, t)
         if not self._samples:
             self._begin = float(samples["t"][0])
         self._samples.append(samples)
@@ -350,6 +354,14 @@ class Watcher:
     def _look(self, samples: NDArray[np.void], demands: Array, values: Mapping[str, float]) -> None:
         self._state = step(self._task, self._state, samples, demands, values)
         self.suspicions = suspicions(self._task, self._state)
+
+
+def _latest(demands: list[tuple[float, Array]], t: float) -> list[tuple[float, Array]]:
+    """Those after the last jump backwards of their clock, which is ``t`` now."""
+    for i in range(len(demands) - 1, 0, -1):
+        if demands[i][0] < demands[i - 1][0]:
+            return demands[i:]
+    return [demand for demand in demands if demand[0] <= t]
 
 
 def is_compiled() -> bool:

@@ -572,10 +572,10 @@ def test_foxglove_for_whom():
 async def _foxglove_for_whom():
     async with foxglove.serving(0) as served, aiohttp.ClientSession() as session:
 
-        async def status(**headers):
+        async def status(protocol="foxglove.sdk.v1", **headers):
             try:
                 async with session.ws_connect(
-                    served.address, protocols=["foxglove.sdk.v1"], headers=headers
+                    served.address, protocols=[protocol], headers=headers
                 ) as live:
                     info = await asyncio.wait_for(live.receive_json(), 5.0)
                     assert info["op"] == "serverInfo"
@@ -591,6 +591,9 @@ async def _foxglove_for_whom():
                        "https://localhost.evil.example"):  # fmt: skip
             assert await status(Origin=origin) == 403, origin
         assert await status(Host="evil.example:8765") == 421
+        assert await status("foxglove.websocket.v1") == 400, "Foxglove before its SDK"
+        async with session.get(served.address.replace("ws:", "http:")) as page:
+            assert page.status == 400
         with pytest.raises(server.UserError, match="cannot be used"):
             async with foxglove.serving(int(served.address.rpartition(":")[2])):
                 pass

@@ -84,6 +84,9 @@ def test_foxglove(with_effects, namespace):
     names += [f"residual_{axis}" for axis in "XYZKMN"]
     assert {identity for _, identity in plotted} == {f"Plot!{name}" for name in names}
     assert {topic for topic, _ in plotted} == set(messages)
+    for tab in tabs[:-1]:  # one open legend a tab: a plot is small
+        plots = [panels[panel] for panel in panels_of(tab["layout"])]
+        assert [plot["showLegend"] for plot in plots] == [True] + [False] * (len(plots) - 1)
     statuses = [p["selectedName"] for k, p in panels.items() if k.startswith("DiagnosticStatus")]
     above = f"{namespace}/" if namespace else ""
     assert statuses == [f"{above}rls_node: model", f"{above}ukf_node: model"]
@@ -146,16 +149,23 @@ def series(messages):
 def test_plotjuggler(with_effects, namespace):
     messages = published(with_effects, namespace)
     root = ElementTree.fromstring(layouts.plotjuggler(with_effects, namespace).encode())
-    curves = [curve.get("name") for curve in root.iter("curve")]
+    shown = [splitter for splitter in root.iter("DockSplitter") if splitter.get("orientation")]
+    curves = [c.get("name") for s in shown for c in s.iterfind("DockArea/plot/curve")]
     assert set(curves) <= set(series(messages))
     assert len(curves) == len(set(curves)) == 2 * (3 * (len(with_effects.estimate) + 1) + 6)
-    for splitter in root.iter("DockSplitter"):
+    for splitter in shown:
         assert len(splitter) == int(splitter.get("count")) == len(splitter.get("sizes").split(";"))
         assert splitter.get("orientation") in ("|", "-")
         assert {child.tag for child in splitter} <= {"DockSplitter", "DockArea"}
-    for area in root.iter("DockArea"):
-        assert [child.tag for child in area] == ["plot"]
-        assert area.find("plot").get("mode") == "TimeSeries"
+        for area in splitter.iterfind("DockArea"):
+            assert [child.tag for child in area] == ["plot"]
+            assert area.find("plot").get("mode") == "TimeSeries"
+    # Where PlotJuggler 3 looks for what to await from a stream; it draws the first container.
+    awaited = root.iterfind("tabbed_widget/Tab/Container/DockSplitter/DockArea/plot/curve")
+    assert sorted(curve.get("name") for curve in awaited) == sorted(curves)
+    for tab in root.iter("Tab"):
+        drawn, hidden = tab.iterfind("Container/DockSplitter")
+        assert drawn in shown and not hidden.get("orientation")
     streamer = root.find("previouslyLoaded_Streamer").get("name")
     plugin = root.find(f"Plugins/plugin[@ID='{streamer}']")
     assert set(plugin.find("selected_topics").get("value").split(";")) == set(messages)

@@ -146,3 +146,25 @@ def test_windows_do_not_reach_across_gaps(heavy):
     again["restart"][0] = True
     window = watcher.take(again, [])
     assert window is not None and window[0]["t"][0] == 4.0
+
+
+@pytest.mark.parametrize("told_first", [True, False])
+@pytest.mark.parametrize("batch", [1, 3, 7])
+def test_a_bag_that_starts_again_starts_a_window(heavy, batch, told_first):
+    """What was demanded before the clock jumped back belongs to no window after it."""
+    watcher = watch.Watcher(heavy)
+    rows = np.zeros(20, dtype=watch.SAMPLE)
+    rows["t"] = [*np.arange(100.0, 104.0, 0.5), *np.arange(1.0, 7.0, 0.5)]
+    rows["restart"][8] = True
+    again = [(t, np.ones(6)) for t in np.arange(0.5, 7.0, 0.25)]
+    demands = [(t, np.zeros(6)) for t in np.arange(99.5, 104.5, 0.25)]
+    windows = []
+    for i in range(0, len(rows), batch):
+        last = rows["t"][i : i + batch][-1]
+        if last < 50.0:
+            while again and again[0][0] <= last + 0.25 * told_first:
+                demands.append(again.pop(0))
+        windows.append(watcher.take(rows[i : i + batch], demands))
+    [(samples, told)] = [window for window in windows if window is not None]
+    assert samples["t"][0] == 1.0 and (np.diff(samples["t"]) > 0.0).all()
+    assert (np.diff(told[:, 0]) > 0.0).all() and (told[:, 1:] == 1.0).all()

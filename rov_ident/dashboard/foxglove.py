@@ -22,6 +22,7 @@ from rov_ident.errors import UserError
 _HOME = "foxglove.dev"
 _PATIENCE = 10.0  # s; for a client to take a message
 _LEAVE = 0.5  # s; for a client to answer that it is closed
+_NO_PROTOCOL = "for programs that speak foxglove.sdk.v1: Foxglove of 2025 or later\n"
 
 
 class Foxglove:
@@ -72,10 +73,13 @@ class Foxglove:
         asked = request.headers.get("Sec-WebSocket-Protocol", "")
         protocols = [name.strip() for name in asked.split(",") if name.strip()]
         inside = f"ws://{self._hidden}:{self._server.port}"
-        async with (
-            aiohttp.ClientSession() as session,
-            session.ws_connect(inside, protocols=protocols, max_msg_size=0) as server,
-        ):
+        async with contextlib.AsyncExitStack() as stack:
+            session = await stack.enter_async_context(aiohttp.ClientSession())
+            try:
+                connection = session.ws_connect(inside, protocols=protocols, max_msg_size=0)
+                server = await stack.enter_async_context(connection)
+            except aiohttp.WSServerHandshakeError as error:
+                raise web.HTTPBadRequest(text=_NO_PROTOCOL) from error
             chosen = [server.protocol] if server.protocol else []
             client = web.WebSocketResponse(timeout=_LEAVE, protocols=chosen, compress=False)
             await client.prepare(request)
