@@ -327,15 +327,28 @@ class Judge:
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
 
     def gain(
-        self, before: Hypothesis, after: Hypothesis, beside: tuple[float, float] | None = None
+        self,
+        before: Hypothesis,
+        after: Hypothesis,
+        beside: tuple[float, float] | None = None,
+        axes: Sequence[str] = (),
     ) -> Gain:
         """Of the component that gains most, of those that surely gain if any do.
 
-        The windows that reach into the time ``beside`` (from and to [s]) do not count.
+        The windows that reach into the time ``beside`` (from and to [s]) do not count. Where none
+        of all surely gains, those of the ``axes`` on which an effect acts are looked at alone: an
+        interval that holds for six is wide where the vehicle was driven in one.
         """
         free, use = np.flatnonzero(~self._guided), self._used(beside)
-        a, b = (self.summed(h)[np.ix_(use, free)] for h in (before, after))
-        return gain_of([VELOCITIES[i] for i in free], a, b, int(use[self._chunk].sum()))
+        a, b = (self.summed(h)[use] for h in (before, after))
+        count = int(use[self._chunk].sum())
+        own = np.array([i for i in free if AXES[i] in axes], dtype=int)
+        gains = [
+            gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count)
+            for of in (free, own)
+            if len(of)
+        ]
+        return next((g for g in gains if g.low > 0.0), gains[0])
 
     def _used(self, beside: tuple[float, float] | None) -> NDArray[np.bool_]:
         """Which chunks count."""
@@ -465,7 +478,8 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
     beside = None
     if onset is not None:
         beside = onset.value - 2.0 * onset.std, onset.value + 2.0 * onset.std
-    gain = judge.gain(trial.rest.hypothesis, final.hypothesis, beside)
+    axes = _axes(search, final, keys)
+    gain = judge.gain(trial.rest.hypothesis, final.hypothesis, beside, axes)
     best = search.cost(final, final)
     explained = trial.rest.rss - final.rss
     alternatives, separable = [], True
@@ -489,7 +503,7 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
     separable = separable and not any(pinned(k, final.hypothesis.values[k], stds[k]) for k in keys)
     return Finding(
         name,
-        _axes(search, final, keys),
+        axes,
         parameters,
         None if onset is None else onset.value,
         gain,
