@@ -136,7 +136,7 @@ def told(true: Config, trial: Trial, offset: float) -> Config:
         return config
     section, key, value = SETTINGS[trial.setting]
     parameters = configuration.to_parameters(config)
-    (parameters[section] if section else parameters)[key] = value
+    (parameters.setdefault(section, {}) if section else parameters)[key] = value
     return configuration.from_parameters(parameters)
 
 
@@ -273,7 +273,7 @@ def measure(trial: Trial) -> dict[str, Any]:
             if trial.change:
                 result |= changed(trial, true, t, values, std)
             elif short:
-                close = np.abs(values - values[-1]) < 0.1 * np.abs(values[-1])
+                close = np.abs(values - values[-1]) <= 0.1 * np.abs(values[-1])
                 last = [int(np.flatnonzero(~c)[-1]) + 1 if not c.all() else 0 for c in close.T]
                 result["settled"] = t[last].tolist()
             line[f"{name} {offset}"] = result

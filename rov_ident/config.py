@@ -359,8 +359,9 @@ class Ukf:
     )
     change_threshold: float = option(
         3.0,
-        "normalised innovation squared, over 2 s, from which the vehicle is taken to have changed "
-        "and its coefficients are learnt anew; 1 is expected, higher where the model is rough",
+        "normalised innovation squared of an axis, over 2 s, from which the vehicle is taken to "
+        "have changed and its coefficients are learnt anew; 1 is expected, higher where the model "
+        "is rough",
         lower=1.0,
     )
     random_walk: float = option(

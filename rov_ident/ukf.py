@@ -99,7 +99,7 @@ _SETTINGS = np.dtype(
 _SCALARS = np.dtype(
     [
         ("t", "f8"),
-        ("surprise", "f8"),  # normalised innovations squared, averaged: 1 when all is well
+        ("surprise", "f8", (6,)),  # normalised innovations squared, averaged: 1 when all is well
         ("refused", "i8", (2,)),  # outliers in a row, of linear and of angular velocity
         ("since", "f8"),  # s since the coefficients walked
         ("started", "?"),
@@ -316,7 +316,8 @@ def _step(task, state, work, sample, side, out):
     out.reason = USED
     if sample.restart or not state.scalars[0].started or not sample.dt > 0.0:
         _restart(state, work.p, sample)
-        state.scalars[0].surprise = 1.0
+        for i in range(6):
+            state.scalars[0].surprise[i] = 1.0
         out.reason = RESTARTED
     else:
         _take_root(task, work, out)
@@ -661,7 +662,7 @@ def _update(task, state, work, sample, side, out):
             z[i] = np.nan
         for j in range(side.shape[1]):
             z[i] += side[6 + i, j] * side[12, j]
-    surprise, count, moving = 0.0, 0, 0
+    moving, blend = 0, blend_of(sample.dt)
     for i in range(6):
         state.adaptation[i].since += sample.dt
         moving += sample.moving[i]
@@ -676,9 +677,9 @@ def _update(task, state, work, sample, side, out):
             worst = max(worst, out.ratio[i])
             if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
                 interrupt(state.adaptation[i])
+                c.surprise[i] += blend * (1.0 - c.surprise[i])
                 continue
-            surprise += min(out.ratio[i], s.gate**2)
-            count += 1
+            c.surprise[i] += blend * (min(out.ratio[i], s.gate**2) - c.surprise[i])
             adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, innovation)
         if worst > s.gate**2:
             out.reason = GATED
@@ -689,11 +690,6 @@ def _update(task, state, work, sample, side, out):
     # One alone is the sensor's. After two it was the wrench, and the velocity is lost.
     if c.refused[0] >= _LOST or c.refused[1] >= _LOST:
         _restart(state, p, sample)
-    blend = blend_of(sample.dt)
-    if count > 0:
-        c.surprise += blend * (surprise / count - c.surprise)
-    elif moving == 0:
-        c.surprise += blend * (1.0 - c.surprise)
 
 
 @inlined
@@ -764,7 +760,10 @@ def _look_back(task, state, work, dt):
     if c.since < _PERIOD:
         return
     _sum_up(state, work, c.since)
-    _walk(task, state, work, c.surprise > task.settings[0].changed, c.since)
+    changed = False
+    for i in range(6):
+        changed |= c.surprise[i] > task.settings[0].changed
+    _walk(task, state, work, changed, c.since)
     c.since = 0.0
 
 

@@ -104,7 +104,7 @@ class Peer:
         return q
 
     def step(self, row, process, surprise):
-        """``process`` (6,), ``surprise``: what the library has found so far, its own matter."""
+        """``process``, ``surprise`` (6,): what the library has found so far, its own matter."""
         self.row, self.process = row, process
         if row["restart"]:
             x, p = self.filter.x, self.filter.P
@@ -123,8 +123,8 @@ class Peer:
         self.since += row["dt"]
         if self.since >= ukf._PERIOD:
             walk = self.task.walk
-            if surprise > self.task.settings["changed"][0]:
-                walk = np.maximum(walk, 1.0 / ukf._RELEARNING_TIME)
+            if (surprise > self.task.settings["changed"][0]).any():
+                walk = np.maximum(walk, 1.0 / ukf.RELEARNING_TIME)
             room = np.maximum(1.0 - np.diag(self.filter.P)[6:], 0.0)
             self.filter.P[6:, 6:] += np.diag(walk * self.since * room)
             self.since = 0.0
