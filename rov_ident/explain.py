@@ -609,7 +609,7 @@ _MOTIONS = dict(
 def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:
     """What the patterns in a model say: where something is left that has no name.
 
-    The share is foretold: each window's, with the parameters that the others give.
+    The share, of squares, is foretold: each window's, with the parameters that the others give.
     """
     found = []
     for name, trial in trials.items():
@@ -619,7 +619,7 @@ def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:
         i = AXES.index(axis)
         before, after = (foretold(f)[i] for f in (trial.rest, final))
         share = float(1.0 - after / before)
-        if share >= _WORTH:
+        if 1.0 - np.sqrt(1.0 - share) >= _WORTH:
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)
 
