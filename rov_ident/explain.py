@@ -155,10 +155,11 @@ def explain(
     left = search.unexplained(final)
     if left:
         final, trials = search.settle(left[-1])
-    residual = _residual(search, final, trials)
 
     say("judging on held-out data", 0.9)
     judge = Judge(Evidence(judge_streams, judge_spans))
+    # Of another bag's time and place a pattern knows nothing.
+    residual = _residual(final, trials, judge if validate is None else None)
     retuned = path[0].hypothesis
     final, found, borne = _judged(search, judge, final, trials)
     minor = [f for f in found if not weighty(f) and f.effect not in borne]
@@ -193,7 +194,7 @@ def explain(
         verdict = "unexplained"
     elif findings:
         verdict = "explained"
-    elif tuning.percent >= 100.0 * _WORTH and tuning.low > 0.0:
+    elif _has_weight(tuning):
         verdict = "retuned"
     evidence = Evidence(streams, blocks(streams))
     simulated = {
@@ -263,14 +264,18 @@ def _bears(search: Search, judge: "Judge", final: Fitted, trials: Trials, name: 
         if neither is None or search.worth(neither, rest, final) >= SURE:
             continue
         gain = judge.gain(neither.hypothesis, final.hypothesis)
-        if gain.low > 0.0 and gain.percent >= 100.0 * _WORTH:
+        if _has_weight(gain):
             return True
     return False
 
 
 def weighty(finding: Finding) -> bool:
     """Whether an effect is of practical weight."""
-    return finding.gain.percent >= 100.0 * _WORTH and finding.gain.low > 0.0
+    return _has_weight(finding.gain)
+
+
+def _has_weight(gain: Gain) -> bool:
+    return gain.percent >= 100.0 * _WORTH and gain.low > 0.0
 
 
 def whole(duration: float) -> Spans:
@@ -606,10 +611,11 @@ _MOTIONS = dict(
 )
 
 
-def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:
+def _residual(final: Fitted, trials: Trials, judge: Judge | None) -> list[Residual]:
     """What the patterns in a model say: where something is left that has no name.
 
-    The share, of squares, is foretold: each window's, with the parameters that the others give.
+    The share, of squares, is foretold: each window's, with the parameters that the others give. A
+    pattern bends to anything, so it has to gain on held-out data as well.
     """
     found = []
     for name, trial in trials.items():
@@ -619,7 +625,11 @@ def _residual(search: Search, final: Fitted, trials: Trials) -> list[Residual]:
         i = AXES.index(axis)
         before, after = (foretold(f)[i] for f in (trial.rest, final))
         share = float(1.0 - after / before)
-        if 1.0 - np.sqrt(1.0 - share) >= _WORTH:
+        if 1.0 - np.sqrt(1.0 - share) < _WORTH:
+            continue
+        if judge is None or _has_weight(
+            judge.gain(trial.rest.hypothesis, final.hypothesis, axes=(axis,))
+        ):
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)
 
