@@ -652,12 +652,11 @@ def group_of(key: Key) -> str:
 
 
 def foretold(fitted: Fitted) -> Array:
-    """Squared residuals (6,) by axis, each window's foretold from all the others; its onsets are
+    """Squared residuals (W, 6) by axis, each window's foretold from all the others; onsets are
     taken as known."""
     dates = onsets(fitted.hypothesis)
     at = fitted.linear.index(k for k in fitted.linear.keys if k not in dates)
-    total: Array = fitted.look.foretold(at).sum(axis=0)
-    return total
+    return fitted.look.foretold(at)
 
 
 def covariance(final: Fitted) -> Array:

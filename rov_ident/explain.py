@@ -155,11 +155,10 @@ def explain(
     left = search.unexplained(final)
     if left:
         final, trials = search.settle(left[-1])
+    residual = _residual(final, trials)
 
     say("judging on held-out data", 0.9)
     judge = Judge(Evidence(judge_streams, judge_spans))
-    # Of another bag's time and place a pattern knows nothing.
-    residual = _residual(final, trials, judge if validate is None else None)
     retuned = path[0].hypothesis
     final, found, borne = _judged(search, judge, final, trials)
     minor = [f for f in found if not weighty(f) and f.effect not in borne]
@@ -611,11 +610,10 @@ _MOTIONS = dict(
 )
 
 
-def _residual(final: Fitted, trials: Trials, judge: Judge | None) -> list[Residual]:
+def _residual(final: Fitted, trials: Trials) -> list[Residual]:
     """What the patterns in a model say: where something is left that has no name.
 
-    The share, of squares, is foretold: each window's, with the parameters that the others give. A
-    pattern bends to anything, so it has to gain on held-out data as well.
+    Each window is foretold with the parameters that the others give. The share is one of squares.
     """
     found = []
     for name, trial in trials.items():
@@ -623,13 +621,9 @@ def _residual(final: Fitted, trials: Trials, judge: Judge | None) -> list[Residu
             continue
         axis, depends_on, frequency = name.removeprefix(f"{UNKNOWN} ").split("|")
         i = AXES.index(axis)
-        before, after = (foretold(f)[i] for f in (trial.rest, final))
-        share = float(1.0 - after / before)
-        if 1.0 - np.sqrt(1.0 - share) < _WORTH:
-            continue
-        if judge is None or _has_weight(
-            judge.gain(trial.rest.hypothesis, final.hypothesis, axes=(axis,))
-        ):
+        before, after = (foretold(f)[:, [i]] for f in (trial.rest, final))
+        if _has_weight(gain_of([VELOCITIES[i]], before, after, 1.0)):
+            share = float(1.0 - after.sum() / before.sum())
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)
 
