@@ -47,6 +47,7 @@ setup(
             "lxml>=5",
             "mcap-ros2-support",
             "mkdocs-material>=9.5",
+            "pymdown-extensions<13",  # 13 is not for the Python 3.11.2 of Debian 12
             "pymavlink>=2.4.40",
             "ruff",
             "mypy",
