@@ -283,12 +283,17 @@ def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_while_loading(domain, number):
+def test_interrupt_while_loading(domain, heavy_path, number):
     """A launch file that is stopped at once does not show where in which module each node was."""
     program = "from rov_ident.nodes import programs; import sys; print(flush=True); "
-    for name in ("rls_node", "dashboard_node"):
-        for delay in (0.2, 0.6):  # s
+    parameters = {
+        "rls_node": ["--params-file", str(heavy_path)],
+        "dashboard_node": ["-p", "port:=0"],
+    }
+    for name, given in parameters.items():
+        for delay in (0.2, 0.6):  # s; a node that is quick is up then
             command = [sys.executable, "-c", f"{program} sys.exit(programs.{name}())"]
+            command += ["--ros-args", *given]
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
             )

@@ -83,14 +83,20 @@ def live(
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # as it is for parting words.
+    interrupted = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()  # where it is raised an exception may be ignored: in a finaliser, say
+        raise KeyboardInterrupt
+
     for number in _INTERRUPTS:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy gives its RCLError no public name
         return _refused(name, _why_unreadable(name, own, error))
     try:
-        _spin(make(), executor(), leave)
+        _spin(make(), executor(), leave, interrupted)
     except UserError as error:
         return _refused(name, str(error))
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -100,10 +106,14 @@ def live(
     return 0
 
 
-def _spin(node: AnyNode, executor: Any, leave: Callable[[AnyNode], None]) -> None:
+def _spin(
+    node: AnyNode,
+    executor: Any,
+    leave: Callable[[AnyNode], None],
+    interrupted: threading.Event,
+) -> None:
     executor.add_node(node)
     # From here on an interrupt waits for the end of a callback.
-    interrupted = threading.Event()
     for number in _INTERRUPTS:
         signal.signal(number, lambda *_: interrupted.set())
     try:
