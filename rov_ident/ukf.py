@@ -662,7 +662,7 @@ def _update(task, state, work, sample, side, out):
             z[i] = np.nan
         for j in range(side.shape[1]):
             z[i] += side[6 + i, j] * side[12, j]
-    moving, blend = 0, blend_of(sample.dt)
+    moving = 0
     for i in range(6):
         state.adaptation[i].since += sample.dt
         moving += sample.moving[i]
@@ -675,6 +675,7 @@ def _update(task, state, work, sample, side, out):
             innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
             out.ratio[i] = innovation**2
             worst = max(worst, out.ratio[i])
+            blend = blend_of(state.adaptation[i].since)
             if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
                 interrupt(state.adaptation[i])
                 c.surprise[i] += blend * (1.0 - c.surprise[i])
