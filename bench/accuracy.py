@@ -47,7 +47,9 @@ from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
+import rov_ident  # noqa: F401  (one BLAS thread, before numpy)
+
+import numpy as np  # isort: skip
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 

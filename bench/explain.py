@@ -33,7 +33,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import rov_ident  # noqa: F401  (one BLAS thread, before numpy)
+
+import numpy as np  # isort: skip
 from scipy.stats import binomtest
 
 import fossen

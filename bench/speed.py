@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import rov_ident.jit  # noqa: F401  (one BLAS thread, before numpy)
+import rov_ident  # noqa: F401  (one BLAS thread, before numpy)
 
 import numpy as np  # isort: skip
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
@@ -30,6 +30,7 @@ from padasip.filters import FilterRLS
 from rich.console import Console
 from rich.table import Table
 
+from fossen import skew
 from rov_ident import config as configuration
 from rov_ident import least_squares as batch
 from rov_ident import rls, sensors, ukf
@@ -182,10 +183,6 @@ class MatrixModel:
         coriolis[3:, 3:] = -skew(momentum[3:])
         damping = -(self.linear + self.quadratic * np.abs(nu) + self.products @ nu)
         return np.linalg.solve(self.mass, force - coriolis @ nu - damping @ nu)
-
-
-def skew(a: np.ndarray) -> np.ndarray:
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
 def runge_kutta(rate: Callable[[np.ndarray], np.ndarray], x: np.ndarray, dt: float) -> np.ndarray:

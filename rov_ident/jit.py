@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numba
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -36,12 +38,6 @@ def _cache_folder() -> Path:
     # Compiled code is run as it is found: never from a folder that others could have made.
     return Path(tempfile.mkdtemp(prefix="rov_ident-"))
 
-
-# One thread for BLAS: the matrices are 30 x 30, and a node shares its computer with a pilot's.
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
-import numba  # noqa: E402  (after the number of threads is set)
 
 # Not by NUMBA_CACHE_DIR, which a child process with other sources would inherit.
 if not os.environ.get("NUMBA_CACHE_DIR"):

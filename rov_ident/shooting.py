@@ -15,11 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
-from rov_ident.effects import Acting, act, add_wrenches, memory
-from rov_ident.jit import kernel
-from rov_ident.model import Array, Model, Structure, columns, current_wrench, generalized_force
+from rov_ident.effects import Acting, act, add_surroundings, has_surroundings, memory
+from rov_ident.jit import inner, kernel
+from rov_ident.model import (
+    NODES,
+    Array,
+    Model,
+    Structure,
+    columns,
+    generalized_force,
+    six,
+    symmetric_product,
+)
 
 Indices = NDArray[np.int64]
+
+_NEARBY = 1e-4  # m/s, rad/s; of the difference quotients
 
 
 class Steps(NamedTuple):
@@ -110,7 +121,11 @@ def shoot(
         np.zeros((k, 6, 6)),
         np.zeros((k, 6, 6)),
     )
-    _shoot(eq, steps, wrench, first, last, start, motion)
+    acting = eq.acting if has_surroundings(eq.acting) else None
+    _shoot(
+        acting, eq.structure, eq.mass, eq.added, eq.inverse, eq.theta.reshape(-1, 1), eq.restoring,
+        steps, wrench, first, last, start, np.zeros(1, _SCRATCH), motion,
+    )  # fmt: skip
     return motion
 
 
@@ -156,94 +171,163 @@ def _thrust(acting, state, t, wrench):
 
 
 @kernel
-def _beyond(eq, t, nu, rotation, out):
-    """Add to out (6,) the wrench of effects and current."""
-    water = np.zeros(3)
-    moving = eq.acting.water[0] != 0.0 or eq.acting.water[1] != 0.0 or eq.acting.water[2] != 0.0
-    relative = nu.copy()
-    if moving:
-        for i in range(3):
-            for j in range(3):
-                water[i] += rotation[j, i] * eq.acting.water[j]
-            relative[i] -= water[i]
-        extra = current_wrench(eq.structure, eq.added, eq.theta, nu, water)
-        for i in range(6):
-            out[i] += extra[i]
-    add_wrenches(eq.acting, t, relative, rotation, out)
-
-
-@kernel
 def _wrenches(eq, steps, nu, out):
+    acting, structure, added, theta = eq.acting, eq.structure, eq.added, eq.theta
+    t, middle = steps.t, steps.middle
     for k in range(len(nu)):
-        _beyond(eq, 0.5 * (steps.t[k] + steps.t[k + 1]), nu[k], steps.middle[k], out[k])
+        now = 0.5 * (t[k] + t[k + 1])
+        add_surroundings(acting, structure, added, theta, now, nu[k], middle[k], out[k])
 
 
-@kernel
-def _pace(eq, t, nu, rotation, wrench, given, out, work):
-    """nu_dot (6,) into out, ``given`` on guided axes; work (6 + EXTENDED_SIZE, 1) is scratch."""
-    h, extended = work[:6], work[6:]
-    theta = eq.theta.reshape(-1, 1)
-    generalized_force(1, eq.structure, eq.mass, theta, nu.reshape(6, 1), h, extended)
-    total = np.empty(6)
+_LANES = 8  # six axes, and none; eight are as quick as seven
+
+_SCRATCH = np.dtype(
+    [
+        ("nu", "f8", (6, 1)),
+        ("push", "f8", (6,)),  # wrench of thrusters, weight and effects
+        ("slope", "f8", (4, 6)),  # of Runge and Kutta's stages
+        ("h", "f8", (6, 1)),
+        ("extended", "f8", (EXTENDED_SIZE, 1)),
+        ("mass", "f8", (6, 6, 1)),
+        ("inverse", "f8", (6, 6, 1)),
+        ("velocity", "f8", (6,)),
+        ("nearby", "f8", (6, _LANES)),
+        ("nearby_h", "f8", (6, _LANES)),
+        ("nearby_extended", "f8", (EXTENDED_SIZE, _LANES)),
+        ("nearby_mass", "f8", (6, 6, _LANES)),
+        ("by_velocity", "f8", (6, 6)),
+        ("jacobian", "f8", (6, 6)),
+        ("square", "f8", (6, 6)),
+    ],
+    align=True,
+)
+
+
+@inner
+def _pace(acting, structure, added, theta, restoring, t, rotation, given, s, out):
+    """nu_dot (6,) at s.nu into out, ``given`` on guided axes; s.push (6,) is the thrusters'."""
     for i in range(6):
-        total[i] = wrench[i] - h[i, 0]
+        s.velocity[i] = s.nu[i, 0]
         for j in range(3):
-            total[i] += eq.restoring[i, j] * rotation[2, j]
-    _beyond(eq, t, nu, rotation, total)
-    if given.any():
-        for i in range(6):
-            for j in range(6):
-                total[i] -= eq.mass[i, j, 0] * given[j]
+            s.push[i] += restoring[i, j] * rotation[2, j]
+    if acting is not None:  # numba leaves this out where it is None
+        flat = theta.reshape(-1)
+        add_surroundings(acting, structure, added, flat, t, s.velocity, rotation, s.push)
+    h = s.h
+    generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
     for i in range(6):
-        out[i] = given[i]
+        h[i, 0] = s.push[i] - h[i, 0]
+    for j in range(len(given)):
+        for i in range(6):
+            h[i, 0] -= s.mass[i, j, 0] * given[j]
+    nu_dot = symmetric_product(s.inverse, six(h, 0), 0)
+    for i in range(6):
+        out[i] = nu_dot[i]
+    for i in range(len(given)):
+        out[i] += given[i]
+
+
+@inner
+def _differentiate(acting, structure, added, theta, wide, t, rotation, s):
+    """s.by_velocity (6, 6): the derivative of the wrench on the vehicle by its velocity s.nu.
+
+    Lane j is a little faster along axis j, the last one along none; ``wide`` (n, _LANES) is theta
+    (n, 1) in each.
+    """
+    nearby, h, last = s.nearby, s.nearby_h, _LANES - 1
+    for i in range(6):
+        for k in range(_LANES):
+            nearby[i, k] = s.nu[i, 0]
+        nearby[i, i] += _NEARBY
+    generalized_force(_LANES, structure, s.nearby_mass, wide, nearby, h, s.nearby_extended)
+    if acting is not None:
+        flat = theta.reshape(-1)
+        for k in (0, 1, 2, 3, 4, 5, last):
+            for i in range(6):
+                s.velocity[i], s.push[i] = nearby[i, k], 0.0
+            add_surroundings(acting, structure, added, flat, t, s.velocity, rotation, s.push)
+            for i in range(6):
+                h[i, k] -= s.push[i]
+    for i in range(6):
         for j in range(6):
-            out[i] += eq.inverse[i, j] * total[j]
+            s.by_velocity[i, j] = (h[i, last] - h[i, j]) / _NEARBY
+
+
+@inner
+def _times(a, b, scale, out):
+    """out = scale a @ b, all (6, 6): quicker than BLAS by what a call of it costs."""
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = 0.0
+        for k in range(6):
+            for j in range(6):
+                out[i, j] += scale * a[i, k] * b[k, j]
+
+
+@inner
+def _advance(inverse, dt, s, phi, gamma):
+    """How a change of nu and of the wrench reaches the end of a step, phi and gamma (6, 6)."""
+    _times(inverse, s.by_velocity, dt, s.jacobian)
+    _times(s.jacobian, s.jacobian, 1.0, s.square)
+    for i in range(6):
+        for j in range(6):
+            unit = 1.0 if i == j else 0.0
+            phi[i, j] = unit + s.jacobian[i, j] + 0.5 * s.square[i, j]
+            s.square[i, j] = unit + 0.5 * s.jacobian[i, j] + s.square[i, j] / 6.0
+    _times(s.square, inverse, dt, gamma)
 
 
 @kernel
-def _shoot(eq, steps, wrench, first, last, start, motion):
-    work = np.empty((6 + EXTENDED_SIZE, 1))
-    a, b, c, d, nearby = np.empty(6), np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    jacobian, square, given = np.empty((6, 6)), np.empty((6, 6)), np.zeros(6)
+def _shoot(
+    acting, structure, mass, added, inverse, theta, restoring, steps, wrench, first, last, start,
+    scratch, motion,
+):  # fmt: skip
+    s = scratch[0]  # the caller's: a record does not keep its array alive
+    s.mass[:], s.inverse[:, :, 0] = mass, inverse
+    wide = np.empty((len(theta), _LANES))
+    for k in range(_LANES):
+        s.nearby_mass[:, :, k], wide[:, k] = mass[:, :, 0], theta[:, 0]
+    slope, nu, given = s.slope, np.empty(6), np.empty(0)
+    node, rotations, middles = steps.t, steps.rotation, steps.middle  # once: to take
+    guided, reached, halfway = steps.given, motion.nu, motion.middle  # them out of a
+    paces, phi, gamma = motion.pace, motion.phi, motion.gamma  # tuple is not free
     for w in range(len(first)):
-        nu = start[w].copy()
         for i in range(6):
-            motion.nu[first[w], i] = nu[i]
+            nu[i] = reached[first[w], i] = start[w, i]
         for k in range(first[w], last[w]):
-            t, dt = steps.t[k], steps.t[k + 1] - steps.t[k]
-            if len(steps.given) > 0:
-                given = steps.given[k]
-            tau, trend, middle = wrench[0, k], 0.5 * dt * wrench[1, k], steps.middle[k]
-            _pace(eq, t, nu, steps.rotation[k], tau - trend, given, a, work)
-            _pace(eq, t + 0.5 * dt, nu + 0.5 * dt * a, middle, tau, given, b, work)
-            _pace(eq, t + 0.5 * dt, nu + 0.5 * dt * b, middle, tau, given, c, work)
-            _pace(eq, t + dt, nu + dt * c, steps.rotation[k + 1], tau + trend, given, d, work)
-            half = motion.middle[k]
-            for i in range(6):
-                begin = nu[i]
-                nu[i] += dt / 6.0 * (a[i] + 2.0 * (b[i] + c[i]) + d[i])
-                half[i] = 0.5 * (begin + nu[i]) + 0.125 * dt * (a[i] - d[i])  # cubic
-            _pace(eq, t + 0.5 * dt, half, middle, tau, given, b, work)
-            motion.pace[k] = b
-            for j in range(6):
-                nearby[:] = half
-                nearby[j] += 1e-4
-                _pace(eq, t + 0.5 * dt, nearby, middle, tau, given, c, work)
+            t, dt = node[k], node[k + 1] - node[k]
+            if len(guided) > 0:
+                given = guided[k]
+            for stage in range(4):
+                ahead = NODES[stage] * dt
                 for i in range(6):
-                    jacobian[i, j] = (c[i] - b[i]) / 1e-4 * dt
-            square[:] = jacobian @ jacobian
-            for i in range(6):
-                for j in range(6):
-                    unit = 1.0 if i == j else 0.0
-                    motion.phi[k, i, j] = unit + jacobian[i, j] + 0.5 * square[i, j]
-                    square[i, j] = unit + 0.5 * jacobian[i, j] + square[i, j] / 6.0
-            motion.gamma[k] = square @ eq.inverse * dt
+                    s.nu[i, 0] = nu[i] + ahead * slope[stage - 1, i] if stage > 0 else nu[i]
+                    s.push[i] = wrench[0, k, i] + (ahead - 0.5 * dt) * wrench[1, k, i]
+                rotation = middles[k]
+                if stage == 0:
+                    rotation = rotations[k]
+                elif stage == 3:
+                    rotation = rotations[k + 1]
+                _pace(
+                    acting, structure, added, theta, restoring, t + ahead, rotation, given, s,
+                    slope[stage],
+                )  # fmt: skip
             worst = 0.0
             for i in range(6):
+                begin, middle = nu[i], slope[1, i] + slope[2, i]
+                nu[i] += dt / 6.0 * (slope[0, i] + 2.0 * middle + slope[3, i])
                 worst = max(worst, abs(nu[i]))
-                motion.nu[k + 1, i] = nu[i]
+                half = 0.5 * (begin + nu[i]) + 0.125 * dt * (slope[0, i] - slope[3, i])  # cubic
+                reached[k + 1, i], halfway[k, i], s.nu[i, 0] = nu[i], half, half
+                s.push[i] = wrench[0, k, i]
+            t += 0.5 * dt
+            _pace(
+                acting, structure, added, theta, restoring, t, middles[k], given, s, paces[k]
+            )  # fmt: skip
+            _differentiate(acting, structure, added, theta, wide, t, middles[k], s)
+            _advance(inverse, dt, s, phi[k], gamma[k])
             if not worst < 50.0:  # no vehicle moves so; NaN too
-                motion.nu[k + 1 : last[w] + 1] = np.nan
+                reached[k + 1 : last[w] + 1] = np.nan
                 break
 
 
@@ -274,7 +358,7 @@ def _tangent(phi, gamma, first, last, force, nodes, out, start):
                     for c in range(p):
                         new[i, c] += f * now[j, c] + g * force[k, j, c]
             now[:] = new
-            moved[:] = phi[k] @ begin
+            _times(phi[k], begin, 1.0, moved)
             begin[:] = moved
 
 

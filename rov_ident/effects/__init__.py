@@ -179,27 +179,31 @@ def acted(acting, t, demand):
     return out
 
 
-@kernel
+@inlined
 def add_wrenches(acting, t, nu, rotation, out):
     """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water."""
     _ALL_WRENCHES(0, acting.wrenches, acting.wrench_parameters, t, nu, rotation, out)
 
 
-@kernel
+@inlined
 def add_surroundings(acting, structure, added_mass, theta, t, nu, rotation, out):
     """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground.
 
     ``structure``, ``added_mass`` (6, 6) and ``theta`` (n,) are those of the model; ``rotation``
     (3, 3) turns body axes into the world.
     """
-    water, relative = np.zeros(3), nu.copy()
-    for i in range(3):
-        for j in range(3):
-            water[i] += rotation[j, i] * acting.water[j]
-        relative[i] -= water[i]
-    if acting.water.any():
-        out += current_wrench(structure, added_mass, theta, nu, water)
-    add_wrenches(acting, t, relative, rotation, out)
+    north, east, down = acting.water[0], acting.water[1], acting.water[2]
+    if north == 0.0 and east == 0.0 and down == 0.0:
+        add_wrenches(acting, t, nu, rotation, out)
+    else:
+        water, relative = np.empty(3), nu.copy()
+        for i in range(3):
+            water[i] = rotation[0, i] * north + rotation[1, i] * east + rotation[2, i] * down
+            relative[i] -= water[i]
+        more = current_wrench(structure, added_mass, theta, nu, water)
+        for i in range(6):
+            out[i] += more[i]
+        add_wrenches(acting, t, relative, rotation, out)
 
 
 def has_surroundings(acting: Acting) -> bool:

@@ -21,6 +21,7 @@ from rov_ident import config as configuration
 from rov_ident.config import Inputs
 from rov_ident.errors import UserError
 from rov_ident.inputs import sources
+from rov_ident.nodes.programs import INTERRUPTS
 from rov_ident.samples import IMU, ODOMETRY, WRENCH
 
 try:  # half the cost of the other, and it keeps the order of arrival across topics
@@ -31,7 +32,6 @@ except ImportError:
 __all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "live", "subscribed"]
 
 AnyNode = TypeVar("AnyNode", bound=Node)
-_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 INPUTS = {
     ODOMETRY: ("odom", Odometry),
@@ -89,7 +89,7 @@ def live(
         interrupted.set()  # where it is raised an exception may be ignored: in a finaliser, say
         raise KeyboardInterrupt
 
-    for number in _INTERRUPTS:
+    for number in INTERRUPTS:
         signal.signal(number, interrupt)
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -114,7 +114,7 @@ def _spin(
 ) -> None:
     executor.add_node(node)
     # From here on an interrupt waits for the end of a callback.
-    for number in _INTERRUPTS:
+    for number in INTERRUPTS:
         signal.signal(number, lambda *_: interrupted.set())
     try:
         # EventsExecutor.spin() never comes back from an interrupt.

@@ -8,15 +8,15 @@ import os
 import signal
 from importlib import import_module
 
-_INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _run(name: str) -> int:
     # No exception: modules that are being loaded catch some, and nothing is open yet.
-    for number in _INTERRUPTS:
+    for number in INTERRUPTS:
         signal.signal(number, lambda *_: os._exit(0))
     module = import_module(f"rov_ident.nodes.{name}")
-    for number in _INTERRUPTS:
+    for number in INTERRUPTS:
         signal.signal(number, signal.default_int_handler)
     try:
         return int(module.main())
