@@ -87,6 +87,7 @@ _REASONS = 100  # names of refusals; what else is wrong is counted together
 LONE = 5.0  # sigma; of a message that jumps there and back between its neighbours
 _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
 _PUSH = 0.03  # of the working wrench; of which a brief demand may
+_STILL = 0.004  # the same where the demand is constant, as it is while nobody demands anything
 GROSS = 0.5  # of the working wrench: no turn of what is demanded, there and back at once
 _COARSE = 0.03  # of the demand itself; of which it may: less would thin the noise of coarse ones
 _MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
@@ -421,13 +422,17 @@ class Sampler:
             after = numbers(queue[1][1])
             last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
             floor, coarse, gross = self._floors[role], 0.0, _NOTHING
+            still = floor
             if role == WRENCH:
                 gross = GROSS * floor
                 lasts = (queue[1][0] - queue[0][0] - _BRIEF) / (_LASTING - _BRIEF)
                 lasts = min(max(lasts, 0.0), 1.0)
+                still = (_STILL + lasts * (_MEANT - _STILL)) * floor
                 floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor
                 coarse = _COARSE + lasts * (_MEANT - _COARSE)
-            found = mend(before, here, after, last, self._scatter[role], floor, coarse, gross, LONE)
+            found = mend(
+                before, here, after, last, self._scatter[role], floor, still, coarse, gross, LONE
+            )
         if found != _SOUND:
             self.counts[f"{role}: outlier between its neighbours"] += 1
         if role == WRENCH or found == _SOUND:
@@ -675,7 +680,7 @@ _SOUND, _MENDED, _GUESSED = range(3)
 
 
 @kernel
-def mend(before, here, after, last, scatter, floor, coarse, gross, gate):
+def mend(before, here, after, last, scatter, floor, still, coarse, gross, gate):
     """Mend the numbers (n,) that jump there and back between messages by more than is usual.
 
     Back it may be only with the ``last`` message. A step, or a ramp, goes there and does not come
@@ -685,7 +690,8 @@ def mend(before, here, after, last, scatter, floor, coarse, gross, gate):
     which. _GUESSED, else _MENDED, or _SOUND.
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
-    ``floor`` (n,), and less than ``coarse`` of the number itself, is always usual.
+    ``floor`` (n,), and less than ``coarse`` of the number itself, is always usual; ``still`` (n,)
+    stands for the floor of a number that is exactly the same before and after.
     """
     found = _SOUND
     for i in range(len(here)):
@@ -693,7 +699,9 @@ def mend(before, here, after, last, scatter, floor, coarse, gross, gate):
         jump = 0.0
         if there * back < 0.0 or there * later < 0.0:
             jump = min(there * there, back * back, later * later)
-        usual = max(floor[i], coarse * min(abs(before[i]), abs(after[i])))
+        constant = before[i] == after[i] and after[i] == last[i]
+        least = still[i] if constant else floor[i]
+        usual = max(least, coarse * min(abs(before[i]), abs(after[i])))
         most = gate * gate * max(scatter[i], usual * usual)
         again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
         if jump > most and (again or jump > gross[i] * gross[i]):

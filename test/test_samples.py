@@ -693,6 +693,16 @@ def test_slow_pulses_are_meant(heavy):
     assert samples["wrench"][:, 0].max() == pytest.approx(20.0)
 
 
+@pytest.mark.parametrize(("push", "taken_for"), [(1.0, "meant"), (4.5, "an outlier")])
+def test_a_lone_demand_while_nothing_is_demanded(heavy, push, taken_for):
+    """While the vehicle coasts, a wrench that never acted has nothing to hide behind."""
+    demands = np.zeros((200, 6))
+    demands[100, 2] = push
+    samples, sampler = pushed(heavy, demands)
+    assert sampler.counts[LONE] == (taken_for == "an outlier")
+    assert (samples["wrench"] != 0.0).any() == (taken_for == "meant")
+
+
 def test_an_outlier_of_one_axis_keeps_no_step_of_another(heavy):
     """At the very message where all others step, one number is wild: only that one is mended."""
     demands = steps(400)
