@@ -179,7 +179,7 @@ def _wrenches(eq, steps, nu, out):
         add_surroundings(acting, structure, added, theta, now, nu[k], middle[k], out[k])
 
 
-_LANES = 8  # six axes, and none; eight are as quick as seven
+_LANES = 8  # six axes, none, and one more to fill the vectors
 
 _SCRATCH = np.dtype(
     [
