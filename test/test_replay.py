@@ -123,7 +123,8 @@ def test_pace_without_imu(domain, brief):
     """At twice the speed; a bag without IMU needs no publisher for it from elsewhere."""
     began = []
     result = replay(brief, HEAVY, rate=2.0, on_report=lambda *_: began.append(time.monotonic()))
-    assert 1.0 < began[-1] - began[1] < 4.0
+    # Five reports a second of the bag. The median: a node that was late at first catches up.
+    assert 0.07 < np.median(np.diff(began)) < 0.3
     assert_same(result.reports["rls"], offline(brief, "rls"))
     assert Level.STALE not in result.reports["rls"].levels
 
