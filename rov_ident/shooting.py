@@ -288,9 +288,10 @@ def _shoot(
     for k in range(_LANES):
         s.nearby_mass[:, :, k], wide[:, k] = mass[:, :, 0], theta[:, 0]
     slope, nu, given = s.slope, np.empty(6), np.empty(0)
-    node, rotations, middles = steps.t, steps.rotation, steps.middle  # once: to take
-    guided, reached, halfway = steps.given, motion.nu, motion.middle  # them out of a
-    paces, phi, gamma = motion.pace, motion.phi, motion.gamma  # tuple is not free
+    # Once: to take an array out of a tuple is not free.
+    node, rotations, middles, guided = steps.t, steps.rotation, steps.middle, steps.given
+    reached, halfway, paces = motion.nu, motion.middle, motion.pace
+    phi, gamma = motion.phi, motion.gamma
     for w in range(len(first)):
         for i in range(6):
             nu[i] = reached[first[w], i] = start[w, i]

@@ -205,3 +205,15 @@ def test_the_completion_of_zsh_knows_every_command(capsys):
     assert script.startswith("#compdef rov-ident")
     for name in COMMANDS:
         assert f"_shtab_rov_ident_{name.replace('-', '_')}_options" in script
+
+
+def test_one_blas_thread_is_said_before_numpy_is_loaded():
+    """Said later it is not heard, and a second thread waits at full load."""
+    program = (
+        "import os, sys, rov_ident; "
+        "print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "1"]
