@@ -252,8 +252,12 @@ def outliers(seeds: int, only: str) -> Iterator[Row]:
                     for k in range(seeds)
                 ]
                 for kind in ESTIMATORS:
-                    moved = max(shift(done[kind], without[kind]) for done, without in pairs)
-                    yield Row(f"5 % outliers, {what}", kind, moved, "sigma", 1.0)
+                    moved = [shift(done[kind], without[kind]) for done, without in pairs]
+                    if seeds > 1:
+                        yield Row(f"  {what}: median", kind, float(np.median(moved)), "sigma", 1.0)
+                        beyond = sum(m > 1.0 for m in moved)
+                        yield Row(f"  {what}: beyond one", kind, beyond, "dives", 0.0)
+                    yield Row(f"5 % outliers, {what}", kind, max(moved), "sigma", 1.0)
 
 
 def spoilt(seed: int, role: str, name: str, index: int, size: float) -> Messages:

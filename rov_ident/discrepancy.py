@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from rov_ident.coefficients import AXES, parse
 from rov_ident.config import Config
@@ -359,7 +360,11 @@ class Search:
         taken = any(
             abs(h.values[k]) < _OWN * abs(now.hypothesis.values[k]) for k in own if k in h.values
         )
-        return not taken and not any(pinned(k, h.values[k], std[k]) for k in new)
+        # a failure that has been there from the start is no failure at a time
+        early = any(
+            h.values[k] <= 0.0 and len(EFFECTS[k[0]].lasting) == 1 for k in onsets(h) if k in new
+        )
+        return not (taken or early) and not any(pinned(k, h.values[k], std[k]) for k in new)
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the price of the added parameters.
@@ -376,7 +381,7 @@ class Search:
     def _rescored(self, fitted: Fitted, noise: Array) -> float:
         look = self.evidence.look(fitted.hypothesis, fitted.look.starts, noise)
         assert look is not None
-        return float(look.linear.rss.sum())
+        return look.rss
 
     def named(self, fitted: Fitted) -> list[str]:
         """The effects (and patterns) that a model has beyond the given one."""
@@ -675,7 +680,8 @@ def covariance(final: Fitted) -> Array:
     moves = final.look.left_out(at)
     w = len(moves)
     if w >= _CLUSTERS:
-        wide = 0.5 * (wide + (w - 1) / w * moves.T @ moves)
+        few = (stdtrit(w - 1, 0.975) / 1.96) ** 2  # Student's: the scatter of few is uncertain
+        wide = 0.5 * (wide + few * (w - 1) / w * moves.T @ moves)
     out = np.zeros((len(keys), len(keys)))
     out[np.ix_(at, at)] = wide
     return out

@@ -54,6 +54,8 @@ _ONSET_STEP = 0.2  # s; of the difference quotient
 _NEARBY = 14.0  # s; in which a better onset is looked for
 _SHOWS = 4.0  # scaled squared residuals by which an onset is too far off: two standard deviations
 _FARTHEST = 30.0  # s; an onset less certain than that is not known at all
+_ASTRAY = 2.0  # times the squared residuals that were foretold: not as foretold
+_LOST = 10.0  # standard deviations of a start from what was measured there
 _OUTLIER = 8.0  # robust standard deviations
 
 
@@ -106,6 +108,15 @@ class Look:
         self.columns = self._projected(raw)
         self.error = self._projected(error.reshape(-1, 1))[:, 0]
         self.linear = self._linear(h.keys, self.columns)
+
+    @property
+    def rss(self) -> float:
+        """Squared residuals; those left out as outliers count as the least that is left out.
+
+        If they counted nothing, a fit could do better by losing a window.
+        """
+        out = np.count_nonzero(self._weight[:, ~self.evidence.guided] == 0.0)
+        return float(self.linear.rss.sum() + _OUTLIER**2 * out)
 
     def _spans(self) -> Iterable[tuple[int, int]]:
         edges = [*self._rows.tolist(), len(self.evidence.nodes)]
@@ -244,7 +255,7 @@ class Fitted:
 
     @property
     def rss(self) -> float:
-        return float(self.linear.rss.sum())
+        return self.look.rss
 
 
 class Evidence:
@@ -471,19 +482,75 @@ class Evidence:
         if start is None:
             look, update_noise = self.look(h, self.begin(), np.full(6, 0.02)), True
         else:
-            look = self.look(h, start.starts, start.noise)
+            look = self._led(h, start)
         if look is None:
             return None
         fitted = self._descend(look, iterations)
         for _ in range(4 if update_noise else 0):
             noise = fitted.look.rescaled()
+            starts = self._recalled(fitted.look.starts, noise)
             settled = np.abs(np.log(noise / fitted.noise)).max() < 0.05
-            again = self.look(fitted.hypothesis, fitted.look.starts, noise)
+            settled = settled and starts is fitted.look.starts
+            again = self.look(fitted.hypothesis, starts, noise)
+            if again is None:  # from where it was it can be simulated
+                again = self.look(fitted.hypothesis, fitted.look.starts, noise)
             assert again is not None
             if settled:
                 return Fitted(fitted.hypothesis, again, fitted.converged)
             fitted = self._descend(again, iterations)
         return fitted
+
+    def _recalled(self, starts: Array, noise: Array) -> Array:
+        """Starts (W, 6), those that have gone astray as measured again.
+
+        Where a vehicle tumbles, a poor model can push one so far that a better one does not find
+        the way back.
+        """
+        measured = self.begin()
+        far: Array = np.max(np.abs(starts - measured) / noise, axis=1, keepdims=True)
+        return np.where(far > _LOST, measured, starts) if far.max() > _LOST else starts
+
+    def _led(self, h: Hypothesis, start: Look) -> Look | None:
+        """A hypothesis simulated where, of what it shares with the one before, everything follows
+        (linearly) what is new in it or gone.
+
+        Otherwise a drag that joins or leaves throws the simulation far off, and the way back is
+        long, or ends elsewhere.
+        """
+        before = start.hypothesis
+        added = [k for k in h.keys if k not in before.values]
+        moves = {k: h.value(k) - before.value(k) for k in (*before.keys, *added) if _scales(k)}
+        moves = {k: d for k, d in moves.items() if d != 0.0}
+        begin = self._recalled(start.starts, start.noise)
+        if not moves:
+            return self.look(h, begin, start.noise)
+        linear = start.linear
+        if added:
+            without = before.having({k: (before if _scales(k) else h).value(k) for k in added})
+            columns = self.columns(without, start.motion, added)
+            linear = start.having(added, start.of(columns))
+        follow = [k for k in before.keys if h.values.get(k) == before.values[k]]
+        at, moved = linear.index(follow), linear.index(moves)
+        far = np.array(list(moves.values()))
+        slope = linear.gradient.sum(axis=0)
+        normal = linear.normal[np.ix_(at, at)]
+        lower, upper = _room(h, follow)
+        change = np.zeros(len(linear.keys))
+        change[moved] = far
+        change[at] = _bounded(
+            normal + np.diag(precision(h.at({k: h.values[k] for k in follow}))),
+            slope[at] - linear.normal[np.ix_(at, moved)] @ far,
+            lower,
+            upper,
+        )
+        there = h.having({k: h.values[k] + change[i] for k, i in zip(follow, at, strict=True)})
+        starts = self._recalled(start.starts_after(change[: len(before.keys)]), start.noise)
+        led = self.look(there, starts, start.noise)
+        foretold = start.rss - 2.0 * slope @ change + change @ linear.normal @ change
+        if led is not None and led.rss < _ASTRAY * foretold:
+            return led
+        looks = (led, self.look(h, begin, start.noise))
+        return min((x for x in looks if x), key=lambda x: x.rss, default=None)
 
     def dated(self, fitted: Fitted, keys: Container[Key] | None = None) -> Fitted:
         """The same with the best onset near by, of all effects or of these parameters.
@@ -517,7 +584,7 @@ class Evidence:
         size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
         slope = linear.gradient.sum(axis=0)[others] / size
         normal = normal / np.outer(size, size) + 1e-6 * np.eye(len(size))
-        return float(linear.rss.sum() - slope @ np.linalg.solve(normal, slope))
+        return float(look.rss - slope @ np.linalg.solve(normal, slope))
 
     def onset_std(self, fitted: Fitted, key: Key, kappa: float) -> float:
         """Standard deviation [s] of an onset, from how far off it can be before that shows.
@@ -542,27 +609,20 @@ class Evidence:
         """Gauss-Newton at fixed noise."""
         h = look.hypothesis
         prior, mean = precision(h), np.array([centre(h.config, key) for key in h.keys])
-        lower, upper = np.array([bounds(k)[1:] for k in h.keys]).reshape(-1, 2).T
-        limit = np.array([reach(key) for key in h.keys])
         for _ in range(iterations):
             linear = look.linear
             value = np.array(list(h.values.values()))
             slope = linear.gradient.sum(axis=0) + prior * (mean - value)
-            change = _bounded(
-                linear.normal + np.diag(prior),
-                slope,
-                np.maximum(lower - value, -limit),
-                np.minimum(upper - value, limit),
-            )
+            change = _bounded(linear.normal + np.diag(prior), slope, *_room(h, h.keys))
             if slope @ change < 1e-4 * linear.count:
                 return Fitted(h, look, True)
-            cost = linear.rss.sum() + prior @ (mean - value) ** 2
+            cost = look.rss + prior @ (mean - value) ** 2
             factor = 1.0
             while factor > 0.05:
                 there = h.at(dict(zip(h.keys, (value + factor * change).tolist(), strict=True)))
                 found = self.look(there, look.starts_after(factor * change), look.noise)
                 if found is not None:
-                    new = found.linear.rss.sum() + prior @ (mean - value - factor * change) ** 2
+                    new = found.rss + prior @ (mean - value - factor * change) ** 2
                     if new < cost:
                         break
                 factor *= 0.4
@@ -573,6 +633,19 @@ class Evidence:
             if cost - new < 1e-4 * linear.count:
                 return Fitted(h, look, True)
         return Fitted(h, look, False)
+
+
+def _scales(key: Key) -> bool:
+    """Whether the wrench is (nearly) linear in a parameter, however far it moves."""
+    return key[0] not in EFFECTS or parameter(key).role == "amplitude"
+
+
+def _room(h: Hypothesis, keys: Sequence[Key]) -> tuple[Array, Array]:
+    """How far parameters may move in one step, downwards and upwards."""
+    value = np.array([h.values[k] for k in keys])
+    lower, upper = np.array([bounds(k)[1:] for k in keys]).reshape(-1, 2).T
+    limit = np.array([reach(k) for k in keys])
+    return np.maximum(lower - value, -limit), np.minimum(upper - value, limit)
 
 
 def onsets(h: Hypothesis) -> list[Key]:

@@ -165,8 +165,11 @@ def explain(
     slight = [k for f in minor for k in search.keys_of(final, f.effect)]
     patterns = [k for k in final.hypothesis.keys if k[0] == UNKNOWN]
     if slight or patterns:
-        kept = search.evidence.fit(final.hypothesis.without([*slight, *patterns]), final.look)
-        final = kept or path[0]
+        kept = final.hypothesis.without([*slight, *patterns])
+        if kept.keys == retuned.keys:  # and not another optimum of the same
+            final = path[0]
+        else:
+            final = search.evidence.fit(kept, final.look) or path[0]
     halves = [s for a, b in blocks(streams) for s in _halved(a, b)]
     everything = Evidence(streams, thinned(halves))
     last = everything.fit(final.hypothesis, None) or final
@@ -613,7 +616,9 @@ _MOTIONS = dict(
 def _residual(final: Fitted, trials: Trials) -> list[Residual]:
     """What the patterns in a model say: where something is left that has no name.
 
-    Each window is foretold with the parameters that the others give. The share is one of squares.
+    Each window is foretold with the parameters that the others give, but not with another pattern:
+    which one it is was chosen by all of them, from many. So it has to gain surely what an effect
+    has to gain at all. The share is one of squares.
     """
     found = []
     for name, trial in trials.items():
@@ -621,11 +626,20 @@ def _residual(final: Fitted, trials: Trials) -> list[Residual]:
             continue
         axis, depends_on, frequency = name.removeprefix(f"{UNKNOWN} ").split("|")
         i = AXES.index(axis)
-        before, after = (foretold(f)[:, [i]] for f in (trial.rest, final))
-        if _has_weight(gain_of([VELOCITIES[i]], before, after, 1.0)):
+        before, after = but_best(*(foretold(f)[:, [i]] for f in (trial.rest, final)))
+        if len(before) > 1 and gain_of([VELOCITIES[i]], before, after, 1.0).low >= 100.0 * _WORTH:
             share = float(1.0 - after.sum() / before.sum())
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)
+
+
+def but_best(before: Array, after: Array) -> tuple[Array, Array]:
+    """Squared residuals (W, 1) of all windows but the one that speaks most for what came after.
+
+    One alone can be foretold badly by chance, where hardly another one tells of some parameter.
+    """
+    most = int(np.argmax(before - after))
+    return np.delete(before, most, axis=0), np.delete(after, most, axis=0)
 
 
 def _changed(config: Config, retuned: Fitted) -> dict[str, Change]:

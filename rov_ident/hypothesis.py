@@ -60,6 +60,15 @@ class Hypothesis:
         gone = set(keys)
         return self.at({k: v for k, v in self.values.items() if k not in gone})
 
+    def value(self, key: Key) -> float:
+        """Of a parameter, free or not, there or not."""
+        section, name = key
+        if key in self.values:
+            return self.values[key]
+        if section == COEFFICIENTS:
+            return self.coefficients.get(name, 0.0)
+        return self.effects.get(section, {}).get(name, bounds(key)[0])
+
     @cached_property
     def effects(self) -> dict[str, dict[str, float]]:
         """The section ``effects``, complete."""

@@ -68,7 +68,8 @@ class Noise:
     def process(self, samples: Samples) -> Array:
         """Density (k, 6) of the wrench's error."""
         lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
-        density: Array = self.floor + lasting * (self.relative * samples["wrench"]) ** 2
+        variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
+        density: Array = self.floor + lasting * variance
         return density
 
 

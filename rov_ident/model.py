@@ -413,12 +413,13 @@ def coriolis(p, nu):
 
 
 @kernel
-def current_wrench(structure, added_mass, theta, nu, water):
-    """What steadily moving water adds to the thruster wrench (6,) of a vehicle in still water.
+def add_current(structure, added_mass, theta, nu, relative, water, out):
+    """Add to out (6,) what steadily moving water adds to the thruster wrench in still water.
 
-    ``added_mass`` (6, 6), ``theta`` (n,), ``nu`` (6,) over ground, ``water`` (3,) the velocity of
-    the water in body axes [m/s], irrotational and constant in the world. The hydrodynamic forces
-    are those of the velocity through the water ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
+    ``added_mass`` (6, 6), ``theta`` (n,), ``nu`` (6,) over ground and ``relative`` (6,) through
+    the water, whose velocity in body axes [m/s] is ``water``, a tuple of three: irrotational and
+    constant in the world. The hydrodynamic forces are those of the velocity through the water
+    ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
 
         M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r - d(nu_r) + g = tau
         nu_c = [water; 0],   nu_c_dot = [-omega x water; 0]
@@ -426,18 +427,21 @@ def current_wrench(structure, added_mass, theta, nu, water):
     Moving what differs from the equation for still water to the right leaves
     ``M_A nu_c_dot + (C_A(nu) nu - d(nu)) - (C_A(nu_r) nu_r - d(nu_r))``.
     """
-    relative, turning = nu.copy(), np.zeros(3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        relative[i] -= water[i]
-        turning[i] = nu[3 + k] * water[j] - nu[3 + j] * water[k]
-    out = force_of_one(structure, added_mass, theta, nu)
-    through_water = force_of_one(structure, added_mass, theta, relative)
+    # one array for all: each that is made here takes as long as the forces themselves
+    work = np.empty((12 + EXTENDED_SIZE, 1))
+    h, through_water, extended = work[:6], work[6:12], work[12:]
+    mass, column = added_mass.reshape(6, 6, 1), theta.reshape(-1, 1)
+    generalized_force(1, structure, mass, column, nu.reshape(6, 1), h, extended)
+    generalized_force(1, structure, mass, column, relative.reshape(6, 1), through_water, extended)
+    turning = (
+        nu[5] * water[1] - nu[4] * water[2],
+        nu[3] * water[2] - nu[5] * water[0],
+        nu[4] * water[0] - nu[3] * water[1],
+    )
     for i in range(6):
-        out[i] -= through_water[i]
+        out[i] += h[i, 0] - through_water[i, 0]
         for j in range(3):
             out[i] += added_mass[i, j] * turning[j]
-    return out
 
 
 @kernel

@@ -3,6 +3,7 @@
 import numpy as np
 
 from rov_ident.jit import inlined, inner, kernel
+from rov_ident.process_noise import LARGEST
 
 MAX_STEP = 0.05  # s; of one step of the prediction
 LIGHTEST = 0.2  # of the rigid body's own inertia: no model that is tried is lighter
@@ -52,9 +53,12 @@ def steps_of(dt):
 
 
 @inlined
-def blend_of(dt):
-    """Of an innovation, so long after the last one, in the average of surprise."""
-    return min(dt / SURPRISE_TIME, 1.0)
+def add_surprise(surprise, i, ratio, since):
+    """Average an innovation's square over its variance, so many seconds after the last one.
+
+    A single kick counts for no more than LARGEST: what has changed shows again and again.
+    """
+    surprise[i] += min(since / SURPRISE_TIME, 1.0) * (min(ratio, LARGEST**2) - surprise[i])
 
 
 @inlined

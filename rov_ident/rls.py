@@ -65,8 +65,8 @@ from rov_ident.recursion import (
     LIGHTEST,
     RELEARNING_TIME,
     add_score,
+    add_surprise,
     begin,
-    blend_of,
     copy,
     steps_of,
 )
@@ -491,7 +491,7 @@ def _predict(task, state, work, sample, side):
             middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
             s.force[i] += task.restoring[i, j] * middle
             s.slope[i] += task.restoring[i, j] * sample.down_slope[j]
-    wrench_noise(task.process[0], sample, s.middle)
+    doubtful = wrench_noise(task.process[0], sample, s.middle)
     for i in range(6):
         for j in range(i + 1):
             total = 0.0
@@ -501,7 +501,7 @@ def _predict(task, state, work, sample, side):
             noise[j, i] = total
         state.adaptation[i].since += sample.dt
         noise[i, i] += state.adaptation[i].density
-        state.adaptation[i].acting = noise[i, i]
+        state.adaptation[i].acting = 0.0 if doubtful else noise[i, i]
     steps = steps_of(sample.dt)
     dt = sample.dt / steps
     for step in range(steps):
@@ -737,16 +737,15 @@ def _update(task, state, work, sample, side, info):
         wild = wild or info.ratio[i] > _WILD**2
         if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
             interrupt(state.adaptation[i])
-            c.surprise[i] += blend_of(since) * (1.0 - c.surprise[i])
+            add_surprise(c.surprise, i, 1.0, since)
             continue
-        blend = blend_of(since)
-        c.surprise[i] += blend * (min(info.ratio[i], s.gate**2) - c.surprise[i])
+        add_surprise(c.surprise, i, info.ratio[i], since)
         # as far as it is the noise, and not the prediction, that an innovation shows
         averaging = min(1.0 + 0.25 * state.adaptation[i].seen, _NOISE_TIME)
         excess = (min(info.ratio[i], _STEADY) - _STEADY_MEAN) * r[i] / spread
         c.noise[i] *= 1.0 + min(since / averaging, 0.1) * excess
         c.noise[i] = min(max(c.noise[i], 0.5), _NOISIEST)
-        adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, e / np.sqrt(spread))
+        adapt(state.adaptation[i], task.process[0], i, _ROOM, e / np.sqrt(spread))
     c.refused *= np.exp(-sample.dt / _PATIENCE_TIME)
     if wild or (gated and c.refused < _PATIENCE):
         c.refused += 1.0

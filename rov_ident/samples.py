@@ -60,6 +60,7 @@ SAMPLE = np.dtype(
         ("down_slope", "f8", (3,)),  # per s, over the interval
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
+        ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
         ("hold", "f8"),  # s: how long a demand acts, of late; 0: not known yet
         ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
         ("surroundings_slope", "f8", (6,)),
@@ -93,6 +94,7 @@ _COARSE = 0.03  # of the demand itself; of which it may: less would thin the noi
 _MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
 _BRIEF, _LASTING = 0.02, 0.1  # s; what is brief, and what lasts
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
+_CALM = 3.0  # times as far as its neighbours move is what stands between two calm levels
 _NOTHING = np.zeros(6)
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
 
@@ -212,11 +214,12 @@ class Sampler:
         self._kinematics["gyro_bias_variance"] = self._settings["gyro_bias_variance"]
         self._demand: Array | None = None
         self._demand_time = -math.inf
-        self._guessed = False  # the present demand: whether it is known
+        self._doubt = np.zeros(6)  # N2, (N m)2: of the present demand
         self._intervals: deque[float] = deque(maxlen=50)  # s; between demands
         self._period = 0.0  # s; as is usual
         self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
-        self._before: dict[str, Array] = {}  # the last message's numbers
+        # the numbers of the last two messages as they came, and of the last two as believed
+        self._past: dict[str, tuple[Array, Array, Array, Array]] = {}
         self._scatter = {role: np.zeros(6) for role in self._floors}
         self._memory = memory()
         if self._sensitivity is not None:
@@ -395,7 +398,7 @@ class Sampler:
                 break
             if take_imu and len(imu) < 3 and not (final or self._waited(t)):
                 break  # its successors tell whether it is an outlier
-            if take_imu and self._mended(IMU)[1] != _SOUND:
+            if take_imu and self._mended(IMU)[1]:
                 imu.popleft()  # of an IMU the others tell enough, and a guess would not do
                 continue
             message = imu.popleft()[1] if take_imu else None
@@ -411,14 +414,15 @@ class Sampler:
         """Whether the newest stamp is so far ahead of t that nothing more is waited for."""
         return max(self._newest.values()) - t > max(self._grace, self._late)
 
-    def _mended(self, role: str) -> tuple[Array, int]:
+    def _mended(self, role: str) -> tuple[Array, bool, Array]:
         """Numbers (6,) of the next message without its outliers, and what :func:`mend` says.
 
         They are mended, each by itself: a step of another axis is not to come late for them.
         """
-        queue, before = self._queues[role], self._before.get(role)
-        here, found = numbers(queue[0][1]), _SOUND
-        if before is not None and len(queue) > 1:
+        queue, past = self._queues[role], self._past.get(role)
+        here, found, doubt = numbers(queue[0][1]), False, np.zeros(6)
+        came, (former, recent, earlier, before) = here.copy(), past or (here, here, here, here)
+        if len(queue) > 1:
             after = numbers(queue[1][1])
             last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
             floor, coarse, gross = self._floors[role], 0.0, _NOTHING
@@ -430,14 +434,19 @@ class Sampler:
                 still = (_STILL + lasts * (_MEANT - _STILL)) * floor
                 floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor
                 coarse = _COARSE + lasts * (_MEANT - _COARSE)
-            found = mend(
-                before, here, after, last, self._scatter[role], floor, still, coarse, gross, LONE
-            )
-        if found != _SOUND:
+            if past is None:  # the first of all may be an outlier like any other
+                doubt = (after - here) ** 2
+            else:
+                found = mend(
+                    former, earlier, before, here, after, last, doubt,
+                    self._scatter[role], floor, still, coarse, gross, LONE,
+                )  # fmt: skip
+        if found:
             self.counts[f"{role}: outlier between its neighbours"] += 1
-        if role == WRENCH or found == _SOUND:
-            self._before[role] = here
-        return here, found
+        if role == WRENCH or not found:
+            earlier, before = before if past else here, here
+        self._past[role] = recent if past else came, came, earlier, before
+        return here, found, doubt
 
     def _reached(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t, or it is not worth waiting."""
@@ -461,9 +470,10 @@ class Sampler:
         restart = not 0.0 < dt <= _MAX_GAP
         wrench = self._mean_wrench(self._previous if not restart else t, t)
         self._previous = t
-        mean, slope, guessed = wrench or (_ZERO_WRENCH, _ZERO_WRENCH, False)
+        mean, slope, doubt = wrench or (_ZERO_WRENCH, _ZERO_WRENCH, _ZERO_WRENCH)
         sample = np.zeros(1, dtype=SAMPLE)
         sample["hold"] = self._period
+        sample["wrench_doubt"] = doubt
         odometry, shift = _ABSENT, 0.0
         if self._sensitivity is not None:
             known = self._kinematics[0]
@@ -500,8 +510,6 @@ class Sampler:
             self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
             self._previous = math.nan
             return None
-        if guessed:
-            sample["restart"] = True
         if self._surrounded:
             _surround(self._acting, sample, self._around)
         if self._sensitivity is not None:
@@ -509,30 +517,27 @@ class Sampler:
             return np.frombuffer(bytearray(sample.tobytes() + sides.tobytes()), self._none.dtype)
         return sample
 
-    def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array, bool] | None:
-        """Mean and slope (6,) of the acting wrench, and whether some of it had to be guessed.
+    def _mean_wrench(self, start: float, end: float) -> tuple[Array, Array, Array] | None:
+        """Mean and slope (6,) of the acting wrench, and what of it is in doubt, squared.
 
         None where no demand is known.
         """
         queue = self._queues[WRENCH]
-        pieces: list[tuple[float, float, Array]] = []
-        now, guessed = start, self._guessed
-        while queue and queue[0][0] <= end:
-            if len(queue) == 1 and queue[0][0] == end and self._demand is not None:
-                break  # it does not act yet, and its successor tells whether it is an outlier
-            demand, found = self._mended(WRENCH)
+        pieces: list[tuple[float, float, Array, Array]] = []
+        now = start
+        # One that comes at the end does not act yet; its successors tell whether it is an outlier.
+        while queue and (queue[0][0] < end or (self._demand is None and queue[0][0] == end)):
+            demand, _, doubt = self._mended(WRENCH)
             at, _ = queue.popleft()
-            self._guessed = found == _GUESSED
-            guessed = guessed or (self._guessed and at < end)
             if self._demand is not None and at > now:
-                pieces.append((now, at, self._act(now, at - now)))
+                pieces.append((now, at, self._act(now, at - now), self._doubt))
                 now = at
             elif self._demand is None:
                 start = now = max(at, start)
             if self._demand_time > -math.inf:
                 self._intervals.append(at - self._demand_time)
                 self._follow_period(self._intervals[-1])
-            self._demand, self._demand_time = demand, at
+            self._demand, self._demand_time, self._doubt = demand, at, doubt
             if self.demands is not None:
                 self.demands.append((at, self._demand))
         hold = min(self._hold, LOST * max(self._intervals, default=math.inf))
@@ -544,12 +549,13 @@ class Sampler:
             return None
         acting = self._act(now, end - now)
         if not pieces:
-            return acting, _ZERO_WRENCH, guessed
-        pieces.append((now, end, acting))
+            return acting, _ZERO_WRENCH, self._doubt
+        pieces.append((now, end, acting, self._doubt))
         length, middle = end - start, 0.5 * (start + end)
-        mean, slope = np.zeros(6), np.zeros(6)
-        for begin, stop, wrench in pieces:
+        mean, slope, doubtful = np.zeros(6), np.zeros(6), np.zeros(6)
+        for begin, stop, wrench, doubt in pieces:
             share = (stop - begin) / length
+            doubtful += share * doubt
             _add_piece(
                 share,
                 12.0 * share * (0.5 * (begin + stop) - middle) / length**2,
@@ -557,7 +563,7 @@ class Sampler:
                 mean,
                 slope,
             )
-        return mean, slope, guessed
+        return mean, slope, doubtful
 
     def _follow_period(self, interval: float) -> None:
         """The usual time between demands, of which a gap is no part."""
@@ -676,40 +682,58 @@ def _average(ratio, i, surprise):
     ratio[i] += 0.05 * (min(surprise, 1e3) - ratio[i])
 
 
-_SOUND, _MENDED, _GUESSED = range(3)
-
-
 @kernel
-def mend(before, here, after, last, scatter, floor, still, coarse, gross, gate):
+def mend(
+    former, earlier, before, here, after, last, doubt, scatter, floor, still, coarse, gross, gate
+):  # fmt: skip
     """Mend the numbers (n,) that jump there and back between messages by more than is usual.
 
     Back it may be only with the ``last`` message. A step, or a ramp, goes there and does not come
-    back; and what is there again two messages on is not lone, whatever stands between. What is,
-    becomes what was before. Where that does not come again either, what is demanded has turned;
-    but if the jump is ``gross`` (n,) a step was at the outlier or right behind it, nobody knows
-    which. _GUESSED, else _MENDED, or _SOUND.
+    back; and what had come two messages before (``former``) and comes again two on is not lone,
+    whatever stands between. What is, becomes what was before. Where that does not come again
+    either, what is demanded has turned; but if the jump is ``gross`` (n,) a step was at the outlier
+    or right behind it, nobody knows which.
+
+    Whether there was one; ``doubt`` (n,) is left with the square of what a number may be off by.
+    Not only those are in doubt: what stands between two calm levels and belongs to neither is a
+    step on its way, or an outlier at its place; and what comes again two messages on may be the
+    first of a demand that alternates.
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
     ``floor`` (n,), and less than ``coarse`` of the number itself, is always usual; ``still`` (n,)
     stands for the floor of a number that is exactly the same before and after.
     """
-    found = _SOUND
+    found = False
     for i in range(len(here)):
         there, back, later = here[i] - before[i], after[i] - here[i], last[i] - here[i]
+        turn = before[i] - earlier[i]
+        step = min(there * there, back * back)
+        comes_again, came_before = later * later, (here[i] - former[i]) ** 2
         jump = 0.0
         if there * back < 0.0 or there * later < 0.0:
-            jump = min(there * there, back * back, later * later)
-        constant = before[i] == after[i] and after[i] == last[i]
+            jump = min(step, max(comes_again, came_before))
+        constant = turn == 0.0 and (before[i] == after[i] or before[i] == last[i])
         least = still[i] if constant else floor[i]
         usual = max(least, coarse * min(abs(before[i]), abs(after[i])))
         most = gate * gate * max(scatter[i], usual * usual)
         again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
+        doubt[i] = 0.0
         if jump > most and (again or jump > gross[i] * gross[i]):
             scatter[i] *= 1.05  # the usual may have changed
-            found = max(found, _MENDED if again else _GUESSED)
+            found = True
+            if not again:
+                doubt[i] = 0.25 * (last[i] - before[i]) ** 2
+            elif comes_again <= most:
+                doubt[i] = there * there
             here[i] = before[i] if again else 0.5 * (before[i] + last[i])
-        else:
-            scatter[i] += 0.02 * (min(jump, most) - scatter[i])
+            continue
+        scatter[i] += 0.02 * (min(jump, most) - scatter[i])
+        around = turn * turn  # of what does not come back at once, on both sides
+        if there * back > 0.0:
+            around = max(around, (last[i] - after[i]) ** 2)
+        calm = max(gate * gate * max(scatter[i], still[i] ** 2), _CALM * _CALM * around)
+        if min(step, came_before) > calm:
+            doubt[i] = 0.5 * (there * there + back * back)
     return found
 
 

@@ -57,8 +57,8 @@ from rov_ident.recursion import (
     LIGHTEST,
     RELEARNING_TIME,
     add_score,
+    add_surprise,
     begin,
-    blend_of,
     copy,
     steps_of,
 )
@@ -509,7 +509,7 @@ def _collect(task, state, work, sample):
     s, c = work.scratch[0], task.settings[0]
     x, p, root, plus, minus = state.x, work.p, work.root, work.moved[0], work.moved[1]
     size, columns = p.shape
-    wrench_noise(task.process[0], sample, s.strength)
+    doubtful = wrench_noise(task.process[0], sample, s.strength)
     speed = 0.0
     for i in range(6):
         total = 0.0
@@ -530,7 +530,8 @@ def _collect(task, state, work, sample):
             noise = state.adaptation[i].density if i == j else 0.0
             for a in range(6):
                 noise += s.centre_inverse[i, a] * s.centre_inverse[j, a] * s.strength[a]
-            state.adaptation[i].acting = noise  # the last one stays: of the axis itself
+            # the last one stays: of the axis itself
+            state.adaptation[i].acting = 0.0 if doubtful else noise
             total = c.weight * total + c.centre * s.shift[i] * s.shift[j] + noise * sample.dt
             p[i, j] = total
             p[j, i] = total
@@ -675,13 +676,13 @@ def _update(task, state, work, sample, side, out):
             innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
             out.ratio[i] = innovation**2
             worst = max(worst, out.ratio[i])
-            blend = blend_of(state.adaptation[i].since)
+            since = state.adaptation[i].since
             if moving == 0:  # on the ground, on deck: what holds it there says nothing of the dive
                 interrupt(state.adaptation[i])
-                c.surprise[i] += blend * (1.0 - c.surprise[i])
+                add_surprise(c.surprise, i, 1.0, since)
                 continue
-            c.surprise[i] += blend * (min(out.ratio[i], s.gate**2) - c.surprise[i])
-            adapt(state.adaptation[i], task.process[0].floor[i], _ROOM, innovation)
+            add_surprise(c.surprise, i, out.ratio[i], since)
+            adapt(state.adaptation[i], task.process[0], i, _ROOM, innovation)
         if worst > s.gate**2:
             out.reason = GATED
             c.refused[first // 3] += 1

@@ -23,9 +23,9 @@ from explain import (
 )
 from hidden import EFFECTS, NESTED, Conditions, draw
 from rov_ident import kinematics
-from rov_ident.discrepancy import pinned
+from rov_ident.discrepancy import Search, pinned
 from rov_ident.errors import UserError
-from rov_ident.explain import explain, from_the_start, gain_of, thinned, whole
+from rov_ident.explain import but_best, explain, from_the_start, gain_of, split, thinned, whole
 from rov_ident.findings import Finding, Gain, Value
 from rov_ident.scores import _own
 from rov_ident.streams import gather
@@ -219,6 +219,62 @@ def test_coloured_noise_of_a_velocity_is_not_taken_for_a_scale(imu_rate):
 )
 def test_an_effect_at_the_end_of_its_range_is_known(key, value, std, is_pinned):
     assert pinned(key, value, std) is is_pinned
+
+
+@pytest.fixture(scope="module")
+def fitted(dive):
+    messages, config = dive
+    streams = gather(messages, config)
+    search = Search(streams, config, split(streams.duration)[0])
+    return search, search.evidence.fit(search.given)
+
+
+def test_what_a_model_keeps_follows_what_leaves_it(fitted):
+    """Without heave's quadratic drag the linear one has to do its work, from the first look on."""
+    search, start = fitted
+    less = start.hypothesis.having({("coefficients", "Z_ww"): 0.0})
+    at_once = search.evidence.fit(less, start.look, iterations=0).rss
+    as_it_was = search.evidence.look(less, start.look.starts, start.noise).linear.rss.sum()
+    assert start.rss < at_once < start.rss + 0.3 * (as_it_was - start.rss)
+
+
+def test_a_window_that_is_lost_costs_more_than_one_that_fits(fitted):
+    """Most of its rows pass for outliers, which must not make it cheap."""
+    search, start = fitted
+    starts = start.look.starts.copy()
+    starts[3] += 3.0
+    lost = search.evidence.look(start.hypothesis, starts, start.noise)
+    assert lost.linear.count < start.linear.count
+    assert lost.rss > start.rss + 1000.0
+
+
+def test_a_start_that_went_astray_is_as_measured_again(fitted):
+    search, start = fitted
+    starts = start.look.starts.copy()
+    starts[3] += 3.0
+    lost = search.evidence.look(start.hypothesis, starts, start.noise)
+    again = search.evidence.fit(start.hypothesis, lost)
+    assert again.rss < start.rss + 10.0
+
+
+def test_a_failure_at_the_first_moment_is_a_gain(fitted):
+    search, start = fitted
+
+    def failing(onset):
+        values = {("thruster_failure", "gain_Z"): 0.8, ("thruster_failure", "onset"): onset}
+        return search.evidence.fit(start.hypothesis.having(values), start.look, iterations=0)
+
+    assert not search.held(start, failing(0.0))
+    assert search.held(start, failing(20.0))
+
+
+def test_one_window_does_not_make_a_pattern():
+    before = np.random.default_rng(3).uniform(0.9, 1.1, (26, 1))
+    after = 0.99 * before
+    before[7] += 12.0
+    gains = [gain_of(["p"], *pair, 1.0) for pair in ((before, after), but_best(before, after))]
+    assert gains[0].percent > 10.0
+    assert gains[1].percent < 2.0
 
 
 def test_a_noisy_axis_does_not_pass_for_a_cause():

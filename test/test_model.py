@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rov_ident import config
 from rov_ident.coefficients import catalogue
 from rov_ident.errors import UserError
-from rov_ident.model import Model, RigidBody, build, columns, coriolis, current_wrench
+from rov_ident.model import Model, RigidBody, add_current, build, columns, coriolis
 from rov_ident.simulate import simulate
 
 Array = NDArray[np.float64]
@@ -343,13 +343,17 @@ def test_current_is_the_difference_of_fossens_two_equations(nu, water):
     through = coriolis_of(A, relative) @ relative - damping_force(VALUES, relative)[0]
     through = through - A @ nu_c_dot
     size = 400.0 * (1.0 + np.abs(nu).max() + np.abs(water).max()) ** 2
-    found = current_wrench(FULL.structure, FULL.added_mass, FULL.theta, nu, water)
+    found = np.zeros(6)
+    add_current(
+        FULL.structure, FULL.added_mass, FULL.theta, nu, relative, tuple(water.tolist()), found
+    )
     same(found, over_ground - through, np.full(6, size))
 
 
 def test_still_water_does_nothing():
     nu = np.random.default_rng(6).normal(size=6)
-    found = current_wrench(FULL.structure, FULL.added_mass, FULL.theta, nu, np.zeros(3))
+    found = np.zeros(6)
+    add_current(FULL.structure, FULL.added_mass, FULL.theta, nu, nu, (0.0, 0.0, 0.0), found)
     np.testing.assert_array_equal(found, 0.0)
 
 

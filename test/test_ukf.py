@@ -12,6 +12,7 @@ from rov_ident import config as configuration
 from rov_ident import ukf
 from rov_ident.estimate import is_passive, physical, prior_of
 from rov_ident.excitation import manoeuvre
+from rov_ident.recursion import SURPRISE_TIME
 from rov_ident.samples import SAMPLE
 
 DT = 0.05
@@ -333,6 +334,22 @@ def test_one_surprised_axis_is_enough_to_learn_anew(heavy, noisy, axis):
     state.scalars["surprise"][0, axis] = 20.0
     surprised, _ = ukf.fold(task, state, noisy[400:410])
     assert (np.diag(surprised.p)[6:] > 1.5 * np.diag(calm.p)[6:]).all()
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_a_surprise_fades_with_time_however_often_the_gyro_speaks(heavy, noisy, every):
+    """Velocities that come with each fifth sample: as long, not five times as long."""
+    task = ukf.problem(heavy)
+    rows = mixed(noisy, every)
+    state, _ = ukf.fold(task, ukf.init(task), rows[:400])
+    state.scalars["surprise"] = 20.0
+    begin = rows["t"][399]
+    later = rows[(rows["t"] > begin) & (rows["t"] <= begin + SURPRISE_TIME)][:]
+    state, _ = ukf.fold(task, state, later)
+    linear, angular = np.split(state.scalars["surprise"][0], 2)
+    expected = 1.0 + 19.0 * np.exp(-1.0)
+    np.testing.assert_allclose(linear, expected, rtol=0.25)
+    np.testing.assert_allclose(angular, expected, rtol=0.25)
 
 
 # ------------------------------------------------------------------ an hour of nothing

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
 from rov_ident.jit import inlined, kernel
-from rov_ident.model import RigidBody, current_wrench
+from rov_ident.model import RigidBody, add_current
 
 EFFECTS: dict[str, Effect] = {
     module.name: import_module(f"{__name__}.{module.name}").EFFECT
@@ -196,13 +196,15 @@ def add_surroundings(acting, structure, added_mass, theta, t, nu, rotation, out)
     if north == 0.0 and east == 0.0 and down == 0.0:
         add_wrenches(acting, t, nu, rotation, out)
     else:
-        water, relative = np.empty(3), nu.copy()
+        water = (
+            rotation[0, 0] * north + rotation[1, 0] * east + rotation[2, 0] * down,
+            rotation[0, 1] * north + rotation[1, 1] * east + rotation[2, 1] * down,
+            rotation[0, 2] * north + rotation[1, 2] * east + rotation[2, 2] * down,
+        )
+        relative = nu.copy()
         for i in range(3):
-            water[i] = rotation[0, i] * north + rotation[1, i] * east + rotation[2, i] * down
             relative[i] -= water[i]
-        more = current_wrench(structure, added_mass, theta, nu, water)
-        for i in range(6):
-            out[i] += more[i]
+        add_current(structure, added_mass, theta, nu, relative, water, out)
         add_wrenches(acting, t, relative, rotation, out)
 
 

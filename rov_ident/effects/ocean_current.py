@@ -1,6 +1,6 @@
 """Water that moves steadily and without rotation; the equations of motion say what that does.
 
-See :func:`rov_ident.model.current_wrench`.
+See :func:`rov_ident.model.add_current`.
 """
 
 import numpy as np

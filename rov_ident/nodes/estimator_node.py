@@ -359,6 +359,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         before, self._stopped = self._stopped, ""
         if self._missing(ODOMETRY) or self._missing(WRENCH):
             self._stopped = "inputs stopped"
+            self._idle = 0.0  # counted from when they are there: their first messages have to wait
         elif self._online.enabled and self._idle > self._config.timeout:
             self._stopped = "no message of the inputs can be used"
         if self._stopped != before:
