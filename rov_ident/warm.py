@@ -7,8 +7,10 @@ same numbers. So one process compiles and ends, and all others read the cache.
 """
 
 import contextlib
+import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numba
@@ -23,12 +25,34 @@ from rov_ident.samples import IMU, ODOMETRY, WRENCH
 def warm_up(config: Config, kind: Kind) -> None:
     """Load all that an estimator runs, compiled by another process if need be."""
     compiled = Path(numba.config.CACHE_DIR) / kind
-    command = [sys.executable, "-m", __name__, kind]
     # Where that fails, what is used compiles itself.
-    if not compiled.exists() and subprocess.run(command, check=False).returncode == 0:
-        with contextlib.suppress(OSError):
-            compiled.touch()
+    if not compiled.exists():
+        with compiler(__name__, kind) as process:
+            failed = process.wait()
+        if not failed:
+            with contextlib.suppress(OSError):
+                compiled.touch()
     _rest(config, kind)
+
+
+def compiler(module: str, *arguments: str) -> subprocess.Popen[bytes]:
+    """A process that runs a module of ours, which calls :func:`end_with_parent`.
+
+    An interrupt is not for it, but for its parent, whose end it does not outlive by a second:
+    however that comes about, the pipe to it is closed.
+    """
+    command = [sys.executable, "-m", module, *arguments]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+
+
+def end_with_parent() -> None:
+    """End this process, whatever it is doing, as soon as its standard input is closed."""
+
+    def listen() -> None:
+        os.read(0, 1)  # not sys.stdin, which an ordinary end would wait for
+        os._exit(1)
+
+    threading.Thread(target=listen, daemon=True).start()
 
 
 def _rest(config: Config, kind: Kind) -> None:
@@ -52,4 +76,5 @@ def any_vehicle() -> Config:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     _rest(any_vehicle(), "ukf" if sys.argv[1:] == ["ukf"] else "rls")

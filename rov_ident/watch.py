@@ -44,7 +44,7 @@ from rov_ident.samples import SAMPLE, joined
 from rov_ident.scores import SURE, inflation
 from rov_ident.shooting import Motion
 from rov_ident.streams import Streams
-from rov_ident.warm import any_vehicle
+from rov_ident.warm import any_vehicle, end_with_parent
 
 WINDOW = 5.0  # s
 MEMORY = 36  # windows
@@ -647,4 +647,5 @@ def _factor(place: int) -> str:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     compile_all()

@@ -317,6 +317,20 @@ def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
     assert "] active" not in said and "Traceback" not in said
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.002, 0.004, 0.5])
+def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, tmp_path, monkeypatch, delay):
+    """Also where it ends while it starts the compiler; who compiles has the same stderr."""
+    monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    for number in (signal.SIGKILL, signal.SIGINT):
+        process = start_node("rls", heavy_path)
+        while "compiling" not in (line := process.stderr.readline()):
+            assert line, "the node ended by itself"
+        time.sleep(delay)
+        _, said = end_node(process, number)
+        assert "Traceback" not in said
+
+
 @pytest.mark.parametrize("estimator", ["rls", "ukf"])
 def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
     """An effect that is configured is estimated; one that is missing is named in /diagnostics."""

@@ -44,7 +44,7 @@ from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
 from rov_ident.online import ESTIMATORS, Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
-from rov_ident.warm import warm_up
+from rov_ident.warm import compiler, warm_up
 
 _OWN_PARAMETERS = ("save_path", "checkpoint_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
@@ -265,7 +265,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         from rov_ident import watch  # here: not needed to begin with
 
         if not watch.is_compiled() and not self._leaving.is_set():
-            self._compiling = subprocess.Popen([sys.executable, "-m", watch.__name__])
+            self._compiling = compiler(watch.__name__)
             if self._leaving.is_set():
                 self._compiling.terminate()
             if self._compiling.wait():
