@@ -3,15 +3,16 @@
 1. The coefficients that the model has are refitted: what that gains is tuning, not physics.
 2. Every effect of the library is scored about that fit, all at once (linear, with the base
    coefficients refitted along); the best few are fitted in full, and the best of them, if it is
-   significant, joins the model. This repeats until nothing is left.
+   significant, joins the model. This repeats until nothing is left, or enough was simulated.
 3. Each named effect is tried against its rivals once more, with the others in place: other effects,
    and patterns of no known cause. What does not earn its place leaves.
 """
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import stdtrit
@@ -26,6 +27,8 @@ from rov_ident.model import Array
 from rov_ident.patterns import Pattern, patterns
 from rov_ident.scores import PRICE, SURE, Scores, inflation, own_inflation, scores_of
 from rov_ident.streams import Streams
+
+T = TypeVar("T")
 
 Progress = Callable[[str], None]
 
@@ -50,6 +53,8 @@ _PATTERN_ROUNDS = 4
 _IMITATION = 0.05  # share of what a named effect explains that a pattern must explain beyond it
 _CLUSTERS = 8  # windows from which their scatter tells anything
 _SHARE = 0.3  # of the best promise: what promises less is not fitted
+_THREADS = 2  # that fit: more would wait for each other, as some of a fit is Python
+_STEPS = 26_000  # simulated for each second of data, after which nothing further is tried
 
 
 @dataclass(frozen=True)
@@ -69,10 +74,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Trial:
-    """A named effect put to the test: the model without it, and with each rival in its stead."""
+    """A named effect put to the test: the model without it, and with each rival in its stead.
+
+    ``rivals`` is None where the search had simulated enough before it came to them.
+    """
 
     rest: Fitted
-    rivals: Mapping[str, Fitted]
+    rivals: Mapping[str, Fitted] | None
 
 
 Trials = dict[str, Trial]
@@ -107,7 +115,26 @@ class Search:
             if p.role == "fixed"
         }
         self.given = Hypothesis(config, base, duration)
+        self._pool = ThreadPoolExecutor(_THREADS, "fit")
+        self.cut_short = False  # whether something was left untried
         self._screened: dict[frozenset[Key], list[Candidate]] = {}
+
+    def _enough(self) -> bool:
+        """Whether so much has been simulated that nothing further is tried; ``cut_short`` from then
+        on.
+
+        It is counted, not timed: a bag gives the same findings however busy the computer is.
+        """
+        self.cut_short = self.evidence.simulated > _STEPS
+        return self.cut_short
+
+    def _each(self, fit: Callable[[T], Fitted | None], of: Iterable[T]) -> list[Fitted | None]:
+        """Fits of several things in threads; an interrupt does not wait for them."""
+        try:
+            return list(self._pool.map(fit, of))
+        except BaseException:
+            self.evidence.stop()
+            raise
 
     # -------------------------------------------------------------- the search
 
@@ -117,7 +144,7 @@ class Search:
         if start is None:
             return []
         path = [start]
-        while len(path) <= _MOST:
+        while len(path) <= _MOST and not self._enough():
             longer = self.longer(path[-1], progress)
             if longer is None:
                 break
@@ -127,11 +154,11 @@ class Search:
     def unexplained(self, final: Fitted) -> list[Fitted]:
         """Fits with what patterns are left, one after the other."""
         found: list[Fitted] = []
-        while len(found) < _MOST_PATTERNS:
+        while len(found) < _MOST_PATTERNS and not (found and self._enough()):
             screened = self.screen_patterns(final)
             if not screened:
                 break
-            tried = (self.fit_pattern(final, *s) for s in screened[:_PATTERNS_TRIED])
+            tried = self.fit_patterns(final, screened[:_PATTERNS_TRIED])
             price = SURE + _choice(self._patterns(final))
             fits = [f for f in tried if f is not None and self.worth(final, f, f) >= price]
             if not fits:
@@ -201,10 +228,10 @@ class Search:
                 rest = self.evidence.fit(self._without(final, name), final.look)
                 if rest is None:
                     continue
-                trials[name] = Trial(rest, self.rivals(rest, name))
+                trials[name] = self._trial(rest, name)
                 better = self._better(final, name, trials[name])
-                if better is not None and last:
-                    better = None  # no end in sight: what is there stays
+                if better is not None and (last or self._enough()):
+                    better = None  # no end in sight, or no time to try it: what is there stays
                 elif better is not None:
                     if progress is not None:
                         progress(f"{name} gives way")
@@ -212,7 +239,7 @@ class Search:
             if better is None:
                 break
             final = self.evidence.fit(better.hypothesis, better.look, update_noise=True) or better
-            final = self.longer(final) or final
+            final = (None if self._enough() else self.longer(final)) or final
         return final, trials
 
     def trials(self, final: Fitted) -> Trials:
@@ -220,9 +247,10 @@ class Search:
         rests = {
             n: self.evidence.fit(self._without(final, n), final.look) for n in self.named(final)
         }
-        return {
-            n: Trial(rest, self.rivals(rest, n)) for n, rest in rests.items() if rest is not None
-        }
+        return {n: self._trial(rest, n) for n, rest in rests.items() if rest is not None}
+
+    def _trial(self, rest: Fitted, name: str) -> Trial:
+        return Trial(rest, None if self._enough() else self.rivals(rest, name))
 
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
         """What should stand in the stead of ``name``, if anything.
@@ -235,7 +263,7 @@ class Search:
         there = self.named(final)
         explained = max(trial.rest.rss - final.rss, 1e-9)
         choices = [trial.rest]
-        for rival, fit in trial.rivals.items():
+        for rival, fit in (trial.rivals or {}).items():
             margin = 0.0
             if rival in EFFECTS and EFFECTS[rival].beyond == name:
                 continue
@@ -263,11 +291,20 @@ class Search:
             and (not self._early(c.name, rest.hypothesis) or EFFECTS[c.name].beyond == name)
         ]
         fits = {self.newest(rest, f): f for f in self.fit_best(rest, candidates)}
-        for candidate, pattern in self.screen_patterns(rest)[:_PATTERNS_TRIED]:
-            fit = self.fit_pattern(rest, candidate, pattern)
+        screened = self.screen_patterns(rest)[:_PATTERNS_TRIED]
+        for (candidate, _), fit in zip(screened, self.fit_patterns(rest, screened), strict=True):
             if fit is not None:
                 fits[candidate.name] = fit
         return fits
+
+    def fit_patterns(
+        self, now: Fitted, screened: Sequence[tuple[Candidate, Pattern]]
+    ) -> list[Fitted | None]:
+        """With each of some patterns."""
+        if any(section == UNKNOWN for section, _ in now.hypothesis.keys):
+            # one that the model has already is brought up to date by what fits it: no two at once
+            return [self.fit_pattern(now, *s) for s in screened]
+        return self._each(lambda s: self.fit_pattern(now, *s), screened)
 
     def fit_pattern(self, now: Fitted, candidate: Candidate, pattern: Pattern) -> Fitted | None:
         """With a pattern; its columns follow the motion that the fit arrives at."""
@@ -306,18 +343,21 @@ class Search:
     def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
         """Full fits of what promises most, and of what every hull has, whatever it promises: a
         model that lacks it can be too far off for a linear view."""
-        fits = []
         least = max(_SHARE * candidates[0].promise, 0.0) if candidates else 0.0
         chosen = [c for c in candidates[:_FITTED] if c.promise >= least]
         hopeful = sorted((c for c in candidates if c.hope > 0.0), key=lambda c: -c.hope)
         chosen += [c for c in hopeful[:_HOPEFUL] if c not in chosen]
-        for candidate in chosen + [c for c in candidates if c.name in PLAIN and c not in chosen]:
-            there = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
-            if there is not None and candidate.name in PLAIN:
-                there = self.pruned(there, now)
-            if there is not None and there.hypothesis.keys != now.hypothesis.keys:
-                fits.append(self.evidence.dated(there, candidate.start))
-        return fits
+        chosen += [c for c in candidates if c.name in PLAIN and c not in chosen]
+        fits = self._each(lambda c: self._fit_candidate(now, c), chosen)
+        return [f for f in fits if f is not None]
+
+    def _fit_candidate(self, now: Fitted, candidate: Candidate) -> Fitted | None:
+        there = self.evidence.fit(now.hypothesis.having(candidate.start), now.look)
+        if there is not None and candidate.name in PLAIN:
+            there = self.pruned(there, now)
+        if there is None or there.hypothesis.keys == now.hypothesis.keys:
+            return None
+        return self.evidence.dated(there, candidate.start)
 
     def pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
         """Without the parameters beyond ``base`` that are not worth their price."""

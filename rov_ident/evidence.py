@@ -7,8 +7,11 @@
 
 import contextlib
 import itertools
+import threading
 from collections.abc import Container, Iterable, Mapping, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +42,7 @@ from rov_ident.shooting import (
     guided_by,
     regressors,
     shoot,
+    start_tangent,
     tangent,
     thrust,
     wrenches,
@@ -56,6 +60,7 @@ _SHOWS = 4.0  # scaled squared residuals by which an onset is too far off: two s
 _FARTHEST = 30.0  # s; an onset less certain than that is not known at all
 _ASTRAY = 2.0  # times the squared residuals that were foretold: not as foretold
 _LOST = 10.0  # standard deviations of a start from what was measured there
+_RATE = 50.0  # Hz; what is measured more often may take longer
 _OUTLIER = 8.0  # robust standard deviations
 
 
@@ -78,6 +83,14 @@ class Linear:
         return np.array([place[key] for key in keys], dtype=np.int64)
 
 
+class Sensitivities(NamedTuple):
+    """How a look changes with the parameters of its hypothesis."""
+
+    starts: Sequence[Array]  # of each window (6, P): what the start makes up for
+    columns: Array  # (6 N, P), the starts eliminated
+    linear: Linear
+
+
 class Look:
     """A hypothesis simulated through all windows: residuals and sensitivities."""
 
@@ -92,22 +105,41 @@ class Look:
         self._weight[:, evidence.guided] = 0.0
         error = error * (self._weight > 0.0)
         self._rows = np.flatnonzero(np.diff(evidence.window, prepend=-1))  # first of each window
-        own = evidence.columns(h, motion, h.keys)
-        j, j0 = tangent(motion, evidence.first, evidence.last, own, evidence.nodes)
+        j0 = start_tangent(motion, evidence.first, evidence.last, evidence.nodes)
         j0 = j0[:, :, ~evidence.guided] * self._weight[:, :, None]
         self._q, self._r = [], []
         for a, b in self._spans():
             q, r = np.linalg.qr(j0[a:b].reshape(6 * (b - a), -1))
             self._q.append(q)
             self._r.append(r)
-        raw = (j * self._weight[:, :, None]).reshape(-1, len(h.keys))
         self._starting = [
-            (q.T @ raw[6 * a : 6 * b], q.T @ error[a:b].ravel())
-            for q, (a, b) in zip(self._q, self._spans(), strict=True)
+            q.T @ error[a:b].ravel() for q, (a, b) in zip(self._q, self._spans(), strict=True)
         ]
-        self.columns = self._projected(raw)
         self.error = self._projected(error.reshape(-1, 1))[:, 0]
-        self.linear = self._linear(h.keys, self.columns)
+        self._squares = np.add.reduceat(self.error**2, self.first)
+        self._sensitivities: Sensitivities | None = None
+
+    def linearised(self) -> "Sensitivities":
+        """Computed when first asked for: of a trial that is no better only the residuals count.
+
+        Not a cached_property, for which all threads wait for each other under Python 3.11.
+        """
+        if self._sensitivities is None:
+            keys = self.hypothesis.keys
+            raw = self._sensed(self.evidence.columns(self.hypothesis, self.motion, keys))
+            spans = zip(self._q, self._spans(), strict=True)
+            starts = [q.T @ raw[6 * a : 6 * b] for q, (a, b) in spans]
+            columns = self._projected(raw)
+            self._sensitivities = Sensitivities(starts, columns, self._linear(keys, columns))
+        return self._sensitivities
+
+    @property
+    def columns(self) -> Array:
+        return self.linearised().columns
+
+    @property
+    def linear(self) -> Linear:
+        return self.linearised().linear
 
     @property
     def rss(self) -> float:
@@ -116,7 +148,7 @@ class Look:
         If they counted nothing, a fit could do better by losing a window.
         """
         out = np.count_nonzero(self._weight[:, ~self.evidence.guided] == 0.0)
-        return float(self.linear.rss.sum() + _OUTLIER**2 * out)
+        return float(self._squares.sum() + _OUTLIER**2 * out)
 
     def _spans(self) -> Iterable[tuple[int, int]]:
         edges = [*self._rows.tolist(), len(self.evidence.nodes)]
@@ -139,15 +171,19 @@ class Look:
             tuple(keys),
             columns.T @ columns,
             np.add.reduceat(columns * self.error[:, None], self.first),
-            np.add.reduceat(self.error**2, self.first),
+            self._squares,
             int(np.count_nonzero(self._weight)) - 6 * len(self.first),
         )
 
     def of(self, force: Array) -> Array:
         """Sensitivities (6 N, C) of the residuals to wrenches (K, 6, C)."""
+        return self._projected(self._sensed(force))
+
+    def _sensed(self, force: Array) -> Array:
+        """The same (6 N, C) from a start that does not give."""
         e = self.evidence
-        j, _ = tangent(self.motion, e.first, e.last, force, e.nodes)
-        return self._projected((j * self._weight[:, :, None]).reshape(-1, force.shape[2]))
+        j = tangent(self.motion, e.first, e.last, force, e.nodes)
+        return (j * self._weight[:, :, None]).reshape(-1, force.shape[2])
 
     def having(self, keys: Sequence[Key], columns: Array) -> Linear:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
@@ -184,10 +220,8 @@ class Look:
 
     def starts_after(self, change: Array) -> Array:
         """The starts (W, 6) that suit a change (P,) of the parameters."""
-        moves = [
-            np.linalg.solve(r, e - a @ change)
-            for r, (a, e) in zip(self._r, self._starting, strict=True)
-        ]
+        parts = zip(self._r, self._starting, self.linearised().starts, strict=True)
+        moves = [np.linalg.solve(r, e - a @ change) for r, e, a in parts]
         starts = self.starts.copy()
         starts[:, ~self.evidence.guided] += moves
         return starts
@@ -244,6 +278,9 @@ class Fitted:
     hypothesis: Hypothesis
     look: Look
     converged: bool
+
+    def __post_init__(self) -> None:
+        self.look.linearised()  # before a pattern is brought up to date
 
     @property
     def linear(self) -> Linear:
@@ -307,8 +344,11 @@ class Evidence:
         self.measured = streams.nu[keep][inside]
         self.times = t[inside]
         self.patterns: dict[Key, Array] = {}  # wrenches (K, 6) of no known cause, by key
+        self._looks = 0  # simulations of all windows so far
+        self._stopped = False
         self._thrusts: dict[object, Array] = {}
-        self._remembered: tuple[Array | None, dict[object, Array]] = (None, {})
+        self._remembered = threading.local()  # wrenches along a motion
+        self._counting = threading.Lock()
 
     def _given(self, nodes: Array) -> Array:
         """Accelerations (K, 6) of the guided axes, from each node to the next."""
@@ -323,15 +363,27 @@ class Evidence:
         at, nu = self.streams.t[good], self.streams.nu[good]
         return np.stack([np.interp(t, at, x) for x in nu.T], axis=1)
 
+    @property
+    def simulated(self) -> float:
+        """Steps simulated so far for each second of data, of which a look counts _RATE at most."""
+        t, first, last = self.steps.t, self.first, self.last
+        rate = float(np.sum(last - first) / np.sum(t[last] - t[first]))
+        return self._looks * min(rate, _RATE)
+
+    def stop(self) -> None:
+        """No thread simulates any longer: what it is at ends by a CancelledError."""
+        self._stopped = True
+
     def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
         inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
         key = tuple(sorted(inputs.items()))
-        if key not in self._thrusts:
+        known = self._thrusts.get(key)
+        if known is None:
             if len(self._thrusts) > 64:
-                self._thrusts.clear()
-            self._thrusts[key] = thrust(self.steps, compiled(effects))
-        return self._thrusts[key]
+                self._thrusts = {}
+            known = self._thrusts[key] = thrust(self.steps, compiled(effects))
+        return known
 
     def look(self, h: Hypothesis, starts: Array, noise: Array) -> Look | None:
         """Simulate; None where that diverges, or the masses are none."""
@@ -342,6 +394,10 @@ class Evidence:
         for key, value in h.values.items():
             if key in self.patterns:
                 wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
+        if self._stopped:
+            raise CancelledError
+        with self._counting:
+            self._looks += 1
         motion = shoot(
             guided_by(h.equations, self.guided), self.steps, wrench, self.first, self.last, starts
         )
@@ -400,9 +456,10 @@ class Evidence:
         """Wrench effects and current (K, 6) along a motion; the last few are remembered."""
         acting = compiled(effects)
         key = (acting.wrench_parameters.tobytes(), acting.water.tobytes())
-        if self._remembered[0] is not motion.middle:
-            self._remembered = motion.middle, {}
-        known = self._remembered[1]
+        mine = self._remembered
+        if getattr(mine, "along", None) is not motion.middle:
+            mine.along, mine.wrenches = motion.middle, {}
+        known: dict[object, Array] = mine.wrenches
         if key not in known:
             known[key] = wrenches(h.equations._replace(acting=acting), self.steps, motion)
         return known[key]

@@ -54,6 +54,10 @@ _AS_WELL = "fits this bag as well"
 _ENOUGH = 600.0  # s; of data to fit
 _LIMIT = 3.0  # a simulation further off than so many standard deviations of the motion has failed
 
+CUT_SHORT = (
+    "the search was cut short after as much simulation as it may take: not all further effects, or "
+    "rivals of those found, were tried; a configuration that fits better (rov-ident fit) helps"
+)
 _NO_TORQUE = (
     "the wrench of these bags never holds a moment: how the vehicle turns is taken from the "
     "measurement, not simulated, and nothing is said about it"
@@ -207,7 +211,9 @@ def explain(
             ("extended", final.hypothesis),
         )
     }
-    notes = (*streams.notes, *((_NO_TORQUE,) if streams.guided.any() else ()))
+    notes = [*streams.notes]
+    notes += [_NO_TORQUE] if streams.guided.any() else []
+    notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
     return Explanation(
         Findings(
@@ -219,7 +225,7 @@ def explain(
             tuple(residual),
             judge.rmse(final.hypothesis),
             verdict,
-            notes,
+            tuple(notes),
         ),
         extended,
         evidence.times,
@@ -489,8 +495,8 @@ def _finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Tria
     gain = judge.gain(trial.rest.hypothesis, final.hypothesis, beside, axes)
     best = search.cost(final, final)
     explained = trial.rest.rss - final.rss
-    alternatives, separable = [], True
-    for rival, fitted in trial.rivals.items():
+    alternatives, separable = [], trial.rivals is not None
+    for rival, fitted in (trial.rivals or {}).items():
         if rival.startswith(UNKNOWN):
             separable = separable and search.cost(fitted, final) > best - SURE
             continue

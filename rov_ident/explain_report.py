@@ -152,8 +152,9 @@ def brief(finding: Finding) -> str:
         for name, v in finding.parameters.items()
         if name in told
     ]
-    others = listed([called(a.effect) for a in finding.alternatives]) or "others"
-    doubt = "" if finding.separable else f"; this run cannot tell it from {others}"
+    others = listed([called(a.effect) for a in finding.alternatives])
+    doubt = f"this run cannot tell it from {others}" if others else "not surely told from all else"
+    doubt = "" if finding.separable else f"; {doubt}"
     return f"{called(finding.effect)} ({', '.join(values)}{doubt})"
 
 
@@ -502,12 +503,11 @@ def _card(finding: Finding) -> str:
         heard = "Why nothing else" if finding.separable else "What else it may be"
         parts += [report.paragraph(f"{heard}:"), report.bullets(tried)]
     if not finding.separable:
-        parts.append(
-            report.paragraph(
-                "This bag cannot tell them apart. The run that would: "
-                f"{finding.manoeuvre or effect.manoeuvre}."
-            )
-        )
+        why = "This bag cannot tell them apart."
+        if not finding.alternatives:
+            why = "What else might do the same has no name, or was not all tried (see the notes)."
+        run = finding.manoeuvre or effect.manoeuvre
+        parts.append(report.paragraph(f"{why} The run that would tell: {run}."))
     return report.card(name[0].upper() + name[1:], parts)
 
 

@@ -46,8 +46,9 @@ class Alternative:
 class Finding:
     """One effect that the simulation lacks.
 
-    ``separable`` is False where the bag cannot tell it from its ``alternatives``; ``manoeuvre`` is
-    then the run that would. ``onset_s``: seconds from the first message, for what begins at a time.
+    ``separable`` is False where the bag cannot tell it from its ``alternatives``, from what has no
+    name, or from what was not tried; ``manoeuvre`` is then the run that would. ``onset_s``: seconds
+    from the first message, for what begins at a time.
     """
 
     effect: str

@@ -53,6 +53,15 @@ def kernel(function: F) -> F:
     return compiled
 
 
+def released(function: F) -> F:
+    """Like :func:`kernel`, without Python's lock, so that other threads go on meanwhile.
+
+    For what runs for a millisecond: to give the lock away and take it again takes microseconds.
+    """
+    compiled: F = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
+    return compiled
+
+
 def inner(function: F) -> F:
     """Like :func:`kernel`, for calls from kernels only: compiled in two thirds of the time."""
     compiled: F = numba.njit(error_model="numpy", **_INNER)(function)

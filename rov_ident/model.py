@@ -412,14 +412,14 @@ def coriolis(p, nu):
     return np.array(coriolis_of(six(p.reshape(6, 1), 0), six(nu.reshape(6, 1), 0)))
 
 
-@kernel
+@inlined
 def add_current(structure, added_mass, theta, nu, relative, water, out):
     """Add to out (6,) what steadily moving water adds to the thruster wrench in still water.
 
-    ``added_mass`` (6, 6), ``theta`` (n,), ``nu`` (6,) over ground and ``relative`` (6,) through
-    the water, whose velocity in body axes [m/s] is ``water``, a tuple of three: irrotational and
-    constant in the world. The hydrodynamic forces are those of the velocity through the water
-    ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
+    ``added_mass`` (6, 6, 1), ``theta`` (n, 1), ``nu`` (6,) over ground and ``relative`` (6,)
+    through the water, whose velocity in body axes [m/s] is ``water``, a tuple of three:
+    irrotational and constant in the world. The hydrodynamic forces are those of the velocity
+    through the water ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
 
         M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r - d(nu_r) + g = tau
         nu_c = [water; 0],   nu_c_dot = [-omega x water; 0]
@@ -428,11 +428,13 @@ def add_current(structure, added_mass, theta, nu, relative, water, out):
     ``M_A nu_c_dot + (C_A(nu) nu - d(nu)) - (C_A(nu_r) nu_r - d(nu_r))``.
     """
     # one array for all: each that is made here takes as long as the forces themselves
-    work = np.empty((12 + EXTENDED_SIZE, 1))
-    h, through_water, extended = work[:6], work[6:12], work[12:]
-    mass, column = added_mass.reshape(6, 6, 1), theta.reshape(-1, 1)
-    generalized_force(1, structure, mass, column, nu.reshape(6, 1), h, extended)
-    generalized_force(1, structure, mass, column, relative.reshape(6, 1), through_water, extended)
+    work = np.empty((24 + EXTENDED_SIZE, 1))
+    h, through_water, extended = work[:6], work[6:12], work[24:]
+    over_ground, over_water = work[12:18], work[18:24]
+    for i in range(6):
+        over_ground[i, 0], over_water[i, 0] = nu[i], relative[i]
+    generalized_force(1, structure, added_mass, theta, over_ground, h, extended)
+    generalized_force(1, structure, added_mass, theta, over_water, through_water, extended)
     turning = (
         nu[5] * water[1] - nu[4] * water[2],
         nu[3] * water[2] - nu[5] * water[0],
@@ -441,7 +443,7 @@ def add_current(structure, added_mass, theta, nu, relative, water, out):
     for i in range(6):
         out[i] += h[i, 0] - through_water[i, 0]
         for j in range(3):
-            out[i] += added_mass[i, j] * turning[j]
+            out[i] += added_mass[i, j, 0] * turning[j]
 
 
 @kernel

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
-from rov_ident.effects import Acting, act, add_surroundings, has_surroundings, memory
-from rov_ident.jit import inner, kernel
+from rov_ident.effects import Acting, add_surroundings, input_effects, let_act, memory, surroundings
+from rov_ident.jit import inner, released
 from rov_ident.model import (
     NODES,
     Array,
@@ -49,13 +49,13 @@ class Steps(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """The equations of motion as the kernels take them."""
+    """The equations of motion, their numbers as the kernels take them."""
 
     structure: Structure
     mass: Array  # (6, 6, 1)
-    added: Array  # (6, 6)
+    added: Array  # (6, 6, 1)
     inverse: Array  # (6, 6); zeros in the rows and columns of axes that are guided
-    theta: Array  # (n,)
+    theta: Array  # (n, 1)
     restoring: Array  # (6, 3)
     acting: Acting
 
@@ -75,9 +75,9 @@ def equations(model: Model, acting: Acting) -> Equations:
     return Equations(
         model.structure,
         np.ascontiguousarray(mass[:, :, None]),
-        np.ascontiguousarray(mass - model.body.mass_matrix),
+        np.ascontiguousarray((mass - model.body.mass_matrix)[:, :, None]),
         np.asarray(np.linalg.inv(mass), dtype=np.float64),
-        np.ascontiguousarray(model.theta),
+        np.ascontiguousarray(model.theta[:, None]),
         model.body.restoring,
         acting,
     )
@@ -97,7 +97,7 @@ def thrust(steps: Steps, acting: Acting) -> Array:
     """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
     wrench = steps.demand.copy()
     if acting.inputs.any():
-        _thrust(acting, memory(), steps.piece_t, wrench)
+        _thrust(*input_effects(acting), memory(), steps.piece_t, wrench)
     share = np.diff(steps.piece_t)[:, None] * wrench
     length = np.diff(steps.t)[:, None]
     mean = np.add.reduceat(share, steps.piece) / length
@@ -121,23 +121,26 @@ def shoot(
         np.zeros((k, 6, 6)),
         np.zeros((k, 6, 6)),
     )
-    acting = eq.acting if has_surroundings(eq.acting) else None
     _shoot(
-        acting, eq.structure, eq.mass, eq.added, eq.inverse, eq.theta.reshape(-1, 1), eq.restoring,
-        steps, wrench, first, last, start, np.zeros(1, _SCRATCH), motion,
+        *surroundings(eq.acting), eq.structure, eq.mass, eq.added, eq.inverse,
+        eq.theta, eq.restoring, steps, wrench, first, last, start,
+        np.zeros(1, _SCRATCH), motion,
     )  # fmt: skip
     return motion
 
 
-def tangent(
-    motion: Motion, first: Indices, last: Indices, force: Array, nodes: Indices
-) -> tuple[Array, Array]:
-    """Sensitivities at ``nodes`` (N,): (N, 6, P) to each column of wrenches (K, 6, P), and
-    (N, 6, 6) to the start of the window."""
-    p = force.shape[2]
-    out, start = np.zeros((len(nodes), 6, p)), np.zeros((len(nodes), 6, 6))
-    _tangent(motion.phi, motion.gamma, first, last, np.ascontiguousarray(force), nodes, out, start)
-    return out, start
+def tangent(motion: Motion, first: Indices, last: Indices, force: Array, nodes: Indices) -> Array:
+    """Sensitivities (N, 6, P) at ``nodes`` (N,) to each column of wrenches (K, 6, P)."""
+    out = np.zeros((len(nodes), 6, force.shape[2]))
+    _tangent(motion.phi, motion.gamma, first, last, np.ascontiguousarray(force), nodes, out)
+    return out
+
+
+def start_tangent(motion: Motion, first: Indices, last: Indices, nodes: Indices) -> Array:
+    """Sensitivities (N, 6, 6) at ``nodes`` (N,) to the start of the window."""
+    out = np.zeros((len(nodes), 6, 6))
+    _start_tangent(motion.phi, first, last, nodes, out)
+    return out
 
 
 def adjoint(motion: Motion, first: Indices, last: Indices, error: Array, nodes: Indices) -> Array:
@@ -156,27 +159,27 @@ def regressors(eq: Equations, motion: Motion) -> Array:
 
 def wrenches(eq: Equations, steps: Steps, motion: Motion) -> Array:
     """Wrench effects and current (K, 6) along a motion."""
-    out = np.zeros((len(motion.middle), 6))
-    _wrenches(eq, steps, motion.middle, out)
+    out, (around, current) = np.zeros((len(motion.middle), 6)), surroundings(eq.acting)
+    if around is not None:
+        _wrenches(around, current, eq.structure, eq.added, eq.theta, steps, motion.middle, out)
     return out
 
 
 # ------------------------------------------------------------------ kernels
 
 
-@kernel
-def _thrust(acting, state, t, wrench):
+@released
+def _thrust(there, parameters, state, t, wrench):
     for k in range(len(wrench)):
-        act(acting, state, t[k], t[k + 1] - t[k], wrench[k])
+        let_act(there, parameters, state, t[k], t[k + 1] - t[k], wrench[k])
 
 
-@kernel
-def _wrenches(eq, steps, nu, out):
-    acting, structure, added, theta = eq.acting, eq.structure, eq.added, eq.theta
+@released
+def _wrenches(around, current, structure, added, theta, steps, nu, out):
     t, middle = steps.t, steps.middle
     for k in range(len(nu)):
         now = 0.5 * (t[k] + t[k + 1])
-        add_surroundings(acting, structure, added, theta, now, nu[k], middle[k], out[k])
+        add_surroundings(around, current, structure, added, theta, now, nu[k], middle[k], out[k])
 
 
 _LANES = 8  # six axes, none, and one more to fill the vectors
@@ -204,15 +207,14 @@ _SCRATCH = np.dtype(
 
 
 @inner
-def _pace(acting, structure, added, theta, restoring, t, rotation, given, s, out):
+def _pace(around, current, structure, added, theta, restoring, t, rotation, given, s, out):
     """nu_dot (6,) at s.nu into out, ``given`` on guided axes; s.push (6,) is the thrusters'."""
     for i in range(6):
         s.velocity[i] = s.nu[i, 0]
         for j in range(3):
             s.push[i] += restoring[i, j] * rotation[2, j]
-    if acting is not None:  # numba leaves this out where it is None
-        flat = theta.reshape(-1)
-        add_surroundings(acting, structure, added, flat, t, s.velocity, rotation, s.push)
+    if around is not None:  # numba leaves this out where it is None
+        add_surroundings(around, current, structure, added, theta, t, s.velocity, rotation, s.push)
     h = s.h
     generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
     for i in range(6):
@@ -228,7 +230,7 @@ def _pace(acting, structure, added, theta, restoring, t, rotation, given, s, out
 
 
 @inner
-def _differentiate(acting, structure, added, theta, wide, t, rotation, s):
+def _differentiate(around, current, structure, added, theta, wide, t, rotation, s):
     """s.by_velocity (6, 6): the derivative of the wrench on the vehicle by its velocity s.nu.
 
     Lane j is a little faster along axis j, the last one along none; ``wide`` (n, _LANES) is theta
@@ -240,12 +242,13 @@ def _differentiate(acting, structure, added, theta, wide, t, rotation, s):
             nearby[i, k] = s.nu[i, 0]
         nearby[i, i] += _NEARBY
     generalized_force(_LANES, structure, s.nearby_mass, wide, nearby, h, s.nearby_extended)
-    if acting is not None:
-        flat = theta.reshape(-1)
+    if around is not None:
         for k in (0, 1, 2, 3, 4, 5, last):
             for i in range(6):
                 s.velocity[i], s.push[i] = nearby[i, k], 0.0
-            add_surroundings(acting, structure, added, flat, t, s.velocity, rotation, s.push)
+            add_surroundings(
+                around, current, structure, added, theta, t, s.velocity, rotation, s.push
+            )
             for i in range(6):
                 h[i, k] -= s.push[i]
     for i in range(6):
@@ -277,10 +280,10 @@ def _advance(inverse, dt, s, phi, gamma):
     _times(s.square, inverse, dt, gamma)
 
 
-@kernel
+@released
 def _shoot(
-    acting, structure, mass, added, inverse, theta, restoring, steps, wrench, first, last, start,
-    scratch, motion,
+    around, current, structure, mass, added, inverse, theta, restoring, steps, wrench, first, last,
+    start, scratch, motion,
 ):  # fmt: skip
     s = scratch[0]  # the caller's: a record does not keep its array alive
     s.mass[:], s.inverse[:, :, 0] = mass, inverse
@@ -310,8 +313,8 @@ def _shoot(
                 elif stage == 3:
                     rotation = rotations[k + 1]
                 _pace(
-                    acting, structure, added, theta, restoring, t + ahead, rotation, given, s,
-                    slope[stage],
+                    around, current, structure, added, theta, restoring, t + ahead, rotation,
+                    given, s, slope[stage],
                 )  # fmt: skip
             worst = 0.0
             for i in range(6):
@@ -323,32 +326,28 @@ def _shoot(
                 s.push[i] = wrench[0, k, i]
             t += 0.5 * dt
             _pace(
-                acting, structure, added, theta, restoring, t, middles[k], given, s, paces[k]
+                around, current, structure, added, theta, restoring, t, middles[k], given, s,
+                paces[k],
             )  # fmt: skip
-            _differentiate(acting, structure, added, theta, wide, t, middles[k], s)
+            _differentiate(around, current, structure, added, theta, wide, t, middles[k], s)
             _advance(inverse, dt, s, phi[k], gamma[k])
             if not worst < 50.0:  # no vehicle moves so; NaN too
                 reached[k + 1 : last[w] + 1] = np.nan
                 break
 
 
-@kernel
-def _tangent(phi, gamma, first, last, force, nodes, out, start):
+@released
+def _tangent(phi, gamma, first, last, force, nodes, out):
     p = force.shape[2]
     now, new = np.zeros((6, p)), np.zeros((6, p))
-    begin, moved = np.zeros((6, 6)), np.zeros((6, 6))
     n = 0
     for w in range(len(first)):
         now[:] = 0.0
-        for i in range(6):
-            for j in range(6):
-                begin[i, j] = 1.0 if i == j else 0.0
         while n < len(nodes) and nodes[n] < first[w]:
             n += 1
         for k in range(first[w], last[w] + 1):
             if n < len(nodes) and nodes[n] == k:
                 out[n] = now
-                start[n] = begin
                 n += 1
             if k == last[w]:
                 break
@@ -359,11 +358,28 @@ def _tangent(phi, gamma, first, last, force, nodes, out, start):
                     for c in range(p):
                         new[i, c] += f * now[j, c] + g * force[k, j, c]
             now[:] = new
-            _times(phi[k], begin, 1.0, moved)
-            begin[:] = moved
 
 
-@kernel
+@released
+def _start_tangent(phi, first, last, nodes, out):
+    now, new = np.zeros((6, 6)), np.zeros((6, 6))
+    n = 0
+    for w in range(len(first)):
+        for i in range(6):
+            for j in range(6):
+                now[i, j] = 1.0 if i == j else 0.0
+        while n < len(nodes) and nodes[n] < first[w]:
+            n += 1
+        for k in range(first[w], last[w] + 1):
+            if n < len(nodes) and nodes[n] == k:
+                out[n] = now
+                n += 1
+            if k < last[w]:
+                _times(phi[k], now, 1.0, new)
+                now[:] = new
+
+
+@released
 def _adjoint(phi, gamma, first, last, error, nodes, out):
     n = len(nodes) - 1
     for w in range(len(first) - 1, -1, -1):
@@ -378,7 +394,7 @@ def _adjoint(phi, gamma, first, last, error, nodes, out):
                 mu = phi[k - 1].T @ mu
 
 
-@kernel
+@released
 def _regressors(structure, nu, pace, out):
     n = out.shape[2]
     momentum, force, other = np.empty((6, n)), np.empty((6, n)), np.empty((6, n))

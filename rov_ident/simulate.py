@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rov_ident.attitude import rotation, rotation_of
 from rov_ident.coefficients import EXTENDED_SIZE
-from rov_ident.effects import Acting, add_surroundings, has_surroundings
+from rov_ident.effects import Acting, add_surroundings, surroundings
 from rov_ident.errors import UserError
 from rov_ident.jit import inner, kernel
 from rov_ident.model import NODES, Array, Model, generalized_force, six, symmetric_product
@@ -77,9 +77,9 @@ def simulate(
     inverse = np.zeros((6, 6))
     inverse[np.ix_(free, free)] = np.linalg.inv(model.mass_matrix[np.ix_(free, free)])
     done = _simulate(
-        effects if effects is not None and has_surroundings(effects) else None,
+        *((None, None) if effects is None else surroundings(effects)),
         model.structure,
-        model.added_mass,
+        np.ascontiguousarray(model.added_mass[:, :, None]),
         model.mass_matrix,
         inverse,
         model.theta.reshape(-1, 1),
@@ -201,8 +201,8 @@ def _derivative(structure, theta, restoring, guided, s, rate):
 
 @kernel
 def _simulate(
-    acting, structure, added_mass, mass, inverse, theta, restoring, t, wrench, wrench_slope, free,
-    guide, attitude, start, max_step, scratch, out,
+    around, current, structure, added_mass, mass, inverse, theta, restoring, t, wrench,
+    wrench_slope, free, guide, attitude, start, max_step, scratch, out,
 ):  # fmt: skip
     """Classical Runge-Kutta; out (N, 19): position, quaternion, nu, nu_dot.
 
@@ -243,9 +243,9 @@ def _simulate(
                 if len(wrench_slope) > 0:
                     for j in range(6):
                         s.push[j] += (now - 0.5 * span) * wrench_slope[i, j]
-                if acting is not None:  # numba leaves this out where it is None
+                if around is not None:  # numba leaves this out where it is None
                     add_surroundings(
-                        acting, structure, added_mass, theta.reshape(-1), t[i] + now,
+                        around, current, structure, added_mass, theta, t[i] + now,
                         stage[7:13], rotation(stage[3:7]), s.push,
                     )  # fmt: skip
                 _derivative(structure, theta, restoring, guided, s, slope[k])

@@ -38,8 +38,8 @@ def warm_up(config: Config, kind: Kind) -> None:
 def compiler(module: str, *arguments: str) -> subprocess.Popen[bytes]:
     """A process that runs a module of ours, which calls :func:`end_with_parent`.
 
-    An interrupt is not for it, but for its parent, whose end it does not outlive by a second:
-    however that comes about, the pipe to it is closed.
+    An interrupt is not for it, but for its parent, whose end it follows once it has loaded its
+    modules: however that comes about, the pipe to it is closed.
     """
     command = [sys.executable, "-m", module, *arguments]
     return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)

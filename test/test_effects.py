@@ -587,9 +587,10 @@ def test_the_tether_feels_the_water_not_the_ground(heavy):
             "tether_drag": {"k": 10.0, "x": 0.0, "y": 0.0, "z": 0.0},
         }
     )
-    out = np.zeros(6)
+    out, mass, theta = np.zeros(6), model.added_mass[:, :, None], model.theta[:, None]
+    around = effects.surroundings(acting)
     effects.add_surroundings(
-        acting, model.structure, model.added_mass, model.theta, 0.0, np.zeros(6), np.eye(3), out
+        *around, model.structure, mass, theta, 0.0, np.zeros(6), np.eye(3), out
     )
     hull = 13.7 * 0.5 + 141.0 * 0.25
     np.testing.assert_allclose(out, [hull + 10.0 * 0.25, 0, 0, 0, 0, 0], atol=1e-12)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from concurrent.futures import CancelledError
 
 import numpy as np
 import pytest
@@ -21,11 +22,21 @@ from explain import (
     trials,
     wrong,
 )
-from hidden import EFFECTS, NESTED, Conditions, draw
-from rov_ident import kinematics
+from hidden import EFFECTS, NESTED, UNKNOWN, Conditions, draw
+from rov_ident import discrepancy, kinematics
 from rov_ident.discrepancy import Search, pinned
 from rov_ident.errors import UserError
-from rov_ident.explain import but_best, explain, from_the_start, gain_of, split, thinned, whole
+from rov_ident.explain import (
+    CUT_SHORT,
+    but_best,
+    explain,
+    from_the_start,
+    gain_of,
+    split,
+    thinned,
+    whole,
+)
+from rov_ident.explain_report import _card
 from rov_ident.findings import Finding, Gain, Value
 from rov_ident.scores import _own
 from rov_ident.streams import gather
@@ -117,6 +128,67 @@ def test_rotation_is_as_measured_where_no_moment_is_known():
     for rmse in (findings.retuned, findings.extended):
         assert math.isfinite(rmse["u"]) and all(math.isnan(rmse[c]) for c in "pqr")
     assert not any(name[0] in "KMN" for name in findings.changed)
+
+
+def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
+    trial = Trial("a minute", "thruster_lag", 0, "test")
+    there = bag(trial, trial.seed, [STRENGTH])
+    whole = explain([there.streams], there.case.config).findings
+    assert whole.effects[0].separable and CUT_SHORT not in whole.notes
+
+    search = Search(there.streams, there.case.config, split(there.streams.duration)[0])
+    search.evidence.fit(search.given)
+    monkeypatch.setattr(discrepancy, "_STEPS", search.evidence.simulated)  # the first step only
+    findings = explain([there.streams], there.case.config).findings
+    assert [f.effect for f in findings.effects] == ["thruster_lag"]
+    assert not findings.effects[0].separable and findings.effects[0].manoeuvre
+    assert CUT_SHORT in findings.notes
+    assert "not all tried" in _card(findings.effects[0])
+
+
+def test_an_interrupt_does_not_wait_for_the_fits(dive):
+    """All that is under way, and in the queue, is dropped."""
+    messages, config = dive
+    streams = gather(messages, config)
+    search = Search(streams, config, split(streams.duration)[0])
+    start = search.evidence.fit(search.given)
+    candidates = search.screen(start)
+    begun = search.evidence.simulated
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "_fit_candidate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            search.fit_best(start, candidates)
+    assert search.evidence.simulated == begun
+    with pytest.raises(CancelledError):
+        search.evidence.fit(search.given)
+
+
+def test_a_fit_keeps_its_patterns_as_they_were(fitted):
+    search, start = fitted
+    pattern = search._patterns(start)[0]
+    search.adopt(pattern)
+    with_pattern = search.evidence.fit(start.hypothesis.having({pattern.keys[0]: 0.1}), start.look)
+    there = with_pattern.look.columns.copy()
+    search.evidence.patterns[pattern.keys[0]] = 2.0 * search.evidence.patterns[pattern.keys[0]]
+    np.testing.assert_array_equal(with_pattern.look.columns, there)
+
+
+@pytest.mark.parametrize("name", ["unknown", "tether_drag"])
+def test_threads_change_nothing(name, monkeypatch):
+    """Also where patterns, which one search shares, are fitted."""
+    name = next(iter(UNKNOWN)) if name == "unknown" else name
+    trial = Trial("a minute", name, 0, "test")
+    there = bag(trial, trial.seed, [STRENGTH])
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr(discrepancy, "_THREADS", threads)
+        found.append(explain([there.streams], there.case.config).findings)
+    assert found[0] == found[1]
+    assert found[0].effects or found[0].residual
 
 
 def test_what_was_left_out_is_told():

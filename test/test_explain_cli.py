@@ -275,7 +275,7 @@ def test_verdicts_in_words():
     )
     assert told.verdict(findings("explained", [lag, drag, bias])) == (
         "The simulation lacks thruster lag (time constant 0.24 s) and quadratic damping "
-        "(Y_vv -210 N s2/m2; this run cannot tell it from others); the sensors show IMU bias "
+        "(Y_vv -210 N s2/m2; not surely told from all else); the sensors show IMU bias "
         "(ax 0.10 m/s2). The 10 s prediction of surge improves by 50 % with thruster lag, the 10 s "
         "prediction of sway improves by 50 % with quadratic damping and the agreement of the "
         "sensors improves by 50 % with IMU bias."

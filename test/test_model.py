@@ -344,16 +344,16 @@ def test_current_is_the_difference_of_fossens_two_equations(nu, water):
     through = through - A @ nu_c_dot
     size = 400.0 * (1.0 + np.abs(nu).max() + np.abs(water).max()) ** 2
     found = np.zeros(6)
-    add_current(
-        FULL.structure, FULL.added_mass, FULL.theta, nu, relative, tuple(water.tolist()), found
-    )
+    mass, theta = FULL.added_mass[:, :, None], FULL.theta[:, None]
+    add_current(FULL.structure, mass, theta, nu, relative, tuple(water.tolist()), found)
     same(found, over_ground - through, np.full(6, size))
 
 
 def test_still_water_does_nothing():
     nu = np.random.default_rng(6).normal(size=6)
     found = np.zeros(6)
-    add_current(FULL.structure, FULL.added_mass, FULL.theta, nu, nu, (0.0, 0.0, 0.0), found)
+    mass, theta = FULL.added_mass[:, :, None], FULL.theta[:, None]
+    add_current(FULL.structure, mass, theta, nu, nu, (0.0, 0.0, 0.0), found)
     np.testing.assert_array_equal(found, 0.0)
 
 

@@ -327,7 +327,9 @@ def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, tmp_path, 
         while "compiling" not in (line := process.stderr.readline()):
             assert line, "the node ended by itself"
         time.sleep(delay)
+        began = time.monotonic()
         _, said = end_node(process, number)
+        assert time.monotonic() - began < 10.0  # of some thirty
         assert "Traceback" not in said
 
 

@@ -69,7 +69,7 @@ Values = Mapping[str, Mapping[str, float]]
 
 
 class Acting(NamedTuple):
-    """The effects of a configuration that have kernels, as these take them."""
+    """The effects of a configuration that have kernels."""
 
     inputs: NDArray[np.bool_]  # which of the input effects are there
     input_parameters: Array  # (inputs, SIZE)
@@ -163,6 +163,18 @@ def memory() -> Array:
     return np.zeros((len(_INPUT), MEMORY))
 
 
+def input_effects(acting: Acting) -> tuple[tuple[bool, ...], tuple[tuple[float, ...], ...]]:
+    """What :func:`let_act` takes: numbers only, as a kernel counts who holds an array."""
+    parameters = tuple(map(tuple, acting.input_parameters.tolist()))
+    return tuple(acting.inputs.tolist()), parameters
+
+
+@inlined
+def let_act(there, parameters, state, t, dt, wrench):
+    """:func:`act` of those :func:`input_effects`."""
+    _ALL_ACTS(0, there, parameters, state, t, dt, wrench)
+
+
 @kernel
 def act(acting, state, t, dt, wrench):
     """wrench (6,), demanded from t to t + dt, becomes the mean of what acts in that time."""
@@ -179,6 +191,21 @@ def acted(acting, t, demand):
     return out
 
 
+class Surroundings(NamedTuple):
+    """Wrench effects: numbers only, as a kernel counts who holds an array."""
+
+    wrenches: tuple[bool, ...]  # which of the wrench effects are there
+    wrench_parameters: tuple[tuple[float, ...], ...]
+
+
+def surroundings(acting: Acting) -> tuple[Surroundings | None, tuple[float, ...] | None]:
+    """What :func:`add_surroundings` takes; None where that adds nothing."""
+    parameters = tuple(map(tuple, acting.wrench_parameters.tolist()))
+    around = Surroundings(tuple(acting.wrenches.tolist()), parameters)
+    water = tuple(acting.water.tolist()) if acting.water.any() else None
+    return around if acting.wrenches.any() or water else None, water
+
+
 @inlined
 def add_wrenches(acting, t, nu, rotation, out):
     """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water."""
@@ -186,16 +213,16 @@ def add_wrenches(acting, t, nu, rotation, out):
 
 
 @inlined
-def add_surroundings(acting, structure, added_mass, theta, t, nu, rotation, out):
+def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotation, out):
     """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground.
 
-    ``structure``, ``added_mass`` (6, 6) and ``theta`` (n,) are those of the model; ``rotation``
-    (3, 3) turns body axes into the world.
+    ``around`` and ``current`` are of :func:`surroundings`; ``structure``, ``added_mass`` (6, 6, 1)
+    and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world.
     """
-    north, east, down = acting.water[0], acting.water[1], acting.water[2]
-    if north == 0.0 and east == 0.0 and down == 0.0:
-        add_wrenches(acting, t, nu, rotation, out)
+    if current is None:  # numba leaves out what is not so
+        add_wrenches(around, t, nu, rotation, out)
     else:
+        north, east, down = current
         water = (
             rotation[0, 0] * north + rotation[1, 0] * east + rotation[2, 0] * down,
             rotation[0, 1] * north + rotation[1, 1] * east + rotation[2, 1] * down,
@@ -205,9 +232,4 @@ def add_surroundings(acting, structure, added_mass, theta, t, nu, rotation, out)
         for i in range(3):
             relative[i] -= water[i]
         add_current(structure, added_mass, theta, nu, relative, water, out)
-        add_wrenches(acting, t, relative, rotation, out)
-
-
-def has_surroundings(acting: Acting) -> bool:
-    """Whether :func:`add_surroundings` adds anything."""
-    return bool(acting.wrenches.any() or acting.water.any())
+        add_wrenches(around, t, relative, rotation, out)

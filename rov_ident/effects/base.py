@@ -10,7 +10,8 @@ An effect says what it does by exactly one of these, each in the file of the eff
     buoyancy).
 ``wrench``
     A kernel ``wrench(p, t, nu, rotation, out)`` that adds to the wrench ``out`` (6,) on the body:
-    ``p`` the parameters in their order (padded to :data:`SIZE`), ``t`` [s] since the first message,
+    ``p`` the parameters in their order (padded to :data:`SIZE`; an array or a tuple, to be read
+    one by one), ``t`` [s] since the first message,
     ``nu`` (6,) body velocities relative to the water, ``rotation`` (3, 3) body -> world (NED).
 ``water``
     ``water(**parameters) -> (3,)``: the velocity of the water in the world [m/s].

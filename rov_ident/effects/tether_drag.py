@@ -5,25 +5,24 @@
 
 import math
 
-import numpy as np
-
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.jit import kernel
 
 
 @kernel
 def wrench(p, t, nu, rotation, out):
-    va, f = np.empty(3), np.empty(3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        va[i] = nu[i] + nu[3 + j] * p[1 + k] - nu[3 + k] * p[1 + j]
-    speed = math.sqrt(va[0] ** 2 + va[1] ** 2 + va[2] ** 2)
-    for i in range(3):
-        f[i] = -p[0] * speed * va[i]
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[i] += f[i]
-        out[3 + i] += p[1 + j] * f[k] - p[1 + k] * f[j]
+    k, x, y, z = p[0], p[1], p[2], p[3]
+    u = nu[0] + nu[4] * z - nu[5] * y
+    v = nu[1] + nu[5] * x - nu[3] * z
+    w = nu[2] + nu[3] * y - nu[4] * x
+    drag = -k * math.sqrt(u**2 + v**2 + w**2)
+    fx, fy, fz = drag * u, drag * v, drag * w
+    out[0] += fx
+    out[1] += fy
+    out[2] += fz
+    out[3] += y * fz - z * fy
+    out[4] += z * fx - x * fz
+    out[5] += x * fy - y * fx
 
 
 EFFECT = Effect(
