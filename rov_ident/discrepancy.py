@@ -29,6 +29,7 @@ from rov_ident.scores import PRICE, SURE, Scores, inflation, own_inflation, scor
 from rov_ident.streams import Streams
 
 T = TypeVar("T")
+R = TypeVar("R")
 
 Progress = Callable[[str], None]
 
@@ -54,7 +55,7 @@ _IMITATION = 0.05  # share of what a named effect explains that a pattern must e
 _CLUSTERS = 8  # windows from which their scatter tells anything
 _SHARE = 0.3  # of the best promise: what promises less is not fitted
 _THREADS = 2  # that fit: more would wait for each other, as some of a fit is Python
-_STEPS = 26_000  # simulated for each second of data, after which nothing further is tried
+_STEPS = 24_000  # simulated for each second of data, after which nothing further is tried
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,11 @@ class Search:
         self.cut_short = self.evidence.simulated > _STEPS
         return self.cut_short
 
-    def _each(self, fit: Callable[[T], Fitted | None], of: Iterable[T]) -> list[Fitted | None]:
-        """Fits of several things in threads; an interrupt does not wait for them."""
+    def _each(self, function: Callable[[T], R], of: Iterable[T]) -> list[R]:
+        """What a function gives for each of several things, in threads, in their order; an
+        interrupt does not wait for their fits."""
         try:
-            return list(self._pool.map(fit, of))
+            return list(self._pool.map(function, of))
         except BaseException:
             self.evidence.stop()
             raise
@@ -244,10 +246,10 @@ class Search:
 
     def trials(self, final: Fitted) -> Trials:
         """Every effect against its rivals, the others in place."""
-        rests = {
-            n: self.evidence.fit(self._without(final, n), final.look) for n in self.named(final)
-        }
-        return {n: self._trial(rest, n) for n, rest in rests.items() if rest is not None}
+        names = self.named(final)
+        rests = self._each(lambda n: self.evidence.fit(self._without(final, n), final.look), names)
+        pairs = zip(names, rests, strict=True)
+        return {n: self._trial(rest, n) for n, rest in pairs if rest is not None}
 
     def _trial(self, rest: Fitted, name: str) -> Trial:
         return Trial(rest, None if self._enough() else self.rivals(rest, name))
@@ -460,17 +462,19 @@ class Search:
             if chosen:
                 start = self._start(dict(zip(chosen, change.tolist(), strict=True)))
                 candidates.append(Candidate(name, start, promise, hope))
-        for effect in EFFECTS.values():
-            roles = {p.role for p in effect.parameters}
-            if effect.name in h.effects:
-                continue
-            if "onset" in roles:
-                candidates += self._beginning(now, effect)
-            elif "place" in roles:
-                candidates += self._attached(now, effect)
-            elif "frequency" in roles:
-                candidates += self._oscillating(now, effect)
+        others = [e for e in EFFECTS.values() if e.name not in h.effects]
+        for found in self._each(lambda effect: self._shaped(now, effect), others):
+            candidates += found
         return sorted(candidates, key=lambda c: (-c.promise, -c.hope))
+
+    def _shaped(self, now: Fitted, effect: Effect) -> list[Candidate]:
+        """An effect with parameters in which nothing is linear: its shape is scanned."""
+        roles = {p.role for p in effect.parameters}
+        if "onset" in roles:
+            return self._beginning(now, effect)
+        if "place" in roles:
+            return self._attached(now, effect)
+        return self._oscillating(now, effect) if "frequency" in roles else []
 
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
         """Parameters of an effect that h lacks, in the groups in which they may join."""
@@ -618,7 +622,8 @@ class Search:
         """
         tried = self._patterns(now)
         price = _choice(tried)
-        ranked = sorted(tried, key=lambda p: -self._reach(now.look, p))
+        reach = self._each(lambda p: self._reach(now.look, p), tried)
+        ranked = [tried[i] for i in np.argsort(-np.array(reach), kind="stable")]
         found = []
         for pattern in ranked[:_SCORED]:
             chosen, start, promise = self._score(now, pattern)
