@@ -131,15 +131,16 @@ def shoot(
 
 def tangent(motion: Motion, first: Indices, last: Indices, force: Array, nodes: Indices) -> Array:
     """Sensitivities (N, 6, P) at ``nodes`` (N,) to each column of wrenches (K, 6, P)."""
-    out = np.zeros((len(nodes), 6, force.shape[2]))
-    _tangent(motion.phi, motion.gamma, first, last, np.ascontiguousarray(force), nodes, out)
+    p, force = force.shape[2], np.ascontiguousarray(force)
+    out = np.zeros((len(nodes), 6, p))
+    _tangent(motion.phi, motion.gamma, first, last, force, np.zeros((6, p)), nodes, out)
     return out
 
 
 def start_tangent(motion: Motion, first: Indices, last: Indices, nodes: Indices) -> Array:
     """Sensitivities (N, 6, 6) at ``nodes`` (N,) to the start of the window."""
     out = np.zeros((len(nodes), 6, 6))
-    _start_tangent(motion.phi, first, last, nodes, out)
+    _tangent(motion.phi, motion.gamma, first, last, None, np.eye(6), nodes, out)
     return out
 
 
@@ -337,12 +338,11 @@ def _shoot(
 
 
 @released
-def _tangent(phi, gamma, first, last, force, nodes, out):
-    p = force.shape[2]
-    now, new = np.zeros((6, p)), np.zeros((6, p))
+def _tangent(phi, gamma, first, last, force, begin, nodes, out):
+    now, new = np.empty(begin.shape), np.empty(begin.shape)
     n = 0
     for w in range(len(first)):
-        now[:] = 0.0
+        now[:] = begin
         while n < len(nodes) and nodes[n] < first[w]:
             n += 1
         for k in range(first[w], last[w] + 1):
@@ -355,28 +355,12 @@ def _tangent(phi, gamma, first, last, force, nodes, out):
             for i in range(6):
                 for j in range(6):
                     f, g = phi[k, i, j], gamma[k, i, j]
-                    for c in range(p):
-                        new[i, c] += f * now[j, c] + g * force[k, j, c]
+                    for c in range(begin.shape[1]):
+                        if force is None:  # numba leaves out what is not so
+                            new[i, c] += f * now[j, c]
+                        else:
+                            new[i, c] += f * now[j, c] + g * force[k, j, c]
             now[:] = new
-
-
-@released
-def _start_tangent(phi, first, last, nodes, out):
-    now, new = np.zeros((6, 6)), np.zeros((6, 6))
-    n = 0
-    for w in range(len(first)):
-        for i in range(6):
-            for j in range(6):
-                now[i, j] = 1.0 if i == j else 0.0
-        while n < len(nodes) and nodes[n] < first[w]:
-            n += 1
-        for k in range(first[w], last[w] + 1):
-            if n < len(nodes) and nodes[n] == k:
-                out[n] = now
-                n += 1
-            if k < last[w]:
-                _times(phi[k], now, 1.0, new)
-                now[:] = new
 
 
 @released
