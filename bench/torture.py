@@ -274,6 +274,36 @@ def spoilt(seed: int, role: str, name: str, index: int, size: float) -> Messages
     return out
 
 
+def firsts(seeds: int, only: str) -> Iterator[Row]:
+    """Of the first three odometry messages some are gross outliers: all that is known of motion."""
+    for name, size in (("linear", 2.0), ("orientation", 1.0)):
+        for wrong in ((0,), (1,), (0, 1), (0, 2)):
+            what = f"{name} of odometry {' and '.join(str(k + 1) for k in wrong)} wrong"
+            if only not in what:
+                continue
+            moved: dict[Kind, list[float]] = {kind: [] for kind in ESTIMATORS}
+            for seed in range(seeds):
+                done = run(started(seed), begun_wrong(seed, name, wrong, size))
+                for kind, values in moved.items():
+                    values.append(shift(done[kind], undisturbed(seed)[kind]))
+            for kind, values in moved.items():
+                yield Row(what, kind, max(values), "sigma", 1.0)
+
+
+def begun_wrong(seed: int, name: str, wrong: tuple[int, ...], size: float) -> Messages:
+    rng, out, count = np.random.default_rng([seed, *wrong]), [], 0
+    for arrival, role, m in dived(seed):
+        if role == ODOMETRY:
+            if count in wrong:
+                values = rng.uniform(-size, size, len(getattr(m, name)))
+                if name == "orientation":
+                    values /= np.linalg.norm(values)
+                m = m._replace(**{name: values})
+            count += 1
+        out.append((arrival, role, m))
+    return out
+
+
 # ------------------------------------------------------------------ garbage
 
 WILD = (
@@ -567,7 +597,9 @@ def still(m: Message, rng: np.random.Generator) -> Message:
     return m._replace(force=np.zeros(3), torque=np.zeros(3))
 
 
-STUDIES = {"faults": faults, "outliers": outliers, "garbage": garbage, "rest": rest}
+STUDIES = {
+    "faults": faults, "outliers": outliers, "firsts": firsts, "garbage": garbage, "rest": rest,
+}  # fmt: skip
 
 
 def main() -> int:

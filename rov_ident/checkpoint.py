@@ -212,7 +212,7 @@ def _bytes(part: NDArray[Any]) -> bytes:
     """Those of its numbers: what lies between the fields of a record may be anything."""
     if part.dtype.names is None:
         return part.tobytes()
-    clean = np.zeros_like(part)
+    clean = np.zeros(part.shape, part.dtype)  # zeros_like leaves what lies between as it is
     for name in part.dtype.names:
         clean[name] = part[name]
     return clean.tobytes()

@@ -16,7 +16,7 @@ from rov_ident.effects import EFFECTS
 from rov_ident.errors import UserError
 from rov_ident.estimate import Estimate, physical, prior_of
 from rov_ident.messages import Array, Message
-from rov_ident.samples import Sampler
+from rov_ident.samples import Sampler, believed
 
 if TYPE_CHECKING:
     from rov_ident.watch import Watcher
@@ -121,6 +121,7 @@ class OnlineEstimator:
             self.sampler.recentre(self.config)
         if self.watcher is not None:
             self.watcher.reset()
+        self._origin = self.memory()
 
     def configure(self, config: Config) -> None:
         """Take other settings of the same model and coefficients; what is learnt stays."""
@@ -165,6 +166,11 @@ class OnlineEstimator:
         """Fold samples (k,) into the estimate unless disabled; INFO (k,)."""
         if len(samples) == 0 or not self._enabled:
             return np.zeros(0, dtype=self._module.INFO)
+        if samples["anew"].any():
+            samples = believed(samples)
+            self._begin_with(self._origin)
+            if self.watcher is not None:
+                self.watcher.reset()
         if self._paused:
             samples = samples.copy()
             samples["restart"][0] = True
@@ -223,13 +229,18 @@ class OnlineEstimator:
         if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
             raise UserError("its numbers are not finite")
         self.reset()
-        self._state, self._recalled = memory.state, memory.stamp
-        self._gained, self._window = memory.gained.copy(), memory.window.copy()
-        self._variance, self._safe = memory.variance, memory.safe
+        self._origin, self._recalled = memory, memory.stamp
+        self._begin_with(memory)
         self.sampler.begin_with(memory.kinematics)
         self._paused = True  # whatever has happened in between
         if self.config.estimate_effects:
             self._recentre()
+
+    def _begin_with(self, memory: Memory) -> None:
+        """Know what is in the memory and nothing else."""
+        self._state, self._centred = memory.state, -math.inf
+        self._gained, self._window = memory.gained.copy(), memory.window.copy()
+        self._variance, self._safe = memory.variance, memory.safe
 
     def _watch(self, elapsed: float) -> None:
         """Information gained per coefficient, in windows of EXCITATION_TIME."""

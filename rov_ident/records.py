@@ -16,7 +16,7 @@ from rov_ident.effects import Acting
 from rov_ident.errors import UserError
 from rov_ident.messages import Array
 from rov_ident.model import Model
-from rov_ident.samples import Sampler, describe, joined
+from rov_ident.samples import Sampler, believed, describe, joined
 from rov_ident.simulate import open_loop
 
 HORIZON = 10.0  # s; of the open-loop windows by which models are judged
@@ -68,7 +68,7 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
     parts.append(sampler.flush())
     if progress is not None:
         progress(total, total)
-    samples = joined(parts)
+    samples = believed(joined(parts))
     counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []

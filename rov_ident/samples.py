@@ -51,6 +51,7 @@ SAMPLE = np.dtype(
         ("t", "f8"),  # s since the first message
         ("dt", "f8"),  # s since the previous sample
         ("restart", "?"),  # the interval before this sample is not known: filters begin anew
+        ("anew", "?"),  # nor is what came before to be believed: what it taught is given up
         ("measured", "?"),  # an odometry message belongs to this sample
         ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
         ("nu", "f8", (6,)),  # m/s, rad/s: through the water
@@ -94,6 +95,8 @@ _COARSE = 0.03  # of the demand itself; of which it may: less would thin the noi
 _MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
 _BRIEF, _LASTING = 0.02, 0.1  # s; what is brief, and what lasts
 _GRID = 1e-4  # m/s; finer numbers than that are not repeated by chance
+_CHANCES = 4  # odometry that is never confirmed within so many is all there is
+_BACK = 0.1  # of a dip's square; what is no further off when it is over was there before it
 _CALM = 3.0  # times as far as its neighbours move is what stands between two calm levels
 _NOTHING = np.zeros(6)
 _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
@@ -106,6 +109,7 @@ _KINEMATICS = np.dtype(
     [
         ("known", "?"),  # an odometry message has been seen since the last restart
         ("inertial", "?"),  # an IMU message has
+        ("chances", "i8"),  # so often may the first odometry of all still be given up
         ("q", "f8", (4,)),
         ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2
@@ -113,6 +117,8 @@ _KINEMATICS = np.dtype(
         ("v", "f8", (3,)),
         ("power", "f8", (6,)),  # of nu, of late
         ("rate", "f8", (3,)),  # rad/s, bias removed
+        ("change", "f8", (3,)),  # rad/s; of that over the last interval
+        ("interval", "f8"),  # s; its length
         ("slow_rate", "f8", (3,)),  # for the angular acceleration of the lever arm
         ("acceleration", "f8", (3,)),  # m/s2 at the origin, body axes
         ("gyro_bias", "f8", (3,)),
@@ -166,6 +172,7 @@ class Sampler:
         self.demands: list[tuple[float, Array]] | None = None
         self._late = 0.0  # s; how long a topic is waited for because it was that late before
         self._clear()
+        self._kinematics["chances"] = _CHANCES
 
     def configure(self, config: Config) -> None:
         """Take other settings; the buffered messages and the motion stay."""
@@ -181,6 +188,8 @@ class Sampler:
             IMU: np.repeat([config.imu.gyro_std, _SHAKE], 3),
             WRENCH: authority(config.dynamics),
         }
+        working = authority(config.dynamics) / np.diag(config.dynamics.mass_matrix)
+        self._agility = np.concatenate([working[3:], working[:3]]) / LONE  # rad/s2, m/s2
 
     def recentre(self, config: Config) -> None:
         """Go on with other values of the effects' parameters; their memory stays."""
@@ -241,6 +250,7 @@ class Sampler:
         self._kinematics = kinematics.copy()
         self._kinematics["known"] = False
         self._kinematics["inertial"] = False
+        self._kinematics["chances"] = _CHANCES
 
     # -------------------------------------------------------------- messages in
 
@@ -426,20 +436,25 @@ class Sampler:
             after = numbers(queue[1][1])
             last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
             floor, coarse, gross = self._floors[role], 0.0, _NOTHING
-            still = floor
+            still, rates, interval = floor, 0, queue[1][0] - queue[0][0]
+            lasts = min(max((interval - _BRIEF) / (_LASTING - _BRIEF), 0.0), 1.0)
             if role == WRENCH:
                 gross = GROSS * floor
-                lasts = (queue[1][0] - queue[0][0] - _BRIEF) / (_LASTING - _BRIEF)
-                lasts = min(max(lasts, 0.0), 1.0)
                 still = (_STILL + lasts * (_MEANT - _STILL)) * floor
                 floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor
                 coarse = _COARSE + lasts * (_MEANT - _COARSE)
+            else:
+                if lasts > 0.0:  # a vehicle, too, is back again if it is given the time
+                    times = [interval, interval, interval, 1.0, 1.0, 1.0]
+                    floor = still = floor + lasts * self._agility * times
+                if len(queue) > 2 and queue[2][0] - queue[0][0] < _LASTING:
+                    rates = 3
             if past is None:  # the first of all may be an outlier like any other
                 doubt = (after - here) ** 2
             else:
                 found = mend(
                     former, earlier, before, here, after, last, doubt,
-                    self._scatter[role], floor, still, coarse, gross, LONE,
+                    self._scatter[role], floor, still, coarse, gross, rates, LONE,
                 )  # fmt: skip
         if found:
             self.counts[f"{role}: outlier between its neighbours"] += 1
@@ -506,6 +521,8 @@ class Sampler:
             repeated = odometry[10] == REPEATED
             why = "velocity repeated" if repeated else "outlier, or marked as not measured"
             self.counts[f"odom: {why}"] += 1
+        if sample["anew"][0]:
+            self.counts["odom: contradicts the first, begun anew"] += 1
         if wrench is None or not known:
             self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
             self._previous = math.nan
@@ -599,6 +616,12 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
     return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=parts[0].dtype)
 
 
+def believed(samples: NDArray[np.void]) -> NDArray[np.void]:
+    """Samples (k,) of SAMPLE without those from before the last one with which all begins anew."""
+    anew = np.flatnonzero(samples["anew"])
+    return samples[anew[-1] :] if len(anew) else samples
+
+
 def sample_type(size: int) -> np.dtype[np.void]:
     """The dtype of samples that know how they change with ``size`` parameters of effects.
 
@@ -684,15 +707,17 @@ def _average(ratio, i, surprise):
 
 @kernel
 def mend(
-    former, earlier, before, here, after, last, doubt, scatter, floor, still, coarse, gross, gate
+    former, earlier, before, here, after, last, doubt, scatter, floor, still, coarse, gross, rates,
+    gate,
 ):  # fmt: skip
     """Mend the numbers (n,) that jump there and back between messages by more than is usual.
 
     Back it may be only with the ``last`` message. A step, or a ramp, goes there and does not come
     back; and what had come two messages before (``former``) and comes again two on is not lone,
-    whatever stands between. What is, becomes what was before. Where that does not come again
-    either, what is demanded has turned; but if the jump is ``gross`` (n,) a step was at the outlier
-    or right behind it, nobody knows which.
+    whatever stands between. The first ``rates`` numbers have inertia: there, two in a row are
+    outliers, too, if what was before comes again. What is one, becomes what was before. Where that
+    does not come again either, what is demanded has turned; but if the jump is ``gross`` (n,) a
+    step was at the outlier or right behind it, nobody knows which.
 
     Whether there was one; ``doubt`` (n,) is left with the square of what a number may be off by.
     Not only those are in doubt: what stands between two calm levels and belongs to neither is a
@@ -717,8 +742,12 @@ def mend(
         usual = max(least, coarse * min(abs(before[i]), abs(after[i])))
         most = gate * gate * max(scatter[i], usual * usual)
         again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
+        returns = last[i] - after[i]
+        dip = min(there * there, returns * returns)
+        comes_back = there * returns < 0.0 and (last[i] - before[i]) ** 2 < _BACK * dip
+        two = i < rates and comes_back and dip > 4.0 * most  # twice as far off as a lone one
         doubt[i] = 0.0
-        if jump > most and (again or jump > gross[i] * gross[i]):
+        if (jump > most and (again or jump > gross[i] * gross[i])) or two:
             scatter[i] *= 1.05  # the usual may have changed
             found = True
             if not again:
@@ -813,7 +842,17 @@ def fuse(
         if has_imu:
             k.attitude_variance += dt * (dt * k.gyro_bias_variance - 2.0 * k.attitude_bias)
             k.attitude_bias -= dt * k.gyro_bias_variance
-    credible = True
+            # A rate that came and went between two messages lasted nobody knows how long.
+            span = dt + k.interval
+            for i in range(3):
+                change = rate[i] - k.rate[i]
+                swing = min(abs(change), abs(k.change[i]))
+                beyond = swing**2 > 4.0 * s.gate**2 * gyro_variance
+                if beyond and change * k.change[i] < 0.0 and span < _LASTING:
+                    k.attitude_variance += (0.5 * span * swing) ** 2
+                k.change[i] = change if k.inertial else 0.0
+            k.interval = dt
+    credible, anew = True, False
     if has_odometry:
         q = turned(odometry[:4] / np.sqrt(np.sum(odometry[:4] ** 2)), rate * shift)
         if not k.known or not k.inertial:
@@ -835,7 +874,12 @@ def fuse(
             _average(k.ratio, _ATTITUDE, surprise)
             # A heading that is set anew is believed when it stays, but it is no bias of the gyro.
             credible = surprise < s.gate**2
-            if credible:
+            if not credible and k.chances > 0:
+                anew = credible = True
+                _set(k.q, q)
+                k.attitude_variance = s.attitude_variance
+                k.attitude_bias = 0.0
+            elif credible:
                 _set(k.q, turned(k.q, gain * e))
                 bias_gain = k.attitude_bias / total
                 for i in range(3):
@@ -911,19 +955,24 @@ def fuse(
                 - (angular[j] * lever[m] - angular[m] * lever[j])
                 + shift * (acceleration[i] + share * (k.acceleration[i] - acceleration[i]))
             )
-        if not k.known or not (has_imu and started):
+        begins = not k.known or not (has_imu and started)
+        total, surprise = k.p_vv + r_linear, 0.0
+        for i in range(3):
+            surprise += (v[i] - k.v[i]) ** 2
+        surprise /= 3.0 * total
+        if not begins and k.chances > 0:
+            # Nobody knows yet which of two that contradict each other is wrong.
+            anew = anew or surprise > s.gate**2
+            if not anew:
+                k.chances = 0
+        if begins or anew:
             _set(k.v, v)
             k.p_vv = r_linear
             k.p_vb = 0.0
             k.p_bb = s.accelerometer_bias_variance
         else:
-            total = k.p_vv + r_linear
-            surprise = 0.0
-            for i in range(3):
-                surprise += (v[i] - k.v[i]) ** 2
             # A filter that refuses for seconds is wrong itself: its variance grows until it agrees,
             # faster than a velocity that has run away can.
-            surprise /= 3.0 * total
             _average(k.ratio, _VELOCITY, surprise)
             taken = surprise <= s.gate**2
             if taken:
@@ -969,6 +1018,11 @@ def fuse(
         for i in range(3):
             out.gyro[i] = rate[i]
             k.acceleration[i] = acceleration[i]
+    if anew:
+        k.chances -= 1
+        out.restart = out.anew = True
+        for i in range(6):
+            k.power[i] = 0.0
     out.measured = taken
     for i in range(3):
         k.rate[i] = rate[i]

@@ -12,7 +12,7 @@ from textbook import with_section
 from rov_ident import sensors
 from rov_ident.frames import from_core, quaternion_to_matrix
 from rov_ident.messages import Imu, Odometry, Wrench
-from rov_ident.samples import IMU, ODOMETRY, SAMPLE, WRENCH, Sampler, describe
+from rov_ident.samples import IMU, ODOMETRY, SAMPLE, WRENCH, Sampler, believed, describe
 
 SECOND = 1_000_000_000
 NOISELESS = sensors.Suite().scaled(0.0)
@@ -653,6 +653,86 @@ def test_velocity_outliers_against_the_imu(heavy):
     assert wild > 2 and sampler.counts["odom: outlier, or marked as not measured"] == wild
     error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
     assert np.abs(error).max() < 0.05
+
+
+BEGUN_ANEW = "odom: contradicts the first, begun anew"
+
+
+@pytest.mark.parametrize("wrong", [(0,), (1,), (0, 1), (0, 2)])
+@pytest.mark.parametrize("field", ["linear", "orientation"])
+def test_odometry_that_begins_with_outliers(heavy, field, wrong):
+    """All begins anew until two messages agree, and what came before is told from the rest."""
+    dive = clean(heavy, 3.0)
+    rng, messages, count = np.random.default_rng([len(field), *wrong]), [], 0
+    for role, m in without_arrival(dive):
+        if role == ODOMETRY:
+            if count in wrong:
+                values = rng.choice([-1.0, 1.0], len(getattr(m, field)))
+                values /= np.linalg.norm(values)
+                m = m._replace(**{field: values})
+            count += 1
+        messages.append((role, m))
+    samples, sampler = taken(heavy, messages)
+    assert sampler.counts[BEGUN_ANEW] == samples["anew"].sum() > 0
+    rest = believed(samples)
+    assert not rest["anew"][1:].any() and rest["restart"][0] and rest["measured"][0]
+    assert rest["t"][0] < samples["t"][0] + 0.2
+    error = rest["nu"] - dive.truth.nu[instants(dive, sampler, rest)]
+    assert np.abs(error).max() < 0.05
+
+
+def test_odometry_that_never_agrees_is_used_all_the_same(heavy):
+    """Far noisier than it is configured to be: nothing else is there to begin with."""
+    dive = clean(heavy, 20.0)
+    rng = np.random.default_rng(6)
+    noisy = [
+        (role, m._replace(linear=m.linear + rng.normal(0.0, 2.0, 3)) if role == ODOMETRY else m)
+        for role, m in without_arrival(dive)
+    ]
+    samples, sampler = taken(heavy, noisy)
+    assert 2 < sampler.counts[BEGUN_ANEW] <= 4
+    assert not samples["anew"][samples["t"] > 0.5].any()
+    assert samples["measured"][samples["t"] > 0.5].sum() > 10
+
+
+def test_a_gap_does_not_undo_what_was_learnt(heavy):
+    """Later on a wrong first message costs a moment of motion, no coefficients."""
+    dive = clean(heavy, 6.0)
+    begin = sensors.START + 3 * SECOND
+    messages = [
+        (role, m) for role, m in without_arrival(dive) if not begin < m.stamp < begin + SECOND
+    ]
+    after = next(i for i, (r, m) in enumerate(messages) if r == ODOMETRY and m.stamp > begin)
+    messages[after] = (ODOMETRY, messages[after][1]._replace(linear=np.ones(3)))
+    samples, sampler = taken(heavy, messages)
+    assert samples["restart"].sum() == 2 and not samples["anew"].any()
+    assert sampler.counts[BEGUN_ANEW] == 0
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 20.0, 30.0, 50.0, 100.0])
+def test_a_slow_imu_is_believed(heavy, rate):
+    """From one of its messages to the next a vehicle turns, and is back with the one after."""
+    dive = sensors.dive(heavy, "steps", 60.0, sensors.Suite(imu_rate=rate), seed=7)
+    _, sampler = taken(heavy, without_arrival(dive))
+    assert sampler.counts["imu: outlier between its neighbours"] <= 0.003 * sampler.counts[IMU]
+
+
+@pytest.mark.parametrize("rate, kept", [(100.0, False), (10.0, True)])
+def test_two_rates_in_a_row_that_no_vehicle_has(heavy, rate, kept):
+    """There and back within 30 ms; at a tenth of a second from one to the next it may be so."""
+    dive = clean(heavy, 6.0, imu_rate=rate)
+    messages, odd = without_arrival(dive), []
+    places = [i for i, (role, _) in enumerate(messages) if role == IMU]
+    for first in (len(places) // 2, len(places) // 3):
+        for place in places[first : first + 2]:
+            m = messages[place][1]
+            rates = m.angular_velocity + [0.9, 0.0, 0.0]
+            messages[place] = (IMU, m._replace(angular_velocity=rates))
+            odd.append(m.stamp)
+    samples, sampler = taken(heavy, messages)
+    there = np.isin(np.rint(samples["t"] * 1e9).astype(int) + sampler.origin, odd)
+    assert there.sum() == (4 if kept else 0)
+    assert sampler.counts["imu: outlier between its neighbours"] == (0 if kept else 4)
 
 
 def pushed(heavy, demands, rate=50.0):

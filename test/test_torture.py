@@ -26,6 +26,14 @@ def test_outliers(channel):
     assert [row for row in rows if not row.met] == []
 
 
+@pytest.mark.parametrize("what", ["linear of odometry 1 wrong", "orientation of odometry 1 and 3"])
+def test_begun_wrong(what):
+    """What a first odometry message taught is given up when the next ones contradict it."""
+    rows = list(torture.firsts(1, what))
+    assert len(rows) == 2
+    assert [row for row in rows if not row.met] == []
+
+
 def test_no_excitation():
     """The covariance stays positive definite and bounded, and what is learnt later is the same."""
     missed = [row for row in torture.rest(1, "at rest", 20_000) if not row.met]
