@@ -242,10 +242,11 @@ def _turned(
             angular=message.angular * FLIP_BODY if turn_body else message.angular,
         )
     if isinstance(message, Imu):
-        message = message._replace(orientation=quaternion_turn.dot(message.orientation))
+        orientation = quaternion_turn.dot(message.orientation)
         if not turn_body:
-            return message
+            return message._replace(orientation=orientation)
         return message._replace(
+            orientation=orientation,
             angular_velocity=message.angular_velocity * FLIP_BODY,
             linear_acceleration=message.linear_acceleration * FLIP_BODY,
         )

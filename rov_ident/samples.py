@@ -153,6 +153,10 @@ _SETTINGS = np.dtype(
 )
 
 
+Waiting = tuple[float, Message, Array]
+"""Time, message, and the :func:`numbers` of an IMU or wrench."""
+
+
 class Sampler:
     """Merges the three topics into samples; the only part of the estimation that waits.
 
@@ -209,11 +213,12 @@ class Sampler:
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
-        self._queues: dict[str, deque[tuple[float, Message]]] = {
+        self._queues: dict[str, deque[Waiting]] = {
             ODOMETRY: deque(),
             IMU: deque(),
             WRENCH: deque(),
         }
+        self._latest = -math.inf  # s; of all topics
         self._newest: dict[str, float] = {}
         self._before_newest: dict[str, float] = {}
         self._first = math.nan
@@ -228,7 +233,7 @@ class Sampler:
         self._period = 0.0  # s; as is usual
         self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
         # the numbers of the last two messages as they came, and of the last two as believed
-        self._past: dict[str, tuple[Array, Array, Array, Array]] = {}
+        self._past: dict[str, Array] = {}
         self._scatter = {role: np.zeros(6) for role in self._floors}
         self._memory = memory()
         if self._sensitivity is not None:
@@ -287,7 +292,7 @@ class Sampler:
         self._suspect.pop(role, None)
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
-            lateness = _LATER * (max(self._newest.values()) - t)
+            lateness = _LATER * (self._latest - t)
             if lateness <= _LATEST:
                 self._late = max(self._late, lateness)
             if role != WRENCH:
@@ -305,9 +310,13 @@ class Sampler:
         self.counts[role] += 1
         self._before_newest[role] = self._newest.get(role, t)
         self._newest[role] = t
+        self._latest = max(self._latest, t)
         if isinstance(message, Odometry):
-            message = self._marked(message)
-        self._queues[role].append((t, to_core(message, self._defaults)))
+            message = to_core(self._marked(message), self._defaults)
+            self._queues[role].append((t, message, _NOTHING))
+        else:
+            message = to_core(message, self._defaults)
+            self._queues[role].append((t, message, numbers(message)))
         if role == WRENCH:
             queue = self._queues[WRENCH]
             while queue[-1][0] - queue[0][0] > _QUEUED:
@@ -327,8 +336,8 @@ class Sampler:
                 variance[:3] = REPEATED
                 return message._replace(twist_variance=variance)
         else:
-            steps = message.linear / _GRID
-            off = bool(np.any(np.abs(steps - np.rint(steps)) > 0.01))
+            steps = [v / _GRID for v in message.linear.tolist()]
+            off = any(abs(step - round(step)) > 0.01 for step in steps)
             self._fine = 20 if off else max(self._fine - 1, 0)
         return message
 
@@ -422,7 +431,7 @@ class Sampler:
 
     def _waited(self, t: float) -> bool:
         """Whether the newest stamp is so far ahead of t that nothing more is waited for."""
-        return max(self._newest.values()) - t > max(self._grace, self._late)
+        return self._latest - t > max(self._grace, self._late)
 
     def _mended(self, role: str) -> tuple[Array, bool, Array]:
         """Numbers (6,) of the next message without its outliers, and what :func:`mend` says.
@@ -430,37 +439,36 @@ class Sampler:
         They are mended, each by itself: a step of another axis is not to come late for them.
         """
         queue, past = self._queues[role], self._past.get(role)
-        here, found, doubt = numbers(queue[0][1]), False, np.zeros(6)
-        came, (former, recent, earlier, before) = here.copy(), past or (here, here, here, here)
-        if len(queue) > 1:
-            after = numbers(queue[1][1])
-            last = numbers(queue[2][1]) if len(queue) > 2 else after  # outliers come in pairs, too
-            floor, coarse, gross = self._floors[role], 0.0, _NOTHING
-            still, rates, interval = floor, 0, queue[1][0] - queue[0][0]
-            lasts = min(max((interval - _BRIEF) / (_LASTING - _BRIEF), 0.0), 1.0)
+        (begin, _, here), found, doubt = queue[0], False, np.zeros(6)
+        if past is None:
+            if len(queue) > 1:  # the first of all may be an outlier like any other
+                doubt = (queue[1][2] - here) ** 2
+            self._past[role] = np.array([here] * 4)
+        elif len(queue) == 1:
+            past[:] = past[1], here, past[3], here
+        else:
+            end, _, after = queue[1]
+            last = queue[2][2] if len(queue) > 2 else after  # outliers come in pairs, too
+            floor, rates = self._floors[role], 0
+            lasts = min(max((end - begin - _BRIEF) / (_LASTING - _BRIEF), 0.0), 1.0)
             if role == WRENCH:
-                gross = GROSS * floor
-                still = (_STILL + lasts * (_MEANT - _STILL)) * floor
-                floor = (_PUSH + lasts * (_MEANT - _PUSH)) * floor
+                usual = _PUSH + lasts * (_MEANT - _PUSH)
+                still = _STILL + lasts * (_MEANT - _STILL)
                 coarse = _COARSE + lasts * (_MEANT - _COARSE)
+                gross = GROSS
             else:
+                usual, still, coarse, gross = 1.0, 1.0, 0.0, 0.0
                 if lasts > 0.0:  # a vehicle, too, is back again if it is given the time
-                    times = [interval, interval, interval, 1.0, 1.0, 1.0]
-                    floor = still = floor + lasts * self._agility * times
-                if len(queue) > 2 and queue[2][0] - queue[0][0] < _LASTING:
+                    times = [end - begin] * 3 + [1.0] * 3
+                    floor = floor + lasts * self._agility * times
+                if len(queue) > 2 and queue[2][0] - begin < _LASTING:
                     rates = 3
-            if past is None:  # the first of all may be an outlier like any other
-                doubt = (after - here) ** 2
-            else:
-                found = mend(
-                    former, earlier, before, here, after, last, doubt,
-                    self._scatter[role], floor, still, coarse, gross, rates, LONE,
-                )  # fmt: skip
+            found = mend(
+                past, here, after, last, doubt, self._scatter[role], floor, usual, still, coarse,
+                gross, rates, LONE, role == WRENCH,
+            )  # fmt: skip
         if found:
             self.counts[f"{role}: outlier between its neighbours"] += 1
-        if role == WRENCH or not found:
-            earlier, before = before if past else here, here
-        self._past[role] = recent if past else came, came, earlier, before
         return here, found, doubt
 
     def _reached(self, t: float) -> bool:
@@ -479,7 +487,7 @@ class Sampler:
         return True
 
     def _sample(
-        self, t: float, pose: tuple[float, Message] | None, imu: Message | None
+        self, t: float, pose: Waiting | None, imu: Message | None
     ) -> NDArray[np.void] | None:
         dt = t - self._previous
         restart = not 0.0 < dt <= _MAX_GAP
@@ -487,8 +495,6 @@ class Sampler:
         self._previous = t
         mean, slope, doubt = wrench or (_ZERO_WRENCH, _ZERO_WRENCH, _ZERO_WRENCH)
         sample = np.zeros(1, dtype=SAMPLE)
-        sample["hold"] = self._period
-        sample["wrench_doubt"] = doubt
         odometry, shift = _ABSENT, 0.0
         if self._sensitivity is not None:
             known = self._kinematics[0]
@@ -513,15 +519,16 @@ class Sampler:
         if t - self._seen_imu > _MERGE and self._kinematics["inertial"][0]:
             self._kinematics["inertial"] = False
             self.counts["imu: gap, odometry alone"] += 1
-        taken, known = fuse(
+        taken, known, anew = fuse(
             self._kinematics, self._settings, sample, t, 0.0 if restart else dt, restart,
-            mean, slope, pose is not None, shift, odometry, inertial, gyro, gyro_variance, specific,
+            mean, slope, doubt, self._period, pose is not None, shift, odometry,
+            inertial, gyro, gyro_variance, specific,
         )  # fmt: skip
         if pose is not None and not taken:
             repeated = odometry[10] == REPEATED
             why = "velocity repeated" if repeated else "outlier, or marked as not measured"
             self.counts[f"odom: {why}"] += 1
-        if sample["anew"][0]:
+        if anew:
             self.counts["odom: contradicts the first, begun anew"] += 1
         if wrench is None or not known:
             self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
@@ -545,7 +552,7 @@ class Sampler:
         # One that comes at the end does not act yet; its successors tell whether it is an outlier.
         while queue and (queue[0][0] < end or (self._demand is None and queue[0][0] == end)):
             demand, _, doubt = self._mended(WRENCH)
-            at, _ = queue.popleft()
+            at = queue.popleft()[0]
             if self._demand is not None and at > now:
                 pieces.append((now, at, self._act(now, at - now), self._doubt))
                 now = at
@@ -572,14 +579,8 @@ class Sampler:
         mean, slope, doubtful = np.zeros(6), np.zeros(6), np.zeros(6)
         for begin, stop, wrench, doubt in pieces:
             share = (stop - begin) / length
-            doubtful += share * doubt
-            _add_piece(
-                share,
-                12.0 * share * (0.5 * (begin + stop) - middle) / length**2,
-                wrench,
-                mean,
-                slope,
-            )
+            turn = 12.0 * share * (0.5 * (begin + stop) - middle) / length**2
+            _add_piece(share, turn, wrench, doubt, mean, slope, doubtful)
         return mean, slope, doubtful
 
     def _follow_period(self, interval: float) -> None:
@@ -707,17 +708,19 @@ def _average(ratio, i, surprise):
 
 @kernel
 def mend(
-    former, earlier, before, here, after, last, doubt, scatter, floor, still, coarse, gross, rates,
-    gate,
+    past, here, after, last, doubt, scatter, floor, push, still, coarse, gross, rates, gate, keeps
 ):  # fmt: skip
     """Mend the numbers (n,) that jump there and back between messages by more than is usual.
 
-    Back it may be only with the ``last`` message. A step, or a ramp, goes there and does not come
-    back; and what had come two messages before (``former``) and comes again two on is not lone,
-    whatever stands between. The first ``rates`` numbers have inertia: there, two in a row are
-    outliers, too, if what was before comes again. What is one, becomes what was before. Where that
-    does not come again either, what is demanded has turned; but if the jump is ``gross`` (n,) a
-    step was at the outlier or right behind it, nobody knows which.
+    ``past`` (4, n) are the last two messages as they came, and the last two as believed, and are
+    brought up to date; what is an outlier belongs to the latter only if it ``keeps`` its place.
+
+    Back a number may be only with the ``last`` message. A step, or a ramp, goes there and does not
+    come back; and what had come two messages before and comes again two on is not lone, whatever
+    stands between. The first ``rates`` numbers have inertia: there, two in a row are outliers, too,
+    if what was before comes again. What is one, becomes what was before. Where that does not come
+    again either, what is demanded has turned; but if the jump is ``gross`` a step was at the
+    outlier or right behind it, nobody knows which.
 
     Whether there was one; ``doubt`` (n,) is left with the square of what a number may be off by.
     Not only those are in doubt: what stands between two calm levels and belongs to neither is a
@@ -725,55 +728,61 @@ def mend(
     first of a demand that alternates.
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
-    ``floor`` (n,), and less than ``coarse`` of the number itself, is always usual; ``still`` (n,)
-    stands for the floor of a number that is exactly the same before and after.
+    ``push``, and less than ``coarse`` of the number itself, is always usual; ``still`` stands for
+    the push on a number that is exactly the same before and after. All three of them but
+    ``coarse`` are shares of ``floor`` (n,).
     """
     found = False
     for i in range(len(here)):
-        there, back, later = here[i] - before[i], after[i] - here[i], last[i] - here[i]
-        turn = before[i] - earlier[i]
+        former, earlier, before, came = past[0, i], past[2, i], past[3, i], here[i]
+        there, back, later = came - before, after[i] - came, last[i] - came
+        turn = before - earlier
         step = min(there * there, back * back)
-        comes_again, came_before = later * later, (here[i] - former[i]) ** 2
+        comes_again, came_before = later * later, (came - former) ** 2
         jump = 0.0
         if there * back < 0.0 or there * later < 0.0:
             jump = min(step, max(comes_again, came_before))
-        constant = turn == 0.0 and (before[i] == after[i] or before[i] == last[i])
-        least = still[i] if constant else floor[i]
-        usual = max(least, coarse * min(abs(before[i]), abs(after[i])))
+        constant = turn == 0.0 and (before == after[i] or before == last[i])
+        least = (still if constant else push) * floor[i]
+        usual = max(least, coarse * min(abs(before), abs(after[i])))
         most = gate * gate * max(scatter[i], usual * usual)
-        again = min((after[i] - before[i]) ** 2, (last[i] - before[i]) ** 2) <= most
+        again = min((after[i] - before) ** 2, (last[i] - before) ** 2) <= most
         returns = last[i] - after[i]
         dip = min(there * there, returns * returns)
-        comes_back = there * returns < 0.0 and (last[i] - before[i]) ** 2 < _BACK * dip
+        comes_back = there * returns < 0.0 and (last[i] - before) ** 2 < _BACK * dip
         two = i < rates and comes_back and dip > 4.0 * most  # twice as far off as a lone one
+        past[0, i], past[1, i] = past[1, i], came
         doubt[i] = 0.0
-        if (jump > most and (again or jump > gross[i] * gross[i])) or two:
+        if (jump > most and (again or jump > (gross * floor[i]) ** 2)) or two:
             scatter[i] *= 1.05  # the usual may have changed
             found = True
             if not again:
-                doubt[i] = 0.25 * (last[i] - before[i]) ** 2
+                doubt[i] = 0.25 * (last[i] - before) ** 2
             elif comes_again <= most:
                 doubt[i] = there * there
-            here[i] = before[i] if again else 0.5 * (before[i] + last[i])
+            here[i] = before if again else 0.5 * (before + last[i])
             continue
         scatter[i] += 0.02 * (min(jump, most) - scatter[i])
         around = turn * turn  # of what does not come back at once, on both sides
         if there * back > 0.0:
             around = max(around, (last[i] - after[i]) ** 2)
-        calm = max(gate * gate * max(scatter[i], still[i] ** 2), _CALM * _CALM * around)
+        calm = max(gate * gate * max(scatter[i], (still * floor[i]) ** 2), _CALM * _CALM * around)
         if min(step, came_before) > calm:
             doubt[i] = 0.5 * (there * there + back * back)
+    if keeps or not found:
+        for i in range(len(here)):
+            past[2, i], past[3, i] = past[3, i], here[i]
     return found
 
 
 @kernel
 def fuse(
-    kinematics, settings, sample, t, dt, restart, wrench, wrench_slope, has_odometry, shift,
-    odometry, has_imu, gyro, gyro_given, specific,
+    kinematics, settings, sample, t, dt, restart, wrench, wrench_slope, wrench_doubt, hold,
+    has_odometry, shift, odometry, has_imu, gyro, gyro_given, specific,
 ):  # fmt: skip
     """One instant of the kinematic filter; fills the sample.
 
-    Returns whether the odometry was taken, and whether the motion is known.
+    Returns whether the odometry was taken, whether the motion is known, and whether it begins anew.
 
     Velocity and accelerometer bias share one 2 x 2 covariance for the three axes, as their noise is
     isotropic::
@@ -789,6 +798,8 @@ def fuse(
     out.t, out.dt, out.restart = t, dt, restart
     _set(out.wrench, wrench)
     _set(out.wrench_slope, wrench_slope)
+    _set(out.wrench_doubt, wrench_doubt)
+    out.hold = hold
     for i in range(4):
         out.attitude[i] = nan
     gyro_variance = s.gyro_variance
@@ -1037,14 +1048,15 @@ def fuse(
         out.down[i] = down[i]
         out.down_slope[i] = (down[i] - k.down[i]) / dt if dt > 0.0 else 0.0
         k.down[i] = down[i]
-    return taken, k.known
+    return taken, k.known, anew
 
 
 @kernel
-def _add_piece(share, turn, wrench, mean, slope):
+def _add_piece(share, turn, wrench, doubt, mean, slope, doubtful):
     for i in range(6):
         mean[i] += share * wrench[i]
         slope[i] += turn * wrench[i]
+        doubtful[i] += share * doubt[i]
 
 
 @kernel

@@ -148,7 +148,7 @@ class _Recorder(Sampler):
 
     def _complete(self, final: bool) -> NDArray[np.void]:
         for role, queue in self._queues.items():
-            for t, message in queue:
+            for t, message, _ in queue:
                 if isinstance(message, Odometry) and message.twist_variance[0] == REPEATED:
                     self.counts["odom: velocity repeated, not measured anew"] += 1
                 else:
