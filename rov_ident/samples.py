@@ -219,8 +219,10 @@ class Sampler:
             WRENCH: deque(),
         }
         self._latest = -math.inf  # s; of all topics
-        self._newest: dict[str, float] = {}
-        self._before_newest: dict[str, float] = {}
+        # s; no topic will bring anything before this. Of demands one more is waited for: it tells,
+        # with the others, whether one is an outlier.
+        self._reach = dict.fromkeys((ODOMETRY, IMU, WRENCH), -math.inf)
+        self._newest_demand = -math.inf  # s
         self._first = math.nan
         self._previous = math.nan  # time of the last sample
         self._seen_imu = -math.inf
@@ -308,18 +310,18 @@ class Sampler:
         if math.isnan(self._first):
             self._first = t
         self.counts[role] += 1
-        self._before_newest[role] = self._newest.get(role, t)
-        self._newest[role] = t
         self._latest = max(self._latest, t)
+        self._reach[role] = t
+        queue = self._queues[role]
         if isinstance(message, Odometry):
-            message = to_core(self._marked(message), self._defaults)
-            self._queues[role].append((t, message, _NOTHING))
-        else:
-            message = to_core(message, self._defaults)
-            self._queues[role].append((t, message, numbers(message)))
+            queue.append((t, to_core(self._marked(message), self._defaults), _NOTHING))
+            return
+        message = to_core(message, self._defaults)
+        queue.append((t, message, numbers(message)))
         if role == WRENCH:
-            queue = self._queues[WRENCH]
-            while queue[-1][0] - queue[0][0] > _QUEUED:
+            self._reach[role] = self._newest_demand if self._newest_demand > -math.inf else t
+            self._newest_demand = t
+            while t - queue[0][0] > _QUEUED:
                 queue.popleft()
 
     def _marked(self, message: Odometry) -> Odometry:
@@ -476,13 +478,8 @@ class Sampler:
         if self._waited(t):
             return True
         grace = max(self._grace, self._late)
-        for role in (ODOMETRY, IMU, WRENCH):
-            # of demands one more, which tells with the others whether one is an outlier
-            newest = (self._before_newest if role == WRENCH else self._newest).get(role)
-            if newest is None:
-                if t - self._first <= grace:
-                    return False
-            elif newest < t and t - newest <= grace:
+        for reach in self._reach.values():
+            if reach < t and t - max(reach, self._first) <= grace:
                 return False
         return True
 
