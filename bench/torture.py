@@ -317,6 +317,7 @@ TEXTS = ("", "map", "rov/map", "base_link_ned", "x" * 300, "\0", "\n\x1b[31m", "
 NOT_OF_A_MESSAGE = (
     " gap, odometry alone",
     " outlier between its neighbours", " velocity repeated", " outlier, or marked as not measured",
+    " contradicts the first, begun anew",
 )  # fmt: skip
 
 
