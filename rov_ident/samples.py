@@ -454,19 +454,19 @@ class Sampler:
             floor, rates = self._floors[role], 0
             lasts = min(max((end - begin - _BRIEF) / (_LASTING - _BRIEF), 0.0), 1.0)
             if role == WRENCH:
-                usual = _PUSH + lasts * (_MEANT - _PUSH)
+                push = _PUSH + lasts * (_MEANT - _PUSH)
                 still = _STILL + lasts * (_MEANT - _STILL)
                 coarse = _COARSE + lasts * (_MEANT - _COARSE)
                 gross = GROSS
             else:
-                usual, still, coarse, gross = 1.0, 1.0, 0.0, 0.0
+                push, still, coarse, gross = 1.0, 1.0, 0.0, 0.0
                 if lasts > 0.0:  # a vehicle, too, is back again if it is given the time
                     times = [end - begin] * 3 + [1.0] * 3
                     floor = floor + lasts * self._agility * times
                 if len(queue) > 2 and queue[2][0] - begin < _LASTING:
                     rates = 3
             found = mend(
-                past, here, after, last, doubt, self._scatter[role], floor, usual, still, coarse,
+                past, here, after, last, doubt, self._scatter[role], floor, push, still, coarse,
                 gross, rates, LONE, role == WRENCH,
             )  # fmt: skip
         if found:
@@ -726,8 +726,8 @@ def mend(
 
     ``scatter`` (n,) are the mean squares of such jumps and are brought up to date; less than
     ``push``, and less than ``coarse`` of the number itself, is always usual; ``still`` stands for
-    the push on a number that is exactly the same before and after. All three of them but
-    ``coarse`` are shares of ``floor`` (n,).
+    the push on a number that is exactly the same before and after. ``push``, ``still`` and
+    ``gross`` are shares of ``floor`` (n,).
     """
     found = False
     for i in range(len(here)):
