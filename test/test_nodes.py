@@ -333,6 +333,21 @@ def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, tmp_path, 
         assert "Traceback" not in said
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path, number):
+    """It starts a thread then; one that was half started kept the process for ever."""
+    for delay in (0.0, 0.0003, 0.001, 0.003):
+        process = start_node("rls", heavy_path)
+        while "] active" not in (line := process.stderr.readline()):
+            assert line, "the node ended by itself"
+        time.sleep(delay)
+        began = time.monotonic()
+        status, said = end_node(process, number)
+        assert status == 0, said
+        assert time.monotonic() - began < 5.0
+        assert "Traceback" not in said
+
+
 @pytest.mark.parametrize("estimator", ["rls", "ukf"])
 def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
     """An effect that is configured is estimated; one that is missing is named in /diagnostics."""

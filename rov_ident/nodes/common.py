@@ -73,13 +73,16 @@ def live(
     make: Callable[[], AnyNode],
     own: Collection[str],
     executor: Callable[[], Any] = Executor,
+    begin: Callable[[AnyNode, threading.Event], None] = lambda node, interrupted: None,
     leave: Callable[[AnyNode], None] = lambda node: None,
 ) -> int:
     """A node's whole life, until interrupted or shut down by itself, as the program's exit status.
 
     It is 0 then, and 2 with one sentence where the user can mend what is wrong. ``own`` are the
-    node's parameters that are no part of a configuration; ``leave`` is called once the node no
-    longer hears anything, but may still publish.
+    node's parameters that are no part of a configuration. ``begin`` is called once the node is up
+    and starts its threads (one that is being started when an interrupt is raised would keep the
+    process for ever); it is given an event that is set by an interrupt, which does not end it.
+    ``leave`` is called once the node no longer hears anything, but may still publish.
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # as it is for parting words.
@@ -96,7 +99,7 @@ def live(
     except Exception as error:  # rclpy gives its RCLError no public name
         return _refused(name, _why_unreadable(name, own, error))
     try:
-        _spin(make(), executor(), leave, interrupted)
+        _spin(make(), executor(), begin, leave, interrupted)
     except UserError as error:
         return _refused(name, str(error))
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -109,6 +112,7 @@ def live(
 def _spin(
     node: AnyNode,
     executor: Any,
+    begin: Callable[[AnyNode, threading.Event], None],
     leave: Callable[[AnyNode], None],
     interrupted: threading.Event,
 ) -> None:
@@ -117,6 +121,7 @@ def _spin(
     for number in INTERRUPTS:
         signal.signal(number, lambda *_: interrupted.set())
     try:
+        begin(node, interrupted)
         # EventsExecutor.spin() never comes back from an interrupt.
         while rclpy.ok() and not interrupted.is_set():
             executor.spin_once(timeout_sec=0.5)

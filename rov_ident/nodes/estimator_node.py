@@ -4,7 +4,6 @@ Nothing here computes a coefficient. Timers run on the steady clock, so that a n
 `use_sim_time` works where nothing publishes `/clock`; a sample's time is its stamp in any case.
 """
 
-import contextlib
 import gc
 import os
 import subprocess
@@ -152,7 +151,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
             for role, (name, type_) in self._sources.items()
         }
         self._publish()
-        self._begin_watching()
+        self._judge = ThreadPoolExecutor(1, "watch")
+        self._leaving = threading.Event()
+        self._compiling: subprocess.Popen[bytes] | None = None
         self.get_logger().info(
             f"active after {time.monotonic() - started:.1f} s of compiling: estimating "
             f"{len(self._online.prior.names)} coefficients of {config.name}"
@@ -247,19 +248,17 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
     # ---------------------------------------------------------------- what the model lacks
 
-    def _begin_watching(self) -> None:
+    def begin_watching(self, interrupted: threading.Event) -> None:
         """Look for what the model lacks in a thread of its own, which may take its time.
 
         What is not compiled yet is compiled by another process: a thread of ours would stop us.
         """
-        self._judge = ThreadPoolExecutor(1, "watch")
-        self._leaving = threading.Event()
-        self._compiling: subprocess.Popen[bytes] | None = None
         begun = self._judge.submit(self._load_watcher)
         begun.add_done_callback(self._complain)
-        if self._lockstep:
-            with contextlib.suppress(TimeoutError):
-                begun.result(_LOADING_TIME)
+        until = time.monotonic() + _LOADING_TIME
+        while self._lockstep and not begun.done() and time.monotonic() < until:
+            if interrupted.wait(0.01):
+                return
 
     def _load_watcher(self) -> None:
         from rov_ident import watch  # here: not needed to begin with
@@ -534,7 +533,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
 def run(kind: Kind) -> int:
     """A node's whole life; its exit status: 0 after an interrupt, 2 for a bad configuration."""
     return live(
-        f"{kind}_node", lambda: _ready(kind), _OWN_PARAMETERS, leave=EstimatorNode.take_leave
+        f"{kind}_node",
+        lambda: _ready(kind),
+        _OWN_PARAMETERS,
+        begin=EstimatorNode.begin_watching,
+        leave=EstimatorNode.take_leave,
     )
 
 
