@@ -91,6 +91,7 @@ _SHAKE = 0.2  # m/s2; of which an accelerometer may always jump
 _PUSH = 0.03  # of the working wrench; of which a brief demand may
 _STILL = 0.004  # the same where the demand is constant, as it is while nobody demands anything
 GROSS = 0.5  # of the working wrench: no turn of what is demanded, there and back at once
+_EXACT = 0.0004  # the same of what stands beside a level that is held exactly
 _COARSE = 0.03  # of the demand itself; of which it may: less would thin the noise of coarse ones
 _MEANT = 0.2  # of both, for a demand that lasts: nobody pushes more than he can
 _BRIEF, _LASTING = 0.02, 0.1  # s; what is brief, and what lasts
@@ -764,6 +765,8 @@ def mend(
         if there * back > 0.0:
             around = max(around, (last[i] - after[i]) ** 2)
         calm = max(gate * gate * max(scatter[i], (still * floor[i]) ** 2), _CALM * _CALM * around)
+        if back * back < calm < there * there and after[i] == last[i]:
+            calm = (gate * _EXACT * floor[i]) ** 2  # a level like that has no noise to hide in
         if min(step, came_before) > calm:
             doubt[i] = 0.5 * (there * there + back * back)
     if keeps or not found:

@@ -819,6 +819,20 @@ def test_what_stands_at_a_step_is_in_doubt(heavy, where, value):
     assert not doubt[:, 1:].any()
 
 
+def test_an_outlier_beside_a_level_that_is_held_exactly(heavy):
+    """It says that the step to nothing came a message early, and the noise before hides it not."""
+    rng = np.random.default_rng(8)
+    demands = np.zeros((400, 6))
+    demands[:200, 2] = 60.0 * (1.0 + 0.01 * rng.normal(size=200))
+    clean, _ = pushed(heavy, demands)
+    assert not clean["wrench_doubt"][clean["t"] > 0.1].any()
+    demands[199, 2] = 1.5
+    samples, _ = pushed(heavy, demands)
+    acting = (samples["t"] > 199 / 50.0) & (samples["t"] - samples["dt"] < 200 / 50.0)
+    assert (samples["wrench_doubt"][:, 2] > 0.0)[samples["t"] > 0.1].sum() == acting.sum()
+    assert ((samples["wrench"] - clean["wrench"]) ** 2 <= 2.0 * samples["wrench_doubt"]).all()
+
+
 def test_the_first_of_a_demand_that_alternates_is_in_doubt(heavy):
     """It may as well be one of two outliers: it is left out, but nothing hangs on it."""
     demands = np.zeros((400, 6))
