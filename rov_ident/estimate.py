@@ -86,15 +86,17 @@ def theta_of(config: Config) -> Array:
 
 
 def calibrated(covariance: Array, score: Array) -> Array:
-    """The covariance (n, n) with its standard deviations widened to those of the sandwich.
+    """The covariance (n, n), in prior standard deviations, widened to that of the sandwich.
 
     ``score`` (n, n) is the covariance of the accumulated score, the prior's included, with its
     correlation in time: for white innovations the inverse of ``covariance``, and nothing changes.
     The sandwich is ``covariance @ score @ covariance``; from a short record it is itself uncertain,
-    and mostly too thin, so that nothing is narrowed.
+    and mostly too thin, so that nothing is narrowed. Nor is anything widened beyond the prior: what
+    no motion has shown is as well known as before.
     """
+    variance = np.diag(covariance)
     sandwich = np.sum((covariance @ score) * covariance, axis=1)
-    widen = np.sqrt(np.maximum(sandwich / np.diag(covariance), 1.0))
+    widen = np.sqrt(np.maximum(np.minimum(sandwich, 1.0) / variance, 1.0))
     wide: Array = covariance * np.outer(widen, widen)
     return wide
 

@@ -8,7 +8,14 @@ import textbook
 from scipy.optimize import minimize
 
 from rov_ident import config as configuration
-from rov_ident.estimate import Estimate, is_passive, physical, prior_of, typical
+from rov_ident.estimate import (
+    Estimate,
+    calibrated,
+    is_passive,
+    physical,
+    prior_of,
+    typical,
+)
 
 
 def variant(heavy, values, remove=()):
@@ -243,3 +250,15 @@ def test_one_sided_damping_beside_one_that_is_held(one_sided):
     found = physical(config.model, prior, Estimate(prior.names, values, np.diag([1.0, 400.0]), 0.0))
     np.testing.assert_allclose(found, [-30.0, 190.0], rtol=1e-12)
     assert is_passive(config.model, prior, found)
+
+
+def test_coloured_residuals_widen_up_to_the_prior():
+    """Four times the score makes standard deviations twice as wide, none wider than at first."""
+    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+    covariance = turn @ np.diag([1e-3, 2e-3, 4e-3]) @ turn.T
+    np.testing.assert_allclose(calibrated(covariance, np.linalg.inv(covariance)), covariance)
+    np.testing.assert_allclose(
+        calibrated(covariance, 4.0 * np.linalg.inv(covariance)), 4.0 * covariance
+    )
+    wide = calibrated(np.diag([1.0, 0.5, 1e-4]), np.diag([4.0, 8.0, 4e4]))
+    np.testing.assert_allclose(wide, np.diag([1.0, 1.0, 4e-4]))
