@@ -267,9 +267,7 @@ def spoilt(seed: int, role: str, name: str, index: int, size: float) -> Messages
         if topic == role and rng.random() < 0.05:
             values = getattr(m, name).copy()
             values[index] = rng.uniform(-size, size)
-            if name == "orientation":
-                values /= np.linalg.norm(values)
-            m = m._replace(**{name: values})
+            m = _with(m, name, values)
         out.append((arrival, topic, m))
     return out
 
@@ -295,13 +293,16 @@ def begun_wrong(seed: int, name: str, wrong: tuple[int, ...], size: float) -> Me
     for arrival, role, m in dived(seed):
         if role == ODOMETRY:
             if count in wrong:
-                values = rng.uniform(-size, size, len(getattr(m, name)))
-                if name == "orientation":
-                    values /= np.linalg.norm(values)
-                m = m._replace(**{name: values})
+                m = _with(m, name, rng.uniform(-size, size, len(getattr(m, name))))
             count += 1
         out.append((arrival, role, m))
     return out
+
+
+def _with(m: Message, name: str, values: np.ndarray) -> Message:
+    """The message with other numbers; an attitude stays one."""
+    scale = np.linalg.norm(values) if name == "orientation" else 1.0
+    return m._replace(**{name: values / scale})
 
 
 # ------------------------------------------------------------------ garbage

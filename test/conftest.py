@@ -218,6 +218,12 @@ def start_node(estimator, parameters, *options):
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 
 
+def until_said(process, words):
+    """Wait for a line with these words on a process's stderr."""
+    while words not in (line := process.stderr.readline()):
+        assert line, "the node ended by itself"
+
+
 def end_node(process, number=signal.SIGINT):
     """Its exit status and all that it said."""
     process.send_signal(number)

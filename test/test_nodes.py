@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import Vehicle, end_node, start_connected, start_node
+from conftest import Vehicle, end_node, start_connected, start_node, until_said
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
@@ -308,8 +308,7 @@ def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
     monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     process = start_node("rls", heavy_path)
-    while "compiling" not in (line := process.stderr.readline()):
-        assert line, "the node ended by itself"
+    until_said(process, "compiling")
     began = time.monotonic()
     status, said = end_node(process)
     assert status == 0, said
@@ -324,8 +323,7 @@ def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, tmp_path, 
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     for number in (signal.SIGKILL, signal.SIGINT):
         process = start_node("rls", heavy_path)
-        while "compiling" not in (line := process.stderr.readline()):
-            assert line, "the node ended by itself"
+        until_said(process, "compiling")
         time.sleep(delay)
         began = time.monotonic()
         _, said = end_node(process, number)
@@ -338,8 +336,7 @@ def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path, number):
     """It starts a thread then; one that was half started kept the process for ever."""
     for delay in (0.0, 0.0003, 0.001, 0.003):
         process = start_node("rls", heavy_path)
-        while "]: active" not in (line := process.stderr.readline()):
-            assert line, "the node ended by itself"
+        until_said(process, "]: active")
         time.sleep(delay)
         began = time.monotonic()
         status, said = end_node(process, number)
