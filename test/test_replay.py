@@ -8,6 +8,7 @@ import sys
 import textwrap
 import time
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -161,10 +162,8 @@ def test_node_refuses(domain, tmp_path):
             process.check()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_no_orphans(domain, bag, tmp_path, number):
-    """However a replay is ended, its nodes end too; what was recorded can be read."""
-    out = tmp_path / "out.mcap"
+def started(bag, out):
+    """A replay in a process of its own that has reported ten times, and its node's process."""
     code = f"from rov_ident.nodes.replay import replay; replay({str(bag)!r}, {str(HEAVY)!r}, "
     code += f"rate=1.0, out={str(out)!r}, on_report=lambda *_: print('report', flush=True))"
     process = subprocess.Popen(
@@ -174,6 +173,35 @@ def test_no_orphans(domain, bag, tmp_path, number):
     for _ in range(10):
         assert process.stdout.readline() == "report\n"
     (node,) = children(process.pid)
+    return process, node
+
+
+def listening(domain):
+    """The addresses at which anything listens for a DDS domain, as /proc writes them."""
+    first = 7400 + 250 * domain
+    found = []
+    for table in ("udp", "udp6", "tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            address, port = line.split()[1].split(":")
+            if first <= int(port, 16) < first + 250:
+                found.append(address)
+    return found
+
+
+def test_no_port_is_open_to_the_network(domain, bag, tmp_path):
+    process, _ = started(bag, tmp_path / "out.mcap")
+    addresses = listening(domain)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert len(addresses) >= 4  # discovery and data, of the player and of the node
+    assert set(addresses) == {"0100007F"}  # 127.0.0.1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_no_orphans(domain, bag, tmp_path, number):
+    """However a replay is ended, its nodes end too; what was recorded can be read."""
+    out = tmp_path / "out.mcap"
+    process, node = started(bag, out)
     process.send_signal(number)
     process.communicate(timeout=20)
     assert process.returncode != 0

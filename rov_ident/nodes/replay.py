@@ -24,6 +24,7 @@ from rov_ident.errors import UserError
 from rov_ident.nodes.player import OnReport, Player
 from rov_ident.online import ESTIMATORS, Report
 
+_LOOPBACK = Path(__file__).with_name("loopback.xml")
 _EXIT_TIME = 10.0  # s; for a node to end after an interrupt
 
 
@@ -49,7 +50,7 @@ def replay(
 
     ``rate`` is the speed relative to the recording; 0: as fast as the nodes can follow. No message
     is lost at any rate. Unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this
-    computer: a replayed thruster wrench must not reach a vehicle.
+    computer, as a replayed thruster wrench must not reach a vehicle, and nothing comes in.
 
     Raises
     ------
@@ -66,7 +67,7 @@ def replay(
     config = configuration.load(config_path)
     topics = inputs.select(recorded, config)
     started = time.monotonic()
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    _keep_to_this_computer()
     with ExitStack() as stack:
         writer = None
         if out is not None:
@@ -126,6 +127,13 @@ def _noted_interrupts() -> Iterator[Callable[[], None]]:
         yield raise_interrupt
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _keep_to_this_computer() -> None:
+    """Neither look for others on the network nor have a port open to it, unless told otherwise."""
+    if os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST":
+        # Fast DDS would still take whatever arrives from anywhere at its ports.
+        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(_LOOPBACK))
 
 
 class _Process:
