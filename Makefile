@@ -28,7 +28,8 @@ check: .venv/test.stamp
 docs: .venv/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-## accuracy over seeds, the tables of docs/accuracy.md (a quarter of an hour)
+## accuracy over seeds, the tables of docs/accuracy.md (some two hours; it may be stopped and goes on
+## where it was)
 accuracy: .venv/demo.stamp
 	$(BIN)/python bench/accuracy.py
 

@@ -76,20 +76,22 @@ EIGHTEEN = {"Y_v": -8.0, "K_p": -0.1, "N_r": -0.1}
 COUPLINGS = {"Y_rdot": 0.3, "Z_qdot": -0.3, "Y_uv": -40.0, "N_uv": -4.0, "Z_q": 1.0, "M_w": 0.5}
 """Six more: about a tenth of what acts on their axis."""
 
-SETTINGS: dict[str, tuple[str, str, Any]] = {
-    "ukf.alpha 0.1": ("ukf", "alpha", 0.1),
-    "ukf.alpha 0.2": ("ukf", "alpha", 0.2),
-    "ukf.alpha 1": ("ukf", "alpha", 1.0),
-    "process_std 0.0001": ("", "process_std", [1e-4] * 6),
-    "process_std 0.001": ("", "process_std", [1e-3] * 6),
-    "process_std 0.003": ("", "process_std", [3e-3] * 6),
-    "ukf.random_walk 0.002": ("ukf", "random_walk", 0.002),
-    "ukf.random_walk 0.01": ("ukf", "random_walk", 0.01),
-    "ukf.change_threshold 1.5": ("ukf", "change_threshold", 1.5),
-    "ukf.change_threshold 2": ("ukf", "change_threshold", 2.0),
-    "ukf.change_threshold 5": ("ukf", "change_threshold", 5.0),
+CHANGED = ("X_udot", "Z_wdot", "N_rdot", "X_uu", "Y_vv", "Z_ww", "K_pp", "M_q", "N_rr")
+
+
+def _constant(factor: float) -> dict[str, Any]:
+    return {"rls": {"forgetting": "constant", "forgetting_factor": factor}}
+
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    **{f"prior.relative_std {v:g}": {"prior": {"relative_std": v}} for v in (0.1, 0.25, 1.0, 2.0)},
+    **{f"process_std {v:g}": {"process_std": [v] * 6} for v in (2e-5, 5e-4, 1e-3, 3e-3)},
+    **{f"rls.forgetting constant, {v:g}": _constant(v) for v in (1.0, 0.999, 0.99, 0.95, 0.9)},
+    **{f"ukf.change_threshold {v:g}": {"ukf": {"change_threshold": v}} for v in (1.5, 2, 4, 6, 10)},
+    **{f"ukf.random_walk {v:g}": {"ukf": {"random_walk": v}} for v in (0.002, 0.01, 0.05)},
+    **{f"ukf.alpha {v:g}": {"ukf": {"alpha": v}} for v in (0.1, 0.2, 1.0)},
 }
-"""Each a section of the parameter file, a key and its value."""
+"""What each puts into the parameter file."""
 
 OFFSETS = (8, 50)  # percent
 CHANGE_TIME = 90.0  # s
@@ -136,9 +138,10 @@ def told(true: Config, trial: Trial, offset: float) -> Config:
     config = true.with_model(true.model.with_theta(wrong))
     if not trial.setting:
         return config
-    section, key, value = SETTINGS[trial.setting]
     parameters = configuration.to_parameters(config)
-    (parameters.setdefault(section, {}) if section else parameters)[key] = value
+    for key, value in SETTINGS[trial.setting].items():
+        inside = isinstance(value, dict)
+        parameters[key] = {**parameters.get(key, {}), **value} if inside else value
     return configuration.from_parameters(parameters)
 
 
@@ -267,8 +270,11 @@ def measure(trial: Trial) -> dict[str, Any]:
             line[key] = np.sqrt(np.diag(bound.bound(true, run, suite, accelerometer))).tolist()
     samples = np.concatenate(list(samples_of(true, run)))
     short = trial.minutes < 10.0
+    # a setting of one estimator is nothing to the other
+    concerned = [n for n in ESTIMATORS if n in SETTINGS.get(trial.setting, ())] or list(ESTIMATORS)
     for offset in OFFSETS:
-        for name, module in ESTIMATORS.items():
+        for name in concerned:
+            module = ESTIMATORS[name]
             config = told(true, trial, offset)
             t, values, std = follow(module, config, samples, GRID if short else 1e9)
             result: dict[str, Any] = {"value": values[-1].tolist(), "std": std[-1].tolist()}
@@ -329,8 +335,10 @@ def _coverage(seeds: int, long_seeds: int) -> Iterator[Trial]:
 def _settings(seeds: int, long_seeds: int) -> Iterator[Trial]:
     for seed in range(min(seeds, 16)):
         for setting in ("", *SETTINGS):
-            for unknown in ("", "coloured force"):
-                yield Trial(seed, unknown=unknown, setting=setting)
+            yield Trial(seed, setting=setting)
+            yield Trial(seed, manoeuvre="pilot", setting=setting)
+            yield Trial(seed, unknown="coloured force", setting=setting)
+            yield Trial(seed, change=CHANGED[seed % len(CHANGED)], setting=setting)
 
 
 def _noise(seeds: int, long_seeds: int) -> Iterator[Trial]:
@@ -341,7 +349,7 @@ def _noise(seeds: int, long_seeds: int) -> Iterator[Trial]:
 
 def _change(seeds: int, long_seeds: int) -> Iterator[Trial]:
     for seed in range(seeds):
-        for name in ("X_udot", "Z_wdot", "N_rdot", "X_uu", "Y_vv", "Z_ww", "K_pp", "M_q", "N_rr"):
+        for name in CHANGED:
             yield Trial(seed, change=name)
 
 
@@ -517,15 +525,8 @@ def change(lines: Lines, bars: Bars) -> None:
             results = [line[f"{name} 8"] for line in group]
 
             def cell(key: str, limit: float) -> str:
-                t = np.array([np.inf if r[key] is None else r[key] for r in results])  # noqa: B023
-                share = np.mean(t <= limit)
-                text = f"{np.median(t):.1f}, {np.quantile(t, 0.9, method='higher'):.1f}"
-                text += f" ({100 * share:.0f} %)"
-                return bars.check(
-                    share >= 0.9,
-                    text,
-                    f"{name} {coefficient} + 30 % {key}",  # noqa: B023
-                )
+                text, share = _within(results, key, limit)  # noqa: B023
+                return bars.check(share >= 0.9, text, f"{name} {coefficient} + 30 % {key}")  # noqa: B023
 
             rows.append(
                 [
@@ -541,33 +542,74 @@ def change(lines: Lines, bars: Bars) -> None:
     )
 
 
+def _within(results: list[dict[str, Any]], key: str, limit: float) -> tuple[str, float]:
+    """Median and 90 % of the seconds after the change, and the share within the limit."""
+    t = np.array([np.inf if r[key] is None else r[key] for r in results])
+    share = float(np.mean(t <= limit))
+    late = np.quantile(t, 0.9, method="higher")
+    return f"{np.median(t):.1f}, {late:.1f} ({100 * share:.0f} %)", share
+
+
 def settings(lines: Lines, bars: Bars) -> None:
-    """Error and intervals by setting: the curves behind the defaults."""
+    """By setting: the curves behind the defaults."""
     rows = []
     for (setting,), group in _grouped(lines, "setting").items():
-        clean = [line for line in group if not line["trial"]["unknown"]]
-        coloured = [line for line in group if line["trial"]["unknown"]]
-        crb = np.array([line["bound_accelerometer"] for line in clean])
-        cells = []
-        for name in ESTIMATORS:
-            error, std, _ = _of(clean, name, 50)
+        for name in (n for n in ESTIMATORS if f"{n} 50" in group[0]):
+            kinds: dict[str, Lines] = defaultdict(list)
+            for line in group:
+                trial = line["trial"]
+                kind = trial["unknown"] or ("change" if trial["change"] else trial["manoeuvre"])
+                kinds[kind].append(line)
+            crb = np.array([line["bound_accelerometer"] for line in kinds["steps"]])
+            error, _, _ = _of(kinds["steps"], name, 50)
             ratio = np.sqrt(np.mean((error / crb) ** 2, axis=0))
-            cover = np.mean(np.abs(error) <= Z * std)
-            error, std, true = _of(coloured, name, 50)
-            cells += [
-                f"{np.median(ratio):.2f}, {ratio.max():.2f}", f"{100 * cover:.0f} %",
-                f"{100 * np.median(np.abs(error / true)):.2f} %",
-                f"{100 * np.mean(np.abs(error) <= Z * std):.0f} %",
-            ]  # fmt: skip
-        rows.append([setting or "all defaults", str(len(clean)), *cells])
+            settled = np.concatenate([line[f"{name} 50"]["settled"] for line in kinds["steps"]])
+            cells = [
+                f"{np.median(ratio):.2f}, {ratio.max():.2f}",
+                f"{np.median(settled):.1f}, {np.quantile(settled, 0.9):.0f}",
+            ]
+            for kind in ("steps", "pilot", "coloured force"):
+                error, std, true = _of(kinds[kind], name, 50)
+                if kind != "steps":
+                    cells.append(f"{100 * np.median(np.abs(error / true)):.2f} %")
+                cells.append(f"{100 * np.mean(np.abs(error) <= Z * std):.1f} %")
+            after = [line[f"{name} {offset}"] for line in kinds["change"] for offset in OFFSETS]
+            cells += [_within(after, key, limit)[0] for key, limit in (("left", 15), ("held", 60))]
+            rows.append([setting or "all defaults", name, str(len(kinds["steps"])), *cells])
     table(
-        "setting | dives"
-        + "".join(
-            f" | {name} error / bound: median, worst | 95 % cover"
-            " | with coloured force: median error | 95 % cover"
-            for name in ESTIMATORS
-        ),
+        "setting | | dives | error / bound: median, worst | settled, s: median, 90 % | 95 % cover"
+        " | pilot: median error | 95 % cover | coloured force: median error | 95 % cover"
+        " | change: left the old value, s: median, 90 % (in 15 s) | holds the new one (in 60 s)",
         rows,
+    )
+    residual_corners((0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0))
+
+
+def residual_corners(corners: tuple[float, ...], seeds: int = 8) -> None:
+    """Noise of the published residual, by the corner of its filter, once the model is learnt."""
+    module, rms = ESTIMATORS["rls"], defaultdict(list)
+    for trial in (Trial(seed) for seed in range(seeds)):
+        true = vehicle(trial)
+        samples = np.concatenate(list(samples_of(true, dive_of(true, trial))))
+        late = samples["t"] > samples["t"][0] + 60.0
+        for corner in corners:
+            config = dataclasses.replace(told(true, trial, 50), residual_corner=corner)
+            task = module.problem(config)
+            _, infos = module.fold(task, module.init(task), samples)
+            share = infos["residual"][late] / authority(true.model)
+            rms[corner].append(np.sqrt(np.mean(share**2, axis=0)))
+    table(
+        "residual_corner, rad/s | 90 % of a step shows after, s"
+        " | noise, of the working wrench: median axis | worst axis",
+        [
+            # (1 + x) exp(-x) = 0.1 at x = 3.89: two equal poles
+            [
+                f"{corner:g}",
+                f"{3.89 / corner:.2f}",
+                *(f"{100 * f(r):.2f} %" for f in (np.median, np.max)),
+            ]
+            for corner, r in ((c, np.sqrt(np.mean(np.square(rms[c]), axis=0))) for c in corners)
+        ],
     )
 
 
