@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.attitude import rotation, turned
+from rov_ident.beat import LOST, Beat, between
 from rov_ident.config import Config
 from rov_ident.effects import (
     act,
@@ -81,8 +82,6 @@ _MAX_GAP = 0.5  # s without a measurement: restart rather than bridge
 _MAX_JUMP = 10.0  # s; a stamp this far ahead, or 1 s back, is another clock (a bag starting over)
 _LATEST = 1.0  # s; a topic that is later than this is not waited for
 _LATER = 1.25  # times as late as a topic was is how long it is waited for from then on
-LOST = 3.0  # times the longest interval between demands of late: another one is missing
-_BLEND = 0.05  # of one interval between demands in what is usual
 _QUEUED = 10.0  # s; of demands that are kept while nothing else comes
 _LAST_STAMP = (2**31 - 1) * 10**9  # ns; of ROS time
 _REASONS = 100  # names of refusals; what else is wrong is counted together
@@ -232,8 +231,9 @@ class Sampler:
         self._demand: Array | None = None
         self._demand_time = -math.inf
         self._doubt = np.zeros(6)  # N2, (N m)2: of the present demand
-        self._intervals: deque[float] = deque(maxlen=50)  # s; between demands
-        self._period = 0.0  # s; as is usual
+        self._beat = Beat()
+        self._heard = -math.inf  # time of the last demand that came
+        self._missing: deque[tuple[float, Array, Array]] = deque()  # guesses at what got lost
         self._velocity, self._fine = b"", 0  # the last velocity; whether they are off the grid
         # the numbers of the last two messages as they came, and of the last two as believed
         self._past: dict[str, Array] = {}
@@ -519,7 +519,7 @@ class Sampler:
             self.counts["imu: gap, odometry alone"] += 1
         taken, known, anew = fuse(
             self._kinematics, self._settings, sample, t, 0.0 if restart else dt, restart,
-            mean, slope, doubt, self._period, pose is not None, shift, odometry,
+            mean, slope, doubt, self._beat.usual, pose is not None, shift, odometry,
             inertial, gyro, gyro_variance, specific,
         )  # fmt: skip
         if pose is not None and not taken:
@@ -544,25 +544,19 @@ class Sampler:
 
         None where no demand is known.
         """
-        queue = self._queues[WRENCH]
         pieces: list[tuple[float, float, Array, Array]] = []
         now = start
-        # One that comes at the end does not act yet; its successors tell whether it is an outlier.
-        while queue and (queue[0][0] < end or (self._demand is None and queue[0][0] == end)):
-            demand, _, doubt = self._mended(WRENCH)
-            at = queue.popleft()[0]
+        while (following := self._next_demand(end)) is not None:
+            at, demand, doubt = following
             if self._demand is not None and at > now:
                 pieces.append((now, at, self._act(now, at - now), self._doubt))
                 now = at
             elif self._demand is None:
                 start = now = max(at, start)
-            if self._demand_time > -math.inf:
-                self._intervals.append(at - self._demand_time)
-                self._follow_period(self._intervals[-1])
             self._demand, self._demand_time, self._doubt = demand, at, doubt
             if self.demands is not None:
                 self.demands.append((at, self._demand))
-        hold = min(self._hold, LOST * max(self._intervals, default=math.inf))
+        hold = min(self._hold, LOST * self._beat.longest)
         if self._demand is None or end - self._demand_time > hold:
             self._demand = None
             self._memory = memory()
@@ -581,10 +575,27 @@ class Sampler:
             _add_piece(share, turn, wrench, doubt, mean, slope, doubtful)
         return mean, slope, doubtful
 
-    def _follow_period(self, interval: float) -> None:
-        """The usual time between demands, of which a gap is no part."""
-        usual = self._period or interval
-        self._period = usual + _BLEND * (min(interval, LOST * usual) - usual)
+    def _next_demand(self, end: float) -> tuple[float, Array, Array] | None:
+        """Time, wrench (6,) and doubt of the next demand before ``end``; it may be a guess."""
+        queue = self._queues[WRENCH]
+        if not queue:
+            return None
+        at = queue[0][0]
+        if self._demand is not None and self._demand_time == self._heard and not self._missing:
+            lost = self._beat.lost(at - self._heard)
+            self._missing.extend(between(self._heard, self._demand, at, queue[0][2], lost))
+        if self._missing and self._missing[0][0] < min(at, end):
+            return self._missing.popleft()
+        # One that comes at the end does not act yet; its successors tell whether it is an outlier.
+        if at > end or (at == end and self._demand is not None):
+            return None
+        demand, _, doubt = self._mended(WRENCH)
+        queue.popleft()
+        self._missing.clear()
+        if self._heard > -math.inf:
+            self._beat.hear(at - self._heard)
+        self._heard = at
+        return at, demand, doubt
 
     def _act(self, t: float, dt: float) -> Array:
         """The wrench (6,) that acts, in the mean from t to t + dt, when the demand is held."""

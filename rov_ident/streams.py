@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.beat import LOST, completed
 from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.messages import Array, Message, Odometry
@@ -19,7 +20,6 @@ from rov_ident.samples import (
     GROSS,
     IMU,
     LONE,
-    LOST,
     ODOMETRY,
     REPEATED,
     WRENCH,
@@ -38,7 +38,7 @@ class Streams:
 
     odometry: ``t`` (N,), position (N, 3), orientation (N, 4) w x y z, nu (N, 6) as measured.
     IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
-    wrench: ``demand_t`` (K,), demand (K, 6), each held to the next.
+    wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; lost ones are guessed.
     ``has_pose`` tells whether the positions mean anything; ``notes`` say what was left out.
     """
 
@@ -89,6 +89,10 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
     for name, found in (("odometry", odometry), ("wrench", wrench)):
         if len(found) < 2:
             raise UserError(f"the bag holds no usable {name} messages")
+    demand_t, demand = completed(
+        np.array([t for t, _ in wrench]),
+        np.array([np.concatenate([m.force, m.torque]) for _, m in wrench]),
+    )
     return Streams(
         np.array([t for t, _ in odometry]),
         np.array([m.position for _, m in odometry]),
@@ -97,8 +101,8 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
         np.array([t for t, _ in imu]),
         np.array([m.angular_velocity for _, m in imu]).reshape(-1, 3),
         np.array([m.linear_acceleration for _, m in imu]).reshape(-1, 3),
-        np.array([t for t, _ in wrench]),
-        np.array([np.concatenate([m.force, m.torque]) for _, m in wrench]),
+        demand_t,
+        demand,
         tuple(f"left out: {reason}" for reason in describe(recorder.counts)),
     )
 

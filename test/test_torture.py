@@ -5,7 +5,9 @@ import pytest
 import torture
 
 
-@pytest.mark.parametrize("what", ["IMU gone", "velocity frozen", "wrench 300 ms late", "hour back"])
+@pytest.mark.parametrize(
+    "what", ["IMU gone", "velocity frozen", "wrench 300 ms late", "hour back", "demands lost"]
+)
 def test_faults_in_time(what):
     """Held, used again within seconds, and the coefficients end where they would have."""
     missed = [row for row in torture.faults(1, what) if not row.met]
