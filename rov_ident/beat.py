@@ -25,24 +25,22 @@ _MOST = 9  # demands in a row that may get lost; a longer silence is one that wa
 class Beat:
     """The time between the demands of a publisher.
 
-    ``usual`` [s] is the mean between those that come, of which a gap is no part.
+    ``usual`` [s] is the mean between those that come, of which a gap is no part, ``longest`` the
+    longest of late. Within ``patience`` [s] none has got lost; of who keeps no time none ever has.
     """
 
     def __init__(self) -> None:
         self.usual = 0.0
+        self.longest = self.patience = math.inf
         self._intervals: deque[float] = deque(maxlen=50)  # s
         self._period = 0.0  # s; between those that are sent
         self._regular = 0.0  # share of the intervals, of late, that were one beat
         self._count = 0
 
-    @property
-    def longest(self) -> float:
-        """The longest interval [s] of late; infinite before there is one."""
-        return max(self._intervals, default=math.inf)
-
     def hear(self, interval: float) -> None:
         """Take in the time [s] between two demands that came."""
         self._intervals.append(interval)
+        self.longest = max(self._intervals)
         usual = self.usual or interval
         self.usual = usual + _BLEND * (min(interval, LOST * usual) - usual)
         if interval < 0.9 * self._period or self._period == 0.0:
@@ -52,10 +50,12 @@ class Beat:
         even = abs(interval / self._period - 1.0) < _EVEN
         self._count += 1
         self._regular += max(_OF_LATE, 1.0 / self._count) * (even - self._regular)
+        keeps_time = self._regular >= _REGULAR and self._count >= _FEW
+        self.patience = 1.5 * self._period if keeps_time else math.inf
 
     def lost(self, interval: float) -> int:
-        """How many demands got lost within an interval [s]; 0 of a publisher that keeps no time."""
-        if interval < 1.5 * self._period or self._regular < _REGULAR or self._count < _FEW:
+        """How many demands got lost within an interval [s]."""
+        if interval < self.patience:
             return 0
         beats = interval / self._period
         whole = round(beats)

@@ -581,7 +581,8 @@ class Sampler:
         if not queue:
             return None
         at = queue[0][0]
-        if self._demand is not None and self._demand_time == self._heard and not self._missing:
+        silent = at - self._heard > self._beat.patience and not self._missing
+        if silent and self._demand is not None and self._demand_time == self._heard:
             lost = self._beat.lost(at - self._heard)
             self._missing.extend(between(self._heard, self._demand, at, queue[0][2], lost))
         if self._missing and self._missing[0][0] < min(at, end):
