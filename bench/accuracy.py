@@ -77,9 +77,11 @@ COUPLINGS = {"Y_rdot": 0.3, "Z_qdot": -0.3, "Y_uv": -40.0, "N_uv": -4.0, "Z_q": 
 """Six more: about a tenth of what acts on their axis."""
 
 CHANGED = ("X_udot", "Z_wdot", "N_rdot", "X_uu", "Y_vv", "Z_ww", "K_pp", "M_q", "N_rr")
+"""Of which one grows in mid-dive."""
 
 
 def _constant(factor: float) -> dict[str, Any]:
+    """Forgetting by a factor each 0.1 s."""
     return {"rls": {"forgetting": "constant", "forgetting_factor": factor}}
 
 
