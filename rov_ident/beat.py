@@ -16,9 +16,8 @@ LOST = 3.0  # times the longest interval between demands of late: another one is
 _BLEND = 0.05  # of one interval in what is usual
 _SHORTEN = 0.3  # of one that is shorter than a beat in the beat
 _EVEN = 0.15  # of a beat; by which an interval of one may be off, and of several twice
-_OF_LATE = 0.02  # of one interval in the share of those of one beat; more at first
-_FEW = 50  # intervals before anything is guessed
-_REGULAR = 0.65  # that share: below it silence is meant, as nothing changes, or the beat is another
+_OF_LATE = 50  # intervals; before there are so many nothing is guessed
+_REGULAR = 0.65  # share of one beat: below it silence is meant, as nothing changes
 _MOST = 9  # demands in a row that may get lost; a longer silence is one that was meant
 
 
@@ -32,10 +31,9 @@ class Beat:
     def __init__(self) -> None:
         self.usual = 0.0
         self.longest = self.patience = math.inf
-        self._intervals: deque[float] = deque(maxlen=50)  # s
+        self._intervals: deque[float] = deque(maxlen=_OF_LATE)  # s
         self._period = 0.0  # s; between those that are sent
         self._regular = 0.0  # share of the intervals, of late, that were one beat
-        self._count = 0
 
     def hear(self, interval: float) -> None:
         """Take in the time [s] between two demands that came."""
@@ -48,9 +46,9 @@ class Beat:
         if interval < 1.5 * self._period or self._regular < _REGULAR:
             self._period += _BLEND * (interval - self._period)
         even = abs(interval / self._period - 1.0) < _EVEN
-        self._count += 1
-        self._regular += max(_OF_LATE, 1.0 / self._count) * (even - self._regular)
-        keeps_time = self._regular >= _REGULAR and self._count >= _FEW
+        heard = len(self._intervals)
+        self._regular += (even - self._regular) / heard
+        keeps_time = self._regular >= _REGULAR and heard == _OF_LATE
         self.patience = 1.5 * self._period if keeps_time else math.inf
 
     def lost(self, interval: float) -> int:

@@ -78,8 +78,6 @@ def compile_all():
 def domain(monkeypatch, compiled):
     """A DDS domain that no other test of this computer uses, seen by nobody on the network."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "")  # a replay sets it: gone with the test
-    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE")
     for number in _DOMAINS:  # a new one each time: the last test's may not have gone yet
         lock = open(Path(tempfile.gettempdir()) / f"rov_ident_domain_{number}", "a")  # noqa: SIM115
         try:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_samples import moments
 
 from rov_ident import sensors
 from rov_ident.beat import Beat, between, completed
@@ -99,8 +100,8 @@ def test_a_record_is_completed():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_wrench_is_not_late(heavy, seed, monkeypatch):
-    """Nor early, and as doubtful as is said."""
+def test_the_wrench_is_not_late(heavy, seed):
+    """Nor early, and as doubtful as is said; against demands that are held until the next."""
     rng = np.random.default_rng(seed)
     suite = sensors.Suite().scaled(0.0)
     messages = sensors.dive(heavy, "multisine", 30.0, suite, seed).messages
@@ -108,25 +109,32 @@ def test_the_wrench_is_not_late(heavy, seed, monkeypatch):
     partly = [m for m in messages if m[1] != WRENCH or rng.random() >= share]
 
     def samples(messages):
+        """Those from 5 s on, as before it is not known that the publisher keeps time; demands."""
         sampler = Sampler(heavy)
+        sampler.demands = []
         parts = [sampler.push(role, message) for _, role, message in messages]
         taken = np.concatenate([*parts, sampler.flush()])
-        taken["t"] += (sampler.origin - sensors.START) * 1e-9
-        return taken[taken["t"] > 5.0]  # before, it is not known that the publisher keeps time
+        late = (sampler.origin - sensors.START) * 1e-9
+        taken["t"] += late
+        demands = [(round(t + late, 6), wrench) for t, wrench in sampler.demands]
+        return taken[taken["t"] > 5.0], dict(demands)
 
-    def compared():
-        """Lateness (6,) [s] of the mean wrench; mean squares (6,) of its error and of the doubt."""
-        whole, part = samples(messages), samples(partly)
-        t, i, j = np.intersect1d(np.round(whole["t"], 6), np.round(part["t"], 6), False, True)
-        assert len(t) > 0.99 * len(whole)
-        error = part["wrench"][j] - whole["wrench"][i]
-        slope = np.gradient(whole["wrench"][i], t, axis=0)
+    (whole, demands), (part, _) = samples(messages), samples(partly)
+    t, i, j = np.intersect1d(np.round(whole["t"], 6), np.round(part["t"], 6), False, True)
+    assert len(t) > 0.99 * len(whole)
+    whole, part = whole[i], part[j]
+    came = {round((m.stamp - sensors.START) * 1e-9, 6) for _, role, m in partly if role == WRENCH}
+    instants = np.array(sorted(came & demands.keys()))
+    kept = np.array([demands[at] for at in instants])
+    held = [moments(instants, kept, end - s["dt"], end)[0] for end, s in zip(t, whole, strict=True)]
+
+    def compared(wrench):
+        """Lateness (6,) [s] of a mean wrench, and the mean square (6,) of its error."""
+        error, slope = wrench - whole["wrench"], np.gradient(whole["wrench"], t, axis=0)
         late = -np.sum(error * slope, axis=0) / np.sum(slope**2, axis=0)
-        return late, np.mean(error**2, axis=0), np.mean(part["wrench_doubt"][j], axis=0)
+        return late, np.mean(error**2, axis=0)
 
-    late, error, doubt = compared()
-    monkeypatch.setattr(Beat, "lost", lambda *_: 0)
-    held, error_held, _ = compared()
-    assert np.abs(late).max() < 0.1 * held.min(), (late, held)
+    (late, error), (late_held, error_held) = compared(part["wrench"]), compared(np.array(held))
+    assert np.abs(late).max() < 0.1 * late_held.min(), (late, late_held)
     assert np.all(error < 0.3 * error_held)
-    assert np.all(error < 1.5 * doubt)
+    assert np.all(error < 1.5 * np.mean(part["wrench_doubt"], axis=0))

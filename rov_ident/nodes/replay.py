@@ -67,8 +67,8 @@ def replay(
     config = configuration.load(config_path)
     topics = inputs.select(recorded, config)
     started = time.monotonic()
-    _keep_to_this_computer()
     with ExitStack() as stack:
+        stack.enter_context(_on_this_computer())
         writer = None
         if out is not None:
             writer = stack.enter_context(BagWriter(Path(out), crash_safe=True))
@@ -129,11 +129,20 @@ def _noted_interrupts() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _keep_to_this_computer() -> None:
+@contextmanager
+def _on_this_computer() -> Iterator[None]:
     """Neither look for others on the network nor have a port open to it, unless told otherwise."""
-    if os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST":
+    ours = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST":
         # Fast DDS would still take whatever arrives from anywhere at its ports.
-        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(_LOOPBACK))
+        ours["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(_LOOPBACK)
+    added = {name: value for name, value in ours.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
 
 
 class _Process:
