@@ -17,7 +17,8 @@ _BLEND = 0.05  # of one interval in what is usual
 _SHORTEN = 0.3  # of one that is shorter than a beat in the beat
 _EVEN = 0.15  # of a beat; by which an interval of one may be off, and of several twice
 _OF_LATE = 50  # intervals; before there are so many nothing is guessed
-_REGULAR = 0.65  # share of one beat: below it silence is meant, as nothing changes
+_REGULAR = 0.65  # share of one beat: before it is reached silence is meant, as nothing changes
+_IRREGULAR = 0.5  # below it time is kept no longer; lower, as the share varies by a few hundredths
 _MOST = 9  # demands in a row that may get lost; a longer silence is one that was meant
 
 
@@ -34,6 +35,7 @@ class Beat:
         self._intervals: deque[float] = deque(maxlen=_OF_LATE)  # s
         self._period = 0.0  # s; between those that are sent
         self._regular = 0.0  # share of the intervals, of late, that were one beat
+        self._keeps_time = False
 
     def hear(self, interval: float) -> None:
         """Take in the time [s] between two demands that came."""
@@ -43,13 +45,14 @@ class Beat:
         self.usual = usual + _BLEND * (min(interval, LOST * usual) - usual)
         if interval < 0.9 * self._period or self._period == 0.0:
             self._period += (_SHORTEN if self._period else 1.0) * (interval - self._period)
-        if interval < 1.5 * self._period or self._regular < _REGULAR:
+        if interval < 1.5 * self._period or not self._keeps_time:
             self._period += _BLEND * (interval - self._period)
         even = abs(interval / self._period - 1.0) < _EVEN
         heard = len(self._intervals)
         self._regular += (even - self._regular) / heard
-        keeps_time = self._regular >= _REGULAR and heard == _OF_LATE
-        self.patience = 1.5 * self._period if keeps_time else math.inf
+        needed = _IRREGULAR if self._keeps_time else _REGULAR
+        self._keeps_time = self._regular >= needed and heard == _OF_LATE
+        self.patience = 1.5 * self._period if self._keeps_time else math.inf
 
     def lost(self, interval: float) -> int:
         """How many demands got lost within an interval [s]."""
