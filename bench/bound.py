@@ -38,7 +38,7 @@ from rov_ident.demo import shipped
 from rov_ident.frames import quaternion_to_matrix
 from rov_ident.jit import kernel
 from rov_ident.messages import Imu, Odometry, Wrench
-from rov_ident.model import Array, columns, generalized_force
+from rov_ident.model import Array, columns, generalized_force, momentum_columns
 from rov_ident.sensors import START, Dive, Suite, dive
 from rov_ident.simulate import simulate
 
@@ -174,6 +174,7 @@ def _filter(
     nu_dot, jacobian = np.empty(6), np.empty((6, 6))
     force, middle, transition = np.empty(6), np.empty(6), np.eye(12)
     momentum, columns_of_force = np.empty((6, m)), np.empty((6, m))
+    extended = np.empty((EXTENDED_SIZE, 1))
     gamma, h, g = np.empty((6, m)), np.empty(12), np.empty(m)
     for i in range(6):
         x[i], p[i, i] = z[0, i], variance[0, i]
@@ -190,9 +191,8 @@ def _filter(
             for i in range(6):
                 middle[i] = x[i] + 0.5 * dt * nu_dot[i]
             _acceleration(structure, mass, inverse, thetas, force, middle, nu_dot, jacobian, work)
-            columns(structure, nu_dot, momentum, columns_of_force)
-            gamma[:] = momentum
-            columns(structure, middle, momentum, columns_of_force)
+            momentum_columns(structure, nu_dot, gamma)
+            columns(structure, middle, momentum, columns_of_force, extended)
             gamma += columns_of_force
             gamma[:] = -dt * (inverse @ gamma)
             step = np.eye(6) + dt * jacobian + 0.5 * dt * dt * (jacobian @ jacobian)
@@ -238,9 +238,8 @@ def _filter(
                 h[b] += x[3 + a]
                 h[3 + b] -= x[a]
                 h[a] -= x[3 + b]
-                columns(structure, nu_dot, momentum, columns_of_force)
-                gamma[:] = momentum
-                columns(structure, nu, momentum, columns_of_force)
+                momentum_columns(structure, nu_dot, gamma)
+                columns(structure, nu, momentum, columns_of_force, extended)
                 gamma += columns_of_force
                 for j in range(m):
                     for i in range(6):

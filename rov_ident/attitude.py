@@ -17,13 +17,19 @@ def rotation_of(w, x, y, z):
     )
 
 
+@inlined
+def rotate(q, r):
+    """r (3, 3) = R, body -> world, of the unit quaternion q (4,)."""
+    a, b, c = rotation_of(q[0], q[1], q[2], q[3])
+    for j in range(3):
+        r[0, j], r[1, j], r[2, j] = a[j], b[j], c[j]
+
+
 @kernel
 def rotation(q):
     """R (3, 3), body -> world, of the unit quaternion q (4,)."""
-    a, b, c = rotation_of(q[0], q[1], q[2], q[3])
     r = np.empty((3, 3))
-    for j in range(3):
-        r[0, j], r[1, j], r[2, j] = a[j], b[j], c[j]
+    rotate(q, r)
     return r
 
 

@@ -36,7 +36,7 @@ from rov_ident.errors import UserError
 from rov_ident.estimate import prior_of
 from rov_ident.excitation import authority
 from rov_ident.jit import inner, kernel
-from rov_ident.model import Array, Model, Structure, columns, generalized_force
+from rov_ident.model import Array, Model, Structure, columns, generalized_force, momentum_columns
 
 _POINTS = 7  # a velocity and its displacements along the six components, for the Jacobian
 _STEP = 1e-6  # m/s, rad/s; of these displacements
@@ -468,7 +468,8 @@ def _filter(
     stage, middle, force, pace = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
     jacobian, square, phi = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
     push, effect = np.zeros((6, 6)), np.zeros((6, n))
-    momentum, momentum_of, force_of = np.zeros((6, m)), np.zeros((6, m)), np.zeros((6, m))
+    of_pace, momentum, of_motion = np.zeros((6, m)), np.zeros((6, m)), np.zeros((6, m))
+    extended = np.empty((EXTENDED_SIZE, 1))
     now, lagged, row, line = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6)
     started = False
     for k in range(len(samples)):
@@ -542,13 +543,13 @@ def _filter(
                     square[i, j] = dt * (unit + 0.5 * jacobian[i, j] + square[i, j] / 6.0)
             _product(square, eq.inverse, push)
             if tangent:
-                columns(eq.structure, c, momentum, force_of)
-                columns(eq.structure, middle, momentum_of, force_of)
+                momentum_columns(eq.structure, c, of_pace)
+                columns(eq.structure, middle, momentum, of_motion, extended)
                 _product(phi, s, new_s)
                 for i in range(6):
                     for j in range(n):
                         e = eq.estimated[j]
-                        effect[i, j] = momentum[i, e] + force_of[i, e]
+                        effect[i, j] = of_pace[i, e] + of_motion[i, e]
                 for i in range(6):
                     for j in range(6):
                         f = push[i, j]

@@ -38,7 +38,7 @@ from rov_ident.coefficients import (
     parse_fin,
 )
 from rov_ident.errors import UserError
-from rov_ident.jit import inlined, kernel
+from rov_ident.jit import inlined, kernel, lean
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -210,11 +210,10 @@ class Model:
     def regressor(self, nu: Array, nu_dot: Array) -> Array:
         """Y (6, n): ``wrench = M_RB nu_dot + C_RB nu + g + Y theta``."""
         structure, n = self.structure, len(self.theta)
-        momentum, force = np.zeros((6, n)), np.zeros((6, n))
-        columns(structure, _vector(nu_dot), momentum, force)
-        of_acceleration = momentum.copy()
-        columns(structure, _vector(nu), momentum, force)
-        return of_acceleration + force
+        momentum, force, of_rate = np.zeros((6, n)), np.zeros((6, n)), np.zeros((6, n))
+        momentum_columns(structure, _vector(nu_dot), of_rate)
+        columns(structure, _vector(nu), momentum, force, np.empty((EXTENDED_SIZE, 1)))
+        return of_rate + force
 
 
 def build(body: RigidBody, values: Mapping[str, float]) -> Model:
@@ -356,7 +355,7 @@ def generalized_force(lanes, structure, mass, theta, nu, h, extended):
             h[row, k] -= theta[first + term, k] * extended[left, k] * extended[right, k]
 
 
-@kernel
+@lean
 def add_added_mass(structure, theta, mass):
     """mass (6, 6, lanes) += M_A: each coefficient enters its entry and the mirrored one."""
     lanes = mass.shape[2]
@@ -368,31 +367,42 @@ def add_added_mass(structure, theta, mass):
                 mass[j, i, k] -= theta[c, k]
 
 
-@kernel
-def columns(structure, nu, momentum, force):
-    """The regressor's two parts: per unit of each coefficient, momentum and force (6, n).
-
-    ``wrench = d/dt(momentum @ theta) + force @ theta + known``: the derivative is left to the
-    caller, who may differentiate, filter or integrate by parts. Both arrays are overwritten.
-    """
-    momentum[:] = 0.0
-    force[:] = 0.0
-    first = len(structure.mass_row)
-    for c in range(first):
+@lean
+def momentum_columns(structure, nu, momentum):
+    """The momentum (6, n) at nu (6,) per unit of each coefficient; the array is overwritten."""
+    for i in range(6):
+        for c in range(momentum.shape[1]):
+            momentum[i, c] = 0.0
+    for c in range(len(structure.mass_row)):
         i, j = structure.mass_row[c], structure.mass_column[c]
         momentum[i, c] = -nu[j]
         momentum[j, c] = -nu[i]
+
+
+@lean
+def columns(structure, nu, momentum, force, extended):
+    """The regressor's two parts: per unit of each coefficient, momentum and force (6, n).
+
+    ``wrench = d/dt(momentum @ theta) + force @ theta + known``: the derivative is left to the
+    caller, who may differentiate (:func:`momentum_columns` of nu_dot), filter or integrate by
+    parts. Both arrays are overwritten; extended (EXTENDED_SIZE, 1) is work space.
+    """
+    momentum_columns(structure, nu, momentum)
+    first = len(structure.mass_row)
+    for i in range(6):
+        for c in range(first, force.shape[1]):
+            force[i, c] = 0.0
+    for c in range(first):
         h = coriolis_of(six(momentum, c), (nu[0], nu[1], nu[2], nu[3], nu[4], nu[5]))
         for k in range(6):
             force[k, c] = h[k]
-    extended = np.empty((EXTENDED_SIZE, 1))
     extend(1, nu.reshape(6, 1), extended)
     for term in range(len(structure.row)):
         left, right = structure.left[term], structure.right[term]
         force[structure.row[term], first + term] = -extended[left, 0] * extended[right, 0]
 
 
-@kernel
+@lean
 def in_motion(structure, moving, out):
     """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,)."""
     first = len(structure.mass_row)
@@ -412,14 +422,27 @@ def coriolis(p, nu):
     return np.array(coriolis_of(six(p.reshape(6, 1), 0), six(nu.reshape(6, 1), 0)))
 
 
+CURRENT = np.dtype(
+    [
+        ("relative", "f8", (6,)),  # nu through the water
+        ("nu", "f8", (6, 1)),
+        ("h", "f8", (6, 1)),
+        ("through_water", "f8", (6, 1)),
+        ("extended", "f8", (EXTENDED_SIZE, 1)),
+    ],
+    align=True,
+)
+"""Work space of :func:`add_current`."""
+
+
 @inlined
-def add_current(structure, added_mass, theta, nu, relative, water, out):
+def add_current(structure, added_mass, theta, nu, water, s, out):
     """Add to out (6,) what steadily moving water adds to the thruster wrench in still water.
 
-    ``added_mass`` (6, 6, 1), ``theta`` (n, 1), ``nu`` (6,) over ground and ``relative`` (6,)
-    through the water, whose velocity in body axes [m/s] is ``water``, a tuple of three:
-    irrotational and constant in the world. The hydrodynamic forces are those of the velocity
-    through the water ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
+    ``added_mass`` (6, 6, 1), ``theta`` (n, 1), ``nu`` (6,) over ground and the velocity of the
+    ``water`` in body axes [m/s], a tuple of three: irrotational and constant in the world. s is a
+    record of CURRENT and keeps the velocity ``relative`` to the water. The hydrodynamic forces are
+    those of ``nu_r = nu - nu_c`` (Fossen 2021, sec. 10.3)::
 
         M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r - d(nu_r) + g = tau
         nu_c = [water; 0],   nu_c_dot = [-omega x water; 0]
@@ -427,21 +450,21 @@ def add_current(structure, added_mass, theta, nu, relative, water, out):
     Moving what differs from the equation for still water to the right leaves
     ``M_A nu_c_dot + (C_A(nu) nu - d(nu)) - (C_A(nu_r) nu_r - d(nu_r))``.
     """
-    # one array for all: each that is made here takes as long as the forces themselves
-    work = np.empty((24 + EXTENDED_SIZE, 1))
-    h, through_water, extended = work[:6], work[6:12], work[24:]
-    over_ground, over_water = work[12:18], work[18:24]
     for i in range(6):
-        over_ground[i, 0], over_water[i, 0] = nu[i], relative[i]
-    generalized_force(1, structure, added_mass, theta, over_ground, h, extended)
-    generalized_force(1, structure, added_mass, theta, over_water, through_water, extended)
+        s.nu[i, 0] = nu[i]
+    generalized_force(1, structure, added_mass, theta, s.nu, s.h, s.extended)
+    s.nu[0, 0] -= water[0]
+    s.nu[1, 0] -= water[1]
+    s.nu[2, 0] -= water[2]
+    generalized_force(1, structure, added_mass, theta, s.nu, s.through_water, s.extended)
     turning = (
         nu[5] * water[1] - nu[4] * water[2],
         nu[3] * water[2] - nu[5] * water[0],
         nu[4] * water[0] - nu[3] * water[1],
     )
     for i in range(6):
-        out[i] += h[i, 0] - through_water[i, 0]
+        s.relative[i] = s.nu[i, 0]
+        out[i] += s.h[i, 0] - s.through_water[i, 0]
         for j in range(3):
             out[i] += added_mass[i, j, 0] * turning[j]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rov_ident.jit import inlined, inner, kernel
+from rov_ident.jit import inlined, inner
 from rov_ident.process_noise import LARGEST
 
 MAX_STEP = 0.05  # s; of one step of the prediction
@@ -26,7 +26,7 @@ INFO = np.dtype(
 """What happened to a sample."""
 
 
-@kernel
+@inner
 def begin(info, sample):
     """Nothing has happened yet to the sample: whether nothing in it would spoil a state.
 
@@ -76,11 +76,3 @@ def add_score(g, lagged, score, since):
             score[a, b] += g[a] * (g[b] + lagged[b]) + lagged[a] * g[b]
     for a in range(n):
         lagged[a] += g[a]
-
-
-@inner
-def copy(a, b):
-    """Into matrix b from a, as far as both go. (``b[:] = a`` takes a second to compile.)"""
-    for i in range(min(len(a), len(b))):
-        for j in range(min(a.shape[1], b.shape[1])):
-            b[i, j] = a[i, j]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import prior_of
 from rov_ident.jit import inlined, kernel
@@ -60,6 +61,7 @@ def filtered_rows(task: Regression, samples: NDArray[np.void], period: float) ->
 def _rows(task, samples, period, out):
     n, m = len(task.scale), len(task.theta)
     momentum, force, p = np.empty((6, m)), np.empty((6, m)), np.empty(6)
+    extended = np.empty((EXTENDED_SIZE, 1))
     now, rate = np.empty((6, n + 1)), np.empty((6, n + 1))  # P, and w P - H
     x, y, u, last = (
         np.zeros((6, n + 1)), np.zeros((6, n + 1)), np.zeros((6, n + 1)), np.zeros((6, n + 1)),
@@ -67,7 +69,7 @@ def _rows(task, samples, period, out):
     w, used, started, since = task.corner, 0, False, 0.0
     for k in range(len(samples)):
         sample = samples[k]
-        _regress(task, sample, momentum, force, p, now, rate)
+        _regress(task, sample, momentum, force, extended, p, now, rate)
         if sample.restart or not started or not sample.dt > 0.0:
             started, since = True, 0.0
             for i in range(6):
@@ -99,10 +101,10 @@ def _rows(task, samples, period, out):
 
 
 @inlined
-def _regress(task, sample, momentum, force, p, now, rate):
+def _regress(task, sample, momentum, force, extended, p, now, rate):
     """now: momenta, rate: corner * momentum - force; the last column is what is known."""
     n, w, nu = len(task.scale), task.corner, sample.nu
-    columns(task.structure, nu, momentum, force)
+    columns(task.structure, nu, momentum, force, extended)
     for i in range(6):
         p[i] = 0.0
         for j in range(6):

@@ -7,7 +7,7 @@ the momentum P is exact: ``s w/(s + w) P = w (P - x)`` where x is the filtered P
 
 import numpy as np
 
-from rov_ident.jit import inlined, kernel
+from rov_ident.jit import inlined, inner
 from rov_ident.model import generalized_force, six, symmetric_product
 
 
@@ -57,7 +57,7 @@ def filtered_residual(
         u[i], last[i] = now, p
 
 
-@kernel
+@inner
 def first_order(corner, dt):
     """a, b0, b1 of ``x = a x + b0 u_before + b1 u_now``.
 

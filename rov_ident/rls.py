@@ -47,7 +47,7 @@ from numpy.typing import NDArray
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
-from rov_ident.jit import inlined, inner, kernel, reordered
+from rov_ident.jit import copy, inlined, inner, kernel, reordered
 from rov_ident.model import (
     AHEAD,
     NODES,
@@ -57,6 +57,7 @@ from rov_ident.model import (
     columns,
     generalized_force,
     in_motion,
+    momentum_columns,
 )
 from rov_ident.process_noise import adapt, first_adaptation, interrupt, process, wrench_noise
 from rov_ident.recursion import (
@@ -67,7 +68,6 @@ from rov_ident.recursion import (
     add_score,
     add_surprise,
     begin,
-    copy,
     steps_of,
 )
 from rov_ident.residual import filtered_residual
@@ -293,6 +293,7 @@ class Work(NamedTuple):
     one_theta: Array  # (m, 1)
     estimated: NDArray[np.int64]  # (n,): indices into theta, in the order of the columns
     scale: Array  # (n,)
+    place: NDArray[np.int64]  # (n,): where each column was
     moves: NDArray[np.bool_]  # (m,)
     moving: NDArray[np.uint8]  # (6,)
     momentum: Array  # (6, m): per unit of each coefficient
@@ -314,7 +315,7 @@ class Work(NamedTuple):
     scratch: NDArray[np.void]  # (1,): in one record, whose parts the compiler knows apart
 
 
-@inner
+@inlined
 def _work(task, state):
     n, m = len(task.scale), len(task.theta)
     columns = _WIDTH * ((n + 2) // _WIDTH + 1)
@@ -323,6 +324,7 @@ def _work(task, state):
         np.empty((m, 1)),
         np.empty(n, dtype=np.int64),
         np.empty(n),
+        np.empty(n, dtype=np.int64),
         np.empty(m, dtype=np.bool_),
         np.empty(6, dtype=np.uint8),
         np.empty((6, m)),
@@ -360,48 +362,49 @@ def _name_columns(task, state, work):
 @kernel
 def _fold(task, state, samples, sides, info):
     work = _work(task, state)
-    _take_over(task, state, work)
-    for k in range(len(samples)):
-        _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
+    _steps(task, state, work, samples, sides, info)
     copy(work.root, state.root)
     copy(work.score, state.score)
     copy(work.sensitivity, state.sensitivity)
 
 
-@inlined
-def _step(task, state, work, sample, side, info):
-    s, c = task.settings[0], state.scalars[0]
-    if not begin(info, sample):
-        info.reason = NOT_FINITE
-        return
-    c.t = sample.t
-    info.reason = USED
-    if sample.restart or not c.started or not sample.dt > 0.0:
-        info.reason = RESTARTED
-        _restart(state, work, sample)
-        _take_sides(task, work, sample, side)
-    else:
-        c.since_update += sample.dt
-        _judge_motion(task, state, work, sample)
-        _take_sides(task, work, sample, side)
-        if _predict(task, state, work, sample, side):
-            _update(task, state, work, sample, side, info)
+@inner
+def _steps(task, state, work, samples, sides, infos):
+    """The fold itself, apart from what makes its arrays (:func:`rov_ident.jit.lean`)."""
+    s, c, x = task.settings[0], state.scalars[0], work.scratch[0]
+    _take_over(task, state, work)
+    for k in range(len(samples)):
+        sample, info, side = samples[k], infos[k], sides[k if sides.shape[2] > 0 else 0]
+        if not begin(info, sample):
+            info.reason = NOT_FINITE
+            continue
+        c.t = sample.t
+        info.reason = USED
+        if sample.restart or not c.started or not sample.dt > 0.0:
+            info.reason = RESTARTED
+            _restart(state, work, sample)
+            _take_sides(task, work, sample, side)
         else:
-            # The model runs away; better begin again with what was known before any data.
-            info.reason = UNPREDICTABLE
-            c.started = False
-            for a in range(len(state.deviation)):
-                state.deviation[a] = 0.0
-            _take_over(task, state, work)
-            return
-        if c.since_update >= _PERIOD - 1e-6:
-            _learn(task, state, work, info)
-    x = work.scratch[0]
-    filtered_residual(
-        task.structure, work.one_theta, x.one_mass, task.restoring, s.corner, state.residual,
-        sample, x.wrench, info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended,
-        info.residual,
-    )  # fmt: skip
+            c.since_update += sample.dt
+            _judge_motion(task, state, work, sample)
+            _take_sides(task, work, sample, side)
+            if _predict(task, state, work, sample, side):
+                _update(task, state, work, sample, side, info)
+            else:
+                # The model runs away; better begin again with what was known before any data.
+                info.reason = UNPREDICTABLE
+                c.started = False
+                for a in range(len(state.deviation)):
+                    state.deviation[a] = 0.0
+                _take_over(task, state, work)
+                continue
+            if c.since_update >= _PERIOD - 1e-6:
+                _learn(task, state, work, info)
+        filtered_residual(
+            task.structure, work.one_theta, x.one_mass, task.restoring, s.corner, state.residual,
+            sample, x.wrench, info.reason == RESTARTED, x.one_nu, x.one_h, x.one_extended,
+            info.residual,
+        )  # fmt: skip
 
 
 @inlined
@@ -507,7 +510,7 @@ def _predict(task, state, work, sample, side):
     for step in range(steps):
         _linearise(task, work, nu, step * dt - 0.5 * sample.dt, dt)
         # the regressor, in the middle of the step
-        columns(task.structure, s.rate, work.of_rate, work.of_motion)
+        momentum_columns(task.structure, s.rate, work.of_rate)
         if free < n:
             _drive(work, task.structure, s.middle, free, n)
             for i in range(6):
@@ -540,7 +543,7 @@ def _predict(task, state, work, sample, side):
 @inlined
 def _drive(work, structure, nu, first, end):
     """work.drive of these columns: the wrench that a unit more of each coefficient adds."""
-    columns(structure, nu, work.momentum, work.of_motion)
+    columns(structure, nu, work.momentum, work.of_motion, work.scratch[0].one_extended)
     for i in range(6):
         for a in range(first, end):
             e = work.estimated[a]
@@ -654,21 +657,18 @@ def _judge_motion(task, state, work, sample):
 @inner
 def _sort(task, state, work):
     """Columns of what moves first, all parts of the state alike."""
-    n = len(state.order)
-    place, at = np.empty(n, dtype=np.int64), 0
+    n, place, at = len(state.order), work.place, 0
     for moves in (True, False):
         for a in range(n):
             if work.moves[work.estimated[a]] == moves:
                 place[at] = a
                 at += 1
-    order, lagged, deviation = state.order.copy(), state.lagged.copy(), state.deviation.copy()
-    solution = state.solution.copy()
+    _permute(place, state.order, work.estimated)
+    _permute(place, state.lagged, work.line)
+    _permute(place, state.deviation, work.line)
+    _permute(place, state.solution, work.line)
     copy(work.score, work.spare)
     for a in range(n):
-        state.order[a] = order[place[a]]
-        state.lagged[a] = lagged[place[a]]
-        state.deviation[a] = deviation[place[a]]
-        state.solution[a] = solution[place[a]]
         for b in range(n):
             work.score[a, b] = work.spare[place[a], place[b]]
     copy(work.sensitivity, work.drive)
@@ -688,6 +688,15 @@ def _sort(task, state, work):
                 work.rows[i, b] = work.spare[a, place[b]] if a < n else 0.0
             work.rows[i, n] = work.spare[a, n] if a < n else 0.0
         _stack(work.root, work.rows, n, 3, 0, work.line)
+
+
+@inner
+def _permute(place, x, before):
+    """x[a] (n,) becomes x[place[a]]; before (n,) is work space."""
+    for a in range(len(x)):
+        before[a] = x[a]
+    for a in range(len(x)):
+        x[a] = before[place[a]]
 
 
 # ---------------------------------------------------------------- update

@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
-from rov_ident.effects import Acting, add_surroundings, input_effects, let_act, memory, surroundings
-from rov_ident.jit import inner, released
+from rov_ident.effects import Acting, act, add_surroundings, memory, surroundings
+from rov_ident.jit import copy, inner, released
 from rov_ident.model import (
+    CURRENT,
     NODES,
     Array,
     Model,
     Structure,
     columns,
     generalized_force,
+    momentum_columns,
     six,
     symmetric_product,
 )
@@ -97,7 +99,7 @@ def thrust(steps: Steps, acting: Acting) -> Array:
     """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
     wrench = steps.demand.copy()
     if acting.inputs.any():
-        _thrust(*input_effects(acting), memory(), steps.piece_t, wrench)
+        _thrust(acting, memory(), steps.piece_t, wrench)
     share = np.diff(steps.piece_t)[:, None] * wrench
     length = np.diff(steps.t)[:, None]
     mean = np.add.reduceat(share, steps.piece) / length
@@ -123,8 +125,8 @@ def shoot(
     )
     _shoot(
         *surroundings(eq.acting), eq.structure, eq.mass, eq.added, eq.inverse,
-        eq.theta, eq.restoring, steps, wrench, first, last, start,
-        np.zeros(1, _SCRATCH), motion,
+        eq.theta, np.repeat(eq.theta, _LANES, axis=1), eq.restoring, steps, wrench, first, last,
+        start, np.zeros(1, _SCRATCH), motion,
     )  # fmt: skip
     return motion
 
@@ -132,29 +134,32 @@ def shoot(
 def tangent(motion: Motion, first: Indices, last: Indices, force: Array, nodes: Indices) -> Array:
     """Sensitivities (N, 6, P) at ``nodes`` (N,) to each column of wrenches (K, 6, P)."""
     p, force = force.shape[2], np.ascontiguousarray(force)
-    out = np.zeros((len(nodes), 6, p))
-    _tangent(motion.phi, motion.gamma, first, last, force, np.zeros((6, p)), nodes, out)
+    out, work = np.zeros((len(nodes), 6, p)), np.empty((2, 6, p))
+    _tangent(motion.phi, motion.gamma, first, last, force, np.zeros((6, p)), nodes, work, out)
     return out
 
 
 def start_tangent(motion: Motion, first: Indices, last: Indices, nodes: Indices) -> Array:
     """Sensitivities (N, 6, 6) at ``nodes`` (N,) to the start of the window."""
-    out = np.zeros((len(nodes), 6, 6))
-    _tangent(motion.phi, motion.gamma, first, last, None, np.eye(6), nodes, out)
+    out, work = np.zeros((len(nodes), 6, 6)), np.empty((2, 6, 6))
+    _tangent(motion.phi, motion.gamma, first, last, None, np.eye(6), nodes, work, out)
     return out
 
 
 def adjoint(motion: Motion, first: Indices, last: Indices, error: Array, nodes: Indices) -> Array:
     """The transpose of :func:`tangent`: errors (N, 6) at the nodes to wrenches (K, 6)."""
     out = np.zeros((len(motion.middle), 6))
-    _adjoint(motion.phi, motion.gamma, first, last, error, nodes, out)
+    _adjoint(motion.phi, motion.gamma, first, last, error, nodes, np.empty((2, 6)), out)
     return out
 
 
 def regressors(eq: Equations, motion: Motion) -> Array:
     """What a unit of each coefficient adds to the wrench side of the equations, (K, 6, n)."""
-    out = np.empty((len(motion.middle), 6, len(eq.theta)))
-    _regressors(eq.structure, motion.middle, motion.pace, out)
+    n = len(eq.theta)
+    out, work, extended = (
+        np.empty((len(motion.middle), 6, n)), np.empty((3, 6, n)), np.empty((EXTENDED_SIZE, 1)),
+    )  # fmt: skip
+    _regressors(eq.structure, motion.middle, motion.pace, work, extended, out)
     return out
 
 
@@ -162,7 +167,10 @@ def wrenches(eq: Equations, steps: Steps, motion: Motion) -> Array:
     """Wrench effects and current (K, 6) along a motion."""
     out, (around, current) = np.zeros((len(motion.middle), 6)), surroundings(eq.acting)
     if around is not None:
-        _wrenches(around, current, eq.structure, eq.added, eq.theta, steps, motion.middle, out)
+        _wrenches(
+            around, current, eq.structure, eq.added, eq.theta, steps, motion.middle,
+            np.zeros(1, CURRENT), out,
+        )  # fmt: skip
     return out
 
 
@@ -170,17 +178,17 @@ def wrenches(eq: Equations, steps: Steps, motion: Motion) -> Array:
 
 
 @released
-def _thrust(there, parameters, state, t, wrench):
+def _thrust(acting, state, t, wrench):
     for k in range(len(wrench)):
-        let_act(there, parameters, state, t[k], t[k + 1] - t[k], wrench[k])
+        act(acting, state, t[k], t[k + 1] - t[k], wrench[k])
 
 
 @released
-def _wrenches(around, current, structure, added, theta, steps, nu, out):
-    t, middle = steps.t, steps.middle
+def _wrenches(around, current, structure, added, theta, steps, nu, scratch, out):
+    t, middle, s = steps.t, steps.middle, scratch[0]
     for k in range(len(nu)):
         now = 0.5 * (t[k] + t[k + 1])
-        add_surroundings(around, current, structure, added, theta, now, nu[k], middle[k], out[k])
+        add_surroundings(around, current, structure, added, theta, now, nu[k], middle[k], s, out[k])
 
 
 _LANES = 8  # six axes, none, and one more to fill the vectors
@@ -195,6 +203,7 @@ _SCRATCH = np.dtype(
         ("mass", "f8", (6, 6, 1)),
         ("inverse", "f8", (6, 6, 1)),
         ("velocity", "f8", (6,)),
+        ("end", "f8", (6,)),  # of the step: nu
         ("nearby", "f8", (6, _LANES)),
         ("nearby_h", "f8", (6, _LANES)),
         ("nearby_extended", "f8", (EXTENDED_SIZE, _LANES)),
@@ -202,6 +211,7 @@ _SCRATCH = np.dtype(
         ("by_velocity", "f8", (6, 6)),
         ("jacobian", "f8", (6, 6)),
         ("square", "f8", (6, 6)),
+        ("current", CURRENT),
     ],
     align=True,
 )
@@ -215,7 +225,9 @@ def _pace(around, current, structure, added, theta, restoring, t, rotation, give
         for j in range(3):
             s.push[i] += restoring[i, j] * rotation[2, j]
     if around is not None:  # numba leaves this out where it is None
-        add_surroundings(around, current, structure, added, theta, t, s.velocity, rotation, s.push)
+        add_surroundings(
+            around, current, structure, added, theta, t, s.velocity, rotation, s.current, s.push
+        )
     h = s.h
     generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
     for i in range(6):
@@ -248,8 +260,9 @@ def _differentiate(around, current, structure, added, theta, wide, t, rotation, 
             for i in range(6):
                 s.velocity[i], s.push[i] = nearby[i, k], 0.0
             add_surroundings(
-                around, current, structure, added, theta, t, s.velocity, rotation, s.push
-            )
+                around, current, structure, added, theta, t, s.velocity, rotation, s.current,
+                s.push,
+            )  # fmt: skip
             for i in range(6):
                 h[i, k] -= s.push[i]
     for i in range(6):
@@ -283,16 +296,16 @@ def _advance(inverse, dt, s, phi, gamma):
 
 @released
 def _shoot(
-    around, current, structure, mass, added, inverse, theta, restoring, steps, wrench, first, last,
-    start, scratch, motion,
+    around, current, structure, mass, added, inverse, theta, wide, restoring, steps, wrench, first,
+    last, start, scratch, motion,
 ):  # fmt: skip
-    s = scratch[0]  # the caller's: a record does not keep its array alive
-    s.mass[:], s.inverse[:, :, 0] = mass, inverse
-    wide = np.empty((len(theta), _LANES))
-    for k in range(_LANES):
-        s.nearby_mass[:, :, k], wide[:, k] = mass[:, :, 0], theta[:, 0]
-    slope, nu, given = s.slope, np.empty(6), np.empty(0)
-    # Once: to take an array out of a tuple is not free.
+    s = scratch[0]
+    for i in range(6):
+        for j in range(6):
+            s.mass[i, j, 0], s.inverse[i, j, 0] = mass[i, j, 0], inverse[i, j]
+            for k in range(_LANES):
+                s.nearby_mass[i, j, k] = mass[i, j, 0]
+    slope, nu, given = s.slope, s.end, s.end[:0]
     node, rotations, middles, guided = steps.t, steps.rotation, steps.middle, steps.given
     reached, halfway, paces = motion.nu, motion.middle, motion.pace
     phi, gamma = motion.phi, motion.gamma
@@ -333,26 +346,30 @@ def _shoot(
             _differentiate(around, current, structure, added, theta, wide, t, middles[k], s)
             _advance(inverse, dt, s, phi[k], gamma[k])
             if not worst < 50.0:  # no vehicle moves so; NaN too
-                reached[k + 1 : last[w] + 1] = np.nan
+                for n in range(k + 1, last[w] + 1):
+                    for i in range(6):
+                        reached[n, i] = np.nan
                 break
 
 
 @released
-def _tangent(phi, gamma, first, last, force, begin, nodes, out):
-    now, new = np.empty(begin.shape), np.empty(begin.shape)
+def _tangent(phi, gamma, first, last, force, begin, nodes, work, out):
+    """work (2, 6, P)."""
+    now, new = work[0], work[1]
     n = 0
     for w in range(len(first)):
-        now[:] = begin
+        copy(begin, now)
         while n < len(nodes) and nodes[n] < first[w]:
             n += 1
         for k in range(first[w], last[w] + 1):
             if n < len(nodes) and nodes[n] == k:
-                out[n] = now
+                copy(now, out[n])
                 n += 1
             if k == last[w]:
                 break
-            new[:] = 0.0
             for i in range(6):
+                for c in range(begin.shape[1]):
+                    new[i, c] = 0.0
                 for j in range(6):
                     f, g = phi[k, i, j], gamma[k, i, j]
                     for c in range(begin.shape[1]):
@@ -360,31 +377,41 @@ def _tangent(phi, gamma, first, last, force, begin, nodes, out):
                             new[i, c] += f * now[j, c]
                         else:
                             new[i, c] += f * now[j, c] + g * force[k, j, c]
-            now[:] = new
+            copy(new, now)
 
 
 @released
-def _adjoint(phi, gamma, first, last, error, nodes, out):
+def _adjoint(phi, gamma, first, last, error, nodes, work, out):
+    """work (2, 6)."""
+    mu, before = work[0], work[1]
     n = len(nodes) - 1
     for w in range(len(first) - 1, -1, -1):
-        mu = np.zeros(6)
+        for i in range(6):
+            mu[i] = 0.0
         for k in range(last[w], first[w] - 1, -1):
             while n >= 0 and nodes[n] > k:
                 n -= 1
             if n >= 0 and nodes[n] == k:
-                mu += error[n]
+                for i in range(6):
+                    mu[i] += error[n, i]
             if k > first[w]:
-                out[k - 1] = gamma[k - 1].T @ mu
-                mu = phi[k - 1].T @ mu
+                for i in range(6):
+                    before[i], out[k - 1, i] = 0.0, 0.0
+                for j in range(6):
+                    for i in range(6):
+                        before[i] += phi[k - 1, j, i] * mu[j]
+                        out[k - 1, i] += gamma[k - 1, j, i] * mu[j]
+                for i in range(6):
+                    mu[i] = before[i]
 
 
 @released
-def _regressors(structure, nu, pace, out):
-    n = out.shape[2]
-    momentum, force, other = np.empty((6, n)), np.empty((6, n)), np.empty((6, n))
+def _regressors(structure, nu, pace, work, extended, out):
+    """work (3, 6, n)."""
+    of_pace, momentum, force = work[0], work[1], work[2]
     for k in range(len(nu)):
-        columns(structure, pace[k], momentum, force)
-        columns(structure, nu[k], other, force)
+        momentum_columns(structure, pace[k], of_pace)
+        columns(structure, nu[k], momentum, force, extended)
         for i in range(6):
-            for j in range(n):
-                out[k, i, j] = -momentum[i, j] - force[i, j]
+            for j in range(out.shape[2]):
+                out[k, i, j] = -of_pace[i, j] - force[i, j]

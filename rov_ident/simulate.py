@@ -7,12 +7,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.attitude import rotation, rotation_of
+from rov_ident.attitude import rotate, rotation_of
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.effects import Acting, add_surroundings, surroundings
 from rov_ident.errors import UserError
-from rov_ident.jit import inner, kernel
-from rov_ident.model import NODES, Array, Model, generalized_force, six, symmetric_product
+from rov_ident.jit import inner, lean
+from rov_ident.model import (
+    CURRENT,
+    NODES,
+    Array,
+    Model,
+    generalized_force,
+    six,
+    symmetric_product,
+)
 
 MAX_STEP = 0.02  # s; within 1e-5 m/s of an adaptive integration for a BlueROV2 driven hard
 
@@ -164,6 +172,9 @@ _SCRATCH = np.dtype(
         ("extended", "f8", (EXTENDED_SIZE, 1)),
         ("mass", "f8", (6, 6, 1)),
         ("inverse", "f8", (6, 6, 1)),  # among the free components
+        ("velocity", "f8", (6,)),
+        ("rotation", "f8", (3, 3)),
+        ("current", CURRENT),
     ],
     align=True,
 )
@@ -199,7 +210,7 @@ def _derivative(structure, theta, restoring, guided, s, rate):
         rate[7 + i] = nu_dot[i] + s.pace[i]
 
 
-@kernel
+@lean
 def _simulate(
     around, current, structure, added_mass, mass, inverse, theta, restoring, t, wrench,
     wrench_slope, free, guide, attitude, start, max_step, scratch, out,
@@ -244,9 +255,12 @@ def _simulate(
                     for j in range(6):
                         s.push[j] += (now - 0.5 * span) * wrench_slope[i, j]
                 if around is not None:  # numba leaves this out where it is None
+                    for j in range(6):
+                        s.velocity[j] = stage[7 + j]
+                    rotate(stage[3:7], s.rotation)
                     add_surroundings(
-                        around, current, structure, added_mass, theta, t[i] + now,
-                        stage[7:13], rotation(stage[3:7]), s.push,
+                        around, current, structure, added_mass, theta, t[i] + now, s.velocity,
+                        s.rotation, s.current, s.push,
                     )  # fmt: skip
                 _derivative(structure, theta, restoring, guided, s, slope[k])
                 if n == 0 and k == 0:

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
-from rov_ident.jit import inlined, inner, kernel, reordered
+from rov_ident.jit import copy, inlined, inner, kernel, reordered
 from rov_ident.model import (
     AHEAD,
     NODES,
@@ -59,7 +59,6 @@ from rov_ident.recursion import (
     add_score,
     add_surprise,
     begin,
-    copy,
     steps_of,
 )
 from rov_ident.residual import filtered_residual
@@ -268,7 +267,7 @@ class Work(NamedTuple):
     scratch: NDArray[np.void]  # (1,): in one record, whose parts the compiler knows apart
 
 
-@inner
+@inlined
 def _work(task, state):
     size, m = len(state.x), len(task.theta)
     columns = LANES * (size // LANES + 1)
@@ -302,38 +301,41 @@ def _work(task, state):
 @kernel
 def _fold(task, state, samples, sides, info):
     work = _work(task, state)
-    for k in range(len(samples)):
-        _step(task, state, work, samples[k], sides[k if sides.shape[2] > 0 else 0], info[k])
+    _steps(task, state, work, samples, sides, info)
     copy(work.p, state.p)
 
 
-@inlined
-def _step(task, state, work, sample, side, out):
-    if not begin(out, sample):
-        out.reason = NOT_FINITE
-        return
-    state.scalars[0].t = sample.t
-    out.reason = USED
-    if sample.restart or not state.scalars[0].started or not sample.dt > 0.0:
-        _restart(state, work.p, sample)
-        for i in range(6):
-            state.scalars[0].surprise[i] = 1.0
-        out.reason = RESTARTED
-    else:
-        _take_root(task, work, out)
-        _move(task, state.x, work, sample, side)
-        if not _collect(task, state, work, sample):
-            out.reason = UNPREDICTABLE
-            state.scalars[0].started = False
-            return
-        in_motion(task.structure, sample.moving, work.moves)
-        for e in range(len(task.theta) - side.shape[1], len(task.theta)):
-            work.moves[e] = True
-        for i in range(len(state.x)):
-            work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
-        _update(task, state, work, sample, side, out)
-        _look_back(task, state, work, sample.dt)
-    _residual(task, state, work, sample, side, out)
+@inner
+def _steps(task, state, work, samples, sides, infos):
+    """The fold itself, apart from what makes its arrays (:func:`rov_ident.jit.lean`)."""
+    c = state.scalars[0]
+    for k in range(len(samples)):
+        sample, info, side = samples[k], infos[k], sides[k if sides.shape[2] > 0 else 0]
+        if not begin(info, sample):
+            info.reason = NOT_FINITE
+            continue
+        c.t = sample.t
+        info.reason = USED
+        if sample.restart or not c.started or not sample.dt > 0.0:
+            _restart(state, work.p, sample)
+            for i in range(6):
+                c.surprise[i] = 1.0
+            info.reason = RESTARTED
+        else:
+            _take_root(task, work, info)
+            _move(task, state.x, work, sample, side)
+            if not _collect(task, state, work, sample):
+                info.reason = UNPREDICTABLE
+                c.started = False
+                continue
+            in_motion(task.structure, sample.moving, work.moves)
+            for e in range(len(task.theta) - side.shape[1], len(task.theta)):
+                work.moves[e] = True
+            for i in range(len(state.x)):
+                work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
+            _update(task, state, work, sample, side, info)
+            _look_back(task, state, work, sample.dt)
+        _residual(task, state, work, sample, side, info)
 
 
 @inner

@@ -18,7 +18,7 @@ from rov_ident.effects.base import SIZE, Array, Effect, Reading
 from rov_ident.errors import UserError
 from rov_ident.estimate import prior_of
 from rov_ident.frames import quaternion_to_matrix
-from rov_ident.model import build
+from rov_ident.model import CURRENT, build
 from rov_ident.records import score
 from rov_ident.simulate import simulate
 
@@ -589,9 +589,8 @@ def test_the_tether_feels_the_water_not_the_ground(heavy):
     )
     out, mass, theta = np.zeros(6), model.added_mass[:, :, None], model.theta[:, None]
     around = effects.surroundings(acting)
-    effects.add_surroundings(
-        *around, model.structure, mass, theta, 0.0, np.zeros(6), np.eye(3), out
-    )
+    nu, work = np.zeros(6), np.zeros(1, CURRENT)[0]
+    effects.add_surroundings(*around, model.structure, mass, theta, 0.0, nu, np.eye(3), work, out)
     hull = 13.7 * 0.5 + 141.0 * 0.25
     np.testing.assert_allclose(out, [hull + 10.0 * 0.25, 0, 0, 0, 0, 0], atol=1e-12)
 

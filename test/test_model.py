@@ -19,9 +19,9 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from rov_ident import config
-from rov_ident.coefficients import catalogue
+from rov_ident.coefficients import EXTENDED_SIZE, catalogue
 from rov_ident.errors import UserError
-from rov_ident.model import Model, RigidBody, add_current, build, columns, coriolis
+from rov_ident.model import CURRENT, Model, RigidBody, add_current, build, columns, coriolis
 from rov_ident.simulate import simulate
 
 Array = NDArray[np.float64]
@@ -340,12 +340,14 @@ def test_current_is_the_difference_of_fossens_two_equations(nu, water):
     nu_c_dot = np.concatenate([-np.cross(nu[3:], water), np.zeros(3)])
     over_ground = coriolis_of(A, nu) @ nu - damping_force(VALUES, nu)[0]
     relative = nu - still
+    work = np.zeros(1, CURRENT)
     through = coriolis_of(A, relative) @ relative - damping_force(VALUES, relative)[0]
     through = through - A @ nu_c_dot
     size = 400.0 * (1.0 + np.abs(nu).max() + np.abs(water).max()) ** 2
     found = np.zeros(6)
     mass, theta = FULL.added_mass[:, :, None], FULL.theta[:, None]
-    add_current(FULL.structure, mass, theta, nu, relative, tuple(water.tolist()), found)
+    add_current(FULL.structure, mass, theta, nu, tuple(water.tolist()), work[0], found)
+    np.testing.assert_array_equal(work[0]["relative"], relative)
     same(found, over_ground - through, np.full(6, size))
 
 
@@ -353,7 +355,8 @@ def test_still_water_does_nothing():
     nu = np.random.default_rng(6).normal(size=6)
     found = np.zeros(6)
     mass, theta = FULL.added_mass[:, :, None], FULL.theta[:, None]
-    add_current(FULL.structure, mass, theta, nu, nu, (0.0, 0.0, 0.0), found)
+    work = np.zeros(1, CURRENT)
+    add_current(FULL.structure, mass, theta, nu, (0.0, 0.0, 0.0), work[0], found)
     np.testing.assert_array_equal(found, 0.0)
 
 
@@ -554,7 +557,7 @@ def split(model: Model, nu: Array) -> tuple[Array, Array]:
     """The two parts of the regressor, (6, n) each."""
     n = len(model.theta)
     momentum, force = np.full((6, n), np.nan), np.full((6, n), np.nan)  # must be overwritten
-    columns(model.structure, nu, momentum, force)
+    columns(model.structure, nu, momentum, force, np.empty((EXTENDED_SIZE, 1)))
     return momentum, force
 
 

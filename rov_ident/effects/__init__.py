@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
-from rov_ident.jit import inlined, kernel
+from rov_ident.jit import inlined, kernel, lean
 from rov_ident.model import RigidBody, add_current
 
 EFFECTS: dict[str, Effect] = {
@@ -163,19 +163,7 @@ def memory() -> Array:
     return np.zeros((len(_INPUT), MEMORY))
 
 
-def input_effects(acting: Acting) -> tuple[tuple[bool, ...], tuple[tuple[float, ...], ...]]:
-    """What :func:`let_act` takes: numbers only, as a kernel counts who holds an array."""
-    parameters = tuple(map(tuple, acting.input_parameters.tolist()))
-    return tuple(acting.inputs.tolist()), parameters
-
-
-@inlined
-def let_act(there, parameters, state, t, dt, wrench):
-    """:func:`act` of those :func:`input_effects`."""
-    _ALL_ACTS(0, there, parameters, state, t, dt, wrench)
-
-
-@kernel
+@lean
 def act(acting, state, t, dt, wrench):
     """wrench (6,), demanded from t to t + dt, becomes the mean of what acts in that time."""
     _ALL_ACTS(0, acting.inputs, acting.input_parameters, state, t, dt, wrench)
@@ -191,19 +179,10 @@ def acted(acting, t, demand):
     return out
 
 
-class Surroundings(NamedTuple):
-    """Wrench effects: numbers only, as a kernel counts who holds an array."""
-
-    wrenches: tuple[bool, ...]  # which of the wrench effects are there
-    wrench_parameters: tuple[tuple[float, ...], ...]
-
-
-def surroundings(acting: Acting) -> tuple[Surroundings | None, tuple[float, ...] | None]:
+def surroundings(acting: Acting) -> tuple[Acting | None, tuple[float, ...] | None]:
     """What :func:`add_surroundings` takes; None where that adds nothing."""
-    parameters = tuple(map(tuple, acting.wrench_parameters.tolist()))
-    around = Surroundings(tuple(acting.wrenches.tolist()), parameters)
     water = tuple(acting.water.tolist()) if acting.water.any() else None
-    return around if acting.wrenches.any() or water else None, water
+    return acting if acting.wrenches.any() or water else None, water
 
 
 @inlined
@@ -213,11 +192,12 @@ def add_wrenches(acting, t, nu, rotation, out):
 
 
 @inlined
-def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotation, out):
+def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotation, s, out):
     """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground.
 
     ``around`` and ``current`` are of :func:`surroundings`; ``structure``, ``added_mass`` (6, 6, 1)
-    and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world.
+    and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world;
+    s is a record of :data:`rov_ident.model.CURRENT`, work space.
     """
     if current is None:  # numba leaves out what is not so
         add_wrenches(around, t, nu, rotation, out)
@@ -228,8 +208,5 @@ def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotat
             rotation[0, 1] * north + rotation[1, 1] * east + rotation[2, 1] * down,
             rotation[0, 2] * north + rotation[1, 2] * east + rotation[2, 2] * down,
         )
-        relative = nu.copy()
-        for i in range(3):
-            relative[i] -= water[i]
-        add_current(structure, added_mass, theta, nu, relative, water, out)
-        add_wrenches(around, t, relative, rotation, out)
+        add_current(structure, added_mass, theta, nu, water, s, out)
+        add_wrenches(around, t, s.relative, rotation, out)
