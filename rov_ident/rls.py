@@ -775,15 +775,14 @@ def _whiten(root, rows, n, count, free, squares):
     """
     columns = root.shape[1]
     for i in range(count):
-        total, held = 0.0, 0.0
-        rows[i, n] = 0.0
-        for a in range(n):
+        rows[i, n], squares[0, i], squares[1, i] = 0.0, 0.0, 0.0
+    for a in range(n):
+        for i in range(count):  # inside, as no row waits for another
             f = rows[i, a] / root[a, a]
-            total += f * f
-            held += f * f if a >= free else 0.0
+            squares[0, i] += f * f
+            squares[1, i] += f * f if a >= free else 0.0
             for k in range(columns):
                 rows[i, k] -= f * root[a, k]
-        squares[0, i], squares[1, i] = total, held
 
 
 @reordered
