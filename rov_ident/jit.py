@@ -102,7 +102,7 @@ def inlined(function: F) -> F:
 
 @inner
 def copy(a: Any, b: Any) -> None:
-    """Into matrix b from a, as far as both go: ``b[:] = a`` allocates, and long to compile."""
+    """Into matrix b from a, as far as both go: ``b[:] = a`` allocates and is slow to compile."""
     for i in range(min(len(a), len(b))):
         for j in range(min(a.shape[1], b.shape[1])):
             b[i, j] = a[i, j]
