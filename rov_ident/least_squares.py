@@ -379,12 +379,12 @@ def _load(restoring, nu, nu_dot, wrench, down, first, scratch):
     s = scratch[0]
     size = min(_LANES, len(nu) - first)
     for k in range(size):
+        x, y, z = down[first + k, 0], down[first + k, 1], down[first + k, 2]
         for i in range(6):
             s.nu[i, k] = nu[first + k, i]
             s.nu_dot[i, k] = nu_dot[first + k, i]
-            s.h[i, k] = wrench[first + k, i]
-            for j in range(3):
-                s.h[i, k] += restoring[i, j] * down[first + k, j]
+            weight = restoring[i, 0] * x + restoring[i, 1] * y + restoring[i, 2] * z
+            s.h[i, k] = wrench[first + k, i] + weight
     for i in range(6):
         for k in range(size, _LANES):
             s.nu[i, k] = 0.0
@@ -481,33 +481,49 @@ def _accumulate(structure, mass, restoring, nu, nu_dot, wrench, down, pattern, c
     """Add to sums (6, n + 1, n + 1), lower halves, the squares of all rows, axis by axis."""
     scratch = np.zeros(1, dtype=_SCRATCH)  # the array: a record does not keep it alive
     block = np.zeros((6, sums.shape[1], _LANES))
+    gram = np.zeros((6, count.max() + 3, count.max() + 3))
     for first in range(0, len(nu), _LANES):
         _features(structure, mass, restoring, nu, nu_dot, wrench, down, first, scratch, block)
         for axis in range(6):
-            _squares(block[axis], pattern[axis], count[axis], sums[axis])
+            _squares(block[axis], pattern[axis], count[axis], gram[axis])
+    for axis in range(6):
+        for a in range(count[axis]):
+            for b in range(a + 1):
+                sums[axis, pattern[axis, a], pattern[axis, b]] += gram[axis, a, b]
 
 
 @reordered
-def _squares(x, pattern, count, sums):
-    """Two rows and two columns of the lower half at a time: each number is read for both."""
-    for a in range(0, count, 2):
-        i0, i1 = pattern[a], pattern[min(a + 1, count - 1)]
-        for b in range(0, a + 1, 2):
-            j0, j1 = pattern[b], pattern[min(b + 1, count - 1)]
-            s00, s01, s10, s11 = 0.0, 0.0, 0.0, 0.0
+def _squares(x, pattern, count, gram):
+    """Add to the lower half of gram the products of the columns in ``pattern``, in its order.
+
+    Four rows and four columns at a time, so that each number is read for four products; what that
+    adds beyond the last column has no meaning.
+    """
+    last = count - 1
+    for a in range(0, count, 4):
+        i0, i1 = pattern[a], pattern[min(a + 1, last)]
+        i2, i3 = pattern[min(a + 2, last)], pattern[min(a + 3, last)]
+        for b in range(0, a + 1, 4):
+            j0, j1 = pattern[b], pattern[min(b + 1, last)]
+            j2, j3 = pattern[min(b + 2, last)], pattern[min(b + 3, last)]
+            s0 = s1 = s2 = s3 = (0.0, 0.0, 0.0, 0.0)
             for k in range(_LANES):
-                f, g, p, q = x[i0, k], x[i1, k], x[j0, k], x[j1, k]
-                s00 += f * p
-                s01 += f * q
-                s10 += g * p
-                s11 += g * q
-            sums[i0, j0] += s00
-            if a + 1 < count:
-                sums[i1, j0] += s10
-                if b + 1 <= a + 1 and b + 1 < count:
-                    sums[i1, j1] += s11
-            if b + 1 <= a:
-                sums[i0, j1] += s01
+                y = (x[j0, k], x[j1, k], x[j2, k], x[j3, k])
+                s0 = _more(s0, x[i0, k], y)
+                s1 = _more(s1, x[i1, k], y)
+                s2 = _more(s2, x[i2, k], y)
+                s3 = _more(s3, x[i3, k], y)
+            for c in range(4):
+                gram[a, b + c] += s0[c]
+                gram[a + 1, b + c] += s1[c]
+                gram[a + 2, b + c] += s2[c]
+                gram[a + 3, b + c] += s3[c]
+
+
+@inlined
+def _more(total, f, y):
+    """total + f y, tuples of four."""
+    return total[0] + f * y[0], total[1] + f * y[1], total[2] + f * y[2], total[3] + f * y[3]
 
 
 # ------------------------------------------------------------------ what a bag can tell
