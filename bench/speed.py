@@ -32,12 +32,12 @@ from rich.table import Table
 
 from fossen import skew
 from rov_ident import config as configuration
-from rov_ident import least_squares as batch
 from rov_ident import rls, sensors, ukf
 from rov_ident.cdr import encode
 from rov_ident.coefficients import ABSOLUTE, EXTENDED_SIZE, NEGATIVE, ONE, PLAIN
 from rov_ident.config import Config
 from rov_ident.demo import shipped
+from rov_ident.equation_error import Log, equation_error, rows
 from rov_ident.inputs import Reader
 from rov_ident.model import Model
 from rov_ident.recording import write_messages
@@ -330,34 +330,29 @@ def moved(model: TextbookModel | MatrixModel, x: np.ndarray, force: np.ndarray) 
     return out
 
 
-# The batch fit's row goes here: least_squares(), 1e6 samples x 6 x 24 against numpy.linalg.lstsq.
-
-
 def least_squares() -> Iterator[Row]:
     """A million samples, 24 coefficients, six rows each."""
     model, n = heavy().model, 1_000_000
     rng = np.random.default_rng(0)
     down = np.tile([0.0, 0.0, 1.0], (n, 1))
     nu, nu_dot, wrench = (rng.uniform(-1.0, 1.0, (n, 6)) for _ in range(3))
-    log = batch.Log(nu, nu_dot, wrench, down)
+    log = Log(nu, nu_dot, wrench, down)
     count = n // 10  # numpy's matrix of a million takes a gibibyte: a tenth, it is linear in them
-    block = np.empty((6, len(model.theta) + 1, count))
-    batch.fill(model, log, block)
-    matrix = np.ascontiguousarray(block.transpose(2, 0, 1)).reshape(6 * count, -1)
-    part = batch.Log(nu[:count], nu_dot[:count], wrench[:count], down[:count])
+    part = Log(nu[:count], nu_dot[:count], wrench[:count], down[:count])
+    matrix = np.ascontiguousarray(rows(model, part).transpose(2, 0, 1)).reshape(6 * count, -1)
     theirs = np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None)[0]
     for tsqr in (False, True):
-        apart = float(np.abs(batch.equation_error(model, part, tsqr=tsqr) / theirs - 1.0).max())
+        apart = float(np.abs(equation_error(model, part, tsqr=tsqr) / theirs - 1.0).max())
         name = "TSQR" if tsqr else "normal equations"
         yield Row(f"least squares, {name}, equal to lstsq", "", "", apart, 1e-8, False, "")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    batch.equation_error(model, log)
+    equation_error(model, log)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
     yield Row("least squares, memory beyond the log", "", "", grown, 100.0, False, "MiB")
     ours, blocks, peer = in_turn(
         5,
-        (lambda: batch.equation_error(model, log), n),
-        (lambda: batch.equation_error(model, log, tsqr=True), n),
+        (lambda: equation_error(model, log), n),
+        (lambda: equation_error(model, log, tsqr=True), n),
         (lambda: np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=None), count),
     )
     yield faster("least squares, a sample", ours, peer, 150.0, "numpy.linalg.lstsq")
