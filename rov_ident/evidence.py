@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from rov_ident.coefficients import AXES, parse
 from rov_ident.effects import EFFECTS, compiled
@@ -265,6 +264,8 @@ class Look:
             power += np.abs(np.fft.rfft(np.bincount(bins, column), size)) ** 2
         frequency = np.fft.rfftfreq(size, step)
         power[(frequency < 1.0 / (t[-1] - t[0])) | (frequency > 2.0)] = 0.0
+        from scipy.ndimage import median_filter  # here: 13 MB that nodes, which watch, do not need
+
         level = median_filter(power, max(5, size // 64)) + 1e-3 * power.max()
         peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
         strongest = peaks[np.argsort(-power[peaks] / np.maximum(level[peaks], 1e-300))]

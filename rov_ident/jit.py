@@ -7,15 +7,18 @@ kernel cannot be run, and a new version does not disturb a running one.
 
 import hashlib
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import CPUDispatcher, cpu_target
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
@@ -103,6 +106,52 @@ def inlined(function: F) -> F:
     """
     compiled: F = numba.njit(inline="always", error_model="numpy")(function)
     return compiled
+
+
+def only_run() -> None:
+    """Set numba up for a process that runs what others have compiled: 30 MB less, and faster.
+
+    To be called before the first kernel is. Otherwise scipy's linear algebra is loaded in case that
+    a kernel with products of matrices comes to be compiled, and what numba compiles for itself at
+    each start is optimised, though only kernels that come to be compiled would use it. These can
+    be, even so, but for such products.
+    """
+    blas, level = "scipy.linalg.cython_blas", numba.config.OPT
+    try:
+        sys.modules.setdefault(blas, None)  # type: ignore[arg-type]  # None: its import fails
+        context = cpu_target.target_context
+        numba.config.OPT = type(level)(0)
+        context.refresh()
+    finally:
+        numba.config.OPT = level
+        if sys.modules[blas] is None:
+            del sys.modules[blas]
+
+
+def interpret() -> None:
+    """Run kernels as the Python that they are, a thousandth as fast but at once.
+
+    Until :func:`stop_interpreting`, and everywhere in this process. Neither divisions by zero nor
+    what is not finite raise anything, as in compiled code.
+    """
+    CPUDispatcher.__call__ = lambda self, *arguments: self.py_func(*arguments)
+    np.seterr(all="ignore")
+
+
+def stop_interpreting() -> None:
+    """Compile kernels again on their first call, or read them from the cache."""
+    if interpreting():
+        del CPUDispatcher.__call__
+        np.seterr(all="warn", under="ignore")
+
+
+def interpreting() -> bool:
+    return "__call__" in vars(CPUDispatcher)
+
+
+def record(fields: Any) -> np.dtype[np.void]:
+    """The dtype of a record whose fields can be read as attributes: compiled, and interpreted."""
+    return np.dtype((np.record, np.dtype(fields, align=True)))
 
 
 @intrinsic

@@ -38,7 +38,7 @@ from rov_ident.coefficients import (
     parse_fin,
 )
 from rov_ident.errors import UserError
-from rov_ident.jit import inlined, kernel, lean
+from rov_ident.jit import inlined, kernel, lean, record
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -422,7 +422,7 @@ def coriolis(p, nu):
     return np.array(coriolis_of(six(p.reshape(6, 1), 0), six(nu.reshape(6, 1), 0)))
 
 
-CURRENT = np.dtype(
+CURRENT = record(
     [
         ("relative", "f8", (6,)),  # nu through the water
         ("nu", "f8", (6, 1)),
@@ -430,7 +430,6 @@ CURRENT = np.dtype(
         ("through_water", "f8", (6, 1)),
         ("extended", "f8", (EXTENDED_SIZE, 1)),
     ],
-    align=True,
 )
 """Work space of :func:`add_current`."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.excitation import authority
-from rov_ident.jit import inlined
+from rov_ident.jit import inlined, record
 
 FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
 LARGEST_FORCE = 0.3  # the same, at most: more would leave nothing to learn coefficients from
@@ -24,7 +24,7 @@ FIRST_TIME, TIME = 1.0, 20.0  # s; in which twice the power doubles the density:
 STEADY = 4.0  # a squared sum counts for at most this often its variance
 LARGEST = 3.0  # standard deviations that a single innovation counts for: outliers are no motion
 
-PROCESS = np.dtype(
+PROCESS = record(
     [
         ("first", "f8", (6,)),  # variance density of the unexplained acceleration to begin with
         ("floor", "f8", (6,)),  # its least
@@ -33,11 +33,10 @@ PROCESS = np.dtype(
         ("least", "f8", (6,)),  # its variance at zero wrench
         ("lasting", "f8"),  # s; how long an error of it lasts, at least
     ],
-    align=True,
 )
 """What does not change: see :func:`process`."""
 
-ADAPTATION = np.dtype(
+ADAPTATION = record(
     [
         ("density", "f8"),  # of the unexplained acceleration, (m/s2)^2/Hz or (rad/s2)^2/Hz
         ("acting", "f8"),  # the same with the noise of the wrench: set by the estimator; 0: unknown
@@ -46,7 +45,6 @@ ADAPTATION = np.dtype(
         ("since", "f8"),  # s since this velocity was measured: counted by the estimator
         ("seen", "f8"),  # s of innovations so far
     ],
-    align=True,
 )
 """What is known of one axis."""
 

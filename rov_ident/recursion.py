@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rov_ident.jit import inlined, inner
+from rov_ident.jit import inlined, inner, record
 from rov_ident.process_noise import LARGEST
 
 MAX_STEP = 0.05  # s; of one step of the prediction
@@ -12,7 +12,7 @@ LAG = 4.0  # s; of the window over the score's correlation
 SURPRISE_TIME = 2.0  # s; over which normalised innovations squared are averaged
 RELEARNING_TIME = 20.0  # s; after a change: coefficients become as uncertain as at first
 
-INFO = np.dtype(
+INFO = record(
     [
         ("t", "f8"),
         ("reason", "i8"),  # index into the estimator's REASONS
@@ -21,7 +21,6 @@ INFO = np.dtype(
         ("forgetting", "f8"),
         ("condition", "f8"),  # as of condition(), before the sample; NaN: not looked at
     ],
-    align=True,
 )
 """What happened to a sample."""
 

@@ -47,7 +47,7 @@ from numpy.typing import NDArray
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
-from rov_ident.jit import copy, inlined, inner, kernel, reordered
+from rov_ident.jit import copy, inlined, inner, kernel, record, reordered
 from rov_ident.model import (
     AHEAD,
     NODES,
@@ -105,17 +105,16 @@ _NOISE_PEAK = 16.0  # variances; no square of a noise is larger in a minute
 _EXCITED = 0.01  # a row with less information than this, relative to the prior, excites nothing
 _SHIFT = 1e-6  # m/s, rad/s; of a velocity, for the Jacobian
 
-_SETTINGS = np.dtype(
+_SETTINGS = record(
     [
         ("corner", "f8"),  # rad/s, of the published residual
         ("gate", "f8"),
         ("forgetting_factor", "f8"),
         ("variable", "?"),
     ],
-    align=True,
 )
 
-_SCALARS = np.dtype(
+_SCALARS = record(
     [
         ("t", "f8"),
         ("since_update", "f8"),
@@ -126,7 +125,6 @@ _SCALARS = np.dtype(
         ("free", "i8"),  # so many of the first columns take rows
         ("started", "?"),
     ],
-    align=True,
 )
 
 
@@ -258,7 +256,7 @@ def condition(task: Problem, state: State) -> float:
 _WIDTH = 32
 _POINTS = 8  # a velocity and its displacements along six axes, side by side; one is spare
 
-_SCRATCH = np.dtype(
+_SCRATCH = record(
     [
         ("nu", "f8", (6, _POINTS)),
         ("mass", "f8", (6, 6, _POINTS)),
@@ -282,7 +280,6 @@ _SCRATCH = np.dtype(
         ("z", "f8", (6,)),  # nu as measured
         ("r", "f8", (6,)),  # its variance
     ],
-    align=True,
 )
 
 

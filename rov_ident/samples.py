@@ -44,10 +44,10 @@ from rov_ident.effects import (
 from rov_ident.effects.base import Reading
 from rov_ident.excitation import authority
 from rov_ident.frames import FrameDefaults, quaternion_from_euler, to_core
-from rov_ident.jit import inlined, kernel
+from rov_ident.jit import inlined, kernel, record
 from rov_ident.messages import Array, Imu, Message, Odometry, Wrench
 
-SAMPLE = np.dtype(
+SAMPLE = record(
     [
         ("t", "f8"),  # s since the first message
         ("dt", "f8"),  # s since the previous sample
@@ -73,7 +73,6 @@ SAMPLE = np.dtype(
         ("gyro_bias", "f8", (3,)),  # rad/s: what was taken off the gyro here
         ("attitude", "f8", (4,)),  # as the odometry has it; NaN: not measured
     ],
-    align=True,
 )
 
 ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
@@ -105,7 +104,7 @@ _VELOCITY, _RATE, _ATTITUDE = range(3)
 RATIOS = ("velocity", "angular rate", "attitude")
 """Of the odometry, each behind a gate of its own against the IMU."""
 
-_KINEMATICS = np.dtype(
+_KINEMATICS = record(
     [
         ("known", "?"),  # an odometry message has been seen since the last restart
         ("inertial", "?"),  # an IMU message has
@@ -131,10 +130,9 @@ _KINEMATICS = np.dtype(
         # squared innovations over their variances, averaged: 1 is expected, see RATIOS
         ("ratio", "f8", (3,)),
     ],
-    align=True,
 )
 
-_SETTINGS = np.dtype(
+_SETTINGS = record(
     [
         ("gravity", "f8"),
         ("water", "f8", (3,)),  # m/s, in the world
@@ -149,7 +147,6 @@ _SETTINGS = np.dtype(
         ("accelerometer_bias_variance", "f8"),
         ("gate", "f8"),
     ],
-    align=True,
 )
 
 
@@ -644,7 +641,7 @@ def sample_type(size: int) -> np.dtype[np.void]:
     first, step = SAMPLE.itemsize, 48 * size
     names = list(SAMPLE.names or ())
     kinds = [SAMPLE.fields[name] for name in names] if SAMPLE.fields else []
-    return np.dtype(
+    return record(
         {
             "names": [*names, "by_wrench", "by_velocity", "about"],
             "formats": [*(k[0] for k in kinds), *([("f8", (6, size))] * 2), ("f8", (size,))],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.effects import Acting, act, add_surroundings, memory, surroundings
-from rov_ident.jit import copy, inner, released
+from rov_ident.jit import copy, inner, record, released
 from rov_ident.model import (
     CURRENT,
     NODES,
@@ -193,7 +193,7 @@ def _wrenches(around, current, structure, added, theta, steps, nu, scratch, out)
 
 _LANES = 8  # six axes, none, and one more to fill the vectors
 
-_SCRATCH = np.dtype(
+_SCRATCH = record(
     [
         ("nu", "f8", (6, 1)),
         ("push", "f8", (6,)),  # wrench of thrusters, weight and effects
@@ -213,7 +213,6 @@ _SCRATCH = np.dtype(
         ("square", "f8", (6, 6)),
         ("current", CURRENT),
     ],
-    align=True,
 )
 
 

@@ -11,7 +11,7 @@ from rov_ident.attitude import rotate, rotation_of
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.effects import Acting, add_surroundings, surroundings
 from rov_ident.errors import UserError
-from rov_ident.jit import inner, lean
+from rov_ident.jit import inner, lean, record
 from rov_ident.model import (
     CURRENT,
     NODES,
@@ -160,7 +160,7 @@ def open_loop(
 
 # ------------------------------------------------------------------ kernels
 
-_SCRATCH = np.dtype(
+_SCRATCH = record(
     [
         ("state", "f8", (13,)),  # position, quaternion, nu
         ("stage", "f8", (13,)),
@@ -176,7 +176,6 @@ _SCRATCH = np.dtype(
         ("rotation", "f8", (3, 3)),
         ("current", CURRENT),
     ],
-    align=True,
 )
 
 

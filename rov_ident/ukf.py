@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from rov_ident.coefficients import EXTENDED_SIZE
 from rov_ident.config import Config
 from rov_ident.estimate import Estimate, Prior, calibrated, prior_of, theta_of
-from rov_ident.jit import copy, inlined, inner, kernel, reordered
+from rov_ident.jit import copy, inlined, inner, kernel, record, reordered
 from rov_ident.model import (
     AHEAD,
     NODES,
@@ -83,7 +83,7 @@ _PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients wa
 _ROOM = 1.5  # of the process noise: see process_noise.adapt (docs/accuracy.md)
 _LOST = 2  # outliers in a row, of linear or of angular velocity, after which it is begun anew
 
-_SETTINGS = np.dtype(
+_SETTINGS = record(
     [
         ("spread", "f8"),  # sqrt(n + lambda)
         ("weight", "f8"),  # of an outer sigma point
@@ -92,10 +92,9 @@ _SETTINGS = np.dtype(
         ("changed", "f8"),  # surprise from which the vehicle is taken to have changed
         ("corner", "f8"),  # rad/s, of the published residual
     ],
-    align=True,
 )
 
-_SCALARS = np.dtype(
+_SCALARS = record(
     [
         ("t", "f8"),
         ("surprise", "f8", (6,)),  # normalised innovations squared, averaged: 1 when all is well
@@ -103,7 +102,6 @@ _SCALARS = np.dtype(
         ("since", "f8"),  # s since the coefficients walked
         ("started", "?"),
     ],
-    align=True,
 )
 
 
@@ -218,7 +216,7 @@ def condition(task: Problem, state: State) -> float:
 
 # ------------------------------------------------------------------ kernels
 
-_SCRATCH = np.dtype(
+_SCRATCH = record(
     [
         # sigma points, and the forces on them
         ("nu", "f8", (6, LANES)),
@@ -246,7 +244,6 @@ _SCRATCH = np.dtype(
         ("mean_wrench", "f8", (6,)),
         ("mean_extended", "f8", (EXTENDED_SIZE, 1)),
     ],
-    align=True,
 )
 
 

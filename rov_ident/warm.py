@@ -1,4 +1,4 @@
-"""Compile an estimator before it is used, in another process.
+"""Compile an estimator in another process than the one that uses it.
 
 What a process has just compiled is not what it would read from the cache: of a function that
 several kernels call, each kernel keeps a copy, optimised once more, but who compiles them all in a
@@ -17,32 +17,51 @@ import numba
 import numpy as np
 
 from rov_ident.config import Config, from_parameters
+from rov_ident.jit import stop_interpreting
 from rov_ident.messages import Imu, Odometry, Wrench
 from rov_ident.online import Kind, OnlineEstimator
 from rov_ident.samples import IMU, ODOMETRY, WRENCH
 
 
+def is_compiled(kind: Kind) -> bool:
+    """Whether all that an estimator runs is in the cache."""
+    return _mark(kind).exists()
+
+
+def compiling(kind: Kind) -> subprocess.Popen[bytes]:
+    """The process that compiles an estimator; see :func:`compiler`."""
+    return compiler(__name__, kind)
+
+
 def warm_up(config: Config, kind: Kind) -> None:
-    """Load all that an estimator runs, compiled by another process if need be."""
-    compiled = Path(numba.config.CACHE_DIR) / kind
-    # Where that fails, what is used compiles itself.
-    if not compiled.exists():
-        with compiler(__name__, kind) as process:
-            failed = process.wait()
-        if not failed:
-            with contextlib.suppress(OSError):
-                compiled.touch()
+    """Have an estimator compiled if need be, wait for it, and load it."""
+    if not is_compiled(kind):
+        with compiling(kind) as process:
+            process.wait()
+    load(config, kind)
+
+
+def load(config: Config, kind: Kind) -> None:
+    """Read all that an estimator runs from the cache; what is not there is compiled now."""
+    stop_interpreting()
     _rest(config, kind)
 
 
+def _mark(kind: Kind) -> Path:
+    return Path(numba.config.CACHE_DIR) / kind
+
+
 def compiler(module: str, *arguments: str) -> subprocess.Popen[bytes]:
-    """A process that runs a module of ours, which calls :func:`end_with_parent`.
+    """A process that runs a module of ours, which calls :func:`end_with_parent`; the same cache.
 
     An interrupt is not for it, but for its parent, whose end it follows once it has loaded its
     modules: however that comes about, the pipe to it is closed.
     """
     command = [sys.executable, "-m", module, *arguments]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+    cache = {"NUMBA_CACHE_DIR": str(numba.config.CACHE_DIR)}  # it may be a folder for this process
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, start_new_session=True, env=os.environ | cache
+    )
 
 
 def end_with_parent() -> None:
@@ -77,4 +96,7 @@ def any_vehicle() -> Config:
 
 if __name__ == "__main__":
     end_with_parent()
-    _rest(any_vehicle(), "ukf" if sys.argv[1:] == ["ukf"] else "rls")
+    kind: Kind = "ukf" if sys.argv[1:] == ["ukf"] else "rls"
+    _rest(any_vehicle(), kind)
+    with contextlib.suppress(OSError):
+        _mark(kind).touch()

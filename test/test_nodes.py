@@ -4,6 +4,7 @@ import math
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -304,23 +305,60 @@ def test_interrupt_while_loading(domain, heavy_path, number):
             assert "Traceback" not in said
 
 
-def test_interrupt_while_compiling(domain, heavy_path, tmp_path, monkeypatch):
+@pytest.fixture
+def nothing_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+
+
+def test_the_first_start_on_a_computer(domain, heavy, heavy_path, nothing_compiled):
+    """Estimates come long before anything is compiled, and in the end each message was used."""
+    messages = dive(heavy, "steps", 40.0, seed=1).messages
+    expected, residuals = offline(heavy, messages)
+    vehicle = Vehicle()
+    began = time.monotonic()
     process = start_node("rls", heavy_path)
-    until_said(process, "compiling")
+    said = []
+    listening = threading.Thread(target=lambda: said.extend(process.stderr))
+    listening.start()
+    vehicle.until(vehicle.connected)
+    first = None
+    for arrival, role, message in messages:
+        while (wait := messages[0][0] + (time.monotonic() - began) * 1e9 - arrival) < 0.0:
+            vehicle.listen(min(-wait * 1e-9, 0.01))
+        vehicle.publish(role, cdr.encode(message))
+        if first is None and vehicle.used() > 0.0:
+            first = time.monotonic() - began
+            assert from_diagnostics(vehicle.coefficients[-1]).names == heavy.estimate
+            assert not any("compiled after" in line for line in said)
+    assert first is not None and first < 10.0
+    assert "interpreted until compiled" in vehicle.words()
+    vehicle.until(lambda: any("compiled after" in line for line in said), 120.0)
+    vehicle.until(lambda: is_stale(vehicle))
+    vehicle.close()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10.0) == 0
+    listening.join()
+    assert len(vehicle.residuals) == len(residuals)
+    report, end = from_diagnostics(vehicle.coefficients[-1]), expected.report()
+    assert report.stamp == end.stamp
+    np.testing.assert_array_less(np.abs(report.values - end.values), 1e-6 * end.std)
+    assert "Traceback" not in "".join(said)
+
+
+def test_interrupt_while_compiling(domain, heavy_path, nothing_compiled):
+    process = start_node("rls", heavy_path)
+    until_said(process, "]: active")
     began = time.monotonic()
     status, said = end_node(process)
     assert status == 0, said
     assert time.monotonic() - began < 5.0
-    assert "]: active" not in said and "Traceback" not in said
+    assert "compiled after" not in said and "Traceback" not in said
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.002, 0.004, 0.5])
-def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, tmp_path, monkeypatch, delay):
+def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, nothing_compiled, delay):
     """Also where it ends while it starts the compiler; who compiles has the same stderr."""
-    monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     for number in (signal.SIGKILL, signal.SIGINT):
         process = start_node("rls", heavy_path)
         until_said(process, "compiling")

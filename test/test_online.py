@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import textbook
 
-from rov_ident import sensors
+from rov_ident import config, sensors
 from rov_ident.estimate import is_passive
 from rov_ident.excitation import manoeuvre
+from rov_ident.jit import interpret, stop_interpreting
 from rov_ident.online import Level, OnlineEstimator
 from rov_ident.samples import IMU, ODOMETRY, WRENCH
 
@@ -295,3 +296,25 @@ def test_garbage(wrong, messages, kind, what, begin):
     report = publishable(estimator)
     assert not any("diverged" in text for text in report.messages), "needs a reset by hand"
     assert used > 50
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_interpreted_it_is_the_same(heavy, messages, kind):
+    """Until a node is compiled it runs the kernels as Python, and then goes on from there."""
+    effects = {"thruster_lag": {"time_constant": 0.1}, "ocean_current": {"north": 0.2, "east": 0.1}}
+    document = config.to_parameters(heavy) | {"effects": effects}
+    sunk = config.from_parameters(document)
+    some = messages[:500]
+    expected = fed(OnlineEstimator(sunk, kind), some).report()
+    interpret()
+    try:
+        interpreted = OnlineEstimator(sunk, kind)
+        for role, message in some[:300]:
+            interpreted.push(role, message)
+    finally:
+        stop_interpreting()
+    report = fed(interpreted, some[300:]).report()
+    assert report.stamp == expected.stamp
+    assert np.abs(report.values - expected.values).max() > 0.0  # sums in another order
+    np.testing.assert_allclose(report.std, expected.std, rtol=1e-7)
+    np.testing.assert_array_less(np.abs(report.values - expected.values), 1e-7 * expected.std)

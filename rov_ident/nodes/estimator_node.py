@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -37,19 +37,21 @@ from rov_ident.config import Config
 from rov_ident.errors import UserError
 from rov_ident.frames import from_core
 from rov_ident.inputs import BATTERY, Reader
+from rov_ident.jit import interpret, interpreting, only_run
 from rov_ident.messages import Wrench
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix, to_status
 from rov_ident.online import ESTIMATORS, Kind, Level, OnlineEstimator, Report
 from rov_ident.samples import IMU, ODOMETRY, WRENCH, describe
-from rov_ident.warm import compiler, warm_up
+from rov_ident.warm import compiler, compiling, is_compiled, load, warm_up
 
 _OWN_PARAMETERS = ("save_path", "checkpoint_path", "lockstep")
 _WATCH_PERIOD = 0.1  # s; between looks at whether the inputs have stopped
 _DIAGNOSTICS_PERIOD = 1.0  # s
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
 _LATE = 2.0  # s; a checkpoint that is older is worth a warning
+_TURN = 0.02  # s; of using messages that wait before anything else is done
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
 _SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
@@ -91,15 +93,26 @@ class EstimatorNode(Node):  # type: ignore[misc]
             "",
             "file in which what is learnt outlives a crash, or a folder for it; empty: none",
         )
-        started = time.monotonic()
-        self.get_logger().info("compiling: half a minute when first started on a computer")
-        warm_up(config, kind)
+        self._started = time.monotonic()
+        self._compiler: subprocess.Popen[bytes] | None = None
+        if interpreting() and not self._lockstep:
+            self.get_logger().info(
+                "compiling, half a minute when first started on a computer: until then "
+                "interpreted, so that estimates lag behind"
+            )
+            self._compiler = compiling(kind)
+        else:
+            if interpreting():
+                self.get_logger().info("compiling: half a minute when first started on a computer")
+            warm_up(config, kind)
         self._online = OnlineEstimator(config, kind)
         self._keeper = None if self._lockstep else self._recalled(str(checkpoint_path))
 
         self._reader = Reader(config)
         self._sources = subscribed(config.inputs)
         self._received: Counter[str] = Counter()
+        self._waiting: deque[tuple[str, bytes, int]] = deque()  # messages received, not yet used
+        self._resting_until = 0.0
         self._silence = dict.fromkeys(self._sources, 0.0)  # s since the last message
         self._idle = 0.0  # s since the last sample
         self._stopped = ""  # why there are no samples
@@ -155,7 +168,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._leaving = threading.Event()
         self._compiling: subprocess.Popen[bytes] | None = None
         self.get_logger().info(
-            f"active after {time.monotonic() - started:.1f} s of compiling: estimating "
+            f"active after {time.monotonic() - self._started:.1f} s: estimating "
             f"{len(self._online.prior.names)} coefficients of {config.name}"
         )
 
@@ -184,6 +197,25 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._received[source] += 1
         self._silence[source] = 0.0
         arrival = self.get_clock().now().nanoseconds if self._reader.on_arrival else 0
+        self._waiting.append((source, data, arrival))
+        self._work()
+        count = self._received.total()
+        if self._lockstep and count % _ACKNOWLEDGED_TOGETHER == 0:  # the rest by _watch
+            self._acknowledge.publish(UInt64(data=count))
+
+    def _work(self) -> None:
+        """Use messages that wait: all, unless they come faster than they can be used."""
+        began = time.monotonic()
+        if began < self._resting_until:
+            return
+        elapsed = 0.0
+        while self._waiting and elapsed < _TURN:
+            self._take(*self._waiting.popleft())
+            elapsed = time.monotonic() - began
+        if self._compiler is not None:
+            self._resting_until = began + 2.0 * elapsed  # for callbacks, and the compiler
+
+    def _take(self, source: str, data: bytes, arrival: int) -> None:
         for role, message in self._reader.read(source, data, arrival):
             info = self._online.push(role, message)
             # The sampler keeps to the frame of the first message that it takes.
@@ -195,9 +227,24 @@ class EstimatorNode(Node):  # type: ignore[misc]
                 # A queue that is worked off is learnt from faster than time goes.
                 if self._keeper and self._online.stamp - self._kept > _CHECKPOINT_PERIOD * 1e9:
                     self._keep()
-        count = self._received.total()
-        if self._lockstep and count % _ACKNOWLEDGED_TOGETHER == 0:  # the rest by _watch
-            self._acknowledge.publish(UInt64(data=count))
+
+    def _go_over_to_compiled(self) -> None:
+        """What is learnt and all that is under way stay as they are: both use the same arrays."""
+        assert self._compiler is not None and self._compiler.stdin is not None
+        self._compiler.stdin.close()
+        if status := self._compiler.returncode:
+            self.get_logger().warning(
+                f"the process that compiles failed ({status}): compiling here, nothing is heard "
+                "for half a minute"
+            )
+        self._compiler = None
+        load(self._config, self._online.kind)
+        _settle()
+        self.get_logger().info(
+            f"compiled after {time.monotonic() - self._started:.1f} s, "
+            f"{len(self._waiting)} messages wait"
+        )
+        self._judge.submit(self._load_watcher).add_done_callback(self._complain)
 
     def _show(self, info: NDArray[np.void]) -> None:
         """Publish the residuals of samples, and what is due by their time."""
@@ -253,6 +300,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
         What is not compiled yet is compiled by another process: a thread of ours would stop us.
         """
+        if self._compiler is not None:
+            return  # later: it would be interpreted, too
         begun = self._judge.submit(self._load_watcher)
         begun.add_done_callback(self._complain)
         until = time.monotonic() + _LOADING_TIME
@@ -351,6 +400,11 @@ class EstimatorNode(Node):  # type: ignore[misc]
                 self.context.try_shutdown()
             elif all(subscription.get_publisher_count() for subscription in self._inputs.values()):
                 self._acknowledge.publish(UInt64(data=self._received.total()))
+            return
+        if self._compiler is not None and self._compiler.poll() is not None:
+            self._go_over_to_compiled()
+        self._work()
+        if self._waiting:
             return
         for role in self._silence:
             self._silence[role] += elapsed
@@ -456,6 +510,10 @@ class EstimatorNode(Node):  # type: ignore[misc]
             level, words = Level.STALE, f"no samples, coefficients held, {words}"
         else:
             level = Level.OK
+        if self._waiting:
+            words = f"{words}; {len(self._waiting)} messages wait"
+        if self._compiler is not None:
+            words = f"{words}; interpreted until compiled"
         return to_status(f"{self._label}: estimation", self._config.name, level, words, values)
 
     # ---------------------------------------------------------------- services
@@ -508,8 +566,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
         if self._keeper is not None:
             self._keep()
             self._keeper.close()
-        if self._compiling is not None:
-            self._compiling.terminate()
+        for process in (self._compiler, self._compiling):
+            if process is not None:
+                process.terminate()
         self.get_logger().info(f"ended: {self._used} samples used")
 
     # ---------------------------------------------------------------- parameters
@@ -532,6 +591,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
 
 def run(kind: Kind) -> int:
     """A node's whole life; its exit status: 0 after an interrupt, 2 for a bad configuration."""
+    only_run()
+    if not is_compiled(kind):
+        interpret()
     return live(
         f"{kind}_node",
         lambda: _ready(kind),
@@ -543,8 +605,12 @@ def run(kind: Kind) -> int:
 
 def _ready(kind: Kind) -> EstimatorNode:
     node = EstimatorNode(kind)
-    # What is there now stays: looking through it again and again would hold up samples.
-    gc.collect()
-    gc.freeze()
+    _settle()
     sys.setswitchinterval(_SWITCHING)
     return node
+
+
+def _settle() -> None:
+    """What is there now stays: looking through it again and again would hold up samples."""
+    gc.collect()
+    gc.freeze()

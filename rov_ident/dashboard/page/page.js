@@ -472,8 +472,7 @@ function build(namespaces, names, coefficients) {
   buildHealth(main, names);
   buildBridges(main);
   if (!coefficients.length) {
-    element(main, "p", "empty", "The nodes are there, and have not reported yet: on its first start on a " +
-      "computer a node compiles for half a minute.");
+    element(main, "p", "empty", "The nodes are there, and have not reported yet.");
     return;
   }
   buildCoefficients(main, names, coefficients);
