@@ -42,12 +42,25 @@ _NOT_TOLD = (
 
 @dataclass(frozen=True)
 class Log:
-    """A motion with its accelerations: nu, nu_dot, wrench (N, 6), down (N, 3), in core axes."""
+    """A motion with its accelerations: nu, nu_dot, wrench (N, 6), down (N, 3), in core axes.
+
+    Raises
+    ------
+    UserError
+        For arrays of other shapes.
+    """
 
     nu: Array
     nu_dot: Array
     wrench: Array
     down: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.nu)
+        for name, width in (("nu", 6), ("nu_dot", 6), ("wrench", 6), ("down", 3)):
+            shape = np.shape(getattr(self, name))
+            if shape != (n, width):
+                raise UserError(f"a log's {name} needs shape {(n, width)}, not {shape}")
 
 
 def equation_error(
@@ -91,7 +104,8 @@ def rows(model: Model, log: Log) -> Array:
     """Regressor and, as the last column, ``tau - known`` of every sample: (6, n + 1, N)."""
     plan = _plan(model)
     parts = [plan.share.swapaxes(1, 2) @ _filled(plan, part) for part in _blocks(log, _BLOCK)]
-    return np.concatenate(parts, axis=2)[:, :, : len(log.nu)]
+    none = np.zeros((6, len(model.theta) + 1, 0))
+    return np.concatenate([none, *parts], axis=2)[:, :, : len(log.nu)]
 
 
 def _check_told(names: Sequence[str], length: Array) -> None:
@@ -196,7 +210,7 @@ def _plan(model: Model) -> Plan:
     width = np.array([len(places) for places in distinct])
     most = -(-width.max() // 4) * 4
     padded = np.array([[*places, *[ONE] * (most - len(places))] for places in distinct])
-    left, right = np.array(products).T.copy()
+    left, right = np.array(products).reshape(-1, 2).T.copy()
     out, base, part, times = (np.array(each) for each in zip(*steps, strict=True))
     return Plan(left, right, out, base, part, times, padded, width, share[:, :most].copy())
 

@@ -131,8 +131,8 @@ def only_run() -> None:
 def interpret() -> None:
     """Run kernels as the Python that they are, a thousandth as fast but at once.
 
-    Until :func:`stop_interpreting`, and everywhere in this process. Neither divisions by zero nor
-    what is not finite raise anything, as in compiled code.
+    Until :func:`stop_interpreting`, and everywhere in this process. numpy's numbers raise nothing
+    when divided by zero, as in compiled code; Python's own would.
     """
     CPUDispatcher.__call__ = lambda self, *arguments: self.py_func(*arguments)
     np.seterr(all="ignore")

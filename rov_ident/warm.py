@@ -3,7 +3,8 @@
 What a process has just compiled is not what it would read from the cache: of a function that
 several kernels call, each kernel keeps a copy, optimised once more, but who compiles them all in a
 row uses the first. Sums in another order differ in their last bits, and the same bag is to give the
-same numbers. So one process compiles and ends, and all others read the cache.
+same numbers. So one process compiles and ends, and all others read the cache. (A live node does not
+wait for it: see :func:`rov_ident.jit.interpret`.)
 """
 
 import contextlib

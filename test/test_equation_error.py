@@ -106,3 +106,15 @@ def test_what_a_log_does_not_tell_is_said(heavy):
     spoilt[5, 0] = np.nan
     with pytest.raises(UserError, match="not finite"):
         equation_error(model, dataclasses.replace(log, nu=spoilt))
+
+
+def test_logs_of_other_shapes_are_refused(heavy):
+    model = build(heavy.model.body, CLASSICAL)
+    log = log_of(model)
+    with pytest.raises(UserError, match=r"nu_dot needs shape \(400, 6\), not \(399, 6\)"):
+        dataclasses.replace(log, nu_dot=log.nu_dot[1:])
+    none = Log(*np.zeros((3, 0, 6)), np.zeros((0, 3)))
+    assert rows(model, none).shape == (6, len(model.theta) + 1, 0)
+    for tsqr in (False, True):
+        with pytest.raises(UserError, match="says nothing of X_udot"):
+            equation_error(model, none, tsqr=tsqr)

@@ -52,6 +52,8 @@ _DIAGNOSTICS_PERIOD = 1.0  # s
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
 _LATE = 2.0  # s; a checkpoint that is older is worth a warning
 _TURN = 0.02  # s; of using messages that wait before anything else is done
+_MOST_WAITING = 200_000  # messages; while compiling, which may take for ever
+_COMPILE_AGAIN = 60.0  # s; at least, between two failures
 _ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
 _LOADING_TIME = 5.0  # s; that a player waits for the watch, if it is compiled
 _SWITCHING = 0.0005  # s; that a sample waits for the thread that watches
@@ -95,6 +97,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         )
         self._started = time.monotonic()
         self._compiler: subprocess.Popen[bytes] | None = None
+        self._compile_again = 0.0
         if interpreting() and not self._lockstep:
             self.get_logger().info(
                 "compiling, half a minute when first started on a computer: until then "
@@ -197,6 +200,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._received[source] += 1
         self._silence[source] = 0.0
         arrival = self.get_clock().now().nanoseconds if self._reader.on_arrival else 0
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting.popleft()
+            self._reader.counts["queue: too many messages wait, the oldest is left out"] += 1
         self._waiting.append((source, data, arrival))
         self._work()
         count = self._received.total()
@@ -204,7 +210,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             self._acknowledge.publish(UInt64(data=count))
 
     def _work(self) -> None:
-        """Use messages that wait: all, unless they come faster than they can be used."""
+        """Use messages that wait; while these are interpreted, for half of the time."""
         began = time.monotonic()
         if began < self._resting_until:
             return
@@ -228,23 +234,26 @@ class EstimatorNode(Node):  # type: ignore[misc]
                 if self._keeper and self._online.stamp - self._kept > _CHECKPOINT_PERIOD * 1e9:
                     self._keep()
 
-    def _go_over_to_compiled(self) -> None:
-        """What is learnt and all that is under way stay as they are: both use the same arrays."""
-        assert self._compiler is not None and self._compiler.stdin is not None
-        self._compiler.stdin.close()
-        if status := self._compiler.returncode:
-            self.get_logger().warning(
-                f"the process that compiles failed ({status}): compiling here, nothing is heard "
-                "for half a minute"
+    def _look_after_compiler(self, now: float) -> None:
+        """Go over to compiled kernels once there are any; the process may fail, for want of memory.
+
+        What is learnt and all that is under way stay as they are: both use the same arrays.
+        """
+        if self._compiler is None or (status := self._compiler.poll()) is None:
+            return
+        if status and now > self._compile_again:
+            self.get_logger().warning(f"compiling failed with status {status}: trying again")
+            self._compile_again = now + _COMPILE_AGAIN
+            self._compiler = compiling(self._online.kind)
+        elif not status:
+            self._compiler = None
+            load(self._config, self._online.kind)
+            _settle()
+            self.get_logger().info(
+                f"compiled after {time.monotonic() - self._started:.1f} s, "
+                f"{len(self._waiting)} messages wait"
             )
-        self._compiler = None
-        load(self._config, self._online.kind)
-        _settle()
-        self.get_logger().info(
-            f"compiled after {time.monotonic() - self._started:.1f} s, "
-            f"{len(self._waiting)} messages wait"
-        )
-        self._judge.submit(self._load_watcher).add_done_callback(self._complain)
+            self._judge.submit(self._load_watcher).add_done_callback(self._complain)
 
     def _show(self, info: NDArray[np.void]) -> None:
         """Publish the residuals of samples, and what is due by their time."""
@@ -401,16 +410,15 @@ class EstimatorNode(Node):  # type: ignore[misc]
             elif all(subscription.get_publisher_count() for subscription in self._inputs.values()):
                 self._acknowledge.publish(UInt64(data=self._received.total()))
             return
-        if self._compiler is not None and self._compiler.poll() is not None:
-            self._go_over_to_compiled()
+        self._look_after_compiler(now)
         self._work()
-        if self._waiting:
-            return
         for role in self._silence:
             self._silence[role] += elapsed
         self._idle += elapsed
         before, self._stopped = self._stopped, ""
-        if self._missing(ODOMETRY) or self._missing(WRENCH):
+        if self._waiting:
+            self._idle = 0.0  # whatever comes or not: there is enough to do
+        elif self._missing(ODOMETRY) or self._missing(WRENCH):
             self._stopped = "inputs stopped"
             self._idle = 0.0  # counted from when they are there: their first messages have to wait
         elif self._online.enabled and self._idle > self._config.timeout:
@@ -519,6 +527,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
     # ---------------------------------------------------------------- services
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._waiting.clear()  # of before the reset
         self._online.reset()
         self._publish()
         self.get_logger().info("reset to the prior")
@@ -526,6 +535,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         return response
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._waiting.clear()  # else what came while disabled would be learnt
         self._online.enabled = request.data
         self._publish()
         response.success = True
@@ -545,7 +555,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
         path = os.path.abspath(str(self._save_path))
         try:
             configuration.dump(self._config.with_values(values), path, "\n".join(lines))
-            response.success, response.message = True, f"saved to {path}"
+            later = f", {len(self._waiting)} messages still wait" if self._waiting else ""
+            response.success, response.message = True, f"saved to {path}{later}"
         except UserError as error:
             response.success, response.message = False, str(error)
         self.get_logger().info(response.message)
@@ -569,7 +580,8 @@ class EstimatorNode(Node):  # type: ignore[misc]
         for process in (self._compiler, self._compiling):
             if process is not None:
                 process.terminate()
-        self.get_logger().info(f"ended: {self._used} samples used")
+        unused = f", {len(self._waiting)} messages not" if self._waiting else ""
+        self.get_logger().info(f"ended: {self._used} samples used{unused}")
 
     # ---------------------------------------------------------------- parameters
 
