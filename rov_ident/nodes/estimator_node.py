@@ -169,7 +169,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._publish()
         self._judge = ThreadPoolExecutor(1, "watch")
         self._leaving = threading.Event()
-        self._compiling: subprocess.Popen[bytes] | None = None
+        self._watch_compiler: subprocess.Popen[bytes] | None = None
         self.get_logger().info(
             f"active after {time.monotonic() - self._started:.1f} s: estimating "
             f"{len(self._online.prior.names)} coefficients of {config.name}"
@@ -322,10 +322,10 @@ class EstimatorNode(Node):  # type: ignore[misc]
         from rov_ident import watch  # here: not needed to begin with
 
         if not watch.is_compiled() and not self._leaving.is_set():
-            self._compiling = compiler(watch.__name__)
+            self._watch_compiler = compiler(watch.__name__)
             if self._leaving.is_set():
-                self._compiling.terminate()
-            if self._compiling.wait():
+                self._watch_compiler.terminate()
+            if self._watch_compiler.wait():
                 return  # we are leaving, or have no memory for it: estimating goes on without
         if self._leaving.is_set():  # a process does not end before its threads do
             return
@@ -577,7 +577,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         if self._keeper is not None:
             self._keep()
             self._keeper.close()
-        for process in (self._compiler, self._compiling):
+        for process in (self._compiler, self._watch_compiler):
             if process is not None:
                 process.terminate()
         unused = f", {len(self._waiting)} messages not" if self._waiting else ""
