@@ -8,15 +8,24 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test check docs accuracy bench validate sdf explain-bench torture audit lock bag picture clean
+.PHONY: demo quick tiers test check docs accuracy bench validate sdf explain-bench torture audit lock bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
 	@$(BIN)/rov-ident demo
 
-## style, types, then all tests
+## style, types, then all tests (under 15 minutes on two cores)
 test: check
-	$(BIN)/python -m pytest -n 2 --timeout 300
+	$(BIN)/python -m pytest -n 2 --timeout 900
+
+## the tests without DDS, programs and long computations (under 90 s, once all is compiled)
+quick: .venv/test.stamp
+	$(BIN)/python -m pytest -n 2 --timeout 300 -m "not dds and not process and not slow" \
+	  --hypothesis-profile quick
+
+## all tests, measured: which of them `make quick` has time for (test/slow.txt)
+tiers: .venv/test.stamp
+	$(BIN)/python -m pytest -n 2 --timeout 900 --find-slow
 
 ## style and types
 check: .venv/test.stamp
@@ -31,21 +40,21 @@ docs: .venv/docs.stamp
 ## accuracy over seeds, the tables of docs/accuracy.md (some two hours; it may be stopped and goes on
 ## where it was)
 accuracy: .venv/demo.stamp
-	$(BIN)/python bench/accuracy.py
+	$(BIN)/python -m bench.studies.accuracy
 
 ## speed against peers, the table of docs/speed.md (ten minutes; let nothing else run)
 bench: .venv/bench.stamp
-	@$(BIN)/python bench/speed.py
+	@$(BIN)/python -m bench.studies.speed
 
 ## offline identification: the tables of docs/offline.md, docs/nomoto.md and docs/forces.md
 validate: .venv/demo.stamp
-	$(BIN)/python bench/validate.py
-	$(BIN)/python bench/validate_nomoto.py
-	$(BIN)/python bench/validate_forces.py
+	$(BIN)/python -m bench.studies.validate
+	$(BIN)/python -m bench.studies.validate_nomoto
+	$(BIN)/python -m bench.studies.validate_forces
 
 ## exported Gazebo models, read by libsdformat; needs the network
 sdf: .venv/drake.stamp
-	PYTHONPATH=.venv/drake $(BIN)/python bench/sdf.py
+	PYTHONPATH=.venv/drake $(BIN)/python -m bench.tools.sdf
 
 # Apart from the rest, and without what it depends on: it is for this alone.
 .venv/drake.stamp: .venv/demo.stamp
@@ -54,8 +63,8 @@ sdf: .venv/drake.stamp
 
 ## what goes wrong at sea, done to both estimators and to live nodes: docs/trust.md (some hours)
 torture: .venv/test.stamp
-	$(BIN)/python bench/torture.py
-	$(BIN)/python bench/torture_live.py
+	$(BIN)/python -m bench.studies.torture
+	$(BIN)/python -m bench.studies.torture_live
 
 ## known faults of the dependencies, and suspicious places in the source; needs the network
 audit: .venv/audit.stamp
@@ -80,7 +89,7 @@ COMPILE := .venv/audit/bin/pip-compile --quiet --no-header --generate-hashes --a
 ## how often explain finds what is hidden, the tables of docs/explain-bench.md (many hours; it may be
 ## stopped and goes on where it was)
 explain-bench: .venv/demo.stamp
-	$(BIN)/python bench/explain.py
+	$(BIN)/python -m bench.studies.explain
 
 ## the shipped bag, anew
 bag: .venv/demo.stamp
@@ -88,7 +97,7 @@ bag: .venv/demo.stamp
 
 ## the picture of `explain` in the README, anew
 picture: .venv/demo.stamp
-	$(BIN)/python bench/picture.py
+	$(BIN)/python -m bench.tools.picture
 
 clean:
 	rm -rf .venv build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -8,7 +8,11 @@ setup(
     name=package_name,
     version="0.1.0",
     packages=find_packages(include=[package_name, f"{package_name}.*"]),
-    package_data={f"{package_name}.dashboard": ["page/*"], f"{package_name}.nodes": ["*.xml"]},
+    package_data={
+        f"{package_name}.dashboard": ["page/*", "*.json", "*.xml"],
+        f"{package_name}.nodes": ["*.xml"],
+        f"{package_name}.reports": ["*.css"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
@@ -21,8 +25,9 @@ setup(
     install_requires=[
         "setuptools",
         "numpy>=1.26",
-        "numba>=0.61",
+        "numba>=0.61,<0.69",  # the minors that bench/tools/versions.py was run with: docs/trust.md
         "scipy>=1.11",
+        "threadpoolctl>=3.2",
         "filterpy>=1.4.5",
         "mcap>=1.6",
         "rosbags>=0.10",
@@ -44,9 +49,12 @@ setup(
             "pytest-timeout",
             "pytest-xdist",
             "hypothesis",
+            "ipykernel>=6",
             "lxml>=5",
             "mcap-ros2-support",
             "mkdocs-material>=9.5",
+            "nbclient>=0.8",
+            "nbformat>=5.7",
             "pymdown-extensions<13",  # 13 is not for the Python 3.11.2 of Debian 12
             "pymavlink>=2.4.40",
             "ruff",
@@ -54,8 +62,6 @@ setup(
             "types-PyYAML",
         ],
         "bench": ["padasip>=1.2"],
-        # `rov-ident dashboard --foxglove`
-        "foxglove": ["foxglove-sdk>=0.14"],
         # `make docs`
         "docs": ["mkdocs>=1.6", "mkdocs-material>=9.5"],
         # `rov-ident import` of ArduSub's logs
@@ -76,6 +82,6 @@ setup(
             "controller_bridge = rov_ident.nodes.programs:controller_bridge",
             "dashboard_node = rov_ident.nodes.programs:dashboard_node",
             "rov-ident = rov_ident.cli:main",
-        ],
+        ]
     },
 )

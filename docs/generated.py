@@ -10,10 +10,12 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-from rov_ident import cli, config
-from rov_ident.coefficients import catalogue, fin_catalogue
+import rov_ident as ri
+from rov_ident.cli import program as cli
+from rov_ident.config import schema
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
+from rov_ident.model.coefficients import catalogue, fin_catalogue
 
 _HOOKS = {
     "coefficients": "adds coefficients to the equations of motion",
@@ -42,6 +44,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 def pages() -> dict[str, str]:
     """Every generated page: its place and its Markdown."""
     made = {
+        "reference/python.md": python(),
         "reference/commands.md": commands(),
         "reference/parameters.md": parameters(),
         "reference/coefficients.md": coefficients(),
@@ -57,6 +60,62 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|")
+
+
+# ------------------------------------------------------------------ Python
+
+
+def python() -> str:
+    """Every public function and class, from its own docstring."""
+    parts = [
+        "# Python\n",
+        "`import rov_ident as ri`. What stands here is public; [the guide](../python.md) says what "
+        "it is for.\n",
+    ]
+    public = {name: getattr(ri, name) for name in sorted(ri.__all__, key=str.lower)}
+    for name, function in public.items():
+        if inspect.isfunction(function):
+            parts += [f"## {name}\n", _signature(name, function), _documented(function)]
+    for name, kind in public.items():
+        if not inspect.isclass(kind):
+            continue
+        parts += [f"## {name}\n", _documented(kind)]
+        own = [c for c in reversed(kind.__mro__) if c.__module__.startswith("rov_ident")]
+        members = {n: m for c in own for n, m in vars(c).items() if not n.startswith("_")}
+        for member, value in members.items():
+            if inspect.isfunction(value) and value.__doc__:
+                parts += [f"### {name}.{member}\n", _signature(member, value), _documented(value)]
+        rows = [
+            [f"`{n}`", inspect.cleandoc(m.__doc__).replace("\n", " ")]
+            for n, m in members.items()
+            if isinstance(m, property) and m.__doc__
+        ]
+        parts += [_table(["attribute", ""], rows)] if rows else []
+    effects = ", ".join(f"[{name}](../effects/{name}.md)" for name in ri.EFFECTS)
+    parts += ["## EFFECTS\n", f"What a simulation may lack, by name: {effects}.\n"]
+    return "\n".join(parts)
+
+
+def _signature(name: str, function: Any) -> str:
+    parameters = inspect.signature(function).parameters.values()
+    bare = [p.replace(annotation=inspect.Parameter.empty) for p in parameters if p.name != "self"]
+    return f"```python\n{name}{inspect.Signature(bare)}\n```\n"
+
+
+def _documented(thing: Any) -> str:
+    """A docstring, whose sections of parameters, results and errors become tables."""
+    text, *sections = re.split(r"\n(?=\w+\n-{3,}\n)", inspect.cleandoc(thing.__doc__))
+    parts = [_paragraphs(text.strip())]
+    for section in sections:
+        title, _, *lines = section.splitlines()
+        rows: list[list[str]] = []
+        for line in filter(None, lines):
+            if line.startswith(" "):
+                rows[-1][1] = f"{rows[-1][1]} {line.strip()}".strip().replace("``", "`")
+            else:
+                rows.append([f"`{line}`", ""])
+        parts.append(_table([title.lower(), ""], rows))
+    return "\n".join(parts)
 
 
 # ------------------------------------------------------------------ commands
@@ -118,7 +177,7 @@ def parameters() -> str:
         "in one sentence that names it.\n",
     ]
     sections: dict[str, list[list[str]]] = {}
-    for p in config.VEHICLE_PARAMETERS + config.PARAMETERS:
+    for p in schema.VEHICLE_PARAMETERS + schema.PARAMETERS:
         section = p.key.rpartition(".")[0]
         sections.setdefault(section, []).append(
             [f"`{p.key}`", _kind(p), _default(p), p.unit, _range(p), p.description]
@@ -139,15 +198,15 @@ def parameters() -> str:
     return "\n".join(parts)
 
 
-def _kind(p: config.Parameter) -> str:
+def _kind(p: schema.Parameter) -> str:
     if p.choices:
         return "text"
-    if p.type is config.Vector:
-        return "numbers" if p.size == config.ANY else f"{p.size} numbers"
-    return {float: "number", int: "whole number", str: "text", config.Names: "names"}[p.type]
+    if p.type is schema.Vector:
+        return "numbers" if p.size == schema.ANY else f"{p.size} numbers"
+    return {float: "number", int: "whole number", str: "text", schema.Names: "names"}[p.type]
 
 
-def _default(p: config.Parameter) -> str:
+def _default(p: schema.Parameter) -> str:
     if p.required:
         return "required"
     if p.default is None:
@@ -157,16 +216,16 @@ def _default(p: config.Parameter) -> str:
     return f"`{p.default}`" if p.default != "" else "empty"
 
 
-def _range(p: config.Parameter) -> str:
+def _range(p: schema.Parameter) -> str:
     live = "; live" if p.live else ""
     if p.choices:
         return ", ".join(f"`{c}`" for c in p.choices if c) + live
     low, high = p.lower, p.upper
-    if p.type not in (float, int, config.Vector) or (math.isinf(low) and math.isinf(high)):
+    if p.type not in (float, int, schema.Vector) or (math.isinf(low) and math.isinf(high)):
         return live.removeprefix("; ")
-    if low == config.POSITIVE and math.isinf(high):
+    if low == schema.POSITIVE and math.isinf(high):
         return f"above 0{live}"
-    low_text = "0 (not itself)" if low == config.POSITIVE else f"{low:g}"
+    low_text = "0 (not itself)" if low == schema.POSITIVE else f"{low:g}"
     if math.isinf(high):
         return f"from {low_text}{live}"
     return f"{low_text} to {high:g}{live}"

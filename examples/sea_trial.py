@@ -17,38 +17,66 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rov_ident import config as configuration
-from rov_ident import plots, preprocess, swing
-from rov_ident.archive import opened
-from rov_ident.batch import Curves, Settings, curves, fit_batch, open_loop_rmse
+from rov_ident.cli import main as program
+from rov_ident.cli.demo import shipped
 from rov_ident.config import Config
-from rov_ident.demo import shipped
-from rov_ident.fit import Fit, write_text
-from rov_ident.fit_report import page
-from rov_ident.frames import quaternion_to_euler
-from rov_ident.importer import import_csv
-from rov_ident.messages import Array
-from rov_ident.records import VELOCITIES
-from rov_ident.result import provenance
-from rov_ident.simulate import simulate
-from rov_ident.swing import Course, Limits, Swing
+from rov_ident.core.files import write_file
+from rov_ident.core.frames import quaternion_to_euler
+from rov_ident.core.messages import Array
+from rov_ident.core.states import State
+from rov_ident.experiment import closed_loop_manoeuvres
+from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits
+from rov_ident.offline.archive import opened
+from rov_ident.offline.batch_fit import Settings, curves, fit_batch, open_loop_rmse
+from rov_ident.offline.fit import Curves, Fit
+from rov_ident.offline.report import page
+from rov_ident.reports import plots
+from rov_ident.reports.result import provenance
+from rov_ident.sampling.records import VELOCITIES
+from rov_ident.simulation.open_loop import simulate
 
-DVL = np.array([0.15, 0.0, 0.1])  # m, from the body origin
+DVL = (0.15, 0.0, 0.1)  # m, from the body origin
 PERIOD = 0.05  # s, of the log
 IDLE = 8.0  # s before and after each run
 STILL = (9.0, 9.0, 9.0, 9.0)
 
-# The controller stays closed: alternating waypoints swing the thrusters between their limits.
+
+@dataclasses.dataclass(frozen=True)
+class Course(AlternatingTargets):
+    """Legs of constant speed and heading, each (duration [s], speed [m/s], heading [rad])."""
+
+    legs: tuple[tuple[float, float, float], ...] = ()
+
+    def target(self, t: float) -> Array:
+        """Position [m] and heading [rad] (4,) aimed at; at the end of the last leg it stays."""
+        target = np.zeros(4)
+        for duration, speed, heading in self.legs:
+            gone = speed * min(t, duration)
+            target[:2] += gone * np.cos(heading), gone * np.sin(heading)
+            target[3] = heading
+            t -= duration
+            if t <= 0.0:
+                break
+        return target
+
+
+# The controller stays closed: alternating waypoints drive the thrusters between their limits.
 RUNS = {
-    ("surge",): Swing("surge", (1.0, 0.0, 0.0, 0.0), (3.0, *STILL[1:])),
-    ("roll",): Swing("roll", (0.0, 0.0, 0.0, 0.0), STILL, (0.7, 0.0)),
-    ("sway", "yaw"): Swing("lateral", (0.0, 1.0, 0.0, 0.9), (9.0, 3.3, 9.0, 2.7)),
-    ("heave", "pitch"): Swing("longitudinal", (0.0, 0.0, 0.7, 0.0), (9.0, 9.0, 3.7, 9.0), (0, 0.7)),
+    ("surge",): AlternatingTargets("surge", (1.0, 0.0, 0.0, 0.0), (3.0, *STILL[1:])),
+    ("roll",): AlternatingTargets("roll", (0.0, 0.0, 0.0, 0.0), STILL, (0.7, 0.0)),
+    ("sway", "yaw"): AlternatingTargets("lateral", (0.0, 1.0, 0.0, 0.9), (9.0, 3.3, 9.0, 2.7)),
+    ("heave", "pitch"): AlternatingTargets(
+        "longitudinal", (0.0, 0.0, 0.7, 0.0), (9.0, 9.0, 3.7, 9.0), (0, 0.7)
+    ),
 }
 # Ahead slowly, then fast, a turn to starboard at speed, one back to port, and slowly on. Sharper
 # turns make a vehicle with a centimetre between its centres roll and pitch away in open loop: the
 # Munk moments of the sway are stronger than its restoring moments.
 JOINT = Course(
-    "joint", ((8.0, 0.3, 0.0), (10.0, 0.6, 0.0), (10.0, 0.6, 0.6), (8.0, 0.4, 0.1), (4.0, 0.2, 0.1))
+    "joint",
+    (0.0,) * 4,
+    (1.0,) * 4,
+    legs=((8.0, 0.3, 0.0), (10.0, 0.6, 0.0), (10.0, 0.6, 0.6), (8.0, 0.4, 0.1), (4.0, 0.2, 0.1)),
 )
 
 
@@ -60,14 +88,14 @@ class Log:
     velocity: Array  # (N, 3) m/s, of the DVL where it is mounted
     omega: Array  # (N, 3) rad/s
     angles: Array  # (N, 3) rad, roll pitch yaw
-    wrench: Array  # (N, 6) demanded from each row to the next
-    depth: list[preprocess.Source]
+    wrench: Array  # (N, 6) command from each row to the next
+    depth: dict[str, Array]  # by source (N,) m, NaN in rows where it has not measured
 
 
-def raw_log(vehicle: Config, run: Swing | Course, duration: float, seed: int) -> Log:
+def raw_log(vehicle: Config, run: AlternatingTargets, duration: float, seed: int) -> Log:
     """A run of the true vehicle as its sensors see it, with outliers, levers and idle minutes."""
     rng = np.random.default_rng(seed)
-    flown = swing.fly(vehicle, run, duration, Limits())
+    flown = closed_loop_manoeuvres.fly(vehicle, run, duration, Limits())
     t = np.arange(0.0, duration + 2.0 * IDLE, PERIOD)
     held = np.searchsorted(flown.t, t - IDLE + 1e-9, side="right") - 1
     at_work = (held >= 0) & (t < IDLE + duration)
@@ -83,48 +111,36 @@ def raw_log(vehicle: Config, run: Swing | Course, duration: float, seed: int) ->
     velocity[spikes] += rng.uniform(-2.0, 2.0, (spikes.sum(), 3))
     angles = quaternion_to_euler(truth.orientation[rows])
 
-    def depth(name: str, every: int, std: float, bias: float, bias_std: float) -> preprocess.Source:
-        z = truth.position[rows][::every, 2]
-        return preprocess.Source(
-            name, t[::every], z + bias + std * rng.standard_normal(len(z)), std, bias_std
-        )
+    def depth(every: int, std: float, bias: float = 0.0) -> Array:
+        z = truth.position[rows][:, 2] + bias + std * rng.standard_normal(n)
+        return np.where(np.arange(n) % every == 0, z, np.nan)
 
-    sources = [
-        depth("pressure", 4, 0.03, 0.0, 0.0),
-        depth("inertial", 2, 0.02, 0.4, 0.5),
-        depth("tracking", 20, 0.3, 0.0, 0.1),
-    ]
     return Log(
         t,
         velocity,
         nu[:, 3:] + 0.003 * rng.standard_normal((n, 3)),
         angles + 0.002 * rng.standard_normal((n, 3)),
         wrench,
-        sources,
+        {"pressure": depth(4, 0.03), "inertial": depth(2, 0.02, 0.4), "tracking": depth(20, 0.3)},
     )
 
 
-def prepared(log: Log, path: Path) -> str:
-    """Cut, cleaned and brought to the origin, as a CSV file for `rov-ident import`; in words."""
-    trim = np.median(log.wrench[log.t < 0.5 * IDLE], axis=0)
-    effort = np.abs(log.wrench - trim)
-    effort = (effort / np.maximum(effort.max(axis=0), 1e-9)).max(axis=1)
-    begin, end = preprocess.dynamic_stretch(log.t, effort, margin=3.0)
-    velocity, bad = preprocess.without_outliers(log.velocity)
-    # No smoothing: the noise is in the model of maximum likelihood, and smoothing would hide it.
-    velocity = preprocess.velocity_at_origin(velocity, log.omega, DVL)
-    depth = preprocess.fused(log.depth, log.t)
-    keep = (log.t >= begin) & (log.t <= end)
-    columns = np.column_stack(
-        [log.t, velocity, log.omega, log.wrench, 0.0 * log.t, 0.0 * log.t, depth.value, log.angles]
-    )[keep]
-    head = "t_s,u,v,w,p,q,r,X,Y,Z,K,M,N,x,y,z,roll,pitch,yaw"
-    np.savetxt(path, columns, "%.9g", ",", header=head, comments="")
-    return (
-        f"{path.stem}: {begin:.0f} to {end:.0f} s of {log.t[-1]:.0f}, "
-        f"{np.count_nonzero(bad.any(axis=1))} outliers, depth to {1e3 * np.median(depth.std):.0f} "
-        f"mm, the inertial one {depth.bias['inertial']:+.2f} m off"
-    )
+def imported(log: Log, table: Path) -> Path:
+    """The log as a CSV file, and prepared as a bag: cut, cleaned, its depths fused.
+
+    Not smoothed: the noise is in the model of maximum likelihood, and smoothing would hide it.
+    """
+    columns = np.column_stack([log.t, log.velocity, log.omega, log.wrench, log.angles])
+    head = "t_s,u,v,w,p,q,r,X,Y,Z,K,M,N,roll,pitch,yaw"
+    columns = np.column_stack([columns, *log.depth.values()])
+    np.savetxt(table, columns, "%.9g", ",", header=",".join([head, *log.depth]), comments="")
+    bag = table.with_suffix(".mcap")
+    depths = ["pressure=0.03", "inertial=0.02,0.5", "tracking=0.3,0.1"]
+    prepared = ["--despike", "--depth", *depths, "--cut-idle", "3"]
+    command = ["import", str(table), "--map", "x=0", "y=0", "--out", str(bag), *prepared]
+    if program(command):
+        raise SystemExit(f"{table} cannot be imported")
+    return bag
 
 
 def fitted(bag: Path, config: Config, channels: tuple[str, ...]) -> Fit:
@@ -132,7 +148,7 @@ def fitted(bag: Path, config: Config, channels: tuple[str, ...]) -> Fit:
         return fit_batch(bags, config, "ml", Settings((channels,)))
 
 
-def together(fits: list[Fit]) -> Fit:
+def together(fits: list[Fit], judged: list[Curves]) -> Fit:
     """One result of fits in a row: of each, the coefficients that its run could tell."""
     covariance = fits[0].covariance.copy()
     for fit in fits[1:]:
@@ -140,14 +156,21 @@ def together(fits: list[Fit]) -> Fit:
         covariance[np.ix_(known, known)] = fit.covariance[np.ix_(known, known)]
     return dataclasses.replace(
         fits[-1],
+        given=fits[0].given,
+        judged=tuple(judged),
         covariance=covariance,
-        identifiable=tuple(any(known) for known in zip(*(fit.identifiable for fit in fits))),
+        states=tuple(map(_best, zip(*(fit.states for fit in fits)))),
         notes=tuple(note for fit in fits for note in fit.notes),
         duration=sum(fit.duration for fit in fits),
         provenance=provenance(
             (bag["file"], bag["sha256"]) for fit in fits for bag in fit.provenance["bags"]
         ),
     )
+
+
+def _best(states: tuple[State, ...]) -> State:
+    """Of a coefficient's states in several fits, that of the last one which identified it."""
+    return next((state for state in reversed(states) if state is not State.HELD), State.HELD)
 
 
 def picture(joint: Curves) -> bytes:
@@ -168,15 +191,15 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     true = configuration.load(shipped("config/bluerov2_heavy.yaml"))
+    # takes the lever arm of the DVL off
+    true = dataclasses.replace(true, odometry=dataclasses.replace(true.odometry, position=DVL))
     off = np.random.default_rng(options.seed).uniform(0.6, 1.4, len(true.model.theta))
     start = true.with_model(true.model.with_theta(true.model.theta * off))
 
     bags = {}
     for k, (channels, run) in enumerate([*RUNS.items(), ((), JOINT)]):
-        table = options.out / f"{run.name}.csv"
-        print(prepared(raw_log(true, run, 40.0, options.seed + k), table))
-        bags[channels] = table.with_suffix(".mcap")
-        import_csv([table], bags[channels])
+        log = raw_log(true, run, 40.0, options.seed + k)
+        bags[channels] = imported(log, options.out / f"{run.name}.csv")
 
     config, fits = start, []
     for channels in RUNS:
@@ -188,7 +211,7 @@ def main(arguments: list[str] | None = None) -> int:
     with opened([bags[()]], start, jobs=1) as judge:
         errors = [open_loop_rmse(judge, c) for c in (start, config, true)]
         drawn = curves(judge, start, config)
-    write_text(options.out / "report.html", page(together(fits), start, [], drawn))
+    write_file(options.out / "report.html", page(together(fits, drawn)))
     (options.out / "joint.png").write_bytes(picture(drawn[0]))
     print("the joint run in open loop, RMSE before, after, and of the true vehicle:")
     for name, *rmse in zip(VELOCITIES, *errors, strict=True):

@@ -1,9 +1,9 @@
-"""Converged coefficients into the parameters of a running controller.
+"""Writes converged coefficients into the parameters of a running controller.
 
 ros2 launch rov_ident bridge.launch.py controller:=/rov/velocity_controller namespace:=rov \
     config:=my_vehicle.yaml layout:=auv_controllers
 
-Nothing is sent before somebody calls /rov/controller_bridge/approve, unless approval:=false.
+Nothing is sent until /rov/controller_bridge/approve is called, unless approval:=false.
 """
 
 import os
@@ -17,7 +17,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def check(context: LaunchContext) -> None:
-    """Without its file the node would say that it is given no vehicle, and not why."""
+    """Raise if the parameter file does not exist; a node would only report a missing vehicle."""
     path = LaunchConfiguration("config").perform(context)
     if not os.path.isfile(path):
         raise RuntimeError(f"config: there is no file {path!r}")
@@ -27,26 +27,28 @@ def generate_launch_description() -> LaunchDescription:
     shipped = PathJoinSubstitution([FindPackageShare("rov_ident"), "config", "bluerov2_heavy.yaml"])
     arguments = [
         DeclareLaunchArgument("controller", description="full name of the controller's node"),
-        DeclareLaunchArgument("namespace", default_value="", description="of the estimators"),
+        DeclareLaunchArgument(
+            "namespace", default_value="", description="namespace of the estimators"
+        ),
         DeclareLaunchArgument("config", default_value=shipped, description="parameter file"),
         DeclareLaunchArgument(
-            "estimator", default_value="ukf_node", description="whose coefficients to send"
+            "estimator", default_value="ukf_node", description="node whose coefficients are sent"
         ),
         DeclareLaunchArgument(
             "parameter",
             default_value="hydrodynamics.{name}",
-            description="the controller's parameter of a coefficient",
+            description="name of the controller's parameter for a coefficient",
         ),
         DeclareLaunchArgument(
             "layout",
             default_value="none",
-            description="none, or a controller whose parameters are known: auv_controllers",
+            description="none, or a known set of parameters: auv_controllers",
         ),
         DeclareLaunchArgument(
             "approval",
             default_value="true",
             choices=["true", "false", "True", "False"],
-            description="send only what ~/approve was called for",
+            description="send only after a call of ~/approve",
         ),
     ]
     bridge = Node(

@@ -1,8 +1,8 @@
-"""Both estimators on each of several vehicles, and one live page of them all.
+"""Starts both estimators for each of several vehicles, and one live page for all of them.
 
 ros2 launch rov_ident fleet.launch.py vehicles:="rov1=rov1.yaml rov2=rov2.yaml"
 
-Each vehicle has its topics, and its nodes, in the namespace of its name.
+The topics and nodes of each vehicle are in the namespace with its name.
 """
 
 import os
@@ -26,7 +26,7 @@ SWITCH = ["true", "false", "True", "False"]
 
 
 def fleet(text: str) -> dict[str, str]:
-    """The parameter file of every namespace: all is checked before the first node starts."""
+    """Return the parameter file of every namespace; raise before any node starts."""
     found: dict[str, str] = {}
     for entry in text.split():
         name, equals, config = entry.partition("=")
@@ -44,7 +44,7 @@ def fleet(text: str) -> dict[str, str]:
 
 
 def estimators(context: LaunchContext) -> list[GroupAction]:
-    """Both estimators of each vehicle named in `vehicles`."""
+    """Return the actions that start both estimators for each vehicle in `vehicles`."""
     path = PathJoinSubstitution([FindPackageShare("rov_ident"), "launch", "identify.launch.py"])
     groups = []
     for namespace, config in fleet(LaunchConfiguration("vehicles").perform(context)).items():
@@ -64,7 +64,9 @@ def estimators(context: LaunchContext) -> list[GroupAction]:
 
 def generate_launch_description() -> LaunchDescription:
     arguments = [
-        DeclareLaunchArgument("vehicles", description="NAMESPACE=PARAMETER_FILE, with blanks"),
+        DeclareLaunchArgument(
+            "vehicles", description="NAMESPACE=PARAMETER_FILE, separated by blanks"
+        ),
         DeclareLaunchArgument(
             "use_sim_time",
             default_value="false",

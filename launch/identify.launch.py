@@ -1,4 +1,4 @@
-"""Both estimators on a live vehicle.
+"""Starts both estimators on a live vehicle.
 
 ros2 launch rov_ident identify.launch.py namespace:=rov config:=my_vehicle.yaml dashboard:=true
 
@@ -20,7 +20,7 @@ SWITCH = ["true", "false", "True", "False"]
 
 
 def check(context: LaunchContext) -> None:
-    """Without its file a node would say that it is given no vehicle, and not why."""
+    """Raise if the parameter file does not exist; a node would only report a missing vehicle."""
     path = LaunchConfiguration("config").perform(context)
     if not os.path.isfile(path):
         raise RuntimeError(f"config: there is no file {path!r}")

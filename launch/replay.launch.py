@@ -1,8 +1,8 @@
-"""Both estimators on a recorded dive.
+"""Starts both estimators on a recorded dive.
 
 ros2 launch rov_ident replay.launch.py bag:=dive.mcap config:=my_vehicle.yaml dashboard:=true
 
-The nodes stay up when the bag has ended, so that their results can be read and saved.
+The nodes keep running after the end of the bag, so that their results can be read and saved.
 """
 
 import os
@@ -20,7 +20,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def check(context: LaunchContext) -> None:
-    """Otherwise the nodes would wait for a player that has given up."""
+    """Raise if the bag does not exist; else the nodes would wait for a player that has ended."""
     path = LaunchConfiguration("bag").perform(context)
     if not os.path.exists(path):
         raise RuntimeError(f"bag: there is no {path!r}")
@@ -43,10 +43,7 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument("rate", default_value="1.0", description="speed of the replay"),
         DeclareLaunchArgument(
-            "delay",
-            default_value="10.0",
-            description="seconds for the nodes to come up; when first started on a computer they "
-            "compile for half a minute, and miss what is played",
+            "delay", default_value="10.0", description="seconds for the nodes to come up"
         ),
     ]
     nodes = IncludeLaunchDescription(

@@ -1,11 +1,85 @@
 """Identify the hydrodynamic coefficients of a marine vehicle while it moves, and from its records.
 
-Everything in this package outside ``nodes`` is free of ROS; ARCHITECTURE.md shows the rooms.
+    import rov_ident as ri
+
+    fit = ri.fit("dive.mcap", "bluerov2_heavy.yaml")
+    print(fit)
+
+What is listed here is public, with `rov_ident.config` and `rov_ident.consumer`; the rest is
+private (ARCHITECTURE.md shows its rooms). Nothing is loaded before it is used, and importing
+changes nothing in the caller's process.
 """
 
-import os
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-# One thread for BLAS, said before numpy is loaded: the matrices are 30 x 30, over which a second
-# one only waits, at full load; and a node shares its computer with a pilot's.
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+if TYPE_CHECKING:
+    from rov_ident.api.comparison import Comparison as Comparison
+    from rov_ident.api.comparison import compare as compare
+    from rov_ident.api.functions import check as check
+    from rov_ident.api.functions import coefficients as coefficients
+    from rov_ident.api.functions import explain as explain
+    from rov_ident.api.functions import fit as fit
+    from rov_ident.api.functions import load as load
+    from rov_ident.api.functions import plan as plan
+    from rov_ident.api.functions import read as read
+    from rov_ident.api.simulation import Simulation as Simulation
+    from rov_ident.api.simulation import simulate as simulate
+    from rov_ident.config import Config as Config
+    from rov_ident.consumer import HydrodynamicModel as HydrodynamicModel
+    from rov_ident.core.errors import UserError as UserError
+    from rov_ident.core.messages import Imu as Imu
+    from rov_ident.core.messages import Odometry as Odometry
+    from rov_ident.core.messages import Wrench as Wrench
+    from rov_ident.discrepancy.explain import Explanation as Explanation
+    from rov_ident.effects import EFFECTS as EFFECTS
+    from rov_ident.estimation.online import OnlineEstimator as OnlineEstimator
+    from rov_ident.estimation.online import Report as Report
+    from rov_ident.experiment.data_quality import Check as Check
+    from rov_ident.experiment.design import Proposal as Proposal
+    from rov_ident.model.equations import Model as Model
+    from rov_ident.offline.fit import Fit as Fit
+    from rov_ident.sampling.records import Record as Record
+
+    __version__: str
+
+_PLACES = {
+    "api.comparison": "Comparison compare",
+    "api.functions": "check coefficients explain fit load plan read",
+    "api.simulation": "Simulation simulate",
+    "config": "Config",
+    "consumer": "HydrodynamicModel",
+    "core.errors": "UserError",
+    "core.messages": "Imu Odometry Wrench",
+    "discrepancy.explain": "Explanation",
+    "effects": "EFFECTS",
+    "estimation.online": "OnlineEstimator Report",
+    "experiment.data_quality": "Check",
+    "experiment.design": "Proposal",
+    "model.equations": "Model",
+    "offline.fit": "Fit",
+    "sampling.records": "Record",
+}
+_PUBLIC = {name: place for place, names in _PLACES.items() for name in names.split()}
+_MODULES = ("config", "consumer")
+
+__all__ = [*_PUBLIC, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        value: Any = getattr(import_module(f"rov_ident.{_PUBLIC[name]}"), name)
+    elif name in _MODULES:
+        return import_module(f"rov_ident.{name}")
+    elif name == "__version__":
+        from importlib.metadata import version
+
+        value = version("rov_ident")
+    else:
+        raise AttributeError(f"module 'rov_ident' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, *_MODULES])

@@ -32,7 +32,7 @@ class Page:
         number = next(self._numbers)
         await self._socket.send_json({"id": number, "method": method, "params": parameters})
         while True:
-            answer = await asyncio.wait_for(self._socket.receive_json(), 30.0)
+            answer = await asyncio.wait_for(self._socket.receive_json(), 120.0)
             if answer.get("method") == "Runtime.exceptionThrown":
                 self.complaints.append(json.dumps(answer["params"]["exceptionDetails"]))
             elif answer.get("method") == "Log.entryAdded":
@@ -64,7 +64,7 @@ class Page:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    async def until(self, expression, seconds=20.0):
+    async def until(self, expression, seconds=120.0):
         end = time.monotonic() + seconds
         while not (value := await self.evaluate(expression)):
             assert time.monotonic() < end, f"not in time: {expression}"
@@ -89,7 +89,7 @@ async def chromium():
         )  # fmt: skip
         try:
             port_file = Path(folder) / "DevToolsActivePort"
-            for _ in range(300):
+            for _ in range(1200):
                 if port_file.exists() and len(port_file.read_text().split()) == 2:
                     break
                 await asyncio.sleep(0.1)

@@ -1,28 +1,107 @@
-"""Live nodes in processes of their own, and a vehicle at the other end of their topics."""
+"""Fixtures, and the tiers of the tests.
+
+`make test` runs everything. `make quick` leaves out what is marked here: `dds` and `process` by
+what a test uses, `slow` by slow.txt, which `make tiers` measures anew.
+"""
 
 import contextlib
 import fcntl
 import itertools
-import math
 import os
 import signal
-import subprocess
-import sys
 import tempfile
-import time
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 
+import hypothesis
 import pytest
 
-from rov_ident import config, sensors
+from bench import HEAVY
+from bench.simulators.live import children, compile_all, end_node, start_connected
+from rov_ident import config
+from rov_ident.simulation import virtual_sensors as sensors
 
-HEAVY = Path(__file__).parent.parent / "config" / "bluerov2_heavy.yaml"
+# A computer that is busy with something else makes no test fail.
+hypothesis.settings.register_profile(
+    "patient", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.register_profile(
+    "quick", hypothesis.settings.get_profile("patient"), max_examples=20
+)
+hypothesis.settings.load_profile("patient")
+
+
+# ------------------------------------------------------------------ tiers
+
+
+SLOW = Path(__file__).with_name("slow.txt")
+QUICK = 90.0  # s of processor for `make quick`: 45 s on two cores, and as much to start and collect
+
+
+def _function(nodeid):
+    """What a line of slow.txt names: a test with all its parameters."""
+    return Path(nodeid.partition("[")[0]).name
+
+
+def pytest_addoption(parser):
+    parser.addoption("--find-slow", action="store_true", help="write slow.txt anew (all tests)")
+
+
+def pytest_collection_modifyitems(items):
+    slow = set(SLOW.read_text().split())
+    for item in items:
+        if {_function(item.nodeid), item.path.name} & slow:
+            item.add_marker("slow")
+        names = getattr(item.function, "__code__", None) and item.function.__code__.co_names
+        if "domain" in item.fixturenames:
+            item.add_marker("dds")
+        elif "compiled" in item.fixturenames or "subprocess" in (names or ()):
+            item.add_marker("process")
+
+
+def _processor():
+    """Seconds of processor that this process and its children that have ended have taken."""
+    return sum(os.times()[:4])
+
+
+_seen = [_processor()]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    """Each report says what its phase took of the processor, however busy the computer is."""
+    report = yield
+    report.processor = _processor() - _seen[0]
+    _seen[0] += report.processor
+    return report
+
+
+def pytest_terminal_summary(config):
+    """Of the tests that start nothing, the quickest stay in the quick tier, up to its budget."""
+    if not config.option.find_slow:
+        return
+    spent = Counter()
+    stats = config.pluginmanager.get_plugin("terminalreporter").stats
+    for report in itertools.chain(*stats.values()):
+        if isinstance(report, pytest.TestReport) and not {"dds", "process"} & set(report.keywords):
+            spent[_function(report.nodeid)] += report.processor
+    quickest = sorted(spent, key=spent.__getitem__)
+    total = itertools.accumulate(spent[name] for name in quickest)
+    slow = [name for name, so_far in zip(quickest, total, strict=True) if so_far > QUICK]
+    SLOW.write_text("\n".join(sorted(slow)) + "\n")
+
+
+# ------------------------------------------------------------------ vehicles
 
 
 @pytest.fixture(scope="session")
 def heavy():
     return config.load(HEAVY)
+
+
+@pytest.fixture
+def heavy_path():
+    return HEAVY
 
 
 @pytest.fixture(scope="session")
@@ -31,21 +110,7 @@ def short_dive(heavy):
     return sensors.dive(heavy, duration=10.0, seed=1).messages
 
 
-# Workers begin far from each other: what one has just left, another should not take up.
-_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-_DOMAINS = itertools.cycle(range(10, 100))
-for _ in range((os.getppid() + 45 * _WORKER) % 90):
-    next(_DOMAINS)
-_LEFT = deque(maxlen=12)  # the locks of domains in which a participant may still seem to live
-
-
-_COMPILE = f"""
-from rov_ident import config, watch
-from rov_ident.warm import warm_up
-for estimator in ("rls", "ukf"):
-    warm_up(config.load({str(HEAVY)!r}), estimator)
-watch.compile_all()
-"""
+# ------------------------------------------------------------------ processes and nodes
 
 
 @pytest.fixture(scope="session")
@@ -57,21 +122,18 @@ def compiled():
 
 
 def pytest_collection_finish(session):
-    """Compile what nodes run before the workers start; rov_ident/warm.py says why not in them."""
+    """Compile what nodes run before the workers start; core/jit.py says why."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
     if wanted and not session.config.option.collectonly:
         compile_all()
 
 
-def compile_all():
-    """All that a node runs, once for all who ask for it."""
-    import numba
-
-    from rov_ident import jit  # noqa: F401 - says where the cache is
-
-    with open(Path(numba.config.CACHE_DIR) / "lock", "a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        subprocess.run([sys.executable, "-c", _COMPILE], check=True)
+# Workers begin far from each other: what one has just left, another should not take up.
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+_DOMAINS = itertools.cycle(range(10, 100))
+for _ in range((os.getppid() + 45 * _WORKER) % 90):
+    next(_DOMAINS)
+_LEFT = deque(maxlen=12)  # the locks of domains in which a participant may still seem to live
 
 
 @pytest.fixture
@@ -96,180 +158,6 @@ def domain(monkeypatch, compiled):
         return
 
 
-_CHUNK = 50  # messages
-_AHEAD = 1.0  # s; that the messages published may be ahead of the samples used
-_PATIENCE = 0.2  # s a chunk; not all messages make samples
-
-
-def in_pace(messages, used, listen, ahead=_AHEAD, patience=_PATIENCE):
-    """The (arrival, role, message), never many more than the nodes have used.
-
-    Fast DDS has 512 messages in shared memory for a process that has no processor for a while. What
-    is lost beyond them is sent again, but seconds after what was sent behind it, which is too late.
-    ``used()`` gives the stamp [ns] of the last sample that all nodes have used; ``listen(seconds)``
-    waits for news of it.
-    """
-    for k, (arrival, role, message) in enumerate(messages, 1):
-        yield arrival, role, message
-        if k % _CHUNK == 0:
-            end = time.monotonic() + patience
-            while message.stamp - used() > ahead * 1e9 and time.monotonic() < end:
-                listen(0.01)
-
-
-class Vehicle:
-    """Publishes the inputs of a node and keeps everything that the node publishes."""
-
-    def __init__(self, estimator="rls", roles=("odom", "imu", "wrench")):
-        import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import WrenchStamped
-        from rclpy.signals import SignalHandlerOptions
-        from std_msgs.msg import Float64MultiArray
-
-        from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
-
-        self.context = rclpy.Context()
-        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("vehicle", context=self.context)
-        self.executor = Executor(context=self.context)
-        self.executor.add_node(self.node)
-        self.estimator = estimator
-        self.publishers = {
-            role: self.node.create_publisher(type_, name, STREAM)
-            for role, (name, type_) in INPUTS.items()
-            if role in roles
-        }
-        self.coefficients, self.values, self.covariance = [], [], []
-        self.residuals, self.diagnostics = [], []
-        name = f"/{estimator}_node"
-        for topic, type_, qos, heard in (
-            (f"{name}/coefficients", DiagnosticArray, LATCHED, self.coefficients),
-            (f"{name}/coefficients/values", Float64MultiArray, LATCHED, self.values),
-            (f"{name}/coefficients/covariance", Float64MultiArray, LATCHED, self.covariance),
-            (f"{name}/wrench_residual", WrenchStamped, STREAM, self.residuals),
-            ("/diagnostics", DiagnosticArray, STREAM, self.diagnostics),
-        ):
-            self.node.create_subscription(type_, topic, heard.append, qos)
-
-    def until(self, ready, seconds=30.0):
-        """Listen until ``ready()``; fails after some seconds."""
-        end = time.monotonic() + seconds
-        while not ready():
-            assert time.monotonic() < end, "nothing of the kind was heard in time"
-            self.executor.spin_once(timeout_sec=0.1)
-
-    def listen(self, seconds):
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=min(seconds, 0.1))
-
-    def connected(self):
-        """Whether both ends know each other: until then topics would overtake one another."""
-        if not all(p.get_subscription_count() for p in self.publishers.values()):
-            return False
-        return all(f"{role} publishers=1" in self.words() for role in self.publishers)
-
-    def publish(self, role, data):
-        self.publishers[role].publish(data)
-
-    def drive(self, messages):
-        """Publish (arrival, role, message) as fast as the node can use them."""
-        from rov_ident import cdr
-
-        for _, role, message in in_pace(messages, self.used, self.listen):
-            self.publish(role, cdr.encode(message))
-
-    def used(self):
-        """The stamp [ns] of the last sample whose residual was published."""
-        from rov_ident.nodes.conversions import from_time
-
-        return from_time(self.residuals[-1].header.stamp) if self.residuals else -math.inf
-
-    def call(self, type_, name, request):
-        client = self.node.create_client(type_, f"/{self.estimator}_node/{name}")
-        self.until(client.service_is_ready)
-        future = client.call_async(request)
-        self.until(future.done)
-        return future.result()
-
-    def words(self):
-        """Everything that /diagnostics has said."""
-        return "\n".join(
-            f"{status.message} " + " ".join(f"{v.key}={v.value}" for v in status.values)
-            for message in self.diagnostics
-            for status in message.status
-        )
-
-    def close(self):
-        import rclpy
-
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-
-def start_node(estimator, parameters, *options):
-    """The process of a node with a parameter file."""
-    command = [sys.executable, "-m", f"rov_ident.nodes.{estimator}_node", "--ros-args"]
-    command += ["--params-file", str(parameters)]
-    for option in options:
-        command += ["-p", option]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-
-
-def until_said(process, words):
-    """Wait for a line with these words on a process's stderr."""
-    while words not in (line := process.stderr.readline()):
-        assert line, "the node ended by itself"
-
-
-def end_node(process, number=signal.SIGINT):
-    """Its exit status and all that it said."""
-    process.send_signal(number)
-    try:
-        _, said = process.communicate(timeout=20)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        raise
-    return process.returncode, said
-
-
-def start_connected(estimator, *options, parameters=HEAVY, **kwargs):
-    """The process of a node that loses nothing, and a vehicle; both have found each other."""
-    process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
-    try:
-        vehicle = Vehicle(estimator, **kwargs)
-        vehicle.until(vehicle.connected, 120.0)
-    except BaseException:
-        process.kill()
-        raise
-    return process, vehicle
-
-
-class Dive:
-    """A dive played to a node at the pace of the clock, which stands still while nobody listens."""
-
-    def __init__(self, messages):
-        self.messages = messages
-        self.done = 0
-
-    def play(self, vehicle, seconds):
-        """Publish this many seconds of it."""
-        from rov_ident import cdr
-
-        start, begun = self.messages[self.done][0], time.monotonic()
-        while self.done < len(self.messages):
-            arrival, role, message = self.messages[self.done]
-            due = (arrival - start) * 1e-9
-            if due > seconds:
-                return
-            vehicle.executor.spin_once(timeout_sec=max(due - (time.monotonic() - begun), 0.0))
-            if time.monotonic() - begun >= due:
-                vehicle.publish(role, cdr.encode(message))
-                self.done += 1
-
-
 @pytest.fixture
 def live(domain):
     """Starts a node; gives the vehicle that is connected to it. In the end both must end well."""
@@ -287,29 +175,3 @@ def live(domain):
         status, said = end_node(process)
         assert status == 0, said
         assert "Traceback" not in said
-
-
-@pytest.fixture
-def heavy_path():
-    return HEAVY
-
-
-def is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def children(pid):
-    """The running processes started by a process."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            except OSError:
-                continue
-            if parent == pid:
-                found.append(int(entry.name))
-    return [child for child in found if is_alive(child) and os.getpid() != child]

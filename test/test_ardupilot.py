@@ -4,18 +4,18 @@ import struct
 
 import numpy as np
 import pytest
-from conftest import HEAVY
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_inputs import DIRECTION, GEOMETRY, POSITION, configured, estimate
 
-from rov_ident import config, thrusters
-from rov_ident.ardupilot import import_log
-from rov_ident.cli import main
-from rov_ident.errors import UserError
-from rov_ident.frames import quaternion_to_euler, quaternion_to_matrix, to_core
-from rov_ident.messages import Imu, Odometry, Wrench
-from rov_ident.recording import write_messages
-from rov_ident.samples import IMU, ODOMETRY, WRENCH
+from bench import HEAVY
+from rov_ident import config
+from rov_ident.cli.program import main
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_to_euler, quaternion_to_matrix, to_core
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
+from rov_ident.io.ardupilot_log import import_log
+from rov_ident.io.write_messages import write_messages
+from rov_ident.model import thruster_allocation as thrusters
 
 VOLTAGE = 15.2
 FORMATS = {  # type: (name, format, columns), as ArduPilot's LogStructure.h has them
@@ -269,7 +269,7 @@ def test_pulses_that_are_none(tmp_path, dive):
 
 
 def test_an_odometry_in_the_bag_is_an_ordinary_one(tmp_path, dive):
-    from rov_ident.bags import Bag, read_messages, select_topics
+    from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 
     import_log(
         dataflash(tmp_path / "log.bin", rows_of(dive)), tmp_path / "b.mcap", configured(**GEOMETRY)

@@ -9,7 +9,6 @@ import sys
 import textwrap
 import time
 import tracemalloc
-from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -25,10 +24,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from rov_ident import cdr
-from rov_ident.bags import Bag, BagWriter, read_messages, select_topics
-from rov_ident.errors import UserError
-from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Imu, Odometry, Wrench
+from rov_ident.io import cdr
+from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_writer import BagWriter
 
 STEP = 20_000_000  # ns
 
@@ -59,8 +59,8 @@ def entries(count, namespace=""):
             yield f"{namespace}/{name}", type_name, message.stamp, cdr.encode(message)
 
 
-def write(path, rows, **options):
-    with BagWriter(path, **options) as writer:
+def write(path, rows):
+    with BagWriter(path) as writer:
         for row in rows:
             writer.write(*row)
     return path
@@ -304,11 +304,11 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path, name):
     path = tmp_path / name
     program = textwrap.dedent(
         f"""
-        import sys, time
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        import time
+        from rov_ident.io.bag_writer import BagWriter
         from test_bags import entries
-        from rov_ident.bags import BagWriter
-        writer = BagWriter({str(path)!r}, crash_safe=True)
+        writer = BagWriter({str(path)!r})
+        writer.go_live()
         begin = time.monotonic()
         for k, row in enumerate(entries(10**6)):
             writer.write(*row)
@@ -319,7 +319,10 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path, name):
                 time.sleep(0.001)
         """
     )
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
     for _ in range(50):
         process.stdout.readline()
     os.kill(process.pid, signal.SIGKILL)
@@ -451,11 +454,7 @@ def test_topics_in_a_namespace_by_name_and_by_type(tmp_path):
         imu=["/rov/imu/data", "/rov/imu/raw"],
         wrench=["/rov/tau"],
     )
-    assert select_topics(bag) == {
-        "odom": "/rov/odom",
-        "imu": "/rov/imu/data",
-        "wrench": "/rov/tau",
-    }
+    assert select_topics(bag) == {"odom": "/rov/odom", "imu": "/rov/imu/data", "wrench": "/rov/tau"}
     chosen = select_topics(bag, {"odom": "rov/odom/filtered", "imu": ""})
     assert chosen["odom"] == "/rov/odom/filtered"
     assert chosen["imu"] == "/rov/imu/data"

@@ -7,19 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HEAVY, end_node
 from controller import AT_FIRST, LISTS
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from rov_ident import bridge
-from rov_ident.bridge import Target
-from rov_ident.errors import UserError
-from rov_ident.formats import auv_controllers
+from bench import HEAVY
+from bench.simulators.live import end_node
+from rov_ident.consumer import parameter_bridge as bridge
+from rov_ident.consumer.formats import auv_controllers
+from rov_ident.consumer.parameter_bridge import Target
+from rov_ident.core.errors import UserError
+from rov_ident.core.states import Level, State
+from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.nodes.conversions import to_diagnostics
-from rov_ident.online import Level, OnlineEstimator
 
 TWO = 'mapping:=["X_u=hydrodynamics.X_u", "X_uu=hydrodynamics.X_uu"]'
 
@@ -146,7 +148,7 @@ class Bridge:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
 
-    def until(self, ready, seconds=30.0):
+    def until(self, ready, seconds=120.0):
         """Whether it comes to pass; the estimator speaks ten times a second meanwhile."""
         end = time.monotonic() + seconds
         while not ready():
@@ -167,7 +169,7 @@ class Bridge:
         self.stamp += 100_000_000
         said = replace(
             self.report, stamp=self.stamp, values=values, std=np.abs(values) / 1000.0,
-            levels=tuple(levels),
+            states=tuple(map(State.at, levels)),
         )  # fmt: skip
         self.publisher.publish(to_diagnostics(said, "heavy"))
 
@@ -206,7 +208,7 @@ class Bridge:
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
         self.controller.terminate()
-        self.controller.wait(10)
+        self.controller.wait(240)
         status, said = end_node(self.process)
         assert status == 0, said
         assert "Traceback" not in said
@@ -343,7 +345,7 @@ def test_half_a_set(start, mode, words):
 def test_bad_parameters(domain, options, sentence):
     command = [sys.executable, "-m", "rov_ident.nodes.controller_bridge", "--ros-args"]
     command += ["--params-file", str(HEAVY), *(part for o in options for part in ("-p", o))]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert ended.returncode == 2
     last = ended.stderr.strip().splitlines()[-1]
     assert last.startswith("controller_bridge: ") and sentence in last

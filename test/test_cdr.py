@@ -13,8 +13,8 @@ from nav_msgs.msg import Odometry as RosOdometry
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu as RosImu
 
-from rov_ident import cdr
-from rov_ident.messages import Imu, Odometry, Wrench
+from rov_ident.core.messages import Imu, Odometry, Wrench
+from rov_ident.io import cdr
 
 # Lengths that leave every alignment behind the strings, and one beyond ASCII.
 FRAME_IDS = ["", "a", "ab", "abc", "abcd", "odom", "world_ned", "rov/base_link_frd", "pôle"]

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from rov_ident import config as configuration
-from rov_ident.bags import Bag, BagWriter
-from rov_ident.cdr import decode_odometry, encode
-from rov_ident.messages import Odometry
-from rov_ident.recording import write_messages
+from rov_ident.core.messages import Odometry
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.cdr import decode_odometry, encode
+from rov_ident.io.write_messages import write_messages
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -21,7 +22,7 @@ HEAVY = ROOT / "config" / "bluerov2_heavy.yaml"
 
 
 def run(*arguments, cwd=None):
-    command = [sys.executable, "-m", "rov_ident.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=cwd)
 
 

@@ -1,30 +1,32 @@
 """The command line, further: streams, seeds, damage and wrong use."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HEAVY
 
-from rov_ident import sensors
-from rov_ident.bags import Bag, BagWriter, read_messages, select_topics
-from rov_ident.demo import shipped
-from rov_ident.errors import UserError
-from rov_ident.recording import write_messages
+from bench import HEAVY
+from rov_ident.cli.demo import shipped
+from rov_ident.core.errors import UserError
+from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.write_messages import write_messages
+from rov_ident.simulation import virtual_sensors as sensors
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
 COMMANDS = (
     "demo", "replay", "fit", "check", "plan", "explain", "simulate", "import", "export",
-    "import-model", "nomoto", "forces", "steer", "coefficients",
+    "import-model", "nomoto", "forces", "coast-down", "steer", "coefficients",
 )  # fmt: skip
 DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "rov_ident.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=240)
 
 
@@ -101,6 +103,24 @@ def test_fitted_configuration_is_taken_by_the_commands(tmp_path, bag):
         out = tmp_path / f"{source[0][2:]}.mcap"
         done = run("simulate", "--config", fitted, *source, "--out", out)
         assert done.returncode == 0, done.stderr
+
+
+def test_the_filter_of_filterpy_beside_ours(tmp_path, bag):
+    out = tmp_path / "fit.json"
+    done = run(
+        "fit", bag, "--config", HEAVY, "--estimator", "ukf", "--reference", 3, "--json", out
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "our filter and filterpy's" in done.stdout
+    told = json.loads(out.read_text())
+    assert 2.8 < told["reference"]["duration_s"] <= 3.0
+    rows = told["reference"]["coefficients"]
+    assert rows.keys() == told["coefficients"].keys()
+    assert max(abs(row["apart_in_std"]) for row in rows.values()) < 1e-6
+    assert any(row["value"] != told["coefficients"][name]["value"] for name, row in rows.items())
+    refused(
+        fit(bag, "--reference"), "reference (--reference) has no meaning with the estimator rls"
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -198,7 +218,10 @@ def test_wrong_use(tmp_path, bag):
 
 def test_a_bag_is_not_replayed_onto_itself(bag):
     before = bag.read_bytes()
-    refused(run("replay", bag, "--config", HEAVY, "--rate", 0, "--out", bag), "is the bag to play")
+    refused(
+        run("replay", bag, "--config", HEAVY, "--rate", 0, "--out", bag),
+        "would replace what it is made from",
+    )
     assert bag.read_bytes() == before
 
 

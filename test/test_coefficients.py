@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rov_ident.coefficients import (
+from rov_ident.core.errors import UserError
+from rov_ident.model.coefficients import (
     ABSOLUTE,
     AXES,
     EXTENDED_SIZE,
@@ -18,7 +19,6 @@ from rov_ident.coefficients import (
     catalogue,
     parse,
 )
-from rov_ident.errors import UserError
 
 # The names that configurations and controllers script against.
 CONTRACT = """

@@ -14,12 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rov_ident.config import (
-    ANY,
     LARGEST,
     PARAMETERS,
-    PULSE_TYPES,
     VEHICLE_PARAMETERS,
-    WRENCH_TYPES,
     Config,
     Names,
     Vector,
@@ -27,10 +24,11 @@ from rov_ident.config import (
     from_parameters,
     load,
     to_parameters,
-    unflatten,
 )
+from rov_ident.config.reading import unflatten
+from rov_ident.config.schema import ANY, PULSE_TYPES, WRENCH_TYPES
+from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
-from rov_ident.errors import UserError
 
 CONFIGS = sorted((Path(__file__).parent.parent / "config").glob("*.yaml"))
 
@@ -211,10 +209,7 @@ REFUSED = [
         {"vehicle__cog": [0, "a", 0]},
         "vehicle.cog is 'a' (text), but must be a list of 3 numbers (m)",
     ),
-    (
-        {"vehicle__frame": "enu"},
-        "vehicle.frame is 'enu' (text), but must be one of frd, fsd, flu",
-    ),
+    ({"vehicle__frame": "enu"}, "vehicle.frame is 'enu' (text), but must be one of frd, fsd, flu"),
     ({"coefficients__X_u": "a"}, "coefficients.X_u is 'a' (text), but must be a number"),
     ({"estimate": "X_u"}, "estimate is 'X_u' (text), but must be a list of names"),
     ({"estimate": [1]}, "estimate is [1] (a list), but must be a list of names"),
@@ -224,10 +219,7 @@ REFUSED = [
     ({"vehicle__mas": 1.0}, "vehicle.mas is an unknown key: did you mean mass?"),
     ({"vehicles": 1.0}, "vehicles is an unknown key: did you mean vehicle?"),
     ({"rls": {"gat": 1.0}}, "rls.gat is an unknown key: did you mean gate?"),
-    (
-        {"qos": {"zzz": 1.0}},
-        "qos.zzz is an unknown key: use one of reliability, depth",
-    ),
+    ({"qos": {"zzz": 1.0}}, "qos.zzz is an unknown key: use one of reliability, depth"),
     (
         {"coefficients__X_uuu": -1.0},
         f"coefficients.X_uuu: 'X_uuu' is not a hydrodynamic coefficient: {TERMS} them all); "
@@ -256,10 +248,7 @@ REFUSED = [
         {"effects": {"thruster_lags": {}}},
         "effects.thruster_lags is an unknown effect: did you mean thruster_lag?",
     ),
-    (
-        {"effects": {"thruster_lag": {"time": 0.1}}},
-        "effects.thruster_lag.time is an unknown key: ",
-    ),
+    ({"effects": {"thruster_lag": {"time": 0.1}}}, "effects.thruster_lag.time is an unknown key: "),
     # unphysical
     ({"vehicle__mass": 0.0}, "vehicle.mass is 0 kg, but must be positive"),
     ({"vehicle__mass": -13.5}, "vehicle.mass is -13.5 kg, but must be positive"),
@@ -268,7 +257,6 @@ REFUSED = [
     ({"vehicle__mass": float("nan")}, "vehicle.mass is nan (a number), but must be finite"),
     ({"vehicle__cob": [0.0, 0.0, float("inf")]}, "vehicle.cob is inf (a number), but must be fini"),
     ({"coefficients__X_u": float("nan")}, "coefficients.X_u is nan (a number), but must be finite"),
-    ({"coefficients__X_u": 10**400}, "coefficients.X_u is 1000"),
     (
         {"vehicle__inertia": [0.26, -0.23, 0.37, 0.0, 0.0, 0.0]},
         "vehicle.inertia [0.26, -0.23, 0.37, 0.0, 0.0, 0.0] is not positive definite: check its "
@@ -315,6 +303,8 @@ def test_every_required_key_is_named_when_missing(key):
 def test_a_number_that_would_overflow_is_refused():
     with pytest.raises(UserError, match="sensible size"):
         from_parameters(minimal(vehicle__buoyancy=2 * LARGEST))
+    with pytest.raises(UserError, match="X_u is 1000.*sensible size"):
+        from_parameters(minimal(coefficients__X_u=10**400))
 
 
 @pytest.mark.parametrize(
@@ -336,10 +326,13 @@ def test_a_number_that_would_overflow_is_refused():
             MINIMAL + "      X_u: -1.0\n",
             "is not valid YAML at line 15, column 7: the key X_u is given twice",
         ),
-        (MINIMAL.replace("bluerov2_heavy", "2024-99-99"), "is not valid YAML: month must be in"),
-        (b"\x89MCAP0\r\n\xff\xfe", "is not a text file: give a YAML parameter file"),
+        (
+            MINIMAL.replace("bluerov2_heavy", "2024-99-99"),
+            "is not valid YAML at line 4, column 13: there is a date: put",
+        ),
+        (b"\x89MCAP0\r\n\xff\xfe", "is not a text file: give a YAML file"),
         ("a: \x00", "is not valid YAML: unacceptable character #x0000"),
-        ("[" * 5000, "is not valid YAML: "),
+        ("[" * 5000, "is not valid YAML at line 1, column 33: the value is nested deeper than 32"),
     ],
 )
 def test_a_file_that_is_no_parameter_file(file, text, message):
@@ -466,23 +459,6 @@ def test_a_written_configuration_has_no_number_that_other_readers_take_for_text(
     assert parameters["coefficients"]["X_u"] == -1e-5
     position = parameters["odometry"]["position"]
     assert [type(x) for x in position] == [float] * 3
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "c.yaml"
-    path.write_text("old")
-    config = from_parameters(minimal())
-
-    def full(self: Path, *args: Any, **kwargs: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(UserError, match=r"c.yaml: cannot be written: No space left on device$"):
-        dump(config, path)
-    monkeypatch.undo()
-    assert path.read_text() == "old"
-    with pytest.raises(UserError, match="cannot be written: No such file or directory$"):
-        dump(config, tmp_path / "none" / "c.yaml")
 
 
 def test_another_model_keeps_what_is_held():

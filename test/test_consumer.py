@@ -7,19 +7,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import HEAVY, end_node
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench import HEAVY
+from bench.simulators.live import end_node
 from rov_ident import config
-from rov_ident.consumer import HydrodynamicModel
-from rov_ident.errors import UserError
-from rov_ident.estimate import is_passive, prior_of
-from rov_ident.frames import from_core, gravity_direction, quaternion_from_euler
-from rov_ident.messages import Odometry
-from rov_ident.model import build
-from rov_ident.online import Level, OnlineEstimator
-from rov_ident.simulate import simulate
+from rov_ident.config.prior import prior_of
+from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import from_core, gravity_direction, quaternion_from_euler
+from rov_ident.core.messages import Odometry
+from rov_ident.core.states import Level
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.estimation.physical import is_passive
+from rov_ident.model.equations import build
+from rov_ident.simulation.open_loop import simulate
 
 HEAVY_CONFIG = config.load(HEAVY)
 UNITS = {"X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg", "Z_ww": "N s2/m2"}
@@ -287,7 +290,7 @@ class Plant:
         assert np.isfinite(flu).all()
         self.wrenches.append(flu * [1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 
-    def next_wrench(self, seconds=20.0):
+    def next_wrench(self, seconds=120.0):
         self.wrenches.clear()
         end = time.monotonic() + seconds
         while not self.wrenches:
@@ -299,7 +302,7 @@ class Plant:
         """The velocity (6,) after this time of odometry and, unless None, commands."""
         from geometry_msgs.msg import Twist, Vector3
 
-        from rov_ident.cdr import encode
+        from rov_ident.io.cdr import encode
 
         for _ in range(round(seconds / STEP)):
             stamp, frames = round(self.t * 1e9), ("odom", "base_link")
@@ -411,7 +414,7 @@ def test_controller(domain, heavy):
 )
 def test_bad_parameters(domain, option, sentence):
     process = start_controller(option)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=240)
     assert process.returncode == 2, said
     assert said.splitlines()[-1].startswith("example_controller: ")
     assert sentence in said and "Traceback" not in said
@@ -421,7 +424,7 @@ def test_unreadable_parameters(domain, tmp_path):
     path = tmp_path / "bad.yaml"
     path.write_text("/**:\n  ros__parameters\n    vehicle: [")
     process = start_controller(path=path)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=240)
     assert process.returncode == 2, said
     assert said.splitlines()[-1].startswith("example_controller: ")
     assert "Traceback" not in said

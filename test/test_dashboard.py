@@ -18,15 +18,16 @@ import aiohttp
 import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
-from conftest import HEAVY, in_pace
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from rclpy.serialization import deserialize_message
 
-from rov_ident import config, layouts, sensors
-from rov_ident.dashboard import foxglove, server
+from bench import HEAVY
+from bench.simulators.live import in_pace
+from rov_ident import config
+from rov_ident.core.states import State
+from rov_ident.dashboard import server
 from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
-from rov_ident.online import ESTIMATORS, Level, OnlineEstimator
+from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
+from rov_ident.simulation import virtual_sensors as sensors
 
 CONFIGS = HEAVY.parent
 
@@ -87,11 +88,11 @@ def fill(store, report, names=("/rls_node", "/ukf_node"), seconds=60, seed=0):
             known = np.exp(-k / 40.0)
             std = np.abs(report.values) * (0.002 + 0.3 * known)
             values = report.values * (1.0 + 0.3 * known * random.standard_normal(n))
-            levels = tuple(Level.OK if known < 0.5 else Level.WARN for _ in range(n))
+            states = (State.CONVERGED if known < 0.5 else State.CONVERGING,) * n
             stamp = 10**18 + k * 200_000_000
             excitation = np.linspace(0.0, 1.0, n)
             said = replace(
-                report, stamp=stamp, values=values, std=std, levels=levels,
+                report, stamp=stamp, values=values, std=std, states=states,
                 lower=values - 1.96 * std, upper=values + 1.96 * std, excitation=excitation,
             )  # fmt: skip
             store.take_report(name, "heavy", said)
@@ -411,7 +412,7 @@ def command(domain):
     for process in started:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=20)
+            _, said = process.communicate(timeout=240)
             assert "Traceback" not in said
         assert process.returncode == 0
 
@@ -423,7 +424,7 @@ NODES = {f"/{vehicle}/{kind}_node": (vehicle, kind) for vehicle in VEHICLES for 
 
 def test_two_vehicles(command):
     """Four nodes in two namespaces, each with its own vehicle's numbers to the last bit; and the
-    page, the table, its JSON and Foxglove show all of them."""
+    page, the table and its JSON show all of them."""
     configs = {vehicle: CONFIGS / name for vehicle, (name, _) in VEHICLES.items()}
     dives = {
         vehicle: sensors.dive(config.load(configs[vehicle]), duration=8.0, seed=seed).messages
@@ -439,18 +440,17 @@ def test_two_vehicles(command):
         options = ["--ros-args", "--params-file", str(configs[vehicle]), "-r", f"__ns:=/{vehicle}"]
         options += ["-p", "qos.reliability:=reliable", "-p", "timeout:=3.0"]
         command(f"rov_ident.nodes.{kind}_node", *options)
-    table = command("rov_ident.cli", "watch")
-    dashboard = command("rov_ident.cli", "dashboard", "--port", "0", "--foxglove", "0", "--json")
-    addresses = json.loads(dashboard.stdout.readline())
+    table = command("rov_ident", "watch")
+    dashboard = command("rov_ident", "dashboard", "--port", "0", "--json")
+    page = json.loads(dashboard.stdout.readline())["page"]
 
     with publishing(dives) as publish:
-        asyncio.run(_until_all_are_shown(addresses["page"], expected, publish))
-        lines = command("rov_ident.cli", "watch", "--once", "--json", "--wait", "30")
-        asyncio.run(_foxglove(addresses["foxglove"]))
+        asyncio.run(_until_all_are_shown(page, expected, publish))
+        lines = command("rov_ident", "watch", "--once", "--json", "--wait", "30")
     table.send_signal(signal.SIGINT)
-    _, shown = table.communicate(timeout=20)
+    _, shown = table.communicate(timeout=240)
     assert all(f"{node} (" in shown for node in NODES)
-    said, _ = lines.communicate(timeout=60)
+    said, _ = lines.communicate(timeout=240)
     state = json.loads(said)["estimators"]
     assert sorted(state) == sorted(NODES)
     for node, report in expected.items():
@@ -469,7 +469,7 @@ def publishing(dives):
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
-    from rov_ident import cdr
+    from rov_ident.io import cdr
     from rov_ident.nodes.common import INPUTS, STREAM, Executor
     from rov_ident.nodes.conversions import from_time
 
@@ -536,73 +536,10 @@ async def _until_all_are_shown(url, expected, publish):
         assert len(state[node]["history"]["rows"]) >= 1
 
 
-async def _foxglove(address):
-    """What Foxglove is offered, and gets: the topics of the layout, in the bytes of ROS."""
-    wanted = {topic for vehicle in VEHICLES for topic in layouts.topics(vehicle)} | {"/diagnostics"}
-    async with aiohttp.ClientSession() as session:
-        protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
-        async with session.ws_connect(address, protocols=protocols) as live:
-            info = await asyncio.wait_for(live.receive_json(), 10.0)
-            assert info["op"] == "serverInfo" and info["capabilities"] == []
-            channels = {}
-            while not wanted <= channels.keys():
-                message = await asyncio.wait_for(live.receive(), 10.0)
-                if message.type == aiohttp.WSMsgType.TEXT:
-                    for channel in json.loads(message.data).get("channels", []):
-                        channels[channel["topic"]] = channel
-            coefficients = channels["/rov1/rls_node/coefficients"]
-            assert coefficients["encoding"] == "cdr"
-            assert coefficients["schemaEncoding"] == "ros2msg"
-            assert "KeyValue[] values" in coefficients["schema"]
-            asked = [{"id": 7, "channelId": coefficients["id"]}]
-            await live.send_json({"op": "subscribe", "subscriptions": asked})
-            while True:
-                message = await asyncio.wait_for(live.receive(), 10.0)
-                if message.type == aiohttp.WSMsgType.BINARY and message.data[0] == 1:
-                    break
-    sent = deserialize_message(message.data[13:], DiagnosticArray)  # op, subscription, time
-    assert [status.name for status in sent.status][:1] == ["X_udot"]
-
-
-def test_foxglove_for_whom():
-    """Foxglove's site and this computer's programs may read; no other page, whatever its name."""
-    asyncio.run(_foxglove_for_whom())
-
-
-async def _foxglove_for_whom():
-    async with foxglove.serving(0) as served, aiohttp.ClientSession() as session:
-
-        async def status(protocol="foxglove.sdk.v1", **headers):
-            try:
-                async with session.ws_connect(
-                    served.address, protocols=[protocol], headers=headers
-                ) as live:
-                    info = await asyncio.wait_for(live.receive_json(), 5.0)
-                    assert info["op"] == "serverInfo"
-                    return 101
-            except aiohttp.WSServerHandshakeError as error:
-                return error.status
-
-        assert await status() == 101
-        for origin in ("https://app.foxglove.dev", "file://", "http://localhost:8080"):
-            assert await status(Origin=origin) == 101, origin
-        for origin in ("http://evil.example", "null", "http://app.foxglove.dev",
-                       "https://foxglove.dev.evil.example", "https://evilfoxglove.dev",
-                       "https://localhost.evil.example"):  # fmt: skip
-            assert await status(Origin=origin) == 403, origin
-        assert await status(Host="evil.example:8765") == 421
-        assert await status("foxglove.websocket.v1") == 400, "Foxglove before its SDK"
-        async with session.get(served.address.replace("ws:", "http:")) as page:
-            assert page.status == 400
-        with pytest.raises(server.UserError, match="cannot be used"):
-            async with foxglove.serving(int(served.address.rpartition(":")[2])):
-                pass
-
-
 def test_watch_hears_nobody(domain):
     ended = subprocess.run(
-        [sys.executable, "-m", "rov_ident.cli", "watch", "--once", "--wait", "0.5"],
-        capture_output=True, text=True, timeout=60,
+        [sys.executable, "-m", "rov_ident", "watch", "--once", "--wait", "0.5"],
+        capture_output=True, text=True, timeout=240,
     )  # fmt: skip
     assert ended.returncode == 2 and not ended.stdout
     assert "no estimator was heard within 0.5 s: start rls_node" in ended.stderr
@@ -611,7 +548,7 @@ def test_watch_hears_nobody(domain):
 @pytest.mark.parametrize(
     "command, sentence",
     [
-        (["rov_ident.cli", "dashboard", "--port", "{taken}"], "cannot be used (Address already in"),
+        (["rov_ident", "dashboard", "--port", "{taken}"], "cannot be used (Address already in"),
         (
             ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=99999"],
             "dashboard_node: port is 99999, but must be between 0 and 65535",
@@ -628,7 +565,7 @@ def test_refused(domain, command, sentence):
         other.listen()
         arguments = [text.format(taken=other.getsockname()[1]) for text in command]
         ended = subprocess.run(
-            [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=60
+            [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=240
         )
     assert ended.returncode == 2, ended.stderr
     assert sentence in " ".join(ended.stderr.split())

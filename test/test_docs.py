@@ -12,13 +12,19 @@ import yaml
 from test_inputs import configured
 
 from rov_ident import config
-from rov_ident.cli import _commands, _parser
+from rov_ident.cli.program import _commands, _parser
 from rov_ident.effects import EFFECTS
-from rov_ident.inputs import _CHOICES
+from rov_ident.io.topics import _CHOICES
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
+FRONT = sorted(ROOT.glob("*.md"))  # README and its like, which are not pages of the site
+SOURCES = {
+    f"/{path.relative_to(ROOT).as_posix()}"
+    for folder in ("rov_ident", "test", "bench", "examples", "launch", "docs")
+    for path in (ROOT / folder).rglob("*")
+} | {"/setup.py"}
 
 
 def blocks(path, language):
@@ -34,7 +40,7 @@ def test_every_command_of_a_tutorial_runs(tmp_path, name):
         (tmp_path / folder).symlink_to(ROOT / folder)
     program = tmp_path / "bin" / "rov-ident"
     program.parent.mkdir()
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m rov_ident.cli "$@"\n')
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m rov_ident "$@"\n')
     program.chmod(0o755)
     environment = {
         **os.environ,
@@ -67,6 +73,23 @@ def test_every_option_that_is_written_of_exists():
                 assert option in known[name], f"{path.name}: rov-ident {name} has no {option}"
 
 
+@pytest.mark.parametrize("path", [*PAGES, *FRONT], ids=lambda p: p.name)
+def test_every_file_that_is_named_exists(path):
+    """Whatever begins with `rov_ident/`, every Python file, and what the front pages link to.
+
+    A Python file may be named by the end of its path: `sampler.py` or `sampling/sampler.py`.
+    """
+    text = path.read_text()
+    named = set(re.findall(r"(?<![\w/])rov_ident/[\w./]*\w", text))
+    named |= set(re.findall(r"(?<![\w.])[\w/.-]*\w\.py\b", text))
+    named |= {f"{m.replace('.', '/')}.py" for m in re.findall(r"python -m (bench\.[\w.]+\w)", text)}
+    for name in {name.removeprefix("../") for name in named if "NAME" not in name}:
+        assert any(source.endswith(f"/{name}") for source in SOURCES), f"{path.name}: {name}"
+    if path in FRONT:
+        for link in re.findall(r"\]\(([^)#:]+)[#)]", text):
+            assert (ROOT / link).exists(), f"{path.name}: {link}"
+
+
 @pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md"], ids=lambda p: p.name)
 def test_the_configurations_in_the_pages_are_read(path):
     """A block of YAML is a whole parameter file, or settings that go into one."""
@@ -81,7 +104,7 @@ def test_the_configurations_in_the_pages_are_read(path):
 def test_the_guide_to_inputs_names_every_type():
     """In full, or after another of its package: `std_msgs/A`, `B`."""
     text = (DOCS / "inputs.md").read_text()
-    for type_name in (*config.ODOMETRY_TYPES, *_CHOICES["wrench"]):
+    for type_name in (*config.schema.ODOMETRY_TYPES, *_CHOICES["wrench"]):
         assert type_name in text or f"`{type_name.partition('/')[2]}`" in text
     for key in (f"`{p.name}`" for p in dataclasses.fields(config.Thrusters)):
         assert key in text or key.strip("`") + ":" in text

@@ -11,16 +11,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rov_ident import config as configuration
-from rov_ident import effects, rls, sensors, ukf
-from rov_ident.coefficients import parse
+from rov_ident import effects
+from rov_ident.config.prior import prior_of
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.effects import EFFECTS, compiled
 from rov_ident.effects.base import SIZE, Array, Effect, Reading
-from rov_ident.errors import UserError
-from rov_ident.estimate import prior_of
-from rov_ident.frames import quaternion_to_matrix
-from rov_ident.model import CURRENT, build
-from rov_ident.records import score
-from rov_ident.simulate import simulate
+from rov_ident.estimation import rls, ukf
+from rov_ident.model.coefficients import parse
+from rov_ident.model.equations import CURRENT, RigidBody, build
+from rov_ident.sampling import records
+from rov_ident.sampling.records import score
+from rov_ident.simulation import virtual_sensors as sensors
+from rov_ident.simulation.open_loop import simulate
 
 AXES = "XYZKMN"
 HOOKS = ("coefficients", "body", "wrench", "water", "act", "sense")
@@ -148,7 +151,7 @@ def simulated(config, values, duration=16.0, noise=0.0, name="steps"):
 
 
 def samples_of(config, dive):
-    return np.concatenate(list(sensors.samples_of(config, dive)))
+    return np.concatenate(list(records.samples_of(config, dive)))
 
 
 @pytest.fixture(scope="module")
@@ -526,7 +529,7 @@ def test_a_vehicle_that_drifts_with_the_water_feels_nothing(heavy):
 def test_a_current_is_a_moving_frame(seed):
     """Galilei: seen from the water, the vehicle moves as it would in still water."""
     rng = np.random.default_rng([12, seed])
-    body = configuration.RigidBody(
+    body = RigidBody(
         13.5, 132.4, 134.0, rng.uniform(-0.03, 0.03, 3), rng.uniform(-0.03, 0.03, 3),
         np.array([[0.3, 0.02, -0.03], [0.02, 0.35, 0.01], [-0.03, 0.01, 0.4]]),
     )  # fmt: skip

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from explain import (
+from bench.simulators.hidden import EFFECTS, NESTED, UNKNOWN, Conditions, draw
+from bench.studies.explain import (
     RULES,
     TIERS,
     WEAK,
@@ -22,24 +23,20 @@ from explain import (
     trials,
     wrong,
 )
-from hidden import EFFECTS, NESTED, UNKNOWN, Conditions, draw
-from rov_ident import discrepancy, kinematics
-from rov_ident.discrepancy import Search, pinned
-from rov_ident.errors import UserError
-from rov_ident.explain import (
-    CUT_SHORT,
-    but_best,
-    explain,
-    from_the_start,
-    gain_of,
-    split,
-    thinned,
-    whole,
-)
-from rov_ident.explain_report import _card
-from rov_ident.findings import Finding, Gain, Value
-from rov_ident.scores import _own
-from rov_ident.streams import gather
+from rov_ident.core.errors import UserError
+from rov_ident.discrepancy import screening, sensor_consistency
+from rov_ident.discrepancy import search as discrepancy
+from rov_ident.discrepancy.explain import CUT_SHORT, _Model, _with_all_data, explain
+from rov_ident.discrepancy.findings import possibly_earlier, without_most_favourable
+from rov_ident.discrepancy.held_out import gain_of, split, thinned, windows
+from rov_ident.discrepancy.hypothesis import at_bound
+from rov_ident.discrepancy.linearisation import linearise
+from rov_ident.discrepancy.output_error import fit, refit
+from rov_ident.discrepancy.report import _card
+from rov_ident.discrepancy.results import Finding, Gain, Value
+from rov_ident.discrepancy.search import Search
+from rov_ident.discrepancy.selection import mean_inflation
+from rov_ident.sampling.raw_streams import gather
 
 STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
 PLACES = {
@@ -137,8 +134,9 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
     assert whole.effects[0].separable and CUT_SHORT not in whole.notes
 
     search = Search(there.streams, there.case.config, split(there.streams.duration)[0])
-    search.evidence.fit(search.given)
-    monkeypatch.setattr(discrepancy, "_STEPS", search.evidence.simulated)  # the first step only
+    fit(search.problem, search.given)
+    first_step = search.problem.steps_simulated
+    monkeypatch.setattr(discrepancy, "BUDGET", first_step)
     findings = explain([there.streams], there.case.config).findings
     assert [f.effect for f in findings.effects] == ["thruster_lag"]
     assert not findings.effects[0].separable and findings.effects[0].manoeuvre
@@ -151,9 +149,9 @@ def test_an_interrupt_does_not_wait_for_the_fits(dive):
     messages, config = dive
     streams = gather(messages, config)
     search = Search(streams, config, split(streams.duration)[0])
-    start = search.evidence.fit(search.given)
-    candidates = search.screen(start)
-    begun = search.evidence.simulated
+    start = fit(search.problem, search.given)
+    candidates = search.screening.candidates(start)
+    begun = search.problem.steps_simulated
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -162,19 +160,19 @@ def test_an_interrupt_does_not_wait_for_the_fits(dive):
         patch.setattr(search, "_fit_candidate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             search.fit_best(start, candidates)
-    assert search.evidence.simulated == begun
+    assert search.problem.steps_simulated == begun
     with pytest.raises(CancelledError):
-        search.evidence.fit(search.given)
+        fit(search.problem, search.given)
 
 
 def test_a_fit_keeps_its_patterns_as_they_were(fitted):
     search, start = fitted
-    pattern = search._patterns(start)[0]
-    search.adopt(pattern)
-    with_pattern = search.evidence.fit(start.hypothesis.having({pattern.keys[0]: 0.1}), start.look)
-    there = with_pattern.look.columns.copy()
-    search.evidence.patterns[pattern.keys[0]] = 2.0 * search.evidence.patterns[pattern.keys[0]]
-    np.testing.assert_array_equal(with_pattern.look.columns, there)
+    pattern = search.patterns.patterns(start)[0]
+    search.patterns.adopt(pattern)
+    with_pattern = refit(start.hypothesis.having({pattern.keys[0]: 0.1}), start.linearisation)
+    there = with_pattern.linearisation.columns.copy()
+    search.problem.patterns[pattern.keys[0]] = 2.0 * search.problem.patterns[pattern.keys[0]]
+    np.testing.assert_array_equal(with_pattern.linearisation.columns, there)
 
 
 @pytest.mark.parametrize("name", ["unknown", "tether_drag"])
@@ -185,7 +183,7 @@ def test_threads_change_nothing(name, monkeypatch):
     there = bag(trial, trial.seed, [STRENGTH])
     found = []
     for threads in (1, 3):
-        monkeypatch.setattr(discrepancy, "_THREADS", threads)
+        monkeypatch.setattr(screening, "THREADS", threads)
         found.append(explain([there.streams], there.case.config).findings)
     assert found[0] == found[1]
     assert found[0].effects or found[0].residual
@@ -275,7 +273,7 @@ def test_coloured_noise_of_a_velocity_is_not_taken_for_a_scale(imu_rate):
     noise = colour / colour.std(axis=0) * 0.25 * streams.nu.std(axis=0)
     noise[:, 3:] = 0.0
     noisy = dataclasses.replace(streams, nu=streams.nu + noise)
-    assert kinematics.search(noisy, case.config, lambda t: t > 0.0)[0] == {}
+    assert sensor_consistency.search(noisy, case.config, [(1e-9, np.inf)])[0] == {}
 
 
 @pytest.mark.parametrize(
@@ -290,7 +288,7 @@ def test_coloured_noise_of_a_velocity_is_not_taken_for_a_scale(imu_rate):
     ],
 )
 def test_an_effect_at_the_end_of_its_range_is_known(key, value, std, is_pinned):
-    assert pinned(key, value, std) is is_pinned
+    assert at_bound(key, value, std) is is_pinned
 
 
 @pytest.fixture(scope="module")
@@ -298,34 +296,36 @@ def fitted(dive):
     messages, config = dive
     streams = gather(messages, config)
     search = Search(streams, config, split(streams.duration)[0])
-    return search, search.evidence.fit(search.given)
+    return search, fit(search.problem, search.given)
 
 
 def test_what_a_model_keeps_follows_what_leaves_it(fitted):
     """Without heave's quadratic drag the linear one has to do its work, from the first look on."""
     search, start = fitted
     less = start.hypothesis.having({("coefficients", "Z_ww"): 0.0})
-    at_once = search.evidence.fit(less, start.look, iterations=0).rss
-    as_it_was = search.evidence.look(less, start.look.starts, start.noise).linear.rss.sum()
+    at_once = refit(less, start.linearisation, iterations=0).rss
+    as_it_was = linearise(
+        search.problem, less, start.linearisation.starts, start.noise
+    ).linear.rss.sum()
     assert start.rss < at_once < start.rss + 0.3 * (as_it_was - start.rss)
 
 
 def test_a_window_that_is_lost_costs_more_than_one_that_fits(fitted):
     """Most of its rows pass for outliers, which must not make it cheap."""
     search, start = fitted
-    starts = start.look.starts.copy()
+    starts = start.linearisation.starts.copy()
     starts[3] += 3.0
-    lost = search.evidence.look(start.hypothesis, starts, start.noise)
+    lost = linearise(search.problem, start.hypothesis, starts, start.noise)
     assert lost.linear.count < start.linear.count
     assert lost.rss > start.rss + 1000.0
 
 
 def test_a_start_that_went_astray_is_as_measured_again(fitted):
     search, start = fitted
-    starts = start.look.starts.copy()
+    starts = start.linearisation.starts.copy()
     starts[3] += 3.0
-    lost = search.evidence.look(start.hypothesis, starts, start.noise)
-    again = search.evidence.fit(start.hypothesis, lost)
+    lost = linearise(search.problem, start.hypothesis, starts, start.noise)
+    again = refit(start.hypothesis, lost)
     assert again.rss < start.rss + 10.0
 
 
@@ -334,17 +334,37 @@ def test_a_failure_at_the_first_moment_is_a_gain(fitted):
 
     def failing(onset):
         values = {("thruster_failure", "gain_Z"): 0.8, ("thruster_failure", "onset"): onset}
-        return search.evidence.fit(start.hypothesis.having(values), start.look, iterations=0)
+        return refit(start.hypothesis.having(values), start.linearisation, iterations=0)
 
-    assert not search.held(start, failing(0.0))
-    assert search.held(start, failing(20.0))
+    assert not search.is_determined(start, failing(0.0))
+    assert search.is_determined(start, failing(20.0))
+
+
+def test_a_model_that_diverges_where_no_fit_has_seen_it_keeps_its_values(fitted):
+    """For a moment of the held-out data the wrench is beyond all that a vehicle can hold."""
+    search, start = fitted
+    failing = {("thruster_failure", "gain_Z"): 0.8, ("thruster_failure", "onset"): 20.0}
+    final = refit(start.hypothesis.having(failing), start.linearisation, iterations=0)
+    streams = search.problem.streams
+    (begin, end), *_ = split(streams.duration)[1]
+    demand = streams.demand.copy()
+    demand[np.searchsorted(streams.demand_t, 0.25 * begin + 0.75 * end), 0] = 1e7
+    wild = dataclasses.replace(streams, demand=demand)
+    gain = Gain("w", 0.1, 0.05, 50.0, 40.0, 60.0)
+    found = Finding("thruster_failure", ("Z",), {}, None, gain, True, None, (), "")
+    model = _Model(final, {}, [found])
+    last, notes = _with_all_data(search, wild, model)
+    assert model.found == [] and model.minor == [found]
+    assert last.linearisation.problem is search.problem
+    assert ["cannot be simulated through all" in note for note in notes] == [True]
 
 
 def test_one_window_does_not_make_a_pattern():
     before = np.random.default_rng(3).uniform(0.9, 1.1, (26, 1))
     after = 0.99 * before
     before[7] += 12.0
-    gains = [gain_of(["p"], *pair, 1.0) for pair in ((before, after), but_best(before, after))]
+    pairs = (before, after), without_most_favourable(before, after)
+    gains = [gain_of(["p"], *pair, 1.0) for pair in pairs]
     assert gains[0].percent > 10.0
     assert gains[1].percent < 2.0
 
@@ -356,8 +376,8 @@ def test_a_noisy_axis_does_not_pass_for_a_cause():
     column = rng.standard_normal((windows * rows, 1))
     push = np.repeat(rng.standard_normal(windows), rows)
     white = rng.standard_normal(windows * rows)
-    assert _own(column, white, first) < 2.0
-    assert _own(column, white + push * column[:, 0], first) > 20.0
+    assert mean_inflation(column, white, first) < 2.0
+    assert mean_inflation(column, white + push * column[:, 0], first) > 20.0
 
 
 def test_a_gain_is_of_a_velocity_that_surely_gains():
@@ -382,7 +402,7 @@ def test_the_best_of_six_that_do_nothing_does_not_surely_gain():
 
 
 def test_a_fit_takes_no_more_data_than_it_needs():
-    hour = whole(3600.0)
+    hour = windows(0.0, 3600.0)
     some = thinned(hour)
     assert set(some) <= set(hour) and len(some) == pytest.approx(120, abs=2)
     assert some[0] == hour[0] and some[-1][1] > 3500.0
@@ -467,7 +487,7 @@ def test_what_may_have_begun_before_the_bag_is_not_told_from_what_lasts():
     for onset, std, told in ((0.0, 26.0, False), (40.0, 26.0, False), (40.0, 0.5, True)):
         values = {"mass_wet": Value(0.3, 0.01, "kg"), "onset": Value(onset, std, "s")}
         finding = Finding("payload", ("Z",), values, onset, gain, True, None, (), "")
-        found = from_the_start(finding)
+        found = possibly_earlier(finding)
         assert found.separable == told
         assert (found.manoeuvre is None) == told
         assert ("buoyancy" in [a.effect for a in found.alternatives]) == (not told)

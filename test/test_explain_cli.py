@@ -6,16 +6,16 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from conftest import HEAVY
 from test_cli_edges import refused, run
 
-from hidden import Conditions, draw
+from bench import HEAVY
+from bench.simulators.hidden import Conditions, draw
 from rov_ident import config as configuration
-from rov_ident import explain_report as told
+from rov_ident.discrepancy import report as told
+from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Value
 from rov_ident.effects import EFFECTS
-from rov_ident.findings import Finding, Findings, Gain, Residual, Value
-from rov_ident.recording import write_messages
-from rov_ident.sensors import dive
+from rov_ident.io.write_messages import write_messages
+from rov_ident.simulation.virtual_sensors import dive
 
 FILES = ["extended.yaml", "findings.json", "report.html"]
 VOID = {"meta", "br", "img", "link", "hr", "input"}
@@ -220,7 +220,7 @@ def test_folder_that_cannot_be_is_one_sentence(folder):
 def test_result_never_replaces_what_is_read(done, folder):
     path = folder / "new/out/extended.yaml"
     before = path.read_bytes()
-    refused(explain(folder, config="new/out/extended.yaml"), "extended.yaml", "replaced")
+    refused(explain(folder, config="new/out/extended.yaml"), "extended.yaml", "would replace")
     assert path.read_bytes() == before
 
 
@@ -253,7 +253,7 @@ def finding(effect, component="u", separable=True, **parameters):
 def findings(verdict, effects=(), residual=()):
     rmse = dict.fromkeys("uvwpqr", 0.1)
     return Findings(
-        rmse, rmse | {"v": 0.05}, {}, tuple(effects), (), tuple(residual), rmse, verdict
+        rmse, rmse | {"v": 0.05}, rmse, {}, tuple(effects), (), tuple(residual), verdict
     )
 
 

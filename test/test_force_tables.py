@@ -1,23 +1,24 @@
 """Force tables: structures found again, values within intervals, tables as people write them."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from rov_ident import autopilot, config, force_tables
-from rov_ident.added_mass import cylinder, parse_hull, spheroid
-from rov_ident.cli import main
-from rov_ident.coefficients import AXES
-from rov_ident.errors import UserError
-from rov_ident.fins import X
+from bench import DATA
+from rov_ident import config
+from rov_ident.cli.program import main
+from rov_ident.core.errors import UserError
+from rov_ident.model.added_mass import cylinder, parse_hull, spheroid
+from rov_ident.model.coefficients import AXES
+from rov_ident.model.fins import X
+from rov_ident.offline import captive_tests as force_tables
+from rov_ident.steering import autopilot
 
 ROOT = Path(__file__).resolve().parents[1]
 REMUS = str(ROOT / "config" / "remus100.yaml")
-DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))  # others': not here
 CAPTIVE = DATA / "kvlcc2-model" / "captive.csv"
 
 
@@ -153,7 +154,7 @@ def test_remus_from_its_table_into_a_configuration(remus_table, tmp_path):
     # the vehicle made from the table turns and dives as the one the table was made from
     made = config.load(out).model
     np.testing.assert_allclose(made.added_mass, truth.added_mass)
-    law = autopilot.Both((autopilot.Turn(0.1), autopilot.Depth(3.0, -1.0)))
+    law = autopilot.both(autopilot.turn(0.1), autopilot.to_depth(3.0, -1.0))
     runs = [autopilot.steer(model, law, 40.0, 1.5) for model in (truth, made)]
     assert abs(runs[0].angles[-1, 2]) > 2.0 and abs(runs[0].position[-1, 2] - 3.0) < 0.5
     np.testing.assert_allclose(runs[1].angles[:, 2], runs[0].angles[:, 2], atol=0.1)
@@ -196,7 +197,8 @@ def test_radius_x_tail_and_comments(tmp_path):
     speed = np.tile([0.5, 1.0, 1.5, 2.0], 6)
     radius = np.repeat([np.inf, 5.0, 10.0, -5.0, -10.0, 20.0], 4)
     stern = 0.1 * np.sin(np.arange(24.0))
-    single = X.to_fins(np.column_stack([stern, np.zeros(24), np.zeros(24)]))
+    fins = np.transpose([[y, z, -1.0] for y, z in X.spans.values()])
+    single = np.column_stack([stern, np.zeros(24), np.zeros(24)]) @ fins
     lines = ["# rotating arm", "U_mps,R_m,ul_rad,ur_rad,ll_rad,lr_rad,M,N"]
     for i in range(24):
         m = -6.0 * speed[i] ** 2 * stern[i] + 1e-3 * np.cos(7.0 * i)

@@ -13,12 +13,12 @@ from lxml import etree
 from test_cli import refused, run
 
 from rov_ident import config as configuration
-from rov_ident.coefficients import catalogue, fin_catalogue, parse
+from rov_ident.consumer.formats import READERS, WRITERS, export, import_model
+from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
-from rov_ident.errors import UserError
-from rov_ident.formats import READERS, WRITERS, export, import_model
-from rov_ident.model import GRAVITY
-from rov_ident.simulate import simulate
+from rov_ident.model.coefficients import catalogue, fin_catalogue, parse
+from rov_ident.model.equations import GRAVITY
+from rov_ident.simulation.open_loop import simulate
 
 COUPLED = {
     "Y_rdot": 0.4, "M_udot": -0.3, "N_v": -2.0, "Y_r": 1.5, "Y_uv": -12.0, "X_vv": 7.0,
@@ -475,4 +475,4 @@ def test_the_commands(heavy_path, tmp_path):
     before, after = configuration.load(heavy_path), configuration.load(again)
     np.testing.assert_allclose(trajectory(after), trajectory(before), rtol=0, atol=1e-6)
     refused(run("import-model", tmp_path / "none.sdf", "--out", again), "none.sdf")
-    refused(run("import-model", sdf, "--out", sdf), "replaced")
+    refused(run("import-model", sdf, "--out", sdf), "would replace")

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import torture
-from rov_ident import cdr
-from rov_ident.messages import Imu, Odometry, Wrench
+from bench.studies import torture
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.io import cdr
 from rov_ident.nodes.conversions import from_diagnostics
-from rov_ident.online import OnlineEstimator
-from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler
+from rov_ident.sampling.sampler import Sampler
 
 KINDS = ["rls", "ukf"]
 TYPES = {Odometry: cdr.ODOMETRY_TYPE, Imu: cdr.IMU_TYPE, Wrench: cdr.WRENCH_TYPE}

@@ -6,17 +6,16 @@ import math
 import numpy as np
 import pytest
 
-import fossen
-import hidden
-from hidden import EFFECTS, EXCITATIONS, FAMILIES, TIERS, UNKNOWN, Conditions, draw
+from bench.simulators import fossen, hidden
+from bench.simulators.hidden import EFFECTS, EXCITATIONS, FAMILIES, TIERS, UNKNOWN, Conditions, draw
 from rov_ident import effects as library
-from rov_ident import inputs
-from rov_ident.bags import Bag
 from rov_ident.config import from_parameters, to_parameters
 from rov_ident.effects.base import Reading
-from rov_ident.recording import write_messages
-from rov_ident.samples import Sampler
-from rov_ident.simulate import simulate
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.write_messages import write_messages
+from rov_ident.sampling.sampler import Sampler
+from rov_ident.simulation.open_loop import simulate
 
 SHORT = Conditions(duration=20.0)
 QUIET = Conditions(duration=40.0, noise=0.0)

@@ -1,17 +1,14 @@
 """Plain logs into bags: what is kept, what is refused, what is said."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from rov_ident import frames
-from rov_ident.bags import Bag, read_messages, select_topics
-from rov_ident.errors import UserError
-from rov_ident.importer import import_csv, parse_columns
+from bench import DATA
+from rov_ident.core import frames
+from rov_ident.core.errors import UserError
+from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.csv_log import import_csv, parse_columns
 
-DATA = Path(os.environ.get("ROV_IDENT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 BASE = ["t_s", *"uvwpqrXYZKMN"]
 EULER = ["roll", "pitch", "yaw"]
 
@@ -232,7 +229,7 @@ def with_cell(columns, heading, row, text):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "has no column `t_s`"),
+        ("", "has no rows below its headings"),
         ("t_s,u\n0,1\n", "has no column `v`: it has t_s, u"),
         (with_cell(table(BASE), "w", 3, "fast"), r"line 5, column `w`: `fast` is not a number"),
         (with_cell(table(BASE), "w", 3, ""), r"line 5, column `w`"),
@@ -246,7 +243,7 @@ def with_cell(columns, heading, row, text):
             r"line 4: yaw is 11\.4.*rad",
         ),
         (with_cell(table([*BASE, "qw", "qx", "qy", "qz"]), "u", 0, "0"), "length 1"),
-        (",".join(BASE), "0 rows"),
+        (",".join(BASE), "has no rows below its headings"),
     ],
 )
 def test_a_log_that_cannot_be_used(tmp_path, out, text, words):

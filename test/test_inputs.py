@@ -1,11 +1,7 @@
 """The same dive in every form that vehicles publish it in: the same estimate."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
-from conftest import HEAVY, Vehicle, end_node, start_node
 from geometry_msgs.msg import (
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -24,19 +20,26 @@ from std_msgs.msg import (
 )
 from test_bags import write_mcap
 
-from rov_ident import cdr, config, inputs, t200, thrusters
-from rov_ident.bags import Bag, BagWriter
-from rov_ident.errors import UserError
-from rov_ident.frames import from_core, quaternion_from_euler, to_core
-from rov_ident.messages import Imu, Odometry, Wrench
+from bench import DATA, HEAVY
+from bench.simulators.live import Vehicle, end_node, start_node
+from rov_ident import config
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import from_core, quaternion_from_euler, to_core
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.io import cdr
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.write_messages import write_messages
+from rov_ident.model import t200_curve as t200
+from rov_ident.model import thruster_allocation as thrusters
 from rov_ident.nodes.conversions import to_time
 from rov_ident.nodes.replay import replay
-from rov_ident.online import OnlineEstimator
-from rov_ident.recording import write_messages
-from rov_ident.records import read_record
-from rov_ident.samples import IMU, ODOMETRY, WRENCH, Sampler, joined
+from rov_ident.sampling.records import read_record
+from rov_ident.sampling.sample import joined
+from rov_ident.sampling.sampler import Sampler
 
-DATA = Path(os.environ.get("ROV_IDENT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 C = 0.7071067811865476
 POSITION = [
     [0.156, 0.111, 0.085], [0.156, -0.111, 0.085], [-0.156, 0.111, 0.085],
@@ -297,7 +300,9 @@ def battery(voltage):
 
 
 def by_battery(**more):
-    return with_wrench("mavros_msgs/RCOut", **{"inputs.battery": config.BATTERY_TYPE}, **more)
+    return with_wrench(
+        "mavros_msgs/RCOut", **{"inputs.battery": config.schema.BATTERY_TYPE}, **more
+    )
 
 
 def test_pulses_at_the_voltage_of_the_battery():
@@ -330,7 +335,7 @@ def test_a_bag_with_a_battery(tmp_path, by_pulses, reference):
     messages, pulses = by_pulses
 
     def rows():
-        yield messages[0][0], "/battery", config.BATTERY_TYPE, battery(16.0)
+        yield messages[0][0], "/battery", config.schema.BATTERY_TYPE, battery(16.0)
         for arrival, role, message in messages:
             if role == WRENCH:
                 array = UInt16MultiArray(data=pulses[message.stamp].tolist())
@@ -340,7 +345,7 @@ def test_a_bag_with_a_battery(tmp_path, by_pulses, reference):
 
     settings = with_wrench(
         "std_msgs/UInt16MultiArray",
-        **{"inputs.battery": config.BATTERY_TYPE, "thrusters.voltage": 12.0},
+        **{"inputs.battery": config.schema.BATTERY_TYPE, "thrusters.voltage": 12.0},
     )
     assert_same(estimate(write(tmp_path / "dive.mcap", rows()), settings), reference)
 
@@ -359,7 +364,7 @@ def test_a_bag_with_a_battery(tmp_path, by_pulses, reference):
 )
 def test_a_battery_that_nothing_depends_on_is_refused(changes):
     with pytest.raises(UserError, match=r"inputs\.battery .* leave it out"):
-        configured(**{"inputs.battery": config.BATTERY_TYPE}, **GEOMETRY, **changes)
+        configured(**{"inputs.battery": config.schema.BATTERY_TYPE}, **GEOMETRY, **changes)
 
 
 def test_an_output_that_is_off_pushes_nothing():
@@ -436,7 +441,7 @@ def test_a_twist_and_its_pose_are_odometry(tmp_path, short_dive, kind):
 
 def test_a_pose_at_other_times_is_interpolated(tmp_path, heavy):
     """Poses at half the rate and other stamps: attitude and position of the truth in between."""
-    from rov_ident import sensors
+    from rov_ident.simulation import virtual_sensors as sensors
 
     still = sensors.Suite().scaled(0.0)
     messages = sensors.dive(heavy, duration=10.0, suite=still, seed=1).messages
@@ -584,9 +589,9 @@ def test_bytes_that_are_no_message(type_name, data):
         "pose"
         if "Pose" in type_name
         else "odom"
-        if type_name in config.ODOMETRY_TYPES
+        if type_name in config.schema.ODOMETRY_TYPES
         else "battery"
-        if type_name == config.BATTERY_TYPE
+        if type_name == config.schema.BATTERY_TYPE
         else "wrench"
     )
     changes = {f"inputs.{role}": type_name}
@@ -643,10 +648,7 @@ def node(domain, tmp_path):
 def test_a_node_on_stamped_forces_twist_and_pose(node, tmp_path, short_dive, matrix):
     """Live over DDS the same numbers as offline from a bag of the same messages."""
     vehicle, settings = node(
-        **{
-            "inputs.odom": "geometry_msgs/TwistStamped",
-            "inputs.wrench": "sensor_msgs/JointState",
-        }
+        **{"inputs.odom": "geometry_msgs/TwistStamped", "inputs.wrench": "sensor_msgs/JointState"}
     )
     inverse = np.linalg.pinv(matrix)
     rows = []
@@ -715,7 +717,7 @@ def test_replay_converts_what_has_no_stamp(domain, tmp_path, by_pulses, referenc
 def test_a_message_package_that_is_not_installed(domain, tmp_path):
     path = live_config(tmp_path, **{"inputs.wrench": "mavros_msgs/RCOut"})
     process = start_node("rls", path)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=240)
     assert process.returncode == 2
     assert "inputs.wrench is mavros_msgs/RCOut, but mavros_msgs is not installed" in said
 

@@ -1,16 +1,30 @@
 """How kernels are run: read from the cache, compiled, or interpreted."""
 
+import os
+import re
+import shutil
 import subprocess
 import sys
+import threading
+import time
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
+import pytest
+from packaging.requirements import Requirement
 
-from rov_ident.jit import interpret, interpreting, kernel, record, stop_interpreting
+import rov_ident
+from rov_ident.core import jit
+from rov_ident.core.jit import Compiler, interpret, interpreting, kernel, record, stop_interpreting
+
+PACKAGE = Path(rov_ident.__file__).parent
+ROOT = PACKAGE.parent
 
 _ONLY_RUN = """
 import sys
 import rov_ident, numba
-from rov_ident.jit import only_run
+from rov_ident.core.jit import only_run
 level = numba.config.OPT
 only_run()
 from rov_ident import config
@@ -50,3 +64,109 @@ def test_interpreted_and_compiled_read_the_same_records():
             stop_interpreting()
     assert ways == [[0.5, np.inf]] * 2
     assert not interpreting()
+
+
+# ------------------------------------------------------------------ the cache
+
+_WHERE = "from rov_ident.core import jit; print(jit.__file__); print(jit.CACHE)"
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A copy of the package, and the function that tells the folder of its compiled kernels."""
+    copy = tmp_path / "rov_ident"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    ours = kept | {"PYTHONPATH": str(tmp_path), "ROV_IDENT_CACHE": str(tmp_path / "cache")}
+
+    def folder(before=""):
+        command = [sys.executable, "-c", before + _WHERE]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=ours, capture_output=True, text=True, check=True
+        )
+        where, cache = done.stdout.split()
+        assert Path(where).is_relative_to(copy)
+        return cache
+
+    return copy, folder
+
+
+def test_no_stale_kernel_can_run(package):
+    """Kernels freeze constants of any module: with another one there is another cache."""
+    copy, folder = package
+    seen = [folder()]
+    assert folder() == seen[0]
+    for name in ("model/coefficients.py", "effects/base.py"):
+        with (copy / name).open("a") as module:
+            module.write("ANOTHER = 1.0\n")
+        seen.append(folder())
+    for library in ("numba", "numpy"):
+        seen.append(folder(f"import {library}; {library}.__version__ += '.1'; "))
+    assert len(set(seen)) == len(seen)
+
+
+# ------------------------------------------------------------------ numba
+
+
+def test_one_module_knows_numba():
+    """Its insides change; `bench/tools/versions.py` is run before setup.py allows another minor."""
+    for path in PACKAGE.rglob("*.py"):
+        if path != Path(jit.__file__):
+            code = path.read_text()
+            assert not re.search(r"^\s*(import|from) (numba|llvmlite)|NUMBA_", code, re.M), path
+
+
+def test_the_minors_of_numba_that_may_be_installed_were_tested():
+    given = re.search(r'"(numba[^"]*)"', (ROOT / "setup.py").read_text()).group(1)
+    allowed = Requirement(given).specifier
+    assert allowed.contains(version("numba"))
+    table = (ROOT / "docs" / "trust.md").read_text()
+    tested = sorted({int(minor) for minor in re.findall(r"numba 0\.(\d+)\.\d", table)})
+    least, most = tested[0], tested[-1]
+    assert [m for m in range(40, 100) if allowed.contains(f"0.{m}.0")] == [*range(least, most + 1)]
+    for locked in (ROOT / "requirements").glob("*.txt"):
+        (pin,) = re.findall(r"^numba==(\S+)", locked.read_text(), re.M)
+        assert allowed.contains(pin), locked
+
+
+# ------------------------------------------------------------------ compiling in another process
+
+
+def exercise(how):
+    if how == "fail":
+        sys.exit(3)
+    if how == "long":
+        time.sleep(60.0)
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(jit, "CACHE", tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+
+
+def test_what_one_process_has_compiled_is_compiled_for_all(cache):
+    job = Compiler(exercise, "well")
+    assert not job.compiled
+    assert job.ensure()
+    assert job.compiled and Compiler(exercise, "well").compiled
+    assert not Compiler(exercise, "fail").compiled
+
+
+def test_a_compiler_that_fails_leaves_no_mark(cache):
+    job = Compiler(exercise, "fail")
+    assert not job.ensure()
+    assert job.poll() == 3 and not job.compiled
+
+
+def test_a_compiler_that_is_stopped_ends_and_starts_no_more(cache):
+    job, results = Compiler(exercise, "long"), []
+    waiting = threading.Thread(target=lambda: results.append(job.ensure()))
+    waiting.start()
+    while job.poll() is None and job._process is None:
+        time.sleep(0.01)
+    job.stop()
+    waiting.join(10.0)
+    assert results == [False]
+    job.start()
+    assert job.poll() is not None

@@ -9,13 +9,14 @@ from xml.etree import ElementTree
 
 import foxglove.layouts as sdk
 import pytest
-from conftest import HEAVY
 from geometry_msgs.msg import WrenchStamped
 
-from rov_ident import config, layouts
-from rov_ident.cli import main
+from bench import HEAVY
+from rov_ident import config
+from rov_ident.cli.program import main
+from rov_ident.dashboard import layouts
+from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.nodes.conversions import to_diagnostics
-from rov_ident.online import OnlineEstimator
 
 FOLDER = HEAVY.parent
 

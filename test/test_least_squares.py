@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rov_ident import least_squares as ls
-from rov_ident import sensors
-from rov_ident.estimate import prior_of
-from rov_ident.regression import filtered_rows, regression
+from rov_ident.config.prior import prior_of
+from rov_ident.offline import least_squares as ls
+from rov_ident.offline.filtered_regression import filtered_rows, regression
+from rov_ident.sampling import records
+from rov_ident.simulation import virtual_sensors as sensors
 
 
 def in_one(samples):
@@ -17,7 +18,7 @@ def in_one(samples):
 
 def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1):
     run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
-    return np.concatenate(list(sensors.samples_of(config, run)))
+    return np.concatenate(list(records.samples_of(config, run)))
 
 
 @pytest.fixture(scope="module")

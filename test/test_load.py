@@ -2,7 +2,7 @@
 
 import pytest
 
-import torture_live
+from bench.studies import torture_live
 
 
 @pytest.mark.parametrize("kind", ["rls", "ukf"])

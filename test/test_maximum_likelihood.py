@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rov_ident import maximum_likelihood as ml
-from rov_ident import sensors
-from rov_ident.archive import of_records
-from rov_ident.batch import Settings, fit_batch, open_loop_rmse
-from rov_ident.errors import UserError
-from rov_ident.hindsight import hindsight
-from rov_ident.recording import write_messages
-from rov_ident.records import predicted, read_record
+from rov_ident.core.errors import UserError
+from rov_ident.io.write_messages import write_messages
+from rov_ident.offline import maximum_likelihood as ml
+from rov_ident.offline.archive import of_records
+from rov_ident.offline.batch_fit import Settings, fit_batch, open_loop_rmse
+from rov_ident.sampling import records
+from rov_ident.sampling.records import predicted, read_record
+from rov_ident.sampling.smoothing import smoothed
+from rov_ident.simulation import virtual_sensors as sensors
 
 
 def in_one(samples):
@@ -21,7 +22,7 @@ def in_one(samples):
 
 def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1):
     run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
-    return hindsight(np.concatenate(list(sensors.samples_of(config, run))))
+    return smoothed(np.concatenate(list(records.samples_of(config, run))))
 
 
 @pytest.fixture(scope="module")

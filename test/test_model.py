@@ -19,10 +19,18 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from rov_ident import config
-from rov_ident.coefficients import EXTENDED_SIZE, catalogue
-from rov_ident.errors import UserError
-from rov_ident.model import CURRENT, Model, RigidBody, add_current, build, columns, coriolis
-from rov_ident.simulate import simulate
+from rov_ident.core.errors import UserError
+from rov_ident.model.coefficients import EXTENDED_SIZE, catalogue
+from rov_ident.model.equations import (
+    CURRENT,
+    Model,
+    RigidBody,
+    add_current,
+    build,
+    columns,
+    coriolis,
+)
+from rov_ident.simulation.open_loop import simulate
 
 Array = NDArray[np.float64]
 
@@ -589,9 +597,7 @@ def test_momentum_differentiated_in_time_and_force_are_the_wrench():
         known = known_rate + coriolis_of(M_RB, nu) @ nu + FULL.restoring_force(DOWN)
         # Central differences err by h^2/6 of the third derivative: 1e-6 of momenta up to 100.
         np.testing.assert_allclose(
-            rate + split(FULL, nu)[1] @ FULL.theta + known,
-            FULL.wrench(nu, nu_dot, DOWN),
-            atol=1e-4,
+            rate + split(FULL, nu)[1] @ FULL.theta + known, FULL.wrench(nu, nu_dot, DOWN), atol=1e-4
         )
 
 

@@ -10,17 +10,28 @@ import time
 
 import numpy as np
 import pytest
-from conftest import Vehicle, children, end_node, start_connected, start_node, until_said
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from rov_ident import cdr, config, rls
-from rov_ident.frames import FLIP_BODY, from_core
-from rov_ident.messages import Odometry, Wrench
+from bench.simulators.live import (
+    Vehicle,
+    children,
+    end_node,
+    slowness,
+    start_connected,
+    start_node,
+    until_said,
+)
+from rov_ident import config
+from rov_ident.core.frames import FLIP_BODY, from_core
+from rov_ident.core.messages import Odometry, Wrench
+from rov_ident.core.states import Level
+from rov_ident.estimation import rls
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.io import cdr
 from rov_ident.nodes.conversions import from_diagnostics, from_time
-from rov_ident.online import Level, OnlineEstimator
-from rov_ident.sensors import dive
+from rov_ident.simulation.virtual_sensors import dive
 
 STALE = bytes([Level.STALE])
 
@@ -75,10 +86,11 @@ def test_outputs(live, heavy, short_dive):
 
     assert len(vehicle.coefficients) > 5  # publish_rate
     last = vehicle.coefficients[-1]
-    assert all(status.message.startswith("inputs stopped: ") for status in last.status)
+    assert all(status.message.startswith("stale: inputs stopped") for status in last.status)
     assert {status.hardware_id for status in last.status} == {heavy.name}
     for status in last.status:
         assert [v.key for v in status.values][:5] == ["value", "std", "unit", "lower", "upper"]
+        assert (status.values[-1].key, status.values[-1].value) == ("state", "stale")
     report = from_diagnostics(last)
     assert report.names == heavy.estimate
     assert report.units == expected.units
@@ -240,7 +252,7 @@ def test_bad_configuration(domain, heavy_path, tmp_path, old, new, sentence):
     path = tmp_path / "bad.yaml"
     path.write_text(text.replace(old, new, 1))
     process = start_node("rls", path)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=240)
     assert process.returncode == 2, said
     last = said.strip().splitlines()[-1]
     assert last.startswith("rls_node: ") and sentence in last
@@ -273,7 +285,7 @@ def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
         command = [sys.executable, "-m", f"rov_ident.nodes.{name}", "--ros-args"]
         command += ["-p", "controller:=/nobody"] * (name == "controller_bridge")
         command.append("--params-file")
-        done = subprocess.run([*command, wrong], capture_output=True, text=True, timeout=60)
+        done = subprocess.run([*command, wrong], capture_output=True, text=True, timeout=240)
         assert done.returncode == 2, done.stderr
         last = done.stderr.strip().splitlines()[-1]
         assert last.startswith(f"{name}: ") and "written alike" in last
@@ -337,7 +349,7 @@ def test_the_first_start_on_a_computer(domain, heavy, heavy_path, nothing_compil
             assert not any("compiled after" in line for line in said)
         if stale is None and time.monotonic() - driving > 5.0:
             stale = is_stale(vehicle)
-    assert first is not None and first < 10.0
+    assert first is not None and first < 10.0 * slowness()
     assert stale is False
     assert sum("compiling failed with status -9: trying again" in line for line in said) == 1
     assert "interpreted until compiled" in vehicle.words()
@@ -345,7 +357,7 @@ def test_the_first_start_on_a_computer(domain, heavy, heavy_path, nothing_compil
     vehicle.until(lambda: is_stale(vehicle))
     vehicle.close()
     process.send_signal(signal.SIGINT)
-    assert process.wait(10.0) == 0
+    assert process.wait(120.0) == 0
     listening.join()
     assert len(vehicle.residuals) == len(residuals)
     report, end = from_diagnostics(vehicle.coefficients[-1]), expected.report()
@@ -360,7 +372,7 @@ def test_interrupt_while_compiling(domain, heavy_path, nothing_compiled):
     began = time.monotonic()
     status, said = end_node(process)
     assert status == 0, said
-    assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 5.0 * slowness()
     assert "compiled after" not in said and "Traceback" not in said
 
 
@@ -373,7 +385,7 @@ def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, nothing_co
         time.sleep(delay)
         began = time.monotonic()
         _, said = end_node(process, number)
-        assert time.monotonic() - began < 10.0  # of some thirty
+        assert time.monotonic() - began < 10.0 * slowness()  # of some thirty
         assert "Traceback" not in said
 
 
@@ -387,7 +399,7 @@ def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path, number):
         began = time.monotonic()
         status, said = end_node(process, number)
         assert status == 0, said
-        assert time.monotonic() - began < 5.0
+        assert time.monotonic() - began < 5.0 * slowness()
         assert "Traceback" not in said
 
 

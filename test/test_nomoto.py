@@ -1,7 +1,6 @@
 """Nomoto's model: what the estimators find, at which rates, and what densifying does."""
 
 import json
-import os
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -12,19 +11,20 @@ from scipy.integrate import solve_ivp
 from test_inputs import twist_and_pose, with_twist
 from test_inputs import write as write_rows
 
-from rov_ident import autopilot, config, nomoto
-from rov_ident.bags import BagWriter
-from rov_ident.cdr import ODOMETRY_TYPE, encode
-from rov_ident.cli import main
-from rov_ident.densify import densify, spiral
-from rov_ident.errors import UserError
-from rov_ident.frames import quaternion_from_euler
-from rov_ident.messages import Odometry
-from rov_ident.model import build
-from rov_ident.zigzag import Zigzag, read
+from bench import DATA
+from rov_ident import config
+from rov_ident.cli.program import main
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_from_euler
+from rov_ident.core.messages import Odometry
+from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.cdr import ODOMETRY_TYPE, encode
+from rov_ident.model.equations import build
+from rov_ident.steering import autopilot, nomoto, nomoto_equation_error, nomoto_model
+from rov_ident.steering.heading_interpolation import densify, spiral
+from rov_ident.steering.zigzag import Zigzag, read
 
 ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))
 KVLCC2 = DATA / "kvlcc2-model"
 FINE = 0.01  # s
 
@@ -132,10 +132,10 @@ def test_recursive_follows_a_change():
     x = rng.normal(size=(600, 2))
     truth = np.where(np.arange(600)[:, None] < 300, [1.0, -2.0], [2.0, -2.0])
     y = np.sum(x * truth, axis=1) + 0.01 * rng.normal(size=600)
-    history = nomoto.recursive(y, x)
+    history = nomoto_equation_error.recursive(y, x)
     np.testing.assert_allclose(history[290], [1.0, -2.0], atol=0.01)
     np.testing.assert_allclose(history[-1], [2.0, -2.0], atol=0.02)
-    stubborn = nomoto.recursive(y, x, lowest=1.0)
+    stubborn = nomoto_equation_error.recursive(y, x, lowest=1.0)
     assert abs(stubborn[-1, 0] - 2.0) > 0.2
 
 
@@ -146,7 +146,7 @@ def test_recursive_does_not_wind_up():
     x[:200], x[-1] = rng.normal(size=(200, 2)), [1.0, 1.0]
     y = x @ [1.0, -2.0] + 0.1 * rng.normal(size=len(x))
     y[-1] = -1.0 + 0.3
-    history = nomoto.recursive(y, x)
+    history = nomoto_equation_error.recursive(y, x)
     assert np.abs(history[-1] - history[-2]).max() < 0.15
 
 
@@ -181,7 +181,7 @@ def test_simulation_is_that_of_the_equations():
         return [y[1], -1.2 * y[1] + y[2] + 0.1 * d, -0.2 * y[1] - 3.0 * y[1] ** 3 + 0.06 * d]
 
     expected = solve_ivp(motion, (0.0, 20.0), first, t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.1)
-    found = nomoto.respond(2, True, theta, run, first)
+    found = nomoto_model.respond(2, True, theta, run, first)
     np.testing.assert_allclose(found, expected.y[0], atol=1e-6)
 
 
@@ -245,7 +245,7 @@ def test_sparse_remus_densified_as_good_as_dense(remus):
         assert model.value("K") == pytest.approx(own.value("K"), rel=0.015)
         assert model.value("T") == pytest.approx(own.value("T"), rel=0.03)
     model = nomoto.fit([sparse], interpolate="spline")
-    assert nomoto.predict(model, dense)[1] <= 1.1 * best.rmse
+    assert nomoto_model.predict(model, dense)[1] <= 1.1 * best.rmse
     # without densifying, differences over 0.5 s are far off
     own, raw = nomoto.fit([dense], method="fd"), nomoto.fit([every(remus, 0.5)], method="fd")
     assert abs(raw.value("T") / own.value("T") - 1.0) > 0.2
@@ -279,10 +279,33 @@ def stable(remus_config):
     return build(body, values)
 
 
+def linearised(model, speed):
+    """The second-order model of the equations of motion for small motions at ``speed`` [m/s].
+
+    Sway and yaw alone, ``M (v', r') = A (v, r) + B delta``; eliminating v gives, with
+    ``F = M^-1 A``, ``G = M^-1 B``: ``a0 = det F, a1 = -tr F, b1 = G_2, b0 = F_21 G_1 - F_11 G_2``.
+    """
+    down, still = np.array([0.0, 0.0, 1.0]), np.zeros(6)
+    rows = np.array([1, 5])
+    f = np.empty((2, 2))
+    inverse = np.linalg.inv(model.mass_matrix[np.ix_(rows, rows)])
+    for i, row in enumerate(rows):
+        ends = []
+        for side in (-1e-6, 1e-6):
+            nu = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+            nu[row] = side
+            ends.append(-inverse @ model.wrench(nu, still, down)[rows])
+        f[:, i] = (ends[1] - ends[0]) / 2e-6
+    g = inverse @ (model.fin_wrench(speed, {"r": 1e-6})[rows] / 1e-6)
+    b0 = f[1, 0] * g[0] - f[0, 0] * g[1]
+    theta = np.array([np.linalg.det(f), -np.trace(f), b0, g[1], 0.0])
+    return nomoto_model.model_of(2, False, "linearised", theta, np.zeros((5, 5)), "rad", 0.0)
+
+
 def test_linearised_equations_of_motion():
     """Nomoto's constants from the model, beside the formulas of the literature and a zigzag."""
     model = stable(config.load(ROOT / "config" / "remus100.yaml"))
-    of_model = nomoto.of_model(model, 1.5)
+    of_model = linearised(model, 1.5)
     found = dict(zip(of_model.names, of_model.values))
     # eliminated by hand (couplings Y_rdot, N_vdot kept)
     c, u = dict(zip(model.names, model.theta)) | model.fins, 1.5
@@ -320,7 +343,7 @@ def test_second_order_is_never_worse_than_first(remus):
 def test_measured_zigzags_are_predicted(fitted, judged, limit, order):
     runs = {a: read(KVLCC2 / f"hsva_Z_{a}_05.csv") for a in (10, 20, 25)}
     model = nomoto.fit([runs[a] for a in fitted], order, nonlinear=True)
-    assert np.degrees(nomoto.predict(model, runs[judged])[1]) < limit
+    assert np.degrees(nomoto_model.predict(model, runs[judged])[1]) < limit
 
 
 # ------------------------------------------------------------------ files
@@ -492,4 +515,4 @@ def test_kinds_of_input_are_not_mixed(short, tmp_path):
     with pytest.raises(UserError, match="runs of one kind"):
         nomoto.fit([short, other])
     with pytest.raises(UserError, match="a run of the same kind"):
-        nomoto.predict(nomoto.fit([short]), other)
+        nomoto_model.predict(nomoto.fit([short]), other)

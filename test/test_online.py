@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import textbook
 
-from rov_ident import config, sensors
-from rov_ident.estimate import is_passive
-from rov_ident.excitation import manoeuvre
-from rov_ident.jit import interpret, stop_interpreting
-from rov_ident.online import Level, OnlineEstimator
-from rov_ident.samples import IMU, ODOMETRY, WRENCH
+from rov_ident import config
+from rov_ident.core.jit import interpret, stop_interpreting
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
+from rov_ident.core.states import Level, State
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.estimation.physical import is_passive
+from rov_ident.simulation import virtual_sensors as sensors
+from rov_ident.simulation.manoeuvres import manoeuvre
 
 KINDS = ["rls", "ukf"]
 SECOND = 1_000_000_000
@@ -54,8 +56,9 @@ def publishable(estimator):
     assert (report.lower <= report.values).all() and (report.values <= report.upper).all()
     np.testing.assert_allclose(report.covariance, report.covariance.T, rtol=1e-6, atol=1e-12)
     assert is_passive(estimator.config.model, estimator.prior, report.values)
-    assert len(report.levels) == len(report.messages) == n
-    assert all(isinstance(level, Level) for level in report.levels)
+    assert len(report.states) == len(report.messages) == n
+    for state, text in zip(report.states, report.messages):
+        assert text.startswith(state.value)
     return report
 
 
@@ -69,7 +72,7 @@ def test_before_any_message(heavy, kind):
     np.testing.assert_allclose(report.values, heavy.model.theta, rtol=1e-9)
     assert not report.excitation.any()
     assert set(report.levels) == {Level.WARN}
-    assert all("not excited" in text for text in report.messages)
+    assert set(report.states) == {State.HELD}
 
 
 def test_converged(trained, heavy):
@@ -119,7 +122,7 @@ def test_words_change_from_converging_to_converged(wrong, messages, kind):
         estimator.push(role, message)
         if k % 100 == 99:
             words.append(publishable(estimator).messages[i])
-    assert words[0].startswith(("not excited", "converging"))
+    assert words[0].startswith(("held: not excited", "converging"))
     assert "converging" in words
     assert words[-1] == "converged"
 
@@ -135,10 +138,10 @@ def test_what_is_not_excited_is_held_and_said_to_be(wrong, kind):
     estimator = OnlineEstimator(wrong, kind)
     fed(estimator, [(role, m) for _, role, m in surge.messages])
     report = publishable(estimator)
-    by_name = dict(zip(report.names, zip(report.levels, report.messages, strict=True)))
-    assert by_name["X_uu"][0] == Level.OK
+    by_name = dict(zip(report.names, zip(report.states, report.messages, strict=True)))
+    assert by_name["X_uu"][0] == State.CONVERGED
     for name in ("Y_vv", "K_pp", "N_rr"):
-        assert by_name[name][0] == Level.WARN and "not excited" in by_name[name][1], name
+        assert by_name[name][0] == State.HELD and "not excited" in by_name[name][1], name
         i = report.names.index(name)
         assert report.values[i] == pytest.approx(estimator.prior.mean[i], rel=0.3)
     later = [(role, m._replace(stamp=m.stamp + 60 * SECOND)) for _, role, m in run.messages]
@@ -148,7 +151,7 @@ def test_what_is_not_excited_is_held_and_said_to_be(wrong, kind):
             estimator.push(role, m._replace(stamp=m.stamp + shift))
     report = publishable(estimator)
     text = dict(zip(report.names, report.messages, strict=True))["X_uu"]
-    assert text == "converged, held: not excited now"
+    assert text == "converged: not excited now"
 
 
 # ------------------------------------------------------------------ switching

@@ -4,6 +4,7 @@ Closed-loop waypoints in the simulator, one channel at a time; cut, cleaned, lev
 channel fitted alone; judged on a joint run with a speed change and a turn.
 """
 
+import json
 import re
 import runpy
 from pathlib import Path
@@ -11,13 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rov_ident import config, preprocess
-from rov_ident import swing as swings
-from rov_ident.errors import UserError
-from rov_ident.frames import quaternion_to_matrix
-from rov_ident.simulate import simulate
-from rov_ident.surge import Run, _simulated, fit_surge
-from rov_ident.swing import Course, Limits
+from rov_ident import config
+from rov_ident.cli import main
+from rov_ident.core.errors import UserError
+from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.offline.coast_down import Run, _simulated, fit_coast_downs
+from rov_ident.sampling import preprocess
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "sea_trial.py"
 
@@ -38,76 +38,46 @@ def test_the_whole_procedure(heavy, tmp_path, capsys):
     assert "<svg" in (tmp_path / "report.html").read_text()
 
 
-def test_a_course_is_followed(heavy):
-    course = Course("there and back", ((2.0, 0.5, 0.0), (4.0, 0.25, np.pi / 2)))
-    np.testing.assert_allclose(course.target(1.0), [0.5, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(course.target(4.0), [1.0, 0.5, 0.0, np.pi / 2], atol=1e-12)
-    np.testing.assert_array_equal(course.target(6.0), course.target(60.0))
-    flown = swings.fly(heavy, course, 12.0, Limits())
-    np.testing.assert_allclose(flown.reach[:2], [1.0, 1.0], atol=0.2)
-
-
 # ------------------------------------------------------------------ pieces
 
 
-def test_lever_arms_are_those_of_a_rigid_body(heavy):
-    """A point of a simulated body, differentiated numerically, gives the origin back."""
-    t = np.arange(0.0, 4.0, 0.002)
-    wrench = np.tile([20.0, 10.0, -15.0, 0.4, -0.5, 0.6], (len(t), 1))
-    run = simulate(heavy.model, t, wrench)
-    lever = np.array([0.3, -0.2, 0.1])
-    r = quaternion_to_matrix(run.orientation)
-    place = run.position + r @ lever
-    omega, omega_dot = run.nu[:, 3:], run.nu_dot[:, 3:]
-    velocity = np.einsum("kji,kj->ki", r, np.gradient(place, t, axis=0))
-    acceleration = np.einsum("kji,kj->ki", r, np.gradient(np.gradient(place, t, axis=0), t, axis=0))
-    inside = slice(5, -5)
-    np.testing.assert_allclose(
-        preprocess.position_at_origin(place, r, lever), run.position, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        preprocess.velocity_at_origin(velocity, omega, lever)[inside],
-        run.nu[inside, :3], atol=1e-3,
-    )  # fmt: skip
-    own = run.nu_dot[:, :3] + np.cross(omega, run.nu[:, :3])
-    np.testing.assert_allclose(
-        preprocess.acceleration_at_origin(acceleration, omega, omega_dot, lever)[inside],
-        own[inside], atol=2e-2,
-    )  # fmt: skip
-
-
-def test_outliers_are_replaced_and_nothing_else(heavy):
+def test_outliers_are_replaced_and_nothing_else():
     t = np.arange(0.0, 20.0, 0.05)
     x = np.sin(t) + 0.01 * np.random.default_rng(0).standard_normal(len(t))
     spoilt = x.copy()
     spoilt[[30, 200, 201, 350]] += [3.0, -2.0, -2.0, 1.0]
-    clean, bad = preprocess.without_outliers(spoilt)
+    clean, bad = preprocess.despiked(spoilt)
     assert set(np.flatnonzero(bad)) >= {30, 200, 201, 350}
     assert bad.sum() < 12
     assert np.abs(clean - np.sin(t)).max() < 0.2
-    with pytest.raises(UserError, match="odd number"):
-        preprocess.without_outliers(x, 4)
+    assert not preprocess.despiked(0.0 * t)[1].any()
 
 
-def test_smoothing_has_no_lag_and_a_derivative():
-    t = np.arange(0.0, 10.0, 0.02)
-    noisy = np.sin(t) + 0.02 * np.random.default_rng(0).standard_normal(len(t))
-    value, slope = preprocess.smoothed(noisy, 0.02, 0.6)
-    assert np.std(value - np.sin(t)) < 0.01
-    assert np.std(slope - np.cos(t)) < 0.12
-    assert abs(np.mean((value - np.sin(t)) * np.cos(t))) < 2e-3
+@pytest.mark.parametrize("corner", [0.5, 2.0])
+def test_smoothing_has_its_corner_and_no_lag(corner):
+    t = np.arange(0.0, 40.0, 0.02)
+    inside = slice(400, -400)
+    for frequency, gain in ((0.2 * corner, 1.0), (corner, np.sqrt(0.5))):
+        x = np.sin(2.0 * np.pi * frequency * t)
+        quarter = np.cos(2.0 * np.pi * frequency * t)[inside]
+        y = preprocess.smoothed(x, 0.02, corner)[inside]
+        assert y @ x[inside] / (x[inside] @ x[inside]) == pytest.approx(gain, abs=0.05)
+        assert y @ quarter / (quarter @ quarter) == pytest.approx(0.0, abs=0.01)
     with pytest.raises(UserError, match="too few"):
-        preprocess.smoothed(noisy[:4], 0.02)
+        preprocess.smoothed(x[:4], 0.02, corner)
+    with pytest.raises(UserError, match="is too high a corner"):
+        preprocess.smoothed(x, 0.02, 25.0)
 
 
 def test_the_dynamic_stretch_is_cut_out():
     t = np.arange(0.0, 100.0, 0.1)
-    wrench = np.where((t > 40.0) & (t < 60.0), 10.0 * np.sign(np.sin(t)), 0.01)
-    begin, end = preprocess.dynamic_stretch(t, wrench)
+    wrench = np.tile([5.0, 0.0, -2.0, 0.0, 0.0, 0.0], (len(t), 1))
+    wrench[:, 5] = np.where((t > 40.0) & (t < 60.0), 10.0 * np.sign(np.sin(t)), 0.01)
+    begin, end = preprocess.dynamic_stretch(t, wrench, 5.0)
     assert begin == pytest.approx(35.0, abs=0.3)
     assert end == pytest.approx(65.0, abs=0.3)
-    with pytest.raises(UserError, match="zero throughout"):
-        preprocess.dynamic_stretch(t, 0.0 * t)
+    with pytest.raises(UserError, match="the same throughout"):
+        preprocess.dynamic_stretch(t, 0.0 * wrench, 5.0)
 
 
 def test_depth_from_three_sources_is_better_than_the_best():
@@ -161,7 +131,7 @@ def surge_runs(noise=0.005, seed=0):
 def test_thrust_and_drag_from_step_up_and_coast_down(anchor):
     off = []
     for seed in range(6):
-        found = fit_surge(surge_runs(seed=seed), MASS, **anchor)
+        found = fit_coast_downs(surge_runs(seed=seed), MASS, **anchor)
         assert found.rmse == pytest.approx(0.005, rel=0.15)
         for name, value, std in zip(found.names, found.values, found.std, strict=True):
             if std > 0.0:
@@ -186,4 +156,111 @@ def test_thrust_and_drag_from_step_up_and_coast_down(anchor):
 )  # fmt: skip
 def test_what_runs_cannot_tell_is_said(runs, options, said):
     with pytest.raises(UserError, match=said):
-        fit_surge(runs, MASS, **options)
+        fit_coast_downs(runs, MASS, **options)
+
+
+def test_coast_down_on_the_command_line(heavy_path, tmp_path, capsys):
+    """As the library has it; by X_udot of the configuration, and by a bollard pull."""
+    logs, runs = [], []
+    for k, run in enumerate(surge_runs()):
+        logs.append(tmp_path / f"run{k}.csv")
+        table = np.column_stack([run.t, run.n, run.u])
+        np.savetxt(logs[-1], table, "%.12g", ",", header="t_s,shaft,u", comments="")
+        runs.append(Run(*np.loadtxt(logs[-1], delimiter=",", skiprows=1).T))
+    heavy = config.load(heavy_path)
+    mass = heavy.model.body.mass
+    common = [*map(str, logs), "--map", "n=shaft", "--config", str(heavy_path)]
+    result, saved = tmp_path / "result.json", tmp_path / "fitted.yaml"
+    assert main(["coast-down", *common, "--json", str(result), "--save", str(saved)]) == 0
+    assert "k1 n + k2 |n| n" in capsys.readouterr().out
+    told = json.loads(result.read_text())
+    found = fit_coast_downs(runs, mass, added_mass=heavy.value("X_udot"))
+    assert told["coefficients"] == found.entries()
+    assert told["speed_rmse_mps"] == found.rmse
+    assert [bag["file"] for bag in told["provenance"]["bags"]] == ["run0.csv", "run1.csv"]
+    assert config.load(saved).value("X_uu") == found.value("X_uu")
+    thrust = 28.0 * (mass - heavy.value("X_udot")) / (MASS - TRUE["X_udot"])
+    arguments = [*common, "--json", str(result), "--bollard", "20", str(thrust)]
+    assert main(["coast-down", *arguments]) == 0
+    told = json.loads(result.read_text())["coefficients"]["X_udot"]
+    assert abs(told["value"] - heavy.value("X_udot")) < 4.0 * told["std"]
+    capsys.readouterr()
+    assert main(["coast-down", *common[:2], "--config", str(heavy_path)]) == 2
+    assert "--map n=HEADING" in capsys.readouterr().err
+
+
+def sea_log(path, **changed):
+    """Ten seconds at rest, ten driven, ten at rest; (N,) columns by their headings."""
+    t = np.arange(0.0, 30.0, 0.1)
+    driven = (t >= 10.0) & (t < 20.0)
+    columns = {"t_s": t} | {name: 0.01 * np.sin(3.0 * t + k) for k, name in enumerate("uvwpqr")}
+    columns |= dict.fromkeys("XYZKMN", 0.0 * t) | {"roll": 0.0 * t, "pitch": 0.0 * t}
+    columns["X"] = 20.0 * driven
+    columns |= changed
+    rows = [",".join(columns)]
+    for row in zip(*columns.values(), strict=True):
+        rows.append(",".join("" if np.isnan(x) else f"{x:.9g}" for x in row))
+    path.write_text("\n".join(rows))
+    return t, columns
+
+
+def imported(path, *options):
+    """The odometry of a log imported with options, (N,) messages."""
+    out = path.with_suffix(".mcap")
+    assert main(["import", str(path), "--out", str(out), *options]) == 0
+    bag = Bag(out)
+    return [m for role, m in read_messages(bag, select_topics(bag)) if role == "odom"]
+
+
+def test_a_log_is_prepared_on_the_command_line(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 30.0, 0.1)
+    spoilt = 0.01 * np.sin(3.0 * t)
+    spoilt[100:300:50] += 2.0
+    true = 5.0 + 0.1 * t
+    sparse = np.where(np.arange(len(t)) % 5 == 0, true + 0.3 * rng.standard_normal(len(t)), np.nan)
+    exact = true + 0.5 + 0.01 * rng.standard_normal(len(t))
+    _, columns = sea_log(path, u=spoilt, usbl=sparse, ins=exact)
+    plain = imported(path)
+    assert len(plain) == len(t)
+    assert plain[100].linear[0] > 1.0
+
+    messages = imported(
+        path, "--polarity", "w", "--despike", "--cut-idle", "2",
+        "--depth", "usbl=0.3", "ins=0.01,1.0",
+    )  # fmt: skip
+    said = capsys.readouterr().err
+    assert "outliers replaced: 4 of u" in said
+    assert "from 2 sources" in said and "cut to" in said
+    stamps = np.array([m.stamp for m in messages]) * 1e-9 - 1.0
+    assert stamps[0] == pytest.approx(8.0) and stamps[-1] == pytest.approx(21.9, abs=0.11)
+    at = np.searchsorted(t, stamps + 1e-6) - 1
+    # the default axes of a CSV are forward-starboard-down
+    linear = np.array([m.linear for m in messages])
+    assert np.abs(linear[:, 0]).max() < 0.05
+    np.testing.assert_allclose(linear[:, 2], -columns["w"][at], atol=1e-8)
+    depth = np.array([m.position[2] for m in messages])
+    assert np.abs(depth - true[at]).max() < 0.2
+
+    messages = imported(path, "--cut", "5", "9", "--smooth", "0.1")
+    assert [messages[0].stamp, messages[-1].stamp] == [6_000_000_000, 10_000_000_000]
+    assert max(abs(m.angular[0]) for m in messages) < 0.004
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--cut", "5", "5.1"], "no rows are left"),
+        (["--polarity", "yaw"], "the log has no `yaw`"),
+        (["--depth", "sonar=0.1"], "has no column `sonar`"),
+        (["--smooth", "6"], "is too high a corner"),
+        (["--smooth", "0.01"], "too few"),
+    ],
+)
+def test_what_cannot_be_prepared_is_said(tmp_path, capsys, options, said):
+    path = tmp_path / "log.csv"
+    sea_log(path)
+    assert main(["import", str(path), "--out", str(tmp_path / "log.mcap"), *options]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "log.mcap").exists()

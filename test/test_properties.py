@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rov_ident import config as configuration
-from rov_ident.messages import Imu, Odometry, Wrench
-from rov_ident.model import build
-from rov_ident.online import OnlineEstimator
+from rov_ident.core.messages import Imu, Odometry, Wrench
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.model.equations import build
 
 KINDS = ["rls", "ukf"]
 SIDE = np.array([1.0, -1.0, 1.0])  # of a vector in a mirror

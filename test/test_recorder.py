@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from rov_ident.bags import Bag, BagWriter
-from rov_ident.errors import UserError
+from rov_ident.core.errors import UserError
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_writer import BagWriter
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
 DEMO = Path(__file__).parent.parent / "bags" / "demo.mcap"
-PROGRAM = [sys.executable, "-m", "rov_ident.cli"]
+PROGRAM = [sys.executable, "-m", "rov_ident"]
 
 
 def complete(path):
@@ -98,8 +99,10 @@ def test_the_disk_is_full_while_recording(tmp_path):
     there = before.read_bytes()
     rows = [(r.topic, r.type_name, r.log_time, r.data) for r in Bag(DEMO).iter_raw()][:20_000]
 
-    def record(path, crash_safe):
-        with BagWriter(path, crash_safe=crash_safe) as writer:
+    def record(path, live):
+        with BagWriter(path) as writer:
+            if live:
+                writer.go_live()
             writer._flushed = -1e9
             for row in rows:
                 writer.write(*row)
@@ -110,9 +113,9 @@ def test_the_disk_is_full_while_recording(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1]))
     try:
         with pytest.raises(UserError, match="File too large"):
-            record(live, crash_safe=True)
+            record(live, live=True)
         with pytest.raises(UserError, match="File too large"):
-            record(before, crash_safe=False)
+            record(before, live=False)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert before.read_bytes() == there

@@ -1,14 +1,15 @@
-"""What both estimators make of noise, doubt and surprise."""
+"""What both estimators make of noise, doubt, outliers and changes of the vehicle."""
 
 import numba
 import numpy as np
 import pytest
 
-from rov_ident import rls, ukf
-from rov_ident.estimate import prior_of
-from rov_ident.process_noise import LARGEST, adapt, first_adaptation, process
-from rov_ident.recursion import SURPRISE_TIME, add_surprise
-from rov_ident.sensors import dive, samples_of
+from rov_ident.config.prior import prior_of
+from rov_ident.estimation import rls, ukf
+from rov_ident.estimation.innovation_monitor import LARGEST, NIS_TIME, first_monitor, lost, watch
+from rov_ident.estimation.process_noise import process
+from rov_ident.sampling.records import samples_of
+from rov_ident.simulation.virtual_sensors import dive
 
 ESTIMATORS = {"rls": rls, "ukf": ukf}
 
@@ -20,11 +21,14 @@ def noisy(heavy):
 
 
 @numba.njit
-def adapted(adaptation, constants, i, room, innovation, count):
-    for _ in range(count):
-        adaptation[i].since = 0.05
-        adaptation[i].acting = 10.0 * adaptation[i].density
-        adapt(adaptation[i], constants[0], i, room, innovation)
+def watched(monitor, constants, i, innovations, moving):
+    """Normalised innovations of axis i, twenty a second; how many were outliers."""
+    count = 0
+    for e in innovations:
+        monitor[i].since = 0.05
+        monitor[i].acting = 10.0 * monitor[i].density
+        count += watch(monitor[i], constants[0], i, 1.5, moving, 5.0, e)
+    return count
 
 
 @pytest.mark.parametrize("axis", [0, 4])
@@ -32,27 +36,49 @@ def test_the_density_stays_within_its_bounds(heavy, axis):
     """However large the innovations, coefficients can still be learnt; and noise never ends."""
     constants = process(heavy)
     for innovation, bound in ((LARGEST, "largest"), (0.0, "floor")):
-        adaptation = first_adaptation(constants)
-        adapted(adaptation, constants, axis, 1.5, innovation, 20_000)
-        assert adaptation["density"][axis] == constants[bound][0, axis]
+        monitor = first_monitor(constants)
+        watched(monitor, constants, axis, np.full(20_000, innovation), True)
+        assert monitor["density"][axis] == constants[bound][0, axis]
     assert (constants["floor"] < constants["first"]).all()
     assert (constants["first"] < constants["largest"]).all()
 
 
-@numba.njit
-def surprised(surprise, ratios, since):
-    for ratio in ratios:
-        add_surprise(surprise, 2, ratio, since)
-
-
-def test_a_single_kick_is_no_change_of_the_vehicle():
+def test_a_single_kick_is_no_change_of_the_vehicle(heavy):
     """It counts for three standard deviations, however large; what lasts is seen in a second."""
-    surprise = np.ones(6)
-    surprised(surprise, np.array([1e6]), 0.05)
-    assert surprise[2] == pytest.approx(1.0 + 0.05 / SURPRISE_TIME * (LARGEST**2 - 1.0))
-    surprised(surprise, np.full(20, 1e6), 0.05)
-    assert 3.0 < surprise[2] < LARGEST**2
-    assert (np.delete(surprise, 2) == 1.0).all()
+    constants = process(heavy)
+    monitor = first_monitor(constants)
+    assert watched(monitor, constants, 2, np.array([1e3]), True) == 1
+    assert monitor["nis"][2] == pytest.approx(1.0 + 0.05 / NIS_TIME * (LARGEST**2 - 1.0))
+    assert watched(monitor, constants, 2, np.full(20, 4.0), True) == 0
+    assert 3.0 < monitor["nis"][2] < LARGEST**2
+    assert (np.delete(monitor["nis"], 2) == 1.0).all()
+
+
+def test_white_innovations_are_no_change_and_no_outliers(heavy):
+    """Their NIS is 1 in the average, and what is added for noise stays below what it began with."""
+    constants = process(heavy)
+    monitor = first_monitor(constants)
+    white = np.random.default_rng(0).standard_normal(20_000)
+    assert watched(monitor, constants, 1, white, True) == 0
+    assert monitor["nis"][1] == pytest.approx(1.0, abs=0.6)
+    assert monitor["density"][1] < constants["first"][0, 1]
+
+
+@numba.njit
+def counted(monitor, first, outlier):
+    return lost(monitor, first, outlier)
+
+
+def test_outliers_count_in_a_row_and_rest_teaches_no_noise(heavy):
+    constants = process(heavy)
+    monitor = first_monitor(constants)
+    assert watched(monitor, constants, 3, np.array([9.0, 1.0, -9.0, 9.0]), True) == 3
+    refused = [True, False, True, True]
+    assert [counted(monitor, 3, outlier) for outlier in refused] == [False, False, False, True]
+    before = monitor.copy()
+    watched(monitor, constants, 3, np.full(400, 2.0), False)
+    assert monitor["density"][3] == before["density"][3]
+    assert monitor["nis"][3] == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS)

@@ -1,4 +1,4 @@
-"""Recursive least squares: against textbook forms, through windup, gaps and surprises."""
+"""Recursive least squares: against textbook forms, through windup, gaps and changes."""
 
 import dataclasses
 
@@ -8,10 +8,11 @@ import textbook
 from textbook import with_section
 
 from rov_ident import config as configuration
-from rov_ident import rls, sensors
-from rov_ident.estimate import prior_of
-from rov_ident.excitation import manoeuvre
-from rov_ident.samples import SAMPLE
+from rov_ident.config.prior import prior_of
+from rov_ident.estimation import rls
+from rov_ident.sampling.sample import SAMPLE
+from rov_ident.simulation import virtual_sensors as sensors
+from rov_ident.simulation.manoeuvres import manoeuvre
 
 DT = 0.02
 
@@ -129,9 +130,9 @@ def test_rows_are_the_tangent_of_a_textbook_observer(heavy, fine, slope):
         rows["wrench_slope"] = np.random.default_rng(1).standard_normal((len(rows), 6))
         rows["wrench_slope"] *= [20.0, 20.0, 20.0, 2.0, 2.0, 2.0]
     task = rls.problem(with_section(config, "rls", gate=1e6))
-    state, adapted = rls.init(task), []
+    state, densities = rls.init(task), []
     for k in range(len(rows)):
-        adapted.append((state.adaptation["density"].copy(), state.scalars["noise"][0].copy()))
+        densities.append(state.monitor["density"].copy())
         state, info = rls.step(task, state, rows[k : k + 1])
         assert info["reason"][0] == (rls.USED if k else rls.RESTARTED)
     assert state.scalars["free"][0] == n
@@ -139,12 +140,13 @@ def test_rows_are_the_tangent_of_a_textbook_observer(heavy, fine, slope):
     r = state.root[:, :n][:, place]
     information, goal = r.T @ r - np.eye(n), r.T @ state.root[:, n]
 
-    (e, s, gains), scale = textbook.innovations(config, model.theta, rows, adapted), narrow.values()
+    e, s, gains = textbook.innovations(config, model.theta, rows, densities)
+    scale = narrow.values()
     phi = np.empty((len(e), n))
     for j, step in enumerate(scale):
         moved = model.theta.copy()
         moved[j] += step
-        phi[:, j] = e - textbook.innovations(config, moved, rows, adapted, gains)[0]
+        phi[:, j] = e - textbook.innovations(config, moved, rows, densities, gains)[0]
     wanted = (phi / s[:, None]).T @ phi
     root = np.sqrt(np.diag(wanted))
     np.testing.assert_allclose(
@@ -194,20 +196,20 @@ def test_constant_forgetting_is_the_textbook_formula(heavy, noisy):
     assert checked > 100
 
 
-def test_surprise_adds_variance_to_what_would_show(heavy, noisy):
+def test_a_large_nis_adds_variance_to_what_would_show(heavy, noisy):
     """A diagonal share of the prior, as there is room to it; the estimate and the rest stay."""
     task, checked = rls.problem(heavy), 0
     state, _ = rls.fold(task, rls.init(task), noisy[:1500])
     surge = [heavy.model.names.index(name) for name in ("X_udot", "X_u", "X_uu")]
     for k in range(1500, 1600):
-        state.scalars["surprise"] = [10.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-        surprised, told = rls.step(task, state, noisy[k : k + 1])
-        state.scalars["surprise"] = 0.0
+        state.monitor["nis"] = [10.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        loosened, told = rls.step(task, state, noisy[k : k + 1])
+        state.monitor["nis"] = 0.0
         state, _ = rls.step(task, state, noisy[k : k + 1])
         if told["forgetting"][0] == 1.0:
             continue
         assert told["forgetting"][0] == pytest.approx(1.0 - 0.1 / 20.0)
-        (r, score, right, phi), (new, new_score, new_right, _) = map(in_order, (state, surprised))
+        (r, score, right, phi), (new, new_score, new_right, _) = map(in_order, (state, loosened))
         p, grown = np.linalg.inv(r.T @ r), np.linalg.inv(new.T @ new)
         added = np.diag(grown - p)
         np.testing.assert_allclose(grown - p, np.diag(added), atol=1e-10)

@@ -13,9 +13,10 @@ from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
-from conftest import HEAVY, Vehicle, end_node, start_node
 from rcl_interfaces.msg import ParameterType
 
+from bench import HEAVY
+from bench.simulators.live import Vehicle, end_node, start_node
 from rov_ident import config
 from rov_ident.nodes import controller_bridge, dashboard_node, estimator_node, parameters
 
@@ -23,10 +24,10 @@ ROOT = HEAVY.parent.parent
 LAUNCH = sorted((ROOT / "launch").glob("*.py"))
 OF_ESTIMATORS = {p.key for p in config.VEHICLE_PARAMETERS + config.PARAMETERS} | {"use_sim_time"}
 DECLARED = {
-    "rls_node": OF_ESTIMATORS | set(estimator_node._OWN_PARAMETERS),
-    "ukf_node": OF_ESTIMATORS | set(estimator_node._OWN_PARAMETERS),
+    "rls_node": OF_ESTIMATORS | {p.key for p in estimator_node._OWN},
+    "ukf_node": OF_ESTIMATORS | {p.key for p in estimator_node._OWN},
     "controller_bridge": OF_ESTIMATORS | {p.key for p in controller_bridge._OWN},
-    "dashboard_node": {p.key for p in dashboard_node._PARAMETERS},
+    "dashboard_node": {p.key for p in dashboard_node._OWN},
 }
 
 
@@ -213,7 +214,7 @@ def test_every_parameter_is_described(domain):
     """With a unit, its bounds as ROS's own ranges, and read-only unless it may change live."""
     from rclpy.node import Node
 
-    own = (*controller_bridge._OWN, *dashboard_node._PARAMETERS)
+    own = (*controller_bridge._OWN, *dashboard_node._OWN)
     with Ros() as context:
         node = Node(
             "described", context=context, automatically_declare_parameters_from_overrides=True

@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 
 from rov_ident import config
 from rov_ident.config import PARAMETERS
-from rov_ident.errors import UserError
+from rov_ident.core.errors import UserError
 from rov_ident.nodes.common import LATCHED
 
 ROOT = Path(__file__).parent.parent
@@ -30,8 +30,8 @@ FORBIDDEN_MODULES = {
     "ctypes", "pty", "telnetlib", "xmlrpc",
 }  # fmt: skip
 FORBIDDEN_CALLS = {
-    "eval", "exec", "compile", "__import__", "execfile", "unsafe_load", "full_load", "load_all",
-    "unsafe_load_all", "full_load_all", "system", "popen", "mktemp", "loadtxt", "genfromtxt",
+    "eval", "exec", "compile", "__import__", "execfile", "system", "popen",
+    "mktemp", "loadtxt", "genfromtxt",
     "fromfile", "memmap", "numexpr",
 }  # fmt: skip
 
@@ -60,10 +60,8 @@ def problems(path, text):
             allow = words.get("allow_pickle")
             if not (isinstance(allow, ast.Constant) and allow.value is False):
                 found.append(f"{where}: np.load without allow_pickle=False")
-        if owner == "yaml" and name == "load":
-            loader = node.args[1] if len(node.args) > 1 else words.get("Loader")
-            if getattr(loader, "id", "") != "_Loader":
-                found.append(f"{where}: yaml.load with another loader")
+        if owner == "yaml" and "load" in name and Path(path).name != "yaml_file.py":
+            found.append(f"{where}: YAML is read by core/yaml_file.py alone")
         if isinstance(words.get("shell"), ast.Constant) and words["shell"].value:
             found.append(f"{where}: shell")
     return found
@@ -85,6 +83,7 @@ def test_nothing_that_is_read_is_run():
         "np.load(f, allow_pickle=True)",
         "yaml.load(f)",
         "yaml.load(f, yaml.UnsafeLoader)",
+        "yaml.safe_load(f)",
         "yaml.full_load(f)",
         "os.system('ls')",
         "subprocess.run('ls', shell=True)",
@@ -113,16 +112,6 @@ def test_yaml_makes_no_objects(tmp_path, heavy_path, tag):
     assert not made.exists()
 
 
-def test_yaml_that_grows(tmp_path):
-    """A billion laughs are refused before anybody laughs."""
-    lines = ["a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
-    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
-    path = tmp_path / "bomb.yaml"
-    path.write_text("\n".join(["/**:", "  ros__parameters:", *(f"    {line}" for line in lines)]))
-    with pytest.raises(UserError):
-        config.load(path)
-
-
 @pytest.mark.parametrize(
     "name", ["../../escaped", "/tmp/escaped", "a/b", "..", "a\n../b", "~root", ".hidden", "a\0b"]
 )
@@ -139,7 +128,7 @@ def test_a_configuration_does_not_say_where_to_write(tmp_path, heavy_path):
     stranger, work = tmp_path / "stranger.yaml", tmp_path / "a" / "b"
     work.mkdir(parents=True)
     stranger.write_text(text)
-    command = [sys.executable, "-m", "rov_ident.cli", "simulate", "--config", str(stranger)]
+    command = [sys.executable, "-m", "rov_ident", "simulate", "--config", str(stranger)]
     command += ["--manoeuvre", "steps", "--duration", "5", "--out", "dive"]
     done = subprocess.run(command, cwd=work, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -225,9 +214,8 @@ OTHERS = {
     "example_controller": ["rov_ident.nodes.example_controller", "--ros-args", "--params-file",
                            str(ROOT / "config" / "bluerov2_heavy.yaml"),
                            "-r", "coefficients:=/ukf_node/coefficients"],
-    "dashboard": ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=0",
-                  "-p", "foxglove_port:=0"],
-    "rov_ident_watch": ["rov_ident.cli", "watch"],
+    "dashboard": ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=0"],
+    "rov_ident_watch": ["rov_ident", "watch"],
 }  # fmt: skip
 
 
@@ -261,7 +249,7 @@ def test_another_node_does_what_its_policy_says(domain, name):
         assert done_by(graph, name) == allowed
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(240)
         graph.destroy_node()
         rclpy.try_shutdown(context=context)
 

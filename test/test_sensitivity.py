@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from rov_ident.config import dump, from_parameters, load, to_parameters
+from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS, estimable
-from rov_ident.errors import UserError
-from rov_ident.online import OnlineEstimator
-from rov_ident.samples import SAMPLE, joined, parts, sample_type
-from rov_ident.sensors import Suite, dive, samples_of
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.sampling.records import samples_of
+from rov_ident.sampling.sample import SAMPLE, joined, parts, sample_type
+from rov_ident.simulation.virtual_sensors import Suite, dive
 
 EXACT = Suite().scaled(0.0)
 

@@ -9,11 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from rov_ident import config, simulate
-from rov_ident.errors import UserError
-from rov_ident.excitation import MANOEUVRES, authority, manoeuvre
-from rov_ident.model import Model, RigidBody, build
-from rov_ident.simulate import Guide, open_loop
+from rov_ident import config
+from rov_ident.core.errors import UserError
+from rov_ident.model.equations import Model, RigidBody, build
+from rov_ident.model.scales import authority
+from rov_ident.simulation import open_loop as simulate
+from rov_ident.simulation.manoeuvres import MANOEUVRES, manoeuvre
+from rov_ident.simulation.open_loop import Guide, open_loop
 
 Array = NDArray[np.float64]
 

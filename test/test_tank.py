@@ -4,23 +4,22 @@ It belongs to others and is no part of the project: set ROV_IDENT_DATA to its fo
 """
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bench import DATA
 from rov_ident import config as configuration
-from rov_ident import inputs
-from rov_ident.bags import Bag
-from rov_ident.explain import explain
-from rov_ident.importer import import_csv
+from rov_ident.discrepancy.explain import explain
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.csv_log import import_csv
 from rov_ident.nodes.replay import replay
-from rov_ident.records import read_record, score
-from rov_ident.streams import gather
+from rov_ident.sampling.raw_streams import gather
+from rov_ident.sampling.records import read_record, score
 
 ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("ROV_IDENT_DATA", ROOT.parent / "shared" / "data"))
 TANK = DATA / "bluerov2-heavy-tank"
 CONFIG = ROOT / "config" / "bluerov2_heavy_tank.yaml"
 CHANNELS = np.array([True, True, True, False, False, False])

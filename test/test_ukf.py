@@ -2,18 +2,21 @@
 
 import dataclasses
 
+import numba
 import numpy as np
 import pytest
 import textbook
-from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from textbook import with_section
 
 from rov_ident import config as configuration
-from rov_ident import ukf
-from rov_ident.estimate import is_passive, physical, prior_of
-from rov_ident.excitation import manoeuvre
-from rov_ident.recursion import SURPRISE_TIME
-from rov_ident.samples import SAMPLE
+from rov_ident.config.prior import prior_of
+from rov_ident.estimation import reference_ukf, ukf
+from rov_ident.estimation.innovation_monitor import NIS_TIME
+from rov_ident.estimation.mass_inverse import invert_mass
+from rov_ident.estimation.physical import is_passive, physical
+from rov_ident.estimation.reference_ukf import ReferenceUkf
+from rov_ident.sampling.sample import SAMPLE
+from rov_ident.simulation.manoeuvres import manoeuvre
 
 DT = 0.05
 COUPLINGS = {
@@ -59,76 +62,13 @@ def wrong_prior(config, seed=5, spread=0.2):
 # ------------------------------------------------------------------ filterpy
 
 
-class Peer:
-    """filterpy's filter on the equations by the book, with the same noise."""
+class ByTheBook(ReferenceUkf):
+    """filterpy's filter on equations that are written a second time."""
 
-    def __init__(self, config, task, state):
-        self.config, self.task = config, task
-        n, u = len(task.scale), config.ukf
-        points = MerweScaledSigmaPoints(6 + n, u.alpha, u.beta, u.kappa)
-        self.filter = UnscentedKalmanFilter(6 + n, 6, DT, None, self.propagated, points)
-        self.filter.x, self.filter.P = state.x.copy(), state.p.copy()
-        self.since = 0.0
-
-    def theta(self, xi):
-        theta = self.task.theta.copy()
-        theta[self.task.estimated] = self.task.scale * xi
-        return theta
-
-    def propagated(self, x, dt):
-        """One sigma point through Runge-Kutta, the wrench and "down" being lines in time."""
-        row, model = self.row, self.config.model
-        theta = self.theta(x[6:])
-        middle = row["down"] - 0.5 * row["dt"] * row["down_slope"]
+    def acceleration(self, theta, nu, tau, down):
+        model = self.model
         ballast = textbook.ballast(model.with_theta(theta).mass_matrix, model.body.mass_matrix)
-
-        def rate(t, nu):
-            late = t - 0.5 * dt
-            tau = row["wrench"] + late * row["wrench_slope"]
-            down = middle + late * row["down_slope"]
-            names = model.coefficients
-            return textbook.acceleration(model.body, names, theta, nu, tau, down, ballast)
-
-        nu, steps = x[:6], max(1, round(np.ceil(dt / 0.05 - 1e-9)))
-        for k in range(steps):
-            nu = textbook.runge_kutta(rate, k * dt / steps, nu, dt / steps)
-        return np.concatenate([nu, x[6:]])
-
-    def noise(self):
-        """Q (6 + n, 6 + n): unknown forces through the inverse mass."""
-        c, row, n = self.config, self.row, len(self.task.scale)
-        inverse = np.linalg.inv(c.model.with_theta(self.theta(self.filter.x[6:])).mass_matrix)
-        strength = (c.wrench.relative_std * row["wrench"]) ** 2 + np.square(c.wrench.floor_std)
-        forces = c.wrench.correlation_time * (inverse * strength) @ inverse.T
-        q = np.zeros((6 + n, 6 + n))
-        q[:6, :6] = (forces + np.diag(self.process)) * row["dt"]
-        return q
-
-    def step(self, row, process, surprise):
-        """``process``, ``surprise`` (6,): what the library has found so far, its own matter."""
-        self.row, self.process = row, process
-        if row["restart"]:
-            x, p = self.filter.x, self.filter.P
-            x[:6], p[:6], p[:, :6] = row["nu"], 0.0, 0.0
-            p[:6, :6] = np.diag(row["odometry_variance"])
-            return
-        self.filter.Q = self.noise()
-        self.filter.predict(dt=row["dt"])
-        z, r = row["odometry"].copy(), row["odometry_variance"].copy()
-        if np.isfinite(row["gyro"]).all():
-            z[3:], r[3:] = row["gyro"], row["gyro_variance"]
-        measured = np.flatnonzero(np.isfinite(z))
-        if len(measured):
-            self.filter._dim_z = len(measured)
-            self.filter.update(z[measured], R=np.diag(r[measured]), hx=lambda x, m=measured: x[m])
-        self.since += row["dt"]
-        if self.since >= ukf._PERIOD:
-            walk = self.task.walk
-            if (surprise > self.task.settings["changed"][0]).any():
-                walk = np.maximum(walk, 1.0 / ukf.RELEARNING_TIME)
-            room = np.maximum(1.0 - np.diag(self.filter.P)[6:], 0.0)
-            self.filter.P[6:, 6:] += np.diag(walk * self.since * room)
-            self.since = 0.0
+        return textbook.acceleration(model.body, model.coefficients, theta, nu, tau, down, ballast)
 
 
 def mixed(rows, every):
@@ -168,12 +108,12 @@ def test_equals_filterpy(heavy, names, alpha, dt, kind):
     config = with_section(config, "ukf", alpha=alpha, gate=1e6, random_walk=0.1)
     task = ukf.problem(config)
     state = ukf.init(task)
-    peer = Peer(config, task, state)
+    peer = ByTheBook(config, task, state)
     assert len(state.x) == 6 + names
     for i in range(len(rows)):
-        process = state.adaptation["density"]
-        state, info = ukf.step(task, state, rows[i : i + 1])
-        peer.step(rows[i], process, state.scalars["surprise"][0])
+        before = state
+        state, info = ukf.step(task, before, rows[i : i + 1])
+        peer.step(rows[i], before, state, info[0])
         assert info["reason"][0] in (ukf.USED, ukf.RESTARTED)
         error = np.abs(state.x - peer.filter.x) / np.sqrt(np.diag(peer.filter.P))
         assert error.max() < 1e-6, f"state at sample {i}"
@@ -184,7 +124,31 @@ def test_equals_filterpy(heavy, names, alpha, dt, kind):
     np.testing.assert_allclose(np.diag(state.p), np.diag(peer.filter.P), rtol=1e-7)
 
 
+def test_the_reference_follows_outliers_and_what_does_not_move(heavy):
+    """Also a velocity that is lost after two outliers, and coefficients that walk."""
+    config = with_section(wrong_prior(heavy), "ukf", random_walk=0.1)
+    rows = textbook.rows_of(*driven(config, 6.0, 3), np.random.default_rng(3), wrench_std=0.01)
+    rows["moving"][30:60, 1], rows["moving"][50:80, 3:] = False, False
+    rows["odometry"][40, 0] += 1.0
+    rows["odometry"][[70, 71], 1] -= 1.0
+    told = []
+    found = reference_ukf.compare(config, rows, told.append)
+    assert tuple(found["coefficients"]) == config.model.names and found["samples"] == len(rows)
+    of_both = found["coefficients"].values()
+    assert max(abs(row["apart_in_std"]) for row in of_both) < 1e-6
+    assert all(row["std"] == pytest.approx(row["reference_std"], rel=1e-6) for row in of_both)
+    values = np.array([row["value"] for row in of_both])
+    learnt = np.abs(values / config.model.theta - 1.0)
+    assert np.median(learnt) > 1e-3
+    assert told == sorted(told) and len(told) == len(rows) // 20
+
+
 # ------------------------------------------------------------------ mass
+
+
+@numba.njit
+def inverted(mass, lightest, inverse):
+    invert_mass(ukf.LANES, mass, lightest, inverse)
 
 
 def test_mass_matrices_are_made_positive_definite(heavy):
@@ -198,7 +162,7 @@ def test_mass_matrices_are_made_positive_definite(heavy):
     assert np.sum(indefinite) >= 3 and not indefinite[0]
     lanes = np.ascontiguousarray(mass.transpose(1, 2, 0))
     inverse = np.zeros_like(lanes)
-    ukf._invert(lanes, ukf.problem(heavy).lightest, inverse)
+    inverted(lanes, ukf.problem(heavy).lightest, inverse)
     for k, before in enumerate(mass):
         expected = before + textbook.ballast(before, body)
         np.testing.assert_allclose(lanes[:, :, k], expected, rtol=1e-9, atol=1e-9)
@@ -327,26 +291,26 @@ def test_follows_a_change(heavy, name, seed):
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_one_surprised_axis_is_enough_to_learn_anew(heavy, noisy, axis):
+def test_one_axis_of_large_nis_is_enough_to_learn_anew(heavy, noisy, axis):
     task = ukf.problem(heavy)
     state, _ = ukf.fold(task, ukf.init(task), noisy[:400])
     calm, _ = ukf.fold(task, state, noisy[400:410])
-    state.scalars["surprise"][0, axis] = 20.0
-    surprised, _ = ukf.fold(task, state, noisy[400:410])
-    assert (np.diag(surprised.p)[6:] > 1.5 * np.diag(calm.p)[6:]).all()
+    state.monitor["nis"][axis] = 20.0
+    loosened, _ = ukf.fold(task, state, noisy[400:410])
+    assert (np.diag(loosened.p)[6:] > 1.5 * np.diag(calm.p)[6:]).all()
 
 
 @pytest.mark.parametrize("every", [1, 5])
-def test_a_surprise_fades_with_time_however_often_the_gyro_speaks(heavy, noisy, every):
+def test_a_large_nis_fades_with_time_however_often_the_gyro_speaks(heavy, noisy, every):
     """Velocities that come with each fifth sample: as long, not five times as long."""
     task = ukf.problem(heavy)
     rows = mixed(noisy, every)
     state, _ = ukf.fold(task, ukf.init(task), rows[:400])
-    state.scalars["surprise"] = 20.0
+    state.monitor["nis"] = 20.0
     begin = rows["t"][399]
-    later = rows[(rows["t"] > begin) & (rows["t"] <= begin + SURPRISE_TIME)][:]
+    later = rows[(rows["t"] > begin) & (rows["t"] <= begin + NIS_TIME)][:]
     state, _ = ukf.fold(task, state, later)
-    linear, angular = np.split(state.scalars["surprise"][0], 2)
+    linear, angular = np.split(state.monitor["nis"], 2)
     expected = 1.0 + 19.0 * np.exp(-1.0)
     np.testing.assert_allclose(linear, expected, rtol=0.25)
     np.testing.assert_allclose(angular, expected, rtol=0.25)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from conftest import HEAVY
 
-from rov_ident import config, thrusters
-from rov_ident.cli import main
-from rov_ident.errors import UserError
-from rov_ident.formats import import_model
+from bench import HEAVY
+from rov_ident import config
+from rov_ident.cli.program import main
+from rov_ident.consumer.formats import import_model
+from rov_ident.core.errors import UserError
+from rov_ident.model import thruster_allocation as thrusters
 
 INERTIA = '<inertia ixx="{0}" iyy="{1}" izz="{2}" ixy="0" ixz="0" iyz="0"/>'
 ROBOT = f"""<?xml version="1.0"?>

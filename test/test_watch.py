@@ -1,6 +1,6 @@
 """What the nodes say of a model that lacks something, and of one that lacks nothing.
 
-The dives come from ``bench/hidden.py``, which knows none of the package's equations.
+The dives come from ``bench/simulators/hidden.py``, which knows none of the package's equations.
 """
 
 import dataclasses
@@ -8,17 +8,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-import hidden
-from rov_ident import watch
+from bench.simulators import hidden
+from rov_ident.core.messages import Array
+from rov_ident.discrepancy.live_windows import MEMORY, WINDOW, is_watched
+from rov_ident.discrepancy.monitor import ALARM, Monitor, penalty, suspicions
 from rov_ident.effects import EFFECTS
-from rov_ident.messages import Array
-from rov_ident.online import OnlineEstimator
-from rov_ident.sensors import Suite, dive
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.sampling.sample import SAMPLE
+from rov_ident.simulation.virtual_sensors import Suite, dive
 
 
 def watching(config, kind="rls"):
     online = OnlineEstimator(config, kind)
-    online.show(watch.Watcher(config))
+    online.attach(Monitor(config))
     return online
 
 
@@ -27,8 +29,8 @@ def play(online, messages):
     seen, last = [], None
     for _, role, message in messages:
         online.push(role, message)
-        if online.watcher.suspicions is not last:
-            last = online.watcher.suspicions
+        if online.monitor.suspicions is not last:
+            last = online.monitor.suspicions
             seen.append(last)
     return seen
 
@@ -64,7 +66,7 @@ def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
 def test_what_a_single_window_says_proves_nothing(every):
     """A knock or a gust fills one window, and something always fits that."""
     case = hidden.draw(102, conditions=hidden.Conditions(duration=85.0))
-    watcher = (online := watching(case.config)).watcher
+    watcher = (online := watching(case.config)).monitor
     play(online, case.messages)
     task, state = watcher._task, watcher._state
     at = [*task.base, *(key for unit in task.units for key in unit)].index(("buoyancy", "delta"))
@@ -74,7 +76,7 @@ def test_what_a_single_window_says_proves_nothing(every):
         more = lacking * old.normal[at]
         power = old.power + 2.0 * lacking * old.moment[at] + lacking * more[at]
         windows[i] = old._replace(moment=old.moment + more, power=power)
-    found = watch.suspicions(task, state._replace(windows=windows))
+    found = suspicions(task, state._replace(windows=windows))
     assert bool(found) == every
 
 
@@ -93,7 +95,7 @@ def test_what_ends_is_forgotten(heavy):
     online = watching(heavy)
     first = play(online, dive(pulled, "steps", 70.0, Suite(), 1).messages)
     assert first[-1] and "constant_force" in (first[-1][0].effect, *first[-1][0].rivals)
-    memory = watch.MEMORY * watch.WINDOW
+    memory = MEMORY * WINDOW
     later = [
         (arrival, role, message._replace(stamp=message.stamp + 80_000_000_000))
         for arrival, role, message in dive(heavy, "steps", memory + 20.0, Suite(), 2).messages
@@ -114,18 +116,18 @@ def test_watching_changes_no_estimate():
 def test_which_effects_are_watched():
     """Sensors disagree among themselves, waves need a frequency, a battery fades too slowly."""
     sensors = {name for name, effect in EFFECTS.items() if effect.sense is not None}
-    left = {name for name, effect in EFFECTS.items() if not watch.watched(effect)}
+    left = {name for name, effect in EFFECTS.items() if not is_watched(effect)}
     assert left == sensors | {"wave", "battery_sag"}
 
 
 @pytest.mark.parametrize("size", [1, 3, 6])
-def test_chance_pays_the_price_as_rarely_as_it_should(size):
-    """Against the chi-squared distribution, whose tail the price bounds."""
+def test_chance_passes_the_penalty_as_rarely_as_it_should(size):
+    """Against the chi-squared distribution, whose tail the penalty bounds."""
     from scipy.stats import chi2
 
-    chance = 100 * chi2.sf(watch.price(size, 100), size)
+    chance = 100 * chi2.sf(penalty(size, 100), size)
     # Chernoff's bound on one squared normal x is sqrt(e pi / 2) x too large, and x is some 30.
-    assert watch.ALARM / 100.0 < chance <= watch.ALARM
+    assert ALARM / 100.0 < chance <= ALARM
 
 
 def test_at_rest_and_in_gaps_nothing_is_said(heavy):
@@ -136,8 +138,8 @@ def test_at_rest_and_in_gaps_nothing_is_said(heavy):
 
 
 def test_windows_do_not_reach_across_gaps(heavy):
-    watcher = watch.Watcher(heavy)
-    rows = np.zeros(10, dtype=watch.SAMPLE)
+    watcher = Monitor(heavy)
+    rows = np.zeros(10, dtype=SAMPLE)
     rows["t"] = np.arange(10)
     demands: list[tuple[float, Array]] = [(0.0, np.zeros(6))]
     assert watcher.take(rows[:4], demands) is None
@@ -152,8 +154,8 @@ def test_windows_do_not_reach_across_gaps(heavy):
 @pytest.mark.parametrize("batch", [1, 3, 7])
 def test_a_bag_that_starts_again_starts_a_window(heavy, batch, told_first):
     """What was demanded before the clock jumped back belongs to no window after it."""
-    watcher = watch.Watcher(heavy)
-    rows = np.zeros(20, dtype=watch.SAMPLE)
+    watcher = Monitor(heavy)
+    rows = np.zeros(20, dtype=SAMPLE)
     rows["t"] = [*np.arange(100.0, 104.0, 0.5), *np.arange(1.0, 7.0, 0.5)]
     rows["restart"][8] = True
     again = [(t, np.ones(6)) for t in np.arange(0.5, 7.0, 0.25)]

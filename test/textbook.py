@@ -9,11 +9,12 @@ import itertools
 
 import numpy as np
 
-from rov_ident import sensors
-from rov_ident.frames import quaternion_to_matrix
-from rov_ident.model import skew
-from rov_ident.samples import SAMPLE
-from rov_ident.simulate import simulate
+from rov_ident.core.frames import quaternion_to_matrix
+from rov_ident.model.equations import skew
+from rov_ident.sampling import records
+from rov_ident.sampling.sample import SAMPLE
+from rov_ident.simulation import virtual_sensors as sensors
+from rov_ident.simulation.open_loop import simulate
 
 # ------------------------------------------------------------------ configurations
 
@@ -167,18 +168,18 @@ def runge_kutta(f, t, x, dt):
 # ------------------------------------------------------------------ observer
 
 
-def innovations(config, theta, rows, adapted, gains=None):
+def innovations(config, theta, rows, densities, gains=None):
     """Innovations (k,), their variances (k,) and gains of an extended Kalman filter of nu.
 
-    Linear velocities and gyro are taken one after the other where they are measured; ``adapted``
-    holds, for each row, the density (6,) of the process noise and the factor (6,) on the variances.
-    Given ``gains``, the covariance is not needed, and these are used.
+    Linear velocities and gyro are taken one after the other where they are measured; ``densities``
+    holds, for each row, that (6,) of the process noise. Given ``gains``, the covariance is not
+    needed, and these are used.
     """
     model, wrench = config.model, config.wrench
     nu, p = rows[0]["nu"].copy(), np.diag(rows[0]["odometry_variance"])
     inverse = np.linalg.inv(model.with_theta(theta).mass_matrix)
     e, s, used = [], [], []
-    for row, (density, factor) in zip(rows[1:], adapted[1:], strict=True):
+    for row, density in zip(rows[1:], densities[1:], strict=True):
         dt = row["dt"]
 
         def rate(t, nu, row=row, dt=dt):
@@ -204,7 +205,7 @@ def innovations(config, theta, rows, adapted, gains=None):
                 continue
             if gains is None:
                 r = row["odometry_variance"][i] if i < 3 else row["gyro_variance"]
-                total = p[i, i] + r * max(factor[i], 1.0)
+                total = p[i, i] + r
                 gain = p[:, i] / total
                 p = p - np.outer(gain, p[i])
             else:
@@ -265,7 +266,7 @@ def prior_and_samples(config, seeds, duration):
         return out
     for seed in seeds:
         run = sensors.dive(config, "steps", duration, seed=seed)
-        parts = list(sensors.samples_of(config, run))
+        parts = list(records.samples_of(config, run))
         rng = np.random.default_rng(1000 + seed)
         factors = np.clip(1.0 + 0.2 * rng.standard_normal(len(config.model.theta)), 0.4, 1.6)
         out.append((off(config, factors), np.concatenate(parts)))

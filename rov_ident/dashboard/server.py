@@ -16,13 +16,13 @@ from typing import Any
 
 from aiohttp import WSCloseCode, web
 
+from rov_ident.core.errors import UserError
 from rov_ident.dashboard.store import Store
-from rov_ident.errors import UserError
 
 HOST = "127.0.0.1"
-PERIOD = 0.5  # s; between two messages to a page
-CLIENTS = 16  # pages open at a time
-_PATIENCE = 10.0  # s; for a page to take a message
+PERIOD = 0.5  # s; between two messages to a page: curves that look alive, at little cost
+CLIENTS = 16  # pages open at a time; each costs a message every PERIOD
+_PATIENCE = 10.0  # s; for a page to take a message, twenty times PERIOD
 _LEAVE = 0.5  # s; for a page to answer that it is closed
 _LARGEST = 4096  # bytes of a message to us, of which there should be none
 _PAGE = files("rov_ident.dashboard") / "page"
@@ -32,7 +32,7 @@ _FILES = {
     "/page.js": ("page.js", "text/javascript"),
 }
 NAMES = (HOST, "localhost")
-"""What this computer is called by those who may ask."""
+"""The names of this computer that a request may give."""
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -43,7 +43,7 @@ PAGES: web.AppKey[set[web.WebSocketResponse]] = web.AppKey("pages")
 
 def application(store: Store, port: int) -> web.Application:
     """The page at `/`, the state at `/state.json`, what is new at `/live` (web socket)."""
-    app = web.Application(middlewares=[guard(port, _own_origins(port))], client_max_size=_LARGEST)
+    app = web.Application(middlewares=[_guard(port)], client_max_size=_LARGEST)
     app[PORT], app[STORE] = port, store
     app[PAGES] = set()
     app.on_response_prepare.append(_protect)
@@ -55,17 +55,13 @@ def application(store: Store, port: int) -> web.Application:
     return app
 
 
-def _own_origins(port: int) -> Callable[[str], bool]:
-    return {f"http://{name}:{port}" for name in NAMES}.__contains__
+def _guard(port: int) -> Any:
+    """Middleware that answers only requests to this computer by its name, of our own origin.
 
-
-def guard(port: int, may: Callable[[str], bool], cross_site: bool = False) -> Any:
-    """Middleware that answers only those who ask this computer by its name and whose origin may.
-
-    Browsers give the origin of every web socket; programs need not. Without ``cross_site`` no other
-    page gets anything, whatever it claims to be.
+    Browsers give the origin of every web socket; programs need not.
     """
     hosts = {f"{name}:{port}" for name in NAMES}
+    origins = {f"http://{host}" for host in hosts}
 
     @web.middleware
     async def check(request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -73,10 +69,10 @@ def guard(port: int, may: Callable[[str], bool], cross_site: bool = False) -> An
         if len(hosts_given) != 1 or hosts_given[0].lower() not in hosts:
             raise web.HTTPMisdirectedRequest(text="ask for http://localhost or 127.0.0.1\n")
         site = request.headers.get("Sec-Fetch-Site", "none")
-        foreign = not cross_site and site not in ("none", "same-origin")
+        foreign = site not in ("none", "same-origin")
         if request.headers.get("Sec-Fetch-Mode") == "navigate":
-            foreign = False  # a link may lead here
-        if foreign or not all(may(origin) for origin in request.headers.getall("Origin", [])):
+            foreign = False  # a link on another page may lead here
+        if foreign or not origins.issuperset(request.headers.getall("Origin", [])):
             raise web.HTTPForbidden(text="not for other pages\n")
         return await handler(request)
 
@@ -112,7 +108,7 @@ async def _state(request: web.Request) -> web.Response:
 
 
 async def _live(request: web.Request) -> web.StreamResponse:
-    """All that there is, then what is new; a page that is slow gets fewer messages."""
+    """Send the whole state, then what is new; a page that is slow gets fewer messages."""
     pages = request.app[PAGES]
     if len(pages) >= CLIENTS:
         raise web.HTTPServiceUnavailable(text=f"{CLIENTS} pages are open: close one\n")
@@ -124,7 +120,7 @@ async def _live(request: web.Request) -> web.StreamResponse:
         await page.prepare(request)
         sender = asyncio.create_task(_send(page, request.app[STORE]))
         try:
-            async for _ in page:  # only to hear that it closes: there is nothing to ask for
+            async for _ in page:  # only to notice that it closes: nothing can be asked for
                 await page.close(code=WSCloseCode.POLICY_VIOLATION, message=b"read only")
         finally:
             sender.cancel()
@@ -160,37 +156,21 @@ def _to_json(state: Any) -> str:
 async def serving(store: Store, port: int) -> AsyncIterator[str]:
     """Serves within the block; gives the address. Port 0: any that is free.
 
-    Raises
-    ------
-    UserError
-        If the port is taken.
+    Raises UserError if the port is taken.
     """
-    async with listening(lambda port: application(store, port), port) as port:
-        yield f"http://{HOST}:{port}/"
-
-
-@contextlib.asynccontextmanager
-async def listening(make: Callable[[int], web.Application], port: int) -> AsyncIterator[int]:
-    """Serves an application, made for the port that it gets, on 127.0.0.1 within the block."""
-    with contextlib.closing(_listen(port)) as open_socket:
-        port = open_socket.getsockname()[1]
-        runner = web.AppRunner(make(port), access_log=None, shutdown_timeout=2.0)
+    with socket.socket() as own:
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            own.bind((HOST, port))
+        except OSError as error:
+            raise UserError(
+                f"port {port} cannot be used ({error.strerror}): give another one, or 0 for any"
+            ) from None
+        port = own.getsockname()[1]
+        runner = web.AppRunner(application(store, port), access_log=None, shutdown_timeout=2.0)
         await runner.setup()
         try:
-            await web.SockSite(runner, open_socket).start()
-            yield port
+            await web.SockSite(runner, own).start()
+            yield f"http://{HOST}:{port}/"
         finally:
             await runner.cleanup()
-
-
-def _listen(port: int) -> socket.socket:
-    open_socket = socket.socket()
-    open_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        open_socket.bind((HOST, port))
-    except OSError as error:
-        open_socket.close()
-        raise UserError(
-            f"port {port} cannot be used ({error.strerror}): give another one, or 0 for any"
-        ) from None
-    return open_socket

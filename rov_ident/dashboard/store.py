@@ -1,4 +1,4 @@
-"""What has been heard of every estimator, and what of it a page has not seen yet.
+"""What every estimator has published, and which part of it a page has not seen yet.
 
 A store is filled by one thread and read by others.
 """
@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident.messages import Array
-from rov_ident.online import Report
+from rov_ident.core.messages import Array
+from rov_ident.estimation.online import Report
 
-POINTS = 600  # of a coefficient's history: more than a picture has room for
-BIN = 0.5  # s of residuals drawn as one
+POINTS = 600  # of a coefficient's history: more than a picture has pixels
+BIN = 0.5  # s of residuals drawn as one: a pixel or two
 BINS = 240  # two minutes
 DIGITS = 6  # significant; a picture shows three
-GONE = 3.0  # s without a message of its own after which an estimator is called silent
+GONE = 3.0  # s without a message after which an estimator is silent: three of its /diagnostics
 
 Mark = tuple[int, int]
 """What a reader has of a series: (epoch, rows)."""
@@ -67,7 +67,7 @@ class Series:
         self._epoch += 1
 
     def since(self, mark: Mark | None) -> tuple[bool, list[Any], Mark]:
-        """Whether to begin anew, the rows that are new, and the mark to come back with."""
+        """Whether to start again, the new rows, and the mark for the next call."""
         now = (self._epoch, self._gone + len(self._rows))
         if mark is None or mark[0] != self._epoch:
             return True, list(self._rows), now
@@ -112,7 +112,7 @@ class Store:
     # ---------------------------------------------------------------- in
 
     def add(self, name: str) -> None:
-        """An estimator is there, even if it has not spoken yet."""
+        """An estimator exists, even if it has not published yet."""
         with self._lock:
             self._estimators.setdefault(name, Estimator(name))
 
@@ -123,7 +123,7 @@ class Store:
                 known.names, known.correlation = report.names, None
                 known.history.clear()
             known.vehicle, known.report, known.heard = vehicle, report, self._now()
-            # The reports of a node that gets no messages are all of one time.
+            # A node without messages repeats its report with the same stamp.
             t = report.stamp * 1e-9
             last = known.history.last
             if report.stamp and (last is None or last[0] != t):
@@ -164,7 +164,7 @@ class Store:
 
     @property
     def known(self) -> dict[str, int]:
-        """Of every estimator that is there, how many kinds of messages were heard."""
+        """For every estimator, how many kinds of messages were received."""
         with self._lock:
             return {
                 name: len(known.statuses) + (known.report is not None)
@@ -173,7 +173,7 @@ class Store:
 
     @property
     def reports(self) -> dict[str, tuple[Estimator, float]]:
-        """Of every estimator that has spoken: itself, and the seconds since its last report."""
+        """Every estimator that has published, and the seconds since its last report."""
         with self._lock:
             now = self._now()
             return {
@@ -183,7 +183,7 @@ class Store:
             }
 
     def changes(self, marks: Mapping[str, Sequence[Mark]] | None = None) -> tuple[Any, Any]:
-        """The present state, with what is new since ``marks``; and the marks to come back with.
+        """The present state, with what is new since ``marks``; and the marks for the next call.
 
         The state is plain data for JSON: no number that is not finite.
         """
@@ -219,6 +219,7 @@ def _described(report: Report | None) -> dict[str, Any]:
         "stamp": report.stamp * 1e-9,
         "names": list(report.names),
         "units": list(report.units),
+        "states": [state.value for state in report.states],
         "levels": [int(level) for level in report.levels],
         "messages": list(report.messages),
         **{

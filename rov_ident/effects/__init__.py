@@ -1,10 +1,12 @@
-"""What a simulation may lack: one file an effect, found by being in this folder.
+"""What a simulation may lack: one file for each effect, found because it is in this folder.
 
-The kernels below run through all effects of a place; :func:`compiled` makes their arguments from
-the section ``effects`` of a configuration.
+Knows equations and no data: effects on the input, the motion, the wrench and the rigid body. The
+kernels below run all effects of one place; :func:`compiled` makes their arguments from the section
+``effects`` of a configuration.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any, NamedTuple, cast
@@ -12,12 +14,12 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.core.jit import inlined, kernel, lean
 from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
-from rov_ident.jit import inlined, kernel, lean
-from rov_ident.model import RigidBody, add_current
+from rov_ident.model.equations import RigidBody, add_current
 
 EFFECTS: dict[str, Effect] = {
-    module.name: import_module(f"{__name__}.{module.name}").EFFECT
+    module.name: replace(import_module(f"{__name__}.{module.name}").EFFECT, name=module.name)
     for module in iter_modules(__path__)
     if module.name != "base"
 }
@@ -159,20 +161,20 @@ def estimable(name: str) -> dict[str, float | None]:
 
 
 def memory() -> Array:
-    """The state of all input effects before the first demand."""
+    """The state of all input effects before the first command."""
     return np.zeros((len(_INPUT), MEMORY))
 
 
 @lean
 def act(acting, state, t, dt, wrench):
-    """wrench (6,), demanded from t to t + dt, becomes the mean of what acts in that time."""
+    """wrench (6,), commanded from t to t + dt, becomes the mean of what acts in that time."""
     _ALL_ACTS(0, acting.inputs, acting.input_parameters, state, t, dt, wrench)
 
 
 @kernel
-def acted(acting, t, demand):
-    """The wrench (N, 6) that acts on average from each t (N,) to the next, of the one demanded."""
-    out, state = demand.copy(), np.zeros((len(acting.inputs), MEMORY))
+def acted(acting, t, command):
+    """The wrench (N, 6) that acts on average from each t (N,) to the next, for a command (N, 6)."""
+    out, state = command.copy(), np.zeros((len(acting.inputs), MEMORY))
     for k in range(len(t)):
         dt = t[k + 1] - t[k] if k + 1 < len(t) else 0.0
         act(acting, state, t[k], dt, out[k])
@@ -197,7 +199,7 @@ def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotat
 
     ``around`` and ``current`` are of :func:`surroundings`; ``structure``, ``added_mass`` (6, 6, 1)
     and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world;
-    s is a record of :data:`rov_ident.model.CURRENT`, work space.
+    s is a record of :data:`rov_ident.model.equations.CURRENT`, work space.
     """
     if current is None:  # numba leaves out what is not so
         add_wrenches(around, t, nu, rotation, out)

@@ -1,15 +1,15 @@
-"""Demands act later: ``acting(t) = demand(t - delay)``.
+"""Commands act later: ``acting(t) = command(t - delay)``.
 
-Exact for demands that are held between calls: what is returned is the mean of the past demands over
-the step, each for as long as it acted. The first demand is taken to have acted for long.
+Exact for commands that are held between calls: what is returned is the mean of the past commands
+over the step, each for as long as it acted. The first command is taken to have acted for long.
 """
 
+from rov_ident.core.jit import kernel
 from rov_ident.effects.base import MEMORY, Effect, EffectParameter
-from rov_ident.jit import kernel
 
 _ROOM = (MEMORY - 1) // 7
-# of past demands, each with its instant: half a second of changes at 290 Hz. With more of them the
-# oldest is forgotten, as if the next one had acted in its place.
+# Past commands with their instants: half a second of changes at 290 Hz. Beyond that the oldest is
+# forgotten, as if the next one had acted in its place.
 
 
 @kernel
@@ -17,7 +17,7 @@ def act(p, state, t, dt, wrench):
     delay = p[0]
     if delay <= 0.0:
         return
-    queue = state[1 : 1 + 7 * _ROOM].reshape(_ROOM, 7)  # instant, demand; oldest first
+    queue = state[1 : 1 + 7 * _ROOM].reshape(_ROOM, 7)  # instant, command; oldest first
     count = int(state[0])
     new = count == 0
     for i in range(6):
@@ -55,12 +55,11 @@ def _forget(queue, entries, count):
 
 
 EFFECT = Effect(
-    name="actuation_delay",
     place="input",
-    summary="The thrusters follow their demand a little later.",
+    summary="The thrusters follow their command a little later.",
     manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
-    parameters=(EffectParameter("delay", "s", "time from demand to thrust", 0.0, 0.0, 0.5, 0.05),),
+    parameters=(EffectParameter("delay", "s", "from command to thrust", 0.0, 0.0, 0.5, 0.05),),
     act=act,
     order=10,
 )

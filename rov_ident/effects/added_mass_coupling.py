@@ -7,7 +7,6 @@ terms come with it.
 from rov_ident.effects.base import Effect
 
 EFFECT = Effect(
-    name="added_mass_coupling",
     place="wrench",
     summary="Accelerating along one axis takes force along another.",
     manoeuvre="quick reversals of thrust on one axis at a time, from rest",

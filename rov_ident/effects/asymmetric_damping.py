@@ -6,7 +6,6 @@
 from rov_ident.effects.base import Effect
 
 EFFECT = Effect(
-    name="asymmetric_damping",
     place="wrench",
     summary="Drag backwards, to port or upwards is not that of the other direction.",
     manoeuvre="the same thrust both ways along the axis, then coasting to rest",

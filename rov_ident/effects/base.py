@@ -16,7 +16,7 @@ An effect says what it does by exactly one of these, each in the file of the eff
 ``water``
     ``water(**parameters) -> (3,)``: the velocity of the water in the world [m/s].
 ``act``
-    A kernel ``act(p, state, t, dt, wrench)``: on entry ``wrench`` (6,) is demanded from ``t`` to
+    A kernel ``act(p, state, t, dt, wrench)``: on entry ``wrench`` (6,) is commanded from ``t`` to
     ``t + dt``, on return it holds the mean of what acts meanwhile. ``state`` (:data:`MEMORY`,) is
     the effect's own, all zeros before the first call. Effects act in the order of ``order``.
 ``sense``
@@ -36,6 +36,9 @@ Array = NDArray[np.float64]
 
 SIZE = 8
 """The most parameters that a kernel takes."""
+
+Role = Literal["amplitude", "place", "onset", "frequency", "phase", "fixed"]
+Axes = tuple[str, str, str]
 
 MEMORY = 1024
 """Numbers that an input effect may keep from one call to the next."""
@@ -68,35 +71,41 @@ class EffectParameter:
     upper: float
     typical: float
     axis: str = ""  # of a parameter that belongs to one axis of X Y Z K M N
-    role: Literal["amplitude", "place", "onset", "frequency", "phase", "fixed"] = "amplitude"
+    role: Role = "amplitude"
 
 
 def per_axis(
-    prefix: str,
-    meaning: str,
-    null: float,
-    lower: float,
-    upper: float,
-    typical: float,
-    units: tuple[str, str] = ("1", "1"),
-    moment: float = 1.0,
-) -> tuple[EffectParameter, ...]:
+    prefix: str, meaning: str, null: float, lower: float, upper: float, typical: float,
+    units: tuple[str, str] = ("1", "1"), moment: float = 1.0,
+) -> tuple[EffectParameter, ...]:  # fmt: skip
     """One parameter for each axis (``gain_X`` ... ``gain_N``), ``units`` of forces and moments.
 
     ``moment`` is what a typical size is multiplied by on K, M and N.
     """
+    sizes = [(axis, units[0], typical) for axis in "XYZ"]
+    sizes += [(axis, units[1], typical * moment) for axis in "KMN"]
     return tuple(
         EffectParameter(
-            f"{prefix}_{axis}",
-            units[axis in "KMN"],
-            f"{meaning} of {axis}",
-            null,
-            lower,
-            upper,
-            typical * (moment if axis in "KMN" else 1.0),
-            axis,
+            f"{prefix}_{axis}", unit, f"{meaning} of {axis}", null, lower, upper, size, axis
         )
-        for axis in "XYZKMN"
+        for axis, unit, size in sizes
+    )
+
+
+FRD, NED = ("forward", "starboard", "down"), ("north", "east", "down")
+ONSET = EffectParameter(
+    "onset", "s", "when, since the first message", 0.0, 0.0, 1e6, 60.0, role="onset"
+)
+
+
+def vector(
+    names: str, unit: str, meaning: str, limit: float, typical: float, axes: Axes = FRD,
+    role: Role = "amplitude",
+) -> tuple[EffectParameter, ...]:  # fmt: skip
+    """One parameter for each component along the ``axes``: null 0, between -limit and limit."""
+    return tuple(
+        EffectParameter(name, unit, f"{meaning} {axis}", 0.0, -limit, limit, typical, role=role)
+        for name, axis in zip(names.split(), axes, strict=True)
     )
 
 
@@ -104,7 +113,7 @@ def per_axis(
 class Effect:
     """An effect of the library; see the module for the hooks, of which each has exactly one.
 
-    ``place`` is where it enters: the *input* (between the demanded and the acting wrench), the
+    ``place`` is where it enters: the *input* (between the commanded and the acting wrench), the
     *motion* (between the motion through the water and what is measured) or the *wrench*.
     ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
     effect that does nearly the same and that every vehicle has: this one is looked for only in a
@@ -112,11 +121,11 @@ class Effect:
     from if it has been there from the start.
     """
 
-    name: str
     place: Literal["input", "motion", "wrench"]
     summary: str
     source: str
     manoeuvre: str
+    name: str = ""  # that of its file
     parameters: tuple[EffectParameter, ...] = ()
     coefficients: tuple[str, ...] = ()
     beyond: str = ""

@@ -3,8 +3,8 @@
 The loss is reached ``duration`` seconds after the first message, and stays.
 """
 
+from rov_ident.core.jit import kernel
 from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.jit import kernel
 
 
 @kernel
@@ -22,15 +22,12 @@ def act(p, state, t, dt, wrench):
 
 
 EFFECT = Effect(
-    name="battery_sag",
     place="input",
     summary="Thrust fades evenly while the battery runs down.",
     manoeuvre="the same steps of thrust at the beginning, in the middle and at the end",
     source="Blue Robotics, T200 thruster, performance charts: thrust over supply voltage",
     parameters=(
-        EffectParameter(
-            "end_loss", "1", "share of the thrust lost in the end", 0.0, -1.0, 1.0, 0.1
-        ),
+        EffectParameter("end_loss", "1", "share of thrust lost in the end", 0.0, -1.0, 1.0, 0.1),
         EffectParameter("duration", "s", "time until then", 180.0, 1.0, 1e6, 180.0, role="fixed"),
     ),
     act=act,

@@ -6,7 +6,7 @@ World z points down (NED), so that a positive delta is buoyancy lost: ``B - delt
 import dataclasses
 
 from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.model import RigidBody
+from rov_ident.model.equations import RigidBody
 
 
 def body(rigid_body: RigidBody, delta: float) -> RigidBody:
@@ -14,15 +14,10 @@ def body(rigid_body: RigidBody, delta: float) -> RigidBody:
 
 
 EFFECT = Effect(
-    name="buoyancy",
     place="wrench",
     summary="The buoyancy is not the configured one: fresh water, ballast, trapped air.",
     manoeuvre="drifting without thrust, level, then pitched and rolled by thrust moments",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
-    parameters=(
-        EffectParameter(
-            "delta", "N", "force down, taken off vehicle.buoyancy", 0.0, -1e5, 1e5, 2.0
-        ),
-    ),
+    parameters=(EffectParameter("delta", "N", "buoyancy lost", 0.0, -1e5, 1e5, 2.0),),
     body=body,
 )

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.model import RigidBody
+from rov_ident.effects.base import Effect, vector
+from rov_ident.model.equations import RigidBody
 
 
 def body(rigid_body: RigidBody, dx: float, dy: float, dz: float) -> RigidBody:
@@ -13,15 +13,10 @@ def body(rigid_body: RigidBody, dx: float, dy: float, dz: float) -> RigidBody:
 
 
 EFFECT = Effect(
-    name="cog_offset",
     place="wrench",
     summary="The centre of gravity is not where it is configured.",
     manoeuvre="drifting without thrust at different roll and pitch angles",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, ch. 3, 4",
-    parameters=(
-        EffectParameter("dx", "m", "added to vehicle.cog, forward", 0.0, -1.0, 1.0, 0.01),
-        EffectParameter("dy", "m", "added to vehicle.cog, starboard", 0.0, -1.0, 1.0, 0.01),
-        EffectParameter("dz", "m", "added to vehicle.cog, down", 0.0, -1.0, 1.0, 0.01),
-    ),
+    parameters=vector("dx dy dz", "m", "added to vehicle.cog", 1.0, 0.01),
     body=body,
 )

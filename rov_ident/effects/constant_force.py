@@ -5,8 +5,8 @@ A pull of the umbilical in one direction, a weight forgotten on the frame (``fz`
 Source: Fossen (2021), sec. 10.2: slowly varying environmental forces as a bias in the world frame.
 """
 
-from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.jit import kernel
+from rov_ident.core.jit import kernel
+from rov_ident.effects.base import NED, Effect, vector
 
 
 @kernel
@@ -17,15 +17,10 @@ def wrench(p, t, nu, rotation, out):
 
 
 EFFECT = Effect(
-    name="constant_force",
     place="wrench",
     summary="A constant force, fixed in the world, pulls at the body origin.",
     manoeuvre="drifting without thrust at headings 90 degrees apart",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.2",
-    parameters=(
-        EffectParameter("fx", "N", "force north", 0.0, -1e5, 1e5, 2.0),
-        EffectParameter("fy", "N", "force east", 0.0, -1e5, 1e5, 2.0),
-        EffectParameter("fz", "N", "force down", 0.0, -1e5, 1e5, 2.0),
-    ),
+    parameters=vector("fx fy fz", "N", "force", 1e5, 2.0, NED),
     wrench=wrench,
 )

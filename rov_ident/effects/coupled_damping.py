@@ -7,7 +7,6 @@ other, and surge, heave and pitch; nothing couples the two groups.
 from rov_ident.effects.base import Effect
 
 EFFECT = Effect(
-    name="coupled_damping",
     place="wrench",
     summary="Motion along one axis drags along another: the hull is not symmetric.",
     manoeuvre="steady motion along one axis at a time, both ways, the others free",

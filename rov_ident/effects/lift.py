@@ -7,14 +7,10 @@ come from the added mass are in the equations of motion already; these are beyon
 from rov_ident.effects.base import Effect
 
 EFFECT = Effect(
-    name="lift",
     place="wrench",
     summary="Hull and fins lift when they meet the flow at an angle while moving ahead.",
     manoeuvre="steady runs ahead while swaying, heaving or turning, at two speeds ahead",
     source="Prestero (2001), Verification of a six-degree of freedom simulation model for the "
     "REMUS autonomous underwater vehicle, MIT, ch. 4",
-    coefficients=(
-        *("Y_uv", "Z_uw", "M_uw", "N_uv"),
-        *("Y_ur", "Z_uq", "M_uq", "N_ur", "K_uv"),
-    ),
+    coefficients=(*("Y_uv", "Z_uw", "M_uw", "N_uv"), *("Y_ur", "Z_uq", "M_uq", "N_ur", "K_uv")),
 )

@@ -3,7 +3,6 @@
 from rov_ident.effects.base import Effect
 
 EFFECT = Effect(
-    name="linear_damping",
     place="wrench",
     summary="Drag in proportion to the velocity along an axis.",
     manoeuvre="slow runs and coasting to rest along the axis, beside the fast ones",

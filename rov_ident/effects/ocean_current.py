@@ -1,11 +1,11 @@
 """Water that moves steadily and without rotation; the equations of motion say what that does.
 
-See :func:`rov_ident.model.add_current`.
+See :func:`rov_ident.model.equations.add_current`.
 """
 
 import numpy as np
 
-from rov_ident.effects.base import Array, Effect, EffectParameter
+from rov_ident.effects.base import NED, Array, Effect, vector
 
 
 def water(north: float, east: float, down: float) -> Array:
@@ -13,15 +13,10 @@ def water(north: float, east: float, down: float) -> Array:
 
 
 EFFECT = Effect(
-    name="ocean_current",
     place="motion",
     summary="The water moves: the vehicle is faster or slower through it than over ground.",
     manoeuvre="runs at headings 90 degrees apart, and drifting without thrust",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.3",
-    parameters=(
-        EffectParameter("north", "m/s", "velocity of the water, north", 0.0, -3.0, 3.0, 0.1),
-        EffectParameter("east", "m/s", "east", 0.0, -3.0, 3.0, 0.1),
-        EffectParameter("down", "m/s", "down", 0.0, -3.0, 3.0, 0.1),
-    ),
+    parameters=vector("north east down", "m/s", "velocity of the water", 3.0, 0.1, NED),
     water=water,
 )

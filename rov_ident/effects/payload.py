@@ -4,9 +4,9 @@
 a small ROV carries has little beside the vehicle and its added mass.
 """
 
-from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.jit import kernel
-from rov_ident.model import GRAVITY
+from rov_ident.core.jit import kernel
+from rov_ident.effects.base import ONSET, Effect, EffectParameter, vector
+from rov_ident.model.equations import GRAVITY
 
 
 @kernel
@@ -21,7 +21,6 @@ def wrench(p, t, nu, rotation, out):
 
 
 EFFECT = Effect(
-    name="payload",
     place="wrench",
     summary="Something heavy (or buoyant) is taken up at a time, or was there from the start.",
     lasting=("buoyancy", "cog_offset", "constant_force"),
@@ -29,21 +28,8 @@ EFFECT = Effect(
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
     parameters=(
         EffectParameter("mass_wet", "kg", "mass less that of the water", 0.0, -1e4, 1e4, 0.3),
-        EffectParameter(
-            "x",
-            "m",
-            "where it hangs, forward of the body origin",
-            0.0,
-            -5.0,
-            5.0,
-            0.1,
-            role="place",
-        ),
-        EffectParameter("y", "m", "to starboard", 0.0, -5.0, 5.0, 0.1, role="place"),
-        EffectParameter("z", "m", "below", 0.0, -5.0, 5.0, 0.1, role="place"),
-        EffectParameter(
-            "onset", "s", "when, since the first message", 0.0, 0.0, 1e6, 60.0, role="onset"
-        ),
+        *vector("x y z", "m", "where it hangs", 5.0, 0.1, role="place"),
+        ONSET,
     ),
     wrench=wrench,
 )

@@ -3,7 +3,6 @@
 from rov_ident.effects.base import Effect
 
 EFFECT = Effect(
-    name="quadratic_damping",
     place="wrench",
     summary="Drag grows with the square of the velocity along an axis.",
     manoeuvre="steady runs along the axis at two speeds at least, the higher twice the lower",

@@ -3,8 +3,8 @@
 R, from roll, pitch and yaw as those of an attitude, turns sensor axes into body axes.
 """
 
+from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
 from rov_ident.effects.base import Effect, EffectParameter, Reading
-from rov_ident.frames import quaternion_from_euler, quaternion_to_matrix
 
 
 def sense(reading: Reading, roll: float, pitch: float, yaw: float) -> Reading:
@@ -18,18 +18,15 @@ def correct(reading: Reading, roll: float, pitch: float, yaw: float) -> Reading:
 
 
 EFFECT = Effect(
-    name="sensor_misalignment",
     place="motion",
     summary="The velocity sensor is mounted at an angle to the body.",
     manoeuvre="straight runs ahead, to the side and down, with a position fix",
     source="Kinsey, Whitcomb (2007), In situ alignment calibration of attitude and Doppler sensors "
     "for precision underwater vehicle navigation, IEEE J. Oceanic Eng. 32(2)",
     parameters=(
-        EffectParameter(
-            "roll", "rad", "of the sensor axes from the body axes", 0.0, -3.2, 3.2, 0.05
-        ),
-        EffectParameter("pitch", "rad", "of the sensor axes", 0.0, -1.6, 1.6, 0.05),
-        EffectParameter("yaw", "rad", "of the sensor axes", 0.0, -3.2, 3.2, 0.05),
+        EffectParameter("roll", "rad", "of sensor axes from body axes", 0.0, -3.2, 3.2, 0.05),
+        EffectParameter("pitch", "rad", "of sensor axes from body axes", 0.0, -1.6, 1.6, 0.05),
+        EffectParameter("yaw", "rad", "of sensor axes from body axes", 0.0, -3.2, 3.2, 0.05),
     ),
     sense=sense,
     correct=correct,

@@ -5,8 +5,8 @@
 
 import math
 
-from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.jit import kernel
+from rov_ident.core.jit import kernel
+from rov_ident.effects.base import Effect, EffectParameter, vector
 
 
 @kernel
@@ -26,7 +26,6 @@ def wrench(p, t, nu, rotation, out):
 
 
 EFFECT = Effect(
-    name="tether_drag",
     place="wrench",
     summary="The tether drags at its point of attachment.",
     beyond="quadratic_damping",
@@ -35,11 +34,7 @@ EFFECT = Effect(
     "dynamics of an underwater flight vehicle, Ocean Engineering 31",
     parameters=(
         EffectParameter("k", "N s2/m2", "drag of the tether", 0.0, 0.0, 1e4, 10.0),
-        EffectParameter(
-            "x", "m", "attachment, forward of the body origin", 0.0, -5.0, 5.0, 0.2, role="place"
-        ),
-        EffectParameter("y", "m", "to starboard", 0.0, -5.0, 5.0, 0.2, role="place"),
-        EffectParameter("z", "m", "below", 0.0, -5.0, 5.0, 0.2, role="place"),
+        *vector("x y z", "m", "attachment", 5.0, 0.2, role="place"),
     ),
     wrench=wrench,
 )

@@ -1,7 +1,7 @@
-"""Thrusters are weaker (or stronger) astern: a factor on negative demand on each axis."""
+"""Thrusters are weaker (or stronger) astern: a factor on a negative command of each axis."""
 
+from rov_ident.core.jit import kernel
 from rov_ident.effects.base import Effect, per_axis
-from rov_ident.jit import kernel
 
 
 @kernel
@@ -12,14 +12,13 @@ def act(p, state, t, dt, wrench):
 
 
 EFFECT = Effect(
-    name="thruster_asymmetry",
     place="input",
-    summary="The thrusters give another share of a negative demand than of a positive one.",
+    summary="The thrusters give another share of a negative command than of a positive one.",
     manoeuvre="quick steps of equal thrust ahead and astern along the axis, from rest",
     source="Yoerger, Cooke, Slotine (1990), The influence of thruster dynamics on underwater "
     "vehicle behavior and their incorporation into control system design, "
     "IEEE J. Oceanic Eng. 15(3)",
-    parameters=per_axis("gain", "factor on a negative demand", 1.0, 0.0, 5.0, 0.1),
+    parameters=per_axis("gain", "factor on a negative command", 1.0, 0.0, 5.0, 0.1),
     act=act,
     order=30,
 )

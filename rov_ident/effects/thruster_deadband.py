@@ -1,7 +1,7 @@
-"""Small demands do nothing: ``sign(d) max(|d| - width, 0)`` on each axis."""
+"""Small commands do nothing: ``sign(c) max(|c| - width, 0)`` on each axis."""
 
+from rov_ident.core.jit import kernel
 from rov_ident.effects.base import Effect, per_axis
-from rov_ident.jit import kernel
 
 
 @kernel
@@ -16,9 +16,8 @@ def act(p, state, t, dt, wrench):
 
 
 EFFECT = Effect(
-    name="thruster_deadband",
     place="input",
-    summary="Small demands do nothing, and larger ones lack that much.",
+    summary="Small commands do nothing, and larger ones lack that much.",
     manoeuvre="small steps of thrust either way around zero, from rest, beside large ones",
     source="Yoerger, Cooke, Slotine (1990), The influence of thruster dynamics on underwater "
     "vehicle behavior and their incorporation into control system design, "

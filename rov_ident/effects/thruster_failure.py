@@ -1,7 +1,7 @@
-"""A thruster fails at a time: from then on the demand of each axis is met by a factor only."""
+"""A thruster fails at a time: from then on each axis gives only a share of its command."""
 
-from rov_ident.effects.base import Effect, EffectParameter, per_axis
-from rov_ident.jit import kernel
+from rov_ident.core.jit import kernel
+from rov_ident.effects.base import ONSET, Effect, per_axis
 
 
 @kernel
@@ -15,7 +15,6 @@ def act(p, state, t, dt, wrench):
 
 
 EFFECT = Effect(
-    name="thruster_failure",
     place="input",
     summary="From a time on, a part of the thrust is missing.",
     lasting=("thruster_gain",),
@@ -23,10 +22,8 @@ EFFECT = Effect(
     source="Sarkar, Podder, Antonelli (2002), Fault-accommodating thruster force allocation of an "
     "AUV considering thruster redundancy and saturation, IEEE Trans. Robotics and Automation 18(2)",
     parameters=(
-        *per_axis("gain", "factor after the failure, on the demand", 1.0, 0.0, 5.0, 0.2),
-        EffectParameter(
-            "onset", "s", "when, since the first message", 0.0, 0.0, 1e6, 60.0, role="onset"
-        ),
+        *per_axis("gain", "factor after the failure, on the command", 1.0, 0.0, 5.0, 0.2),
+        ONSET,
     ),
     act=act,
     order=42,

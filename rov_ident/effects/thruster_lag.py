@@ -1,14 +1,14 @@
-"""First-order lag between the demanded and the acting wrench.
+"""First-order lag between the commanded and the acting wrench.
 
-``T d(acting)/dt = demand - acting``, solved exactly for a demand held during the step. The mean
-over the step is returned, so that the impulse is right however long the step is. The first demand
+``T d(acting)/dt = command - acting``, solved exactly for a command held during the step. The mean
+over the step is returned, so that the impulse is right however long the step is. The first command
 is taken to have acted for long.
 """
 
 import math
 
+from rov_ident.core.jit import kernel
 from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.jit import kernel
 
 
 @kernel
@@ -29,14 +29,11 @@ def act(p, state, t, dt, wrench):
 
 
 EFFECT = Effect(
-    name="thruster_lag",
     place="input",
-    summary="The thrusters follow their demand with a first-order lag, the same on every axis.",
+    summary="The thrusters follow their command with a first-order lag, the same on every axis.",
     manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
-    parameters=(
-        EffectParameter("time_constant", "s", "time constant of the lag", 0.0, 0.0, 3.0, 0.1),
-    ),
+    parameters=(EffectParameter("time_constant", "s", "of the lag", 0.0, 0.0, 3.0, 0.1),),
     act=act,
     order=50,
 )

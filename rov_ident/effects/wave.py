@@ -6,8 +6,8 @@ the wavelength.
 
 import math
 
-from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.jit import kernel
+from rov_ident.core.jit import kernel
+from rov_ident.effects.base import NED, Effect, EffectParameter, vector
 
 
 @kernel
@@ -19,19 +19,14 @@ def wrench(p, t, nu, rotation, out):
 
 
 EFFECT = Effect(
-    name="wave",
     place="wrench",
     summary="Waves push back and forth with one frequency.",
     manoeuvre="keeping station without thrust for ten periods, at two headings",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.2",
     parameters=(
-        EffectParameter("fx", "N", "amplitude north", 0.0, -1e5, 1e5, 3.0),
-        EffectParameter("fy", "N", "amplitude east", 0.0, -1e5, 1e5, 3.0),
-        EffectParameter("fz", "N", "amplitude down", 0.0, -1e5, 1e5, 3.0),
+        *vector("fx fy fz", "N", "amplitude", 1e5, 3.0, NED),
         EffectParameter("frequency", "Hz", "frequency", 0.2, 0.01, 5.0, 0.2, role="frequency"),
-        EffectParameter(
-            "phase", "rad", "phase at the first message", 0.0, -6.3, 6.3, 1.0, role="phase"
-        ),
+        EffectParameter("phase", "rad", "at the first message", 0.0, -6.3, 6.3, 1.0, role="phase"),
     ),
     wrench=wrench,
 )

@@ -1,4 +1,4 @@
-"""What nodes share: how one lives and ends; topics and their quality of service."""
+"""What all nodes share: start and end of their processes, topics, quality of service."""
 
 import signal
 import sys
@@ -19,12 +19,12 @@ from sensor_msgs.msg import Imu
 
 from rov_ident import config as configuration
 from rov_ident.config import Inputs
-from rov_ident.errors import UserError
-from rov_ident.inputs import sources
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
+from rov_ident.io.topics import sources
 from rov_ident.nodes.programs import INTERRUPTS
-from rov_ident.samples import IMU, ODOMETRY, WRENCH
 
-try:  # half the cost of the other, and it keeps the order of arrival across topics
+try:  # costs half as much, and keeps the order of arrival across topics
     from rclpy.experimental import EventsExecutor as Executor
 except ImportError:
     from rclpy.executors import SingleThreadedExecutor as Executor
@@ -40,9 +40,7 @@ INPUTS = {
 }
 
 LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -50,10 +48,7 @@ STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 def subscribed(inputs: Inputs) -> dict[str, tuple[str, type]]:
     """The relative topic and the message class of every role of the configured inputs.
 
-    Raises
-    ------
-    UserError
-        If a package of messages is not installed.
+    Raises UserError if a package of messages is not installed.
     """
     found = {}
     for role, (topic, type_name) in sources(inputs).items():
@@ -78,18 +73,18 @@ def live(
 ) -> int:
     """A node's whole life, until interrupted or shut down by itself, as the program's exit status.
 
-    It is 0 then, and 2 with one sentence where the user can mend what is wrong. ``own`` are the
+    It is 0 then, and 2 with one sentence where the user can correct what is wrong. ``own`` are the
     node's parameters that are no part of a configuration. ``begin`` is called once the node is up
     and starts its threads (one that is being started when an interrupt is raised would keep the
     process for ever); it is given an event that is set by an interrupt, which does not end it.
     ``leave`` is called once the node no longer hears anything, but may still publish.
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
-    # as it is for parting words.
+    # open, so that the last messages can be published.
     interrupted = threading.Event()
 
     def interrupt(*_: object) -> None:
-        interrupted.set()  # where it is raised an exception may be ignored: in a finaliser, say
+        interrupted.set()  # the exception may be lost: one raised in a finaliser is ignored
         raise KeyboardInterrupt
 
     for number in INTERRUPTS:
@@ -122,7 +117,7 @@ def _spin(
         signal.signal(number, lambda *_: interrupted.set())
     try:
         begin(node, interrupted)
-        # EventsExecutor.spin() never comes back from an interrupt.
+        # EventsExecutor.spin() does not return after an interrupt.
         while rclpy.ok() and not interrupted.is_set():
             executor.spin_once(timeout_sec=0.5)
     finally:
@@ -145,5 +140,5 @@ def _why_unreadable(name: str, own: Collection[str], error: Exception) -> str:
             except UserError as reason:
                 return str(reason)
     if "same type" in str(error):
-        return "ROS 2 wants the numbers of a list written alike: [0.0, 0.02, 1.0], not [0, 0.02, 1]"
+        return "the numbers of a list must be written alike: [0.0, 0.02, 1.0], not [0, 0.02, 1]"
     return str(error).partition(", at ")[0]

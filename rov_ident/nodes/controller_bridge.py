@@ -9,17 +9,12 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue, SetParametersResult
-from rcl_interfaces.srv import (
-    GetParameters,
-    ListParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor
@@ -27,49 +22,50 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from rov_ident import bridge
-from rov_ident.bridge import Change, Values
-from rov_ident.config import Names, own
-from rov_ident.consumer import HydrodynamicModel
-from rov_ident.errors import UserError
+from rov_ident.config import Names
+from rov_ident.config import Parameter as Own
+from rov_ident.consumer import parameter_bridge as bridge
+from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
+from rov_ident.consumer.parameter_bridge import Change, Values
+from rov_ident.core.errors import UserError
+from rov_ident.core.states import Level
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, live
 from rov_ident.nodes.conversions import from_diagnostics, to_status
-from rov_ident.online import Level
 
-_LOOK_PERIOD = 0.5  # s; between two comparisons of controller and estimator
-_DIAGNOSTICS_PERIOD = 1.0  # s
+_LOOK_PERIOD = 0.5  # s; between two comparisons of controller and estimator: a second at most late
+_DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _THREADS = 3  # the one that waits for the controller, the one that hears its answer, and services
 
 _OWN = (
-    own("controller", str, "", "full name of the controller's node, such as /rov/velocity"),
-    own("parameter", str, "hydrodynamics.{name}", "the controller's parameter of a coefficient"),
-    own(
+    Own("controller", str, "", "full name of the controller's node, such as /rov/velocity"),
+    Own("parameter", str, "hydrodynamics.{name}", "the controller's parameter of a coefficient"),
+    Own(
         "mapping", Names, (),
         "NAME=PARAMETER, NAME=-PARAMETER or NAME=PARAMETER[INDEX]; given any, only these are sent",
     ),
-    own(
+    Own(
         "layout", str, "none", "a controller whose parameters are known; instead of parameter",
         choices=tuple(bridge.LAYOUTS),
     ),
-    own("approval", bool, True, "send only what ~/approve was called for", live=True),
-    own(
+    Own("approval", bool, True, "send only what ~/approve was called for", live=True),
+    Own(
         "period", float, 5.0, "least time between two sets", "s",
         lower=0.1, upper=86400.0, live=True,
     ),
-    own(
+    Own(
         "dead_band.std", float, 1.0, "a coefficient is new beyond so many standard deviations",
         lower=0.0, upper=1000.0, live=True,
     ),
-    own(
+    Own(
         "dead_band.percent", float, 1.0, "and beyond so much of what the controller has", "%",
         lower=0.0, upper=1000.0, live=True,
     ),
-    own(
+    Own(
         "hold_after", float, 2.0, "coefficients that were not heard for longer are not sent", "s",
         lower=0.01, upper=3600.0,
     ),
-    own("patience", float, 2.0, "for an answer of the controller", "s", lower=0.01, upper=60.0),
+    Own("patience", float, 2.0, "for an answer of the controller", "s", lower=0.01, upper=60.0),
 )  # fmt: skip
 
 
@@ -79,10 +75,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
     Publishes `~/pending` (what would be sent) and `/diagnostics`; services `~/approve`, `~/revert`
     (what the controller had at first, and no more sets until `~/enable`) and `~/enable`.
 
-    Raises
-    ------
-    UserError
-        If the parameters make no configuration.
+    Raises UserError if the parameters make no configuration.
     """
 
     def __init__(self) -> None:
@@ -96,32 +89,28 @@ class ControllerBridge(Node):  # type: ignore[misc]
                 "node, such as /velocity_controller (`ros2 node list` shows it)"
             )
         self._controller = controller
-        self._targets = bridge.targets(
-            self._config,
-            self._settings["parameter"],
-            self._settings["mapping"],
-            self._settings["layout"],
-        )
+        given = (self._settings[name] for name in ("parameter", "mapping", "layout"))
+        self._targets = bridge.targets(self._config, *given)
         self._names = list(dict.fromkeys(target.parameter for target in self._targets))
 
-        self._lock = threading.Lock()  # around what hearing and looking share
+        self._lock = threading.Lock()  # around what several callbacks share
         self._model = HydrodynamicModel(self._config, self._settings["hold_after"])
         self._wanted: dict[str, float] = {}
         self._std: dict[str, float] = {}
         self._refusal = "no coefficients were heard yet"
 
         self._original: Values | None = None
-        self._open: tuple[Values, Values] | None = None  # before, and a set on its way
+        self._open: tuple[Values, Values] | None = None  # the values before, and the set sent
         self._unanswered: tuple[Any, Any] | None = None  # its client and future
         self._pending: Sequence[Change] = ()
         self._enabled = True
         self._sent = 0
-        self._tried = -float("inf")  # s, when a set was last sent, taken or not
+        self._tried = -float("inf")  # s, when a set was last sent, accepted or not
         self._level, self._words = Level.WARN, "waiting for the controller"
         self._logged = ""
 
         self._leaving = threading.Event()
-        # A callback that waits for the controller must not keep its answer from being heard.
+        # A callback that waits for the controller must not block the one that receives the answer.
         answers, looks = ReentrantCallbackGroup(), MutuallyExclusiveCallbackGroup()
         self._list = self._client(ListParameters, "list_parameters", answers)
         self._get = self._client(GetParameters, "get_parameters", answers)
@@ -138,8 +127,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_LOOK_PERIOD, self._look, looks, clock=steady)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers, clock=steady)
-        self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._take_parameters)
+        parameters.follow(self, partial(parameters.own, self, _OWN), self._take_parameters)
 
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:
         return self.create_client(type_, f"{self._controller}/{service}", callback_group=group)
@@ -195,20 +183,19 @@ class ControllerBridge(Node):  # type: ignore[misc]
 
     def _compare(self) -> Sequence[Change]:
         """What should be sent; raises UserError where nothing can be."""
-        held = bridge.read(self._targets, self._read())  # also to know at once what it had
+        # Read in any case, to know its original values from the start.
+        held = bridge.read(self._targets, self._read())
         if not self._enabled:
             raise UserError("disabled: nothing is sent until ~/enable")
         wanted, std, refusal = self._usable()
         if refusal:
             raise UserError(refusal)
-        # With what the controller keeps of its own the set may be another than the estimator's.
+        # Values that only the controller has make another set than the estimator's.
         model = self._config.dynamics.with_values(held | wanted)
         if reason := self._model.why_unphysical(model):
             raise UserError(f"together with what the controller has: {reason}")
-        settings = self._settings
-        return bridge.changes(
-            held, wanted, std, settings["dead_band.std"], settings["dead_band.percent"]
-        )
+        band = self._settings["dead_band.std"], self._settings["dead_band.percent"]
+        return bridge.changes(held, wanted, std, *band)
 
     def _send(self, pending: Sequence[Change]) -> None:
         self._tried = time.monotonic()
@@ -226,14 +213,14 @@ class ControllerBridge(Node):  # type: ignore[misc]
         self._open = (before, new)
         try:
             reason = self._write(new)
-        except UserError as error:  # it may or may not have taken it
+        except UserError as error:  # it may or may not have accepted it
             reason = str(error)
         self._settle(reason)
 
     def _settle(self, reason: str = "") -> None:
-        """See what became of the last set; take it back if it was not taken whole.
+        """Check whether the last set was accepted, and undo it if it was accepted only in part.
 
-        Raises UserError unless it was; if the controller cannot be asked now, call it again.
+        Raises UserError unless it was accepted; if the controller does not answer, call it again.
         """
         if self._open is None:
             return
@@ -255,31 +242,31 @@ class ControllerBridge(Node):  # type: ignore[misc]
         self._open = None
 
     def _wait_for_answer(self, reason: str = "") -> None:
-        """Raises UserError while a set is unanswered: it may still be taken, and in part."""
+        """Raises UserError while a set is unanswered: it may still be accepted, even in part."""
         if self._unanswered is None:
             return
         client, future = self._unanswered
         if client.service_is_ready() and not future.done():
             raise UserError(reason or f"{self._controller} has not answered to a set yet")
-        self._unanswered = None  # or it is gone, and its next life knows nothing of it
+        self._unanswered = None  # or it has ended, and will start without it
 
     def _read(self) -> dict[str, bridge.Value]:
-        """The parameters that coefficients are in; raises UserError if they cannot be had."""
+        """The parameters that hold coefficients; raises UserError if they cannot be read."""
         answer = self._call(self._get, GetParameters.Request(names=self._names))
         if len(answer.values) != len(self._names):
             raise UserError(self._missing())
         values: dict[str, bridge.Value] = {}
         for name, value in zip(self._names, answer.values):
+            if value.type == ParameterType.PARAMETER_NOT_SET:
+                raise UserError(self._missing())
             if value.type == ParameterType.PARAMETER_DOUBLE:
                 values[name] = value.double_value
             elif value.type == ParameterType.PARAMETER_DOUBLE_ARRAY:
                 values[name] = tuple(value.double_array_value)
-            elif value.type == ParameterType.PARAMETER_NOT_SET:
-                raise UserError(self._missing())
             else:
                 raise UserError(f"{name} of {self._controller} is no floating-point number")
         if self._original is None:
-            bridge.read(self._targets, values)  # raises where it is not what we were told
+            bridge.read(self._targets, values)  # raises where they do not fit the mapping
             self._original = values
         return values
 
@@ -293,9 +280,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
 
     def _write(self, values: Values) -> str:
         """Set parameters; why the controller refused, if it did."""
-        messages = [
-            ParameterMessage(name=name, value=_to_message(value)) for name, value in values.items()
-        ]
+        messages = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         if self._set_all.service_is_ready():
             request = SetParametersAtomically.Request(parameters=messages)
             results = [self._call(self._set_all, request).result]
@@ -326,7 +311,7 @@ class ControllerBridge(Node):  # type: ignore[misc]
         return future.result()
 
     def leave(self) -> None:
-        """Wait for no more answers: nobody hears them."""
+        """Wait for no more answers: nothing receives them any more."""
         self._leaving.set()
 
     # ---------------------------------------------------------------- services
@@ -387,16 +372,10 @@ class ControllerBridge(Node):  # type: ignore[misc]
     def _publish_pending(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [
-            to_status(
-                change.coefficient,
-                self._controller,
-                Level.OK,
-                change.words,
-                {"held": repr(change.held), "wanted": repr(change.wanted), "std": repr(change.std)},
-            )
-            for change in self._pending
-        ]
+        for change in self._pending:
+            name, words = change.coefficient, change.words
+            values = {key: repr(getattr(change, key)) for key in ("held", "wanted", "std")}
+            message.status.append(to_status(name, self._controller, Level.OK, words, values))
         self._pending_out.publish(message)
 
     def _diagnose(self) -> None:
@@ -414,33 +393,17 @@ class ControllerBridge(Node):  # type: ignore[misc]
         message.status = [status]
         self._diagnostics.publish(message)
 
-    # ---------------------------------------------------------------- parameters
-
-    def _check_parameters(self, changes: list[Parameter]) -> SetParametersResult:
-        try:
-            parameters.own(self, _OWN, changes)
-        except UserError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _take_parameters(self, _: list[Parameter]) -> None:
-        self._settings = parameters.own(self, _OWN)
+    def _take_parameters(self, settings: dict[str, Any]) -> None:
+        self._settings = settings
 
 
 class _HalfChangedError(UserError):
-    """The one thing that must not be: worth a word of its own."""
-
-
-def _to_message(value: bridge.Value) -> ParameterValue:
-    if isinstance(value, tuple):
-        kind = ParameterType.PARAMETER_DOUBLE_ARRAY
-        return ParameterValue(type=kind, double_array_value=list(value))
-    return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    """The controller has a part of a set, which is an ERROR and not only a WARN."""
 
 
 class _Executor(MultiThreadedExecutor):  # type: ignore[misc]
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        # rclpy's own does not wait for callbacks, and each then says what it could not do.
+        # rclpy's own does not wait for callbacks, each of which would then log a failure.
         self._executor.shutdown()
         return bool(super().shutdown(timeout_sec))
 

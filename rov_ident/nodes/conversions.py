@@ -1,15 +1,18 @@
 """Reports to and from ROS messages."""
 
 import array
+import contextlib
 import math
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
-from rov_ident.messages import Array
-from rov_ident.online import Level, Report
+from rov_ident.core.messages import Array
+from rov_ident.core.states import Level, State
+from rov_ident.estimation.online import Report
 
 _SECOND = 1_000_000_000  # ns
 
@@ -35,24 +38,34 @@ def to_status(
 
 def to_diagnostics(report: Report, hardware_id: str) -> DiagnosticArray:
     """`~/coefficients`; numbers as text that reads back to the last bit."""
-    array_ = DiagnosticArray()
-    array_.header.stamp = to_time(report.stamp)
-    columns = (report.values, report.std, report.lower, report.upper, report.excitation)
-    rows = np.stack(columns, axis=1).tolist()
-    for i, (value, std, lower, upper, excitation) in enumerate(rows):
-        values = {
-            "value": repr(value),
-            "std": repr(std),
-            "unit": report.units[i],
-            "lower": repr(lower),
-            "upper": repr(upper),
-            "excitation": repr(excitation),
-        }
-        status = to_status(
-            report.names[i], hardware_id, report.levels[i], report.messages[i], values
-        )
-        array_.status.append(status)
-    return array_
+    message = DiagnosticArray()
+    message.header.stamp = to_time(report.stamp)
+    for (name, entry), level in zip(entries(report).items(), report.levels):
+        words = entry.pop("message")
+        texts = {k: v if isinstance(v, str) else repr(v) for k, v in entry.items()}
+        message.status.append(to_status(name, hardware_id, level, words, texts))
+    return message
+
+
+def entries(report: Report) -> dict[str, dict[str, Any]]:
+    """Every coefficient with its numbers, unit, state and message."""
+    states = [state.value for state in report.states]
+    values, std, lower, upper, excitation = np.stack(
+        [report.values, report.std, report.lower, report.upper, report.excitation]
+    ).tolist()
+    rows = zip(values, std, report.units, lower, upper, excitation, states, report.messages)
+    keys = ("value", "std", "unit", "lower", "upper", "excitation", "state", "message")
+    return {name: dict(zip(keys, row)) for name, row in zip(report.names, rows)}
+
+
+def for_json(report: Report) -> dict[str, dict[str, Any]]:
+    """As :func:`entries`, with the levels, and None for an excitation that is not known."""
+    found = entries(report)
+    for entry, level in zip(found.values(), report.levels):
+        entry["level"] = level.name
+        if not math.isfinite(entry["excitation"]):
+            entry["excitation"] = None
+    return found
 
 
 def from_diagnostics(message: DiagnosticArray) -> Report:
@@ -60,10 +73,7 @@ def from_diagnostics(message: DiagnosticArray) -> Report:
 
     Its covariance has the variances alone: the correlations are on `~/coefficients/covariance`.
 
-    Raises
-    ------
-    ValueError
-        If a key is missing, or a number is not one or not finite.
+    Raises ValueError if a key is missing, or a number is not one or not finite.
     """
     statuses = message.status
     fields = [{pair.key: pair.value for pair in status.values} for status in statuses]
@@ -87,9 +97,18 @@ def from_diagnostics(message: DiagnosticArray) -> Report:
         upper=upper,
         covariance=np.diag(std**2),
         excitation=np.array([float(field.get("excitation", math.nan)) for field in fields]),
-        levels=tuple(Level(status.level[0]) for status in statuses),
+        states=tuple(map(_state, statuses, fields)),
         messages=tuple(status.message for status in statuses),
     )
+
+
+def _state(status: DiagnosticStatus, fields: dict[str, str]) -> State:
+    """As it is given, unless it is missing or contradicts the level."""
+    likely = State.at(Level(status.level[0]))
+    with contextlib.suppress(ValueError):
+        given = State(fields.get("state"))
+        return given if given.level == likely.level else likely
+    return likely
 
 
 def to_matrix(names: tuple[str, ...], columns: str, matrix: Array) -> Float64MultiArray:

@@ -18,24 +18,25 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from rov_ident.cdr import decode_odometry, encode
-from rov_ident.consumer import HydrodynamicModel
-from rov_ident.errors import UserError
-from rov_ident.excitation import LEVEL, authority
-from rov_ident.frames import (
+from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import (
     from_core,
     gravity_direction,
     quaternion_normalise,
     to_core,
     velocity_of_arm,
 )
-from rov_ident.messages import Array, Wrench
+from rov_ident.core.messages import Array, Wrench
+from rov_ident.io.cdr import decode_odometry, encode
+from rov_ident.model.scales import authority
 from rov_ident.nodes import parameters
 from rov_ident.nodes.common import LATCHED, live
+from rov_ident.simulation.manoeuvres import LEVEL
 
 _LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-_RATE = 50.0  # Hz
-_FASTEST = 100.0  # m/s, rad/s; what is beyond it is no velocity
+_RATE = 50.0  # Hz; usual for the velocity loop of an ROV
+_FASTEST = 100.0  # m/s, rad/s; a larger value is no velocity
 _LAG = 0.3  # s, of the reference behind the command
 _OWN_PARAMETERS = {
     "gain": "of surge sway heave, roll pitch yaw [1/s]; an axis of gain 0 is left free",
@@ -49,16 +50,13 @@ class ExampleController(Node):  # type: ignore[misc]
     Without odometry or commands for `timeout` the wrench is zero; without fresh coefficients it
     goes on with the last good ones.
 
-    Raises
-    ------
-    UserError
-        If the parameters make no configuration.
+    Raises UserError if the parameters make no configuration.
     """
 
     def __init__(self) -> None:
         super().__init__("example_controller", automatically_declare_parameters_from_overrides=True)
         self._config = parameters.declare(self, _OWN_PARAMETERS)
-        # By default roll and pitch are left to right themselves.
+        # By default roll and pitch are not controlled: the vehicle rights itself.
         self._gain = self._own_parameter("gain", np.array([2.0, 2.0, 2.0, 0.0, 0.0, 2.0]))
         self._limit = self._own_parameter("limit", 1.5 * authority(self._config.model))
         self._hydrodynamics = HydrodynamicModel(self._config)
@@ -100,7 +98,7 @@ class ExampleController(Node):  # type: ignore[misc]
         # A twist has the axes of a wrench.
         turned = to_core(Wrench(0, "", linear, angular), self._config.frames)
         command = np.concatenate([turned.force, turned.torque])
-        if (abs(command) <= _FASTEST).all():  # not so with a NaN
+        if (abs(command) <= _FASTEST).all():  # false for NaN
             self._command, self._commanded = command, time.monotonic()
 
     def _measure(self, data: bytes) -> None:
@@ -114,7 +112,7 @@ class ExampleController(Node):  # type: ignore[misc]
         nu = np.concatenate([at_origin, odometry.angular])
         down = gravity_direction(quaternion_normalise(odometry.orientation))
         good = (abs(nu) <= _FASTEST).all() and np.isfinite(down).all()
-        # A driver that repeats itself has stopped measuring.
+        # A driver that repeats a stamp has stopped measuring.
         if good and odometry.stamp != self._stamp:
             self._nu, self._down = nu, down
             self._stamp, self._measured = odometry.stamp, time.monotonic()
@@ -130,8 +128,8 @@ class ExampleController(Node):  # type: ignore[misc]
             self._reference = before - math.expm1(-1.0 / (_RATE * _LAG)) * (self._command - before)
             nu_dot = (self._command - self._reference) / _LAG
             nu_dot += self._gain * (self._reference - self._nu)
-            demand = self._hydrodynamics.wrench(self._nu, nu_dot, self._down)
-            tau[self._gain > 0.0] = np.clip(demand, -self._limit, self._limit)[self._gain > 0.0]
+            command = self._hydrodynamics.wrench(self._nu, nu_dot, self._down)
+            tau[self._gain > 0.0] = np.clip(command, -self._limit, self._limit)[self._gain > 0.0]
             fresh = "fresh" if self._hydrodynamics.fresh(now) else "the last good"
             state = f"controlling with {fresh} coefficients"
         frames, stamp = self._config.frames, self.get_clock().now().nanoseconds

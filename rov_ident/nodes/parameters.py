@@ -1,17 +1,26 @@
 """The configuration as ROS 2 parameters: declared, described, changed while running."""
 
 import contextlib
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import ParameterAlreadyDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from rov_ident import coefficients, config
+from rov_ident import config
 from rov_ident.config import Config
+from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
+from rov_ident.model import coefficients
+
+Settings = TypeVar("Settings")
 
 _LARGEST_INTEGER = 2**31 - 1
 _DECLARED = {p.key: p for p in config.VEHICLE_PARAMETERS + config.PARAMETERS}
@@ -23,10 +32,7 @@ def declare(node: Node, own: Iterable[str]) -> Config:
     The node declares its overrides by itself, so that names that nobody knows are seen and
     refused. Those called in ``own`` are the node's and are left alone.
 
-    Raises
-    ------
-    UserError
-        One sentence naming the key and what to change.
+    Raises UserError, one sentence naming the key and what to change.
     """
     given = {
         name: parameter.value
@@ -56,14 +62,11 @@ def changed(node: Node, own: Iterable[str], changes: Iterable[RosParameter] = ()
 def declare_own(node: Node, declared: Iterable[config.Parameter]) -> dict[str, Any]:
     """Declare parameters that are a node's own; their values, checked.
 
-    Raises
-    ------
-    UserError
-        One sentence naming the parameter and what to change.
+    Raises UserError, one sentence naming the parameter and what to change.
     """
     values = {}
     for parameter in declared:
-        # Some nodes declare their overrides by themselves.
+        # Nodes that declare their overrides automatically have it already.
         with contextlib.suppress(ParameterAlreadyDeclaredException):
             node.declare_parameter(parameter.key, None, ParameterDescriptor(dynamic_typing=True))
         given = node.get_parameter(parameter.key).value
@@ -84,6 +87,23 @@ def own(
     }
 
 
+def follow(
+    node: Node, read: Callable[[Iterable[RosParameter]], Settings], take: Callable[[Settings], None]
+) -> None:
+    """Have parameters changed while running: ``read`` gives the settings with these changes, or
+    raises UserError, which refuses them; ``take`` is given what was accepted."""
+
+    def check(changes: list[RosParameter]) -> SetParametersResult:
+        try:
+            read(changes)
+        except UserError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(lambda _: take(read(())))
+
+
 def _redeclare(node: Node, key: str, value: Any, descriptor: ParameterDescriptor) -> None:
     if node.has_parameter(key):
         node.undeclare_parameter(key)
@@ -91,7 +111,7 @@ def _redeclare(node: Node, key: str, value: Any, descriptor: ParameterDescriptor
 
 
 def _as_declared(kind: Any, value: Any) -> Any:
-    """A value in the type ROS should show it in; the file may say 5 for 5.0."""
+    """A value in its declared type: the file may have 5 for 5.0."""
     if value is None:
         return None
     if kind is config.Vector:

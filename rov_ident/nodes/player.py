@@ -15,18 +15,19 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import Trigger
 
-from rov_ident.bags import BagWriter, RawMessage
-from rov_ident.errors import UserError
+from rov_ident.core.errors import UserError
+from rov_ident.estimation.online import Report
+from rov_ident.io.bag_reader import RawMessage
+from rov_ident.io.bag_writer import BagWriter
 from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
 from rov_ident.nodes.conversions import from_diagnostics, to_time
-from rov_ident.online import Report
 
 OnReport = Callable[[str, Report], None]
 
 WINDOW = 64  # messages on their way; less than every queue is deep
 _CLOCK_PERIOD = 25_000_000  # ns, of the bag; as `ros2 bag play --clock`
-_PATIENCE = 60.0  # s; a node silent for longer will not come back
-_START_TIME = 300.0  # s; for a node to compile on a slow computer
+_PATIENCE = 60.0  # s; far longer than a busy computer holds a node up: it will not come back
+_START_TIME = 300.0  # s; for a node to compile, ten times what docs/speed.md has measured
 
 _OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
     "coefficients": (DiagnosticArray, LATCHED),
@@ -37,9 +38,9 @@ _OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
 
 
 class Player(Node):  # type: ignore[misc]
-    """One bag into the nodes ``{estimator}_node`` of the same DDS domain.
+    """Plays one bag into the nodes ``{estimator}_node`` of the same DDS domain.
 
-    ``check`` is called while waiting; it raises where waiting is in vain.
+    ``check`` is called while waiting; it raises if there is nothing left to wait for.
     """
 
     def __init__(
@@ -103,19 +104,17 @@ class Player(Node):  # type: ignore[misc]
         self._acknowledged[estimator] = count.data
 
     def destroy_node(self) -> None:
-        # First the executor: it holds on to the publishers.
+        # First the executor, which holds references to the publishers.
         self._executor.shutdown()
         super().destroy_node()
 
     # ---------------------------------------------------------------- playing
 
     def wait_for_nodes(self, start: int) -> None:
-        """Until everything is connected both ways. ``start`` [ns] is the time the bag begins.
+        """Wait until everything is connected both ways. ``start`` [ns] is the time the bag begins.
 
-        Raises
-        ------
-        UserError
-            If other nodes of the same names, or other publishers of the inputs, are about.
+        Raises UserError if other nodes of the same names, or other publishers of the inputs, are
+        running.
         """
         self._now = start
         self._wait(self._connected, "to start", _START_TIME)
@@ -140,7 +139,7 @@ class Player(Node):  # type: ignore[misc]
             )
 
     def play(self, messages: Iterable[tuple[str, RawMessage]], rate: float) -> int:
-        """Play (role, message) at the recorded pace times ``rate``; 0: as fast as the nodes can.
+        """Play (role, message) at the recorded speed times ``rate``; 0: as fast as the nodes can.
 
         Returns how many messages every node has taken: all of them.
         """
@@ -149,15 +148,15 @@ class Player(Node):  # type: ignore[misc]
             if rate > 0.0:
                 began = began or (time.monotonic(), raw.log_time)
                 self._spin_until(began[0] + (raw.log_time - began[1]) * 1e-9 / rate)
-            self._wait(self._has_room, "to take messages")
+            self._wait(partial(self._all_took, self._sent - WINDOW + 1), "to take messages")
             self._tick(raw.log_time)
             self._inputs[role].publish(raw.data)
             self._sent += 1
-        self._wait(self._all_taken, "to take the last messages")
+        self._wait(partial(self._all_took, self._sent), "to take the last messages")
         return self._sent
 
     def finish(self) -> None:
-        """Have the nodes use what they still hold, and wait for their last reports."""
+        """Have the nodes use all messages they still hold, and wait for their last reports."""
         for estimator, client in self._flushes.items():
             future = client.call_async(Trigger.Request())
             self._wait(future.done, "to finish")
@@ -170,11 +169,8 @@ class Player(Node):  # type: ignore[misc]
             self._clock_time = self._now
             self._clock.publish(Clock(clock=to_time(self._now)))
 
-    def _has_room(self) -> bool:
-        return self._sent - min(self._acknowledged.values()) < WINDOW
-
-    def _all_taken(self) -> bool:
-        return min(self._acknowledged.values()) >= self._sent
+    def _all_took(self, count: int) -> bool:
+        return min(self._acknowledged.values()) >= count
 
     def _has_report(self, estimator: str, stamp: int) -> bool:
         return estimator in self.reports and self.reports[estimator].stamp == stamp

@@ -1,20 +1,24 @@
-"""The nodes as programs, which end without a word also when interrupted before they are up.
+"""The nodes as programs, which end silently even if they are interrupted while starting.
 
-Half of a start is loading modules: a launch file that is stopped at once would fill the screen with
-where each of its nodes was.
+Loading modules is half of a start: otherwise a launch file that is stopped at once would fill the
+screen with a traceback of each of its nodes.
 """
 
 import os
 import signal
+from functools import partial
 from importlib import import_module
+
+from rov_ident.core.threads import limit_process
 
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
 def _run(name: str) -> int:
-    # No exception: modules that are being loaded catch some, and nothing is open yet.
+    # Not by an exception: modules that are being loaded catch some. Nothing is open yet.
     for number in INTERRUPTS:
         signal.signal(number, lambda *_: os._exit(0))
+    limit_process()  # before numpy is loaded
     module = import_module(f"rov_ident.nodes.{name}")
     for number in INTERRUPTS:
         signal.signal(number, signal.default_int_handler)
@@ -24,21 +28,8 @@ def _run(name: str) -> int:
         return 0
 
 
-def rls_node() -> int:
-    return _run("rls_node")
-
-
-def ukf_node() -> int:
-    return _run("ukf_node")
-
-
-def controller_bridge() -> int:
-    return _run("controller_bridge")
-
-
-def dashboard_node() -> int:
-    return _run("dashboard_node")
-
-
-def example_controller() -> int:
-    return _run("example_controller")
+rls_node = partial(_run, "rls_node")
+ukf_node = partial(_run, "ukf_node")
+controller_bridge = partial(_run, "controller_bridge")
+dashboard_node = partial(_run, "dashboard_node")
+example_controller = partial(_run, "example_controller")

@@ -1,4 +1,4 @@
-"""A bag through live nodes: their processes, the player, and what comes out."""
+"""Plays a bag into live nodes: starts and ends their processes, records what they publish."""
 
 import os
 import signal
@@ -17,20 +17,22 @@ from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
 from rov_ident import config as configuration
-from rov_ident import inputs
-from rov_ident.bags import Bag, BagWriter
 from rov_ident.config import Inputs, Qos
-from rov_ident.errors import UserError
+from rov_ident.core.errors import UserError
+from rov_ident.core.files import check_output
+from rov_ident.estimation.online import ESTIMATORS, Report
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_writer import BagWriter
 from rov_ident.nodes.player import OnReport, Player
-from rov_ident.online import ESTIMATORS, Report
 
 _LOOPBACK = Path(__file__).with_name("loopback.xml")
-_EXIT_TIME = 10.0  # s; for a node to end after an interrupt
+_EXIT_TIME = 10.0  # s; for a node to end after an interrupt, which takes under a second
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """What the nodes ended with. ``reports`` by estimator; ``messages`` every node has taken."""
+    """The last ``reports`` by estimator, and the number of ``messages`` that every node took."""
 
     reports: Mapping[str, Report]
     messages: int
@@ -52,31 +54,27 @@ def replay(
     is lost at any rate. Unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this
     computer, as a replayed thruster wrench must not reach a vehicle, and nothing comes in.
 
-    Raises
-    ------
-    UserError
-        If the bag or configuration cannot be used, or the topics are taken by someone else.
+    Raises UserError if the bag or configuration cannot be used, or the topics are taken by someone
+    else.
     """
     if not 0.0 <= rate < float("inf"):
         raise UserError(f"rate is {rate}, but must be positive, or 0 for as fast as possible")
     if unknown := set(estimators) - set(ESTIMATORS):
         raise UserError(f"{min(unknown)} is no live estimator: use {' or '.join(ESTIMATORS)}")
-    if out is not None and Path(out).resolve() == Path(bag).resolve():
-        raise UserError(f"{out} is the bag to play: give another name for the recording")
+    if out is not None:
+        check_output(out, [bag, config_path], bag=True)
     recorded = Bag(Path(bag))
     config = configuration.load(config_path)
     topics = inputs.select(recorded, config)
     started = time.monotonic()
     with ExitStack() as stack:
         stack.enter_context(_on_this_computer())
-        writer = None
-        if out is not None:
-            writer = stack.enter_context(BagWriter(Path(out), crash_safe=True))
+        writer = None if out is None else stack.enter_context(BagWriter(out))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rov_ident-")))
         nodes = []
         for estimator in estimators:
             name = f"{estimator}_node"
-            # Written anew: it may hold what our reader takes and that of ROS 2 does not.
+            # A new file: the given one may hold what our reader accepts and that of ROS 2 does not.
             parameters = folder / f"{name}.yaml"
             settings = replace(
                 configuration.load(config_path, name),
@@ -99,13 +97,12 @@ def replay(
         player = Player(context, estimators, writer, on_report, check)
         stack.callback(player.destroy_node)
         player.wait_for_nodes(next(recorded.iter_raw(topics.values())).log_time)
+        if writer is not None:
+            writer.go_live()
         count = player.play(inputs.as_played(recorded, topics, config), rate)
         player.finish()
         return ReplayResult(
-            dict(player.reports),
-            count,
-            time.monotonic() - started,
-            None if out is None else Path(out),
+            player.reports, count, time.monotonic() - started, None if out is None else Path(out)
         )
 
 
@@ -119,7 +116,7 @@ def _noted_interrupts() -> Iterator[Callable[[], None]]:
         if noted.is_set():
             raise KeyboardInterrupt
 
-    if threading.current_thread() is not threading.main_thread():  # who gets none
+    if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
         yield raise_interrupt
         return
     before = signal.signal(signal.SIGINT, lambda *_: noted.set())
@@ -131,10 +128,10 @@ def _noted_interrupts() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def _on_this_computer() -> Iterator[None]:
-    """Neither look for others on the network nor have a port open to it, unless told otherwise."""
+    """Keep DDS on this computer, discovery and ports, unless the environment says otherwise."""
     ours = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST":
-        # Fast DDS would still take whatever arrives from anywhere at its ports.
+        # Fast DDS would still accept whatever arrives at its ports from elsewhere.
         ours["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(_LOOPBACK)
     added = {name: value for name, value in ours.items() if name not in os.environ}
     os.environ.update(added)
@@ -146,14 +143,14 @@ def _on_this_computer() -> Iterator[None]:
 
 
 class _Process:
-    """A node in a process of its own, gone at the end of the `with` block."""
+    """A node in a process of its own, ended with the `with` block."""
 
     def __init__(self, name: str, parameters: Path) -> None:
         self.name = name
         command = [sys.executable, "-m", f"rov_ident.nodes.{name}", "--ros-args"]
         command += ["--params-file", str(parameters), "--log-level", "warn"]
         command += ["-p", "use_sim_time:=true", "-p", "lockstep:=true"]
-        # A session of its own: Ctrl-C is for us, who then interrupt the node.
+        # A session of its own: Ctrl-C interrupts this process only, which then interrupts the node.
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -171,7 +168,7 @@ class _Process:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             self._last_line = line.strip() or self._last_line
-            if not line.startswith(f"{self.name}: "):  # that sentence goes into our exception
+            if not line.startswith(f"{self.name}: "):  # raised as our own exception
                 sys.stderr.write(line)
 
     def check(self) -> None:
@@ -184,17 +181,13 @@ class _Process:
             raise UserError(self._last_line.removeprefix(f"{self.name}: "))
         raise RuntimeError(f"{self.name} ended with status {status}: {self._last_line}")
 
-    def wait(self, seconds: float) -> None:
-        """Until the node has ended."""
-        self._process.wait(seconds)
-
     def __enter__(self) -> "_Process":
         return self
 
     def __exit__(self, *_: object) -> None:
         self._process.send_signal(signal.SIGINT)
         try:
-            self.wait(_EXIT_TIME)
+            self._process.wait(_EXIT_TIME)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

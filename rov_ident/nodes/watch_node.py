@@ -1,11 +1,13 @@
-"""Hears every estimator of this DDS domain, in any namespace, and takes part in nothing."""
+"""Listens to every estimator in this DDS domain, in any namespace, and publishes nothing."""
 
 import math
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import numpy as np
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
@@ -13,46 +15,39 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64MultiArray
 
-from rov_ident.cdr import decode_wrench
+from rov_ident.core.errors import UserError
 from rov_ident.dashboard.store import Status, Store
-from rov_ident.nodes.common import LATCHED
+from rov_ident.io.cdr import decode_wrench
+from rov_ident.nodes.common import LATCHED, Executor
 from rov_ident.nodes.conversions import from_diagnostics
 
-Forward = Callable[[str, str, bytes, int], None]
-"""(topic, type, bytes, time of arrival in ns)."""
-
-_SEARCH_PERIOD = 0.5  # s; between looks for new estimators
+_SEARCH_PERIOD = 0.5  # s; between searches for new estimators, which nobody notices
 _COEFFICIENTS = "/coefficients"
 _DIAGNOSTIC_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
-# What is missed is missed: nobody shall wait for us.
-_HEARSAY = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Best effort: no publisher has to wait for a listener.
+_BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class WatchNode(Node):  # type: ignore[misc]
     """Subscribes to all that estimators publish and puts it into a store.
 
     An estimator is known by its topic: ``NAME/coefficients``, a DiagnosticArray that someone
-    publishes. ``forward`` is set before the node is spun, and given the bytes of every message.
+    publishes.
     """
 
-    def __init__(
-        self,
-        store: Store,
-        name: str = "rov_ident_watch",
-        context: Context | None = None,
-    ) -> None:
+    def __init__(self, store: Store, name: str, context: Context) -> None:
         super().__init__(name, context=context)
-        self.forward: Forward | None = None
         self._store = store
         self._known: set[str] = set()
-        self._listen("/diagnostics", DiagnosticArray, _HEARSAY, self._take_diagnostics)
+        self._listen("/diagnostics", DiagnosticArray, _BEST_EFFORT, self._take_diagnostics)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SEARCH_PERIOD, self._search, clock=steady)
 
     def _search(self) -> None:
-        """Take up the estimators that are new."""
+        """Subscribe to the estimators that are new."""
         for topic, types in self.get_topic_names_and_types():
             name = topic.removesuffix(_COEFFICIENTS)
             if name in self._known or name in ("", topic) or _DIAGNOSTIC_TYPE not in types:
@@ -61,35 +56,21 @@ class WatchNode(Node):  # type: ignore[misc]
                 continue
             self._known.add(name)
             self._store.add(name)
-            self._listen(topic, DiagnosticArray, LATCHED, partial(self._take_report, name))
-            self._listen(
-                f"{topic}/covariance",
-                Float64MultiArray,
-                LATCHED,
-                partial(self._take_covariance, name),
-            )
-            self._listen(
-                f"{name}/wrench_residual",
-                WrenchStamped,
-                _HEARSAY,
-                partial(self._take_residual, name),
-            )
-            if self.forward is not None:  # the same numbers again, for who plots arrays
-                self._listen(f"{topic}/values", Float64MultiArray, LATCHED, lambda _: None)
+            for heard, type_, qos, take in (
+                (topic, DiagnosticArray, LATCHED, self._take_report),
+                (f"{topic}/covariance", Float64MultiArray, LATCHED, self._take_covariance),
+                (f"{name}/wrench_residual", WrenchStamped, _BEST_EFFORT, self._take_residual),
+            ):
+                self._listen(heard, type_, qos, partial(take, name))
 
     def _listen(
         self, topic: str, type_: type, qos: QoSProfile, take: Callable[[bytes], None]
     ) -> None:
-        package = type_.__module__.partition(".")[0]
-        type_name = f"{package}/msg/{type_.__name__}"
-
         def receive(data: bytes) -> None:
             try:
                 take(data)
             except ValueError as error:
                 self.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=10.0)
-            if self.forward is not None:
-                self.forward(topic, type_name, data, time.time_ns())
 
         self.create_subscription(type_, topic, receive, qos, raw=True)
 
@@ -119,3 +100,29 @@ class WatchNode(Node):  # type: ignore[misc]
                 self._store.take_status(
                     f"/{node}", kind, Status(status.level[0], status.message, values)
                 )
+
+
+@contextmanager
+def watching(
+    store: Store, name: str, arguments: Sequence[str] | None = ()
+) -> Iterator[tuple[WatchNode, Any]]:
+    """A node that fills the store, and the executor to spin it with, within the block.
+
+    ``arguments`` are ROS's own; None: those of the program. Interrupts are left to the caller.
+    """
+    context = Context()
+    try:
+        given = None if arguments is None else list(arguments)  # rclpy takes no other sequence
+        rclpy.init(args=given, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy gives its RCLError no public name
+        raise UserError(str(error).partition(", at ")[0]) from error
+    try:
+        node, executor = WatchNode(store, name, context), Executor(context=context)
+        executor.add_node(node)
+        try:
+            yield node, executor
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)

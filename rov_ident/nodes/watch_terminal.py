@@ -1,4 +1,4 @@
-"""`rov-ident watch`: what the running estimators say, as a table or as lines of JSON."""
+"""`rov-ident watch`: what the running estimators publish, as a table or as lines of JSON."""
 
 import json
 import math
@@ -7,30 +7,29 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from itertools import chain
 from typing import Any
 
-import rclpy
-from rclpy.context import Context
-from rclpy.signals import SignalHandlerOptions
 from rich import box
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from rov_ident.core.errors import UserError
+from rov_ident.core.states import Level
 from rov_ident.dashboard.store import GONE, Estimator, Store, plain
-from rov_ident.errors import UserError
-from rov_ident.nodes.common import Executor
-from rov_ident.nodes.watch_node import WatchNode
-from rov_ident.online import Level
+from rov_ident.estimation.online import Report
+from rov_ident.nodes.conversions import entries, for_json
+from rov_ident.nodes.programs import INTERRUPTS
+from rov_ident.nodes.watch_node import watching
 
 Heard = Mapping[str, tuple[Estimator, float]]
-"""By the full name of a node: what it said, and how long ago it did [s]."""
+"""By the full name of a node: what it published, and how long ago [s]."""
 
-_REFRESH = 4.0  # Hz
-_SETTLING = 3.5  # s; without news: who was missed at first announces itself every 3 s
+_REFRESH = 4.0  # Hz; nodes publish at 5 Hz
+_SETTLING = 3.5  # s; without a new one: DDS repeats announcements every 3 s
 _COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "dim"}
-_WORDS = {Level.OK: "ok", Level.WARN: "warn", Level.ERROR: "error", Level.STALE: "stale"}
 
 
 def watch(as_json: bool, out: Console, err: Console) -> None:
@@ -55,12 +54,9 @@ def watch(as_json: bool, out: Console, err: Console) -> None:
 
 
 def watch_once(patience: float, as_json: bool, out: Console) -> None:
-    """What all estimators say now: one table, or one line of JSON.
+    """Print what all estimators publish now: one table, or one line of JSON.
 
-    Raises
-    ------
-    UserError
-        If none is heard within ``patience`` [s].
+    Raises UserError if none is heard within ``patience`` [s].
     """
     with _hearing() as (store, spin, ended):
         end, known, since = time.monotonic() + patience, store.known, time.monotonic()
@@ -85,30 +81,20 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
 
 @contextmanager
 def _hearing() -> Iterator[tuple[Store, Callable[[float], None], threading.Event]]:
-    """The store, how to hear for some seconds, and whether we were interrupted."""
+    """The store, a function that listens for some seconds, and an event set by an interrupt."""
     ended = threading.Event()
-    before = {
-        number: signal.signal(number, lambda *_: ended.set())
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    context = Context()
-    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     store = Store(time.monotonic)
-    node = WatchNode(store, context=context)
-    executor = Executor(context=context)
-    executor.add_node(node)
-
-    def spin(seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0 and not ended.is_set():
-            executor.spin_once(timeout_sec=min(left, 0.1))
-
+    before = {number: signal.signal(number, lambda *_: ended.set()) for number in INTERRUPTS}
     try:
-        yield store, spin, ended
+        with watching(store, "rov_ident_watch") as (_, executor):
+
+            def spin(seconds: float) -> None:
+                end = time.monotonic() + seconds
+                while (left := end - time.monotonic()) > 0.0 and not ended.is_set():
+                    executor.spin_once(timeout_sec=min(left, 0.1))
+
+            yield store, spin, ended
     finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -125,22 +111,11 @@ def _print_json(heard: Heard, out: Console) -> None:
 def _as_json(known: Estimator, silent: float) -> dict[str, Any]:
     report = known.report
     assert report is not None
-    columns = (report.values, report.std, report.lower, report.upper, report.excitation)
-    coefficients = {}
-    for i, name in enumerate(report.names):
-        numbers = [float(column[i]) for column in columns]
-        coefficients[name] = {
-            **dict(zip(("value", "std", "lower", "upper"), numbers)),
-            "excitation": numbers[4] if math.isfinite(numbers[4]) else None,
-            "unit": report.units[i],
-            "level": report.levels[i].name,
-            "message": report.messages[i],
-        }
     return {
         "vehicle": known.vehicle,
         "stamp_ns": report.stamp,
         "silent_s": plain(silent),
-        "coefficients": coefficients,
+        "coefficients": for_json(report),
         "health": {kind: vars(status) for kind, status in known.statuses.items()},
     }
 
@@ -149,7 +124,7 @@ def _as_json(known: Estimator, silent: float) -> dict[str, Any]:
 
 
 def _picture(heard: Heard, console: Console) -> Group | Text:
-    """One table a vehicle, its estimators side by side; above each what they say of themselves."""
+    """One table for each vehicle, its estimators side by side, their diagnostics above it."""
     if not heard:
         return Text("waiting for rls_node or ukf_node (Ctrl-C ends)", style="dim")
     vehicles: dict[str, list[str]] = {}
@@ -175,45 +150,31 @@ def _health(name: str, known: Estimator, silent: float) -> Text:
 
 def _table(namespace: str, estimators: Mapping[str, Estimator], width: int) -> Table:
     wide = width >= 60 + 30 * len(estimators)
-    table = Table(
-        title=namespace.rstrip("/") or None,
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-    )
+    title = namespace.rstrip("/") or None
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
-    names: dict[str, str] = {}  # name and unit of coefficients
+    units: dict[str, str] = {}
+    columns = []
     for node, known in estimators.items():
-        short = node.rpartition("/")[2].removesuffix("_node")
-        table.add_column(short, justify="right")
-        table.add_column("std", justify="right")
-        table.add_column("level")
-        if wide:
-            table.add_column("excited", justify="right")
         assert known.report is not None
-        names.update(zip(known.report.names, known.report.units))
+        units.update(zip(known.report.names, known.report.units))
+        columns.append(_cells(known.report))
+        short = node.rpartition("/")[2].removesuffix("_node")
+        for head in (short, "std", "state", "excited")[: 3 + wide]:
+            table.add_column(head, justify="left" if head == "state" else "right")
     table.add_column("unit")
-    for name, unit in names.items():
-        cells: list[Text | str] = []
-        for known in estimators.values():
-            cells += _cells(known, name, wide)
-        table.add_row(name, *cells, unit)
+    for name, unit in units.items():
+        rows = (cells.get(name, [Text()] * 4)[: 3 + wide] for cells in columns)
+        table.add_row(name, *chain.from_iterable(rows), unit)
     return table
 
 
-def _cells(known: Estimator, name: str, wide: bool) -> list[Text | str]:
-    report = known.report
-    if report is None or name not in report.names:
-        return [""] * (3 + wide)
-    i = report.names.index(name)
-    level = report.levels[i]
-    colour = _COLOURS[level]
-    cells: list[Text | str] = [
-        Text(f"{report.values[i]:.5g}", style=colour),
-        Text(f"{report.std[i]:.2g}", style=colour),
-        Text(_WORDS[level], style=colour),
-    ]
-    if wide:
-        excitation = float(report.excitation[i])
-        cells.append(f"{100 * excitation:.0f} %" if math.isfinite(excitation) else "")
+def _cells(report: Report) -> dict[str, list[Text]]:
+    """Value, standard deviation, state and excitation of every coefficient."""
+    cells = {}
+    for name, entry, state in zip(report.names, entries(report).values(), report.states):
+        colour, excitation = _COLOURS[state.level], entry["excitation"]
+        texts = (f"{entry['value']:.5g}", f"{entry['std']:.2g}", state.value)
+        cells[name] = [Text(text, style=colour) for text in texts]
+        cells[name].append(Text(f"{100 * excitation:.0f} %" if math.isfinite(excitation) else ""))
     return cells

@@ -6,8 +6,11 @@ const POINTS = 300;                    // of a curve
 const CELL = 12;                       // px; the least in which a name can stand
 const EXCITED = 0.05;                  // share of the prior variance from which a motion shows it
 const AXES = ["X", "Y", "Z", "K", "M", "N"];
-const LEVELS = [["✓", "converged"], ["…", "converging, or held"], ["✕", "diverged, or at a bound"],
-                ["○", "held: inputs stopped"]];
+const STATES = {                       // word: sign and level, as in core/states.py
+  "converged": ["✓", 0], "converging": ["…", 1], "held": ["–", 1], "at bound": ["!", 2],
+  "diverged": ["✕", 2], "stale": ["○", 3],
+};
+const COLOURS = ["good", "fair", "bad", "none"];  // of levels
 const HEALTH = ["ok", "warning", "error", "stale"];
 
 const estimators = new Map();          // by full name: the latest state, with history and residuals
@@ -161,9 +164,9 @@ function keyOf(parent, index, name) {
   parent.append(name);
 }
 
-function levelCounts(state) {
-  const counts = [0, 0, 0, 0];
-  for (const level of state.levels ?? []) counts[state.gone ? 3 : level] += 1;
+function stateCounts(state) {
+  const counts = Object.fromEntries(Object.keys(STATES).map((word) => [word, 0]));
+  for (const word of state.states ?? []) counts[state.gone ? "stale" : word] += 1;
   return counts;
 }
 
@@ -177,10 +180,10 @@ function buildHealth(main, names) {
     const vehicle = element(title, "span", "soft");
     const health = element(title, "span");
     const bar = element(tile, "div", "bar");
-    const parts = LEVELS.map((_, level) => {
+    const parts = Object.entries(STATES).map(([word, [, level]]) => {
       const part = element(bar, "i");
-      part.style.background = `var(--${["good", "fair", "bad", "none"][level]})`;
-      return part;
+      part.style.background = `var(--${COLOURS[level]})`;
+      return [word, part];
     });
     const counts = element(tile, "p", "words");
     const inputs = element(tile, "p", "words soft");
@@ -194,14 +197,14 @@ function buildHealth(main, names) {
       health.textContent = state.gone
         ? (state.silent === null ? "has not spoken yet" : `silent for ${duration(state.silent)}`)
         : HEALTH[worst];
-      const tally = levelCounts(state);
-      parts.forEach((part, level) => {
-        part.style.flexGrow = tally[level];
-        part.hidden = !tally[level];
-        part.title = `${tally[level]} ${LEVELS[level][1]}`;
+      const tally = stateCounts(state);
+      parts.forEach(([word, part]) => {
+        part.style.flexGrow = tally[word];
+        part.hidden = !tally[word];
+        part.title = `${tally[word]} ${word}`;
       });
-      counts.textContent = tally.map((n, level) => n && `${LEVELS[level][0]} ${n} ${LEVELS[level][1]}`)
-        .filter(Boolean).join(" · ");
+      counts.textContent = Object.entries(tally).filter(([, n]) => n)
+        .map(([word, n]) => `${STATES[word][0]} ${n} ${word}`).join(" · ");
       const rates = Object.entries(of.inputs?.values ?? {}).filter(([key]) => key.endsWith(" rate"))
         .map(([key, value]) => `${key.slice(0, -5)} ${value}`).join(", ");
       inputs.textContent = [rates, of.inputs?.message].filter(Boolean).join(" · ");
@@ -246,8 +249,8 @@ function buildCoefficients(main, names, coefficients) {
   }
   const legend = element(main, "div", "legend soft");
   names.forEach((name, index) => keyOf(element(legend, "span"), index, `${shortName(name)}, with its 95 % interval`));
-  LEVELS.forEach(([glyph, word], level) =>
-    element(legend, "span", `levels-${level}`, `${glyph} ${word}`));
+  for (const [word, [sign, level]] of Object.entries(STATES))
+    element(legend, "span", `levels-${level}`, `${sign} ${word}`);
   const grid = element(main, "div", "grid");
   for (const coefficient of coefficients) {
     const card = element(grid, "div", "card");
@@ -271,9 +274,9 @@ function buildCoefficients(main, names, coefficients) {
         const at = cursor === null ? null : nearest(state.history, end - cursor);
         const [v, s] = at ? [at[1][i], at[2][i]] : [state.values[i], state.std[i]];
         value.textContent = `${written(v, s)} ± ${interval(s)}`;
-        const level = state.gone ? 3 : state.levels[i];
+        const [sign, level] = STATES[state.gone ? "stale" : state.states[i]];
         words.className = `state levels-${level}`;
-        words.textContent = at ? `${duration(end - at[0])} ago` : LEVELS[level][0];
+        words.textContent = at ? `${duration(end - at[0])} ago` : sign;
         words.title = state.messages[i];
         const points = state.history.filter(([t]) => t >= start).map(([t, values, std]) =>
           [t, values[i], values[i] - 1.96 * std[i], values[i] + 1.96 * std[i]]);

@@ -1,0 +1,231 @@
+"""Live nodes in processes of their own, and a vehicle at the other end of their topics."""
+
+import fcntl
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from bench import HEAVY
+
+
+def compile_all():
+    """All that a node runs, once for all who ask for it."""
+    from rov_ident.core.jit import CACHE
+    from rov_ident.discrepancy import monitor
+    from rov_ident.estimation.compilation import compiler
+
+    with open(CACHE / "lock", "a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for job in (compiler("rls"), compiler("ukf"), monitor.compiler()):
+            assert job.ensure()
+
+
+_CHUNK = 50  # messages
+_AHEAD = 1.0  # s; that the messages published may be ahead of the samples used
+_PATIENCE = 0.2  # s a chunk; not all messages make samples
+
+
+def in_pace(messages, used, listen, ahead=_AHEAD, patience=_PATIENCE):
+    """The (arrival, role, message), never many more than the nodes have used.
+
+    Fast DDS has 512 messages in shared memory for a process that has no processor for a while. What
+    is lost beyond them is sent again, but seconds after what was sent behind it, which is too late.
+    ``used()`` gives the stamp [ns] of the last sample that all nodes have used; ``listen(seconds)``
+    waits for news of it.
+    """
+    for k, (arrival, role, message) in enumerate(messages, 1):
+        yield arrival, role, message
+        if k % _CHUNK == 0:
+            end = time.monotonic() + patience
+            while message.stamp - used() > ahead * 1e9 and time.monotonic() < end:
+                listen(0.01)
+
+
+class Vehicle:
+    """Publishes the inputs of a node and keeps everything that the node publishes."""
+
+    def __init__(self, estimator="rls", roles=("odom", "imu", "wrench")):
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import WrenchStamped
+        from rclpy.signals import SignalHandlerOptions
+        from std_msgs.msg import Float64MultiArray
+
+        from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
+
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = rclpy.create_node("vehicle", context=self.context)
+        self.executor = Executor(context=self.context)
+        self.executor.add_node(self.node)
+        self.estimator = estimator
+        self.publishers = {
+            role: self.node.create_publisher(type_, name, STREAM)
+            for role, (name, type_) in INPUTS.items()
+            if role in roles
+        }
+        self.coefficients, self.values, self.covariance = [], [], []
+        self.residuals, self.diagnostics = [], []
+        name = f"/{estimator}_node"
+        for topic, type_, qos, heard in (
+            (f"{name}/coefficients", DiagnosticArray, LATCHED, self.coefficients),
+            (f"{name}/coefficients/values", Float64MultiArray, LATCHED, self.values),
+            (f"{name}/coefficients/covariance", Float64MultiArray, LATCHED, self.covariance),
+            (f"{name}/wrench_residual", WrenchStamped, STREAM, self.residuals),
+            ("/diagnostics", DiagnosticArray, STREAM, self.diagnostics),
+        ):
+            self.node.create_subscription(type_, topic, heard.append, qos)
+
+    def until(self, ready, seconds=120.0):
+        """Listen until ``ready()``; fails after some seconds."""
+        end = time.monotonic() + seconds
+        while not ready():
+            assert time.monotonic() < end, "nothing of the kind was heard in time"
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def listen(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=min(seconds, 0.1))
+
+    def connected(self):
+        """Whether both ends know each other: until then topics would overtake one another."""
+        if not all(p.get_subscription_count() for p in self.publishers.values()):
+            return False
+        return all(f"{role} publishers=1" in self.words() for role in self.publishers)
+
+    def publish(self, role, data):
+        self.publishers[role].publish(data)
+
+    def drive(self, messages):
+        """Publish (arrival, role, message) as fast as the node can use them."""
+        from rov_ident.io import cdr
+
+        for _, role, message in in_pace(messages, self.used, self.listen):
+            self.publish(role, cdr.encode(message))
+
+    def used(self):
+        """The stamp [ns] of the last sample whose residual was published."""
+        from rov_ident.nodes.conversions import from_time
+
+        return from_time(self.residuals[-1].header.stamp) if self.residuals else -math.inf
+
+    def call(self, type_, name, request):
+        client = self.node.create_client(type_, f"/{self.estimator}_node/{name}")
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def words(self):
+        """Everything that /diagnostics has said."""
+        return "\n".join(
+            f"{status.message} " + " ".join(f"{v.key}={v.value}" for v in status.values)
+            for message in self.diagnostics
+            for status in message.status
+        )
+
+    def close(self):
+        import rclpy
+
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def start_node(estimator, parameters, *options):
+    """The process of a node with a parameter file."""
+    command = [sys.executable, "-m", f"rov_ident.nodes.{estimator}_node", "--ros-args"]
+    command += ["--params-file", str(parameters)]
+    for option in options:
+        command += ["-p", option]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def until_said(process, words):
+    """Wait for a line with these words on a process's stderr."""
+    while words not in (line := process.stderr.readline()):
+        assert line, "the node ended by itself"
+
+
+def end_node(process, number=signal.SIGINT):
+    """Its exit status and all that it said."""
+    process.send_signal(number)
+    try:
+        _, said = process.communicate(timeout=120)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
+    return process.returncode, said
+
+
+def start_connected(estimator, *options, parameters=HEAVY, **kwargs):
+    """The process of a node that loses nothing, and a vehicle; both have found each other."""
+    process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
+    try:
+        vehicle = Vehicle(estimator, **kwargs)
+        vehicle.until(vehicle.connected, 120.0)
+    except BaseException:
+        process.kill()
+        raise
+    return process, vehicle
+
+
+class Dive:
+    """A dive played to a node at the pace of the clock, which stands still while nobody listens."""
+
+    def __init__(self, messages):
+        self.messages = messages
+        self.done = 0
+
+    def play(self, vehicle, seconds):
+        """Publish this many seconds of it."""
+        from rov_ident.io import cdr
+
+        start, begun = self.messages[self.done][0], time.monotonic()
+        while self.done < len(self.messages):
+            arrival, role, message = self.messages[self.done]
+            due = (arrival - start) * 1e-9
+            if due > seconds:
+                return
+            vehicle.executor.spin_once(timeout_sec=max(due - (time.monotonic() - begun), 0.0))
+            if time.monotonic() - begun >= due:
+                vehicle.publish(role, cdr.encode(message))
+                self.done += 1
+
+
+def slowness():
+    """How many times longer than alone a computation takes on this computer just now; at least 1.
+
+    Limits on time are multiplied by it, as others may use the computer as well.
+    """
+    wall, processor = time.monotonic(), time.process_time()
+    while time.process_time() - processor < 0.1:
+        pass
+    now = (time.monotonic() - wall) / (time.process_time() - processor)
+    return max(1.0, now, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def children(pid):
+    """The running processes started by a process."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except OSError:
+                continue
+            if parent == pid:
+                found.append(int(entry.name))
+    return [child for child in found if is_alive(child) and os.getpid() != child]

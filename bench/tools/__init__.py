@@ -1,0 +1,1 @@
+"""Programs for developers that measure nothing about the estimates themselves."""

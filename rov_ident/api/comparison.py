@@ -1,0 +1,261 @@
+"""Two results side by side: what changed, and by how much against its uncertainty."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rov_ident import config as configuration
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array
+from rov_ident.reports.result import NORMAL, Result, Shown
+from rov_ident.reports.table import PLUS_MINUS, Table, estimate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rov_ident.discrepancy.explain import Explanation
+
+_LARGEST_FILE = 100_000_000  # bytes; more than any result has
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Named numbers (n,) with their standard deviations, read from a result."""
+
+    label: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    std: Array
+    bags: frozenset[str]  # their sha256
+
+
+@dataclass(frozen=True)
+class Comparison(Shown):
+    """What two results say of the same coefficients: all arrays (n,) in the order of ``names``.
+
+    ``deviations`` is the difference over its standard deviation, from the standard deviations of
+    both as if their errors were independent; NaN where neither result has one. ``only_a`` and
+    ``only_b`` are names that one of them lacks.
+    """
+
+    labels: tuple[str, str]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    a: Array
+    a_std: Array
+    b: Array
+    b_std: Array
+    only_a: tuple[str, ...]
+    only_b: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def difference(self) -> Array:
+        """b - a (n,), each in its unit."""
+        return self.b - self.a
+
+    @property
+    def difference_std(self) -> Array:
+        """Standard deviation of the difference (n,)."""
+        return np.hypot(self.a_std, self.b_std)
+
+    @property
+    def deviations(self) -> Array:
+        """The difference in standard deviations of it (n,)."""
+        std = self.difference_std
+        return self.difference / np.where(std > 0.0, std, np.nan)
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """The names whose difference is outside its 95 % interval, the surest first."""
+        sure = np.nan_to_num(np.abs(self.deviations))
+        return tuple(self.names[i] for i in np.argsort(-sure) if sure[i] > NORMAL)
+
+    @property
+    def sentence(self) -> str:
+        """How many coefficients changed, and which one most surely."""
+        n, chance = len(self.names), 0.05 * len(self.names)
+        text = (
+            f"From {self.labels[0]} to {self.labels[1]}, {len(self.changed)} of {n} coefficients "
+            f"differ by more than the 95 % interval of the difference (by chance: {chance:.1f})"
+        )
+        if not self.changed:
+            return f"{text}."
+        first = self.names.index(self.changed[0])
+        return f"{text}; most surely {self.changed[0]}, by {self.deviations[first]:+.1f} std."
+
+    def table(self) -> Table:
+        """Both values with half of their 95 % intervals, and the difference in its std."""
+        a, b = self.labels
+        offs = (f"{off:+.1f}" if math.isfinite(off) else "-" for off in self.deviations)
+        rows = [
+            [name, *first, *second, unit, off, "changed" if name in self.changed else ""]
+            for name, first, second, unit, off in zip(
+                self.names,
+                map(_written, self.a, self.a_std),
+                map(_written, self.b, self.b_std),
+                self.units,
+                offs,
+            )
+        ]
+        head = ["", a, PLUS_MINUS, b, PLUS_MINUS, "unit", "difference [std]", ""]
+        return Table(f"{a} against {b}", head, rows, text=(5, 7))
+
+    def plot(self) -> "Figure":
+        """Both values with their 95 % intervals, relative to the first."""
+        from rov_ident.reports import plots
+
+        percent = 100.0 / np.maximum(np.abs(np.where(self.a == 0.0, self.b, self.a)), 1e-12)
+        columns = zip(self.labels, (self.a, self.b), (self.a_std, self.b_std))
+        rows = {
+            label: (percent * (value - self.a), percent * NORMAL * np.nan_to_num(std))
+            for label, value, std in columns
+        }
+        label = f"difference from {self.labels[0]} [%], with 95 % intervals"
+        return plots.intervals(self.names, rows, label)
+
+    def to_json(self) -> str:
+        """Both values, their difference, and which changed."""
+        keys = ("a", "a_std", "b", "b_std", "difference", "difference_std", "deviations")
+        columns = zip(*(getattr(self, key).tolist() for key in keys))
+        entries: dict[str, dict[str, Any]] = {}
+        for name, unit, values in zip(self.names, self.units, columns):
+            finite = {k: v if math.isfinite(v) else None for k, v in zip(keys, values)}
+            entries[name] = {"unit": unit, **finite, "changed": name in self.changed}
+        document = {"a": self.labels[0], "b": self.labels[1], "coefficients": entries}
+        others = ("changed", "only_a", "only_b", "sentence", "notes")
+        document |= {key: getattr(self, key) for key in others}
+        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def _written(value: float, std: float) -> tuple[str, str]:
+    return (f"{value:.5g}", "") if std == 0.0 else estimate(value, NORMAL * std)
+
+
+def compare(
+    a: "Result | Explanation | Config | str | os.PathLike[str]",
+    b: "Result | Explanation | Config | str | os.PathLike[str]",
+) -> Comparison:
+    """Compare two results: which coefficients changed, and by how many standard deviations.
+
+    Parameters
+    ----------
+    a, b
+        A Fit, an Explanation, a Config, or the path of the JSON of ``fit``, ``explain``, ``nomoto``
+        or ``forces`` or of a parameter file (YAML). Values of a configuration have no uncertainty:
+        they are compared as they are.
+
+    Returns
+    -------
+    Comparison
+        Values, standard deviations and differences (n,), each in the coefficient's unit.
+
+    Raises
+    ------
+    UserError
+        If a file cannot be read, holds no estimates, or the two have no coefficient in common.
+    """
+    one, two = _estimates(a), _estimates(b)
+    names = tuple(name for name in one.names if name in two.names)
+    if not names:
+        raise UserError(f"{one.label} and {two.label} have no coefficient in common")
+    first, second = (np.array([e.names.index(n) for n in names]) for e in (one, two))
+    units = tuple(one.units[i] for i in first)
+    for name, unit, i in zip(names, units, second, strict=True):
+        if unit != two.units[i]:
+            raise UserError(f"{name} is in {unit} in {one.label}, in {two.units[i]} in {two.label}")
+    same_data = (
+        "both are made from the same data: their errors go together, and the standard deviation of "
+        "the difference is an upper bound of it"
+    )
+    labels = (one.label, two.label) if one.label != two.label else ("a", "b")
+    return Comparison(
+        labels, names, units,
+        one.values[first], one.std[first], two.values[second], two.std[second],
+        tuple(n for n in one.names if n not in names),
+        tuple(n for n in two.names if n not in names),
+        (same_data,) if one.bags & two.bags else (),
+    )  # fmt: skip
+
+
+def _estimates(source: Any) -> Estimates:
+    if isinstance(source, Config):
+        return _of_config(source, source.name)
+    if isinstance(source, Shown):
+        label = source.estimator if isinstance(source, Result) else "explain"
+        return _of_document(json.loads(source.to_json()), label)
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        return _of_config(configuration.load(path), path.name)
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise UserError(f"{path} is larger than any result")
+        return _of_document(json.loads(path.read_text(encoding="utf-8")), path.name)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is no JSON of a result: {error}") from error
+
+
+def _of_config(config: Config, label: str) -> Estimates:
+    model = config.model
+    units = tuple(c.unit for c in model.coefficients)
+    return Estimates(label, model.names, units, model.theta, 0.0 * model.theta, frozenset())
+
+
+def _of_document(document: Any, label: str) -> Estimates:
+    """The numbers in the JSON of a result.
+
+    Raises UserError if there are none.
+    """
+    found: dict[str, tuple[str, float, float]] = {}
+    entry: Any
+    for name, entry in _entries(document):
+        value, std, unit = entry.get("value", entry.get("to")), entry.get("std"), entry.get("unit")
+        numeric = all(isinstance(x, int | float) and math.isfinite(x) for x in (value, std))
+        if not (numeric and isinstance(unit, str) and float(std) >= 0.0):
+            raise UserError(f"{label}: {name} has no value, std and unit as results have them")
+        found[name] = (unit, float(value), float(std))
+    if not found:
+        raise UserError(
+            f"{label} holds no estimates: give the JSON of fit, explain, nomoto or forces"
+        )
+    units, values, std = zip(*found.values(), strict=True)
+    bags = _mappings(_mapping(document.get("provenance")).get("bags"))
+    hashes = frozenset(str(bag["sha256"]) for bag in bags if "sha256" in bag)
+    return Estimates(label, tuple(found), units, np.array(values), np.array(std), hashes)
+
+
+def _mapping(x: Any) -> Mapping[str, Any]:
+    return x if isinstance(x, Mapping) else {}
+
+
+def _mappings(x: Any) -> list[Mapping[str, Any]]:
+    return [_mapping(one) for one in x] if isinstance(x, list) else []
+
+
+def _entries(document: Any) -> list[tuple[str, Mapping[str, Any]]]:
+    """Every named number of a result: of `fit`, of `explain`, of `forces`, of `nomoto`."""
+    top = _mapping(document)
+    groups = [("", top.get("coefficients", top))]
+    if "retuned" in top:
+        groups = [("", _mapping(top["retuned"]).get("changed"))]
+        effects = _mappings(top.get("effects"))
+        groups += [(f"{effect.get('effect')}.", effect.get("parameters")) for effect in effects]
+    elif "axes" in top:
+        groups = [("", _mapping(axis).get("terms")) for axis in _mapping(top["axes"]).values()]
+    return [
+        # a coefficient of an effect is called as in a fit
+        (name if name[:1].isupper() else f"{prefix}{name}", entry)
+        for prefix, group in groups
+        for name, entry in _mapping(group).items()
+        if isinstance(entry, Mapping) and "std" in entry
+    ]

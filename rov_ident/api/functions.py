@@ -1,0 +1,381 @@
+"""From files to results: reading, fitting, explaining, checking, planning."""
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident import config as configuration
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.threads import one_blas_thread
+from rov_ident.discrepancy.explain import Explanation
+from rov_ident.discrepancy.explain import explain as explain_streams
+from rov_ident.estimation.online import ESTIMATORS
+from rov_ident.experiment import data_quality, design
+from rov_ident.experiment.data_quality import Check
+from rov_ident.experiment.design import Limits, Proposal
+from rov_ident.io import topics
+from rov_ident.io.bag_reader import Bag
+from rov_ident.model.coefficients import (
+    MOTIONS,
+    Coefficient,
+    FinCoefficient,
+    catalogue,
+    fin_catalogue,
+)
+from rov_ident.offline import archive, batch_fit
+from rov_ident.offline.batch_fit import CHANNELS, KINDS, Settings
+from rov_ident.offline.fit import Fit, fit_online
+from rov_ident.sampling.raw_streams import Streams, gather
+from rov_ident.sampling.records import Record, read_record
+
+File = str | os.PathLike[str]
+Files = File | Sequence[File]
+
+
+class Progress(Protocol):
+    """Called now and then with what is being done, and the share of it that is, where known."""
+
+    def __call__(self, what: str, share: float | None = None) -> None: ...
+
+
+def _silent(what: str, share: float | None = None) -> None:
+    pass
+
+
+def _several(files: Files) -> list[Path]:
+    one = isinstance(files, str | os.PathLike)
+    return [Path(files)] if one else [Path(file) for file in files]  # type: ignore[arg-type, union-attr]
+
+
+def load(config: File | Config, node: str = "") -> Config:
+    """Read a parameter file of a vehicle, the one that nodes and commands use.
+
+    Parameters
+    ----------
+    config
+        Path of the YAML file. Vectors in it are in the axes of its key ``vehicle.frame``; those of
+        the Config are always forward-starboard-down, in SI units. A Config is returned as it is.
+    node
+        Name of a node (``rls_node``, ``ukf_node``) whose own section overrides ``/**``.
+
+    Raises
+    ------
+    UserError
+        If a key is missing, of a wrong type or unphysical: one sentence that names it.
+    """
+    return configuration.load(config, node)
+
+
+@one_blas_thread()
+def read(bag: File, config: File | Config, progress: Progress | None = None) -> Record:
+    """Read a bag into samples: all that was measured, on one clock, as the estimators see it.
+
+    Parameters
+    ----------
+    bag
+        Path of an ``.mcap`` file or a rosbag2 directory. Axes of its messages follow their frame
+        ids, or the configuration.
+    config
+        Path of a parameter file, or a Config.
+    progress
+        Called with a sentence and the share (0 to 1) that is done.
+
+    Returns
+    -------
+    Record
+        ``samples`` (k,), a structured array: ``t`` [s] since the first message, ``nu`` (k, 6) [m/s,
+        rad/s] through the water and ``wrench`` (k, 6) [N, N m] in body axes forward-starboard-down,
+        ``orientation`` (k, 4) w x y z, body to north-east-down, and what else `SAMPLE` lists;
+        ``duration`` [s]; ``notes`` on what was refused.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read, lacks a topic or yields no sample.
+    """
+    say, path = progress or _silent, Path(bag)
+    return read_record(path, load(config), lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
+
+
+@one_blas_thread()
+def fit(
+    bags: Files,
+    config: File | Config,
+    estimator: str = "ml",
+    channels: str | Sequence[str] | None = None,
+    *,
+    validate: File | None = None,
+    prior: bool = True,
+    weighted: bool = True,
+    process: bool = True,
+    jobs: int = 1,
+    dask: str = "",
+    reference: float = 0.0,
+    progress: Progress | None = None,
+) -> Fit:
+    """Identify the coefficients of a vehicle from its bags.
+
+    Parameters
+    ----------
+    bags
+        Path of an ``.mcap`` file or a rosbag2 directory, or several.
+    config
+        Path of a parameter file, or a Config: the values to begin with, and what is known.
+    estimator
+        ``ml`` maximum likelihood; ``ls`` least squares; ``iv`` instrumental variables; ``rls`` and
+        ``ukf`` the same code as the live nodes, which sees every sample once.
+    channels
+        ls, iv, ml: fit these axes alone, the others follow the measurement: ``"surge"``,
+        ``"surge,yaw"``, ``"lateral"`` (sway, yaw), ``"longitudinal"`` (heave, pitch). Several: one
+        group after the other. None: all together.
+    validate
+        Path of a bag that the fit does not see, on which it is judged.
+    prior
+        ls, iv, ml: whether the configured values count as one more measurement.
+    weighted
+        ls, iv: whether each axis is weighed by its residual.
+    process
+        ml: whether errors of the wrench are allowed for.
+    jobs
+        ls, iv, ml: processes that read the bags. A script that asks for more than one needs the
+        usual ``if __name__ == "__main__"``.
+    dask
+        ls, iv, ml: address of a Dask scheduler that reads the bags, or ``"local"``.
+    reference
+        ukf: seconds of the first bag over which filterpy's own filter runs beside ours on the same
+        model and samples; ``more["reference"]`` has both.
+    progress
+        As in :func:`read`.
+
+    Returns
+    -------
+    Fit
+        ``names``, ``values`` (n,), ``std`` (n,), ``lower`` and ``upper`` (n,) in SI units, signs as
+        SNAME has them; ``fitted``, a Config with these values.
+
+    Raises
+    ------
+    UserError
+        If there is no such estimator or channel, an option has no meaning with the estimator, a bag
+        cannot be read, or the data are too few.
+    """
+    live = estimator in ESTIMATORS
+    if not live and estimator not in KINDS:
+        known = ", ".join((*ESTIMATORS, *KINDS))
+        raise UserError(f"there is no estimator '{estimator}': use {known}")
+    ignored = {
+        "channels (--channels)": live and channels is not None,
+        "prior (--no-prior)": live and not prior,
+        "weighted (--ordinary)": estimator not in ("ls", "iv") and not weighted,
+        "process (--output-error)": estimator != "ml" and not process,
+        "jobs (--jobs)": live and jobs != 1,
+        "dask (--dask)": live and bool(dask),
+        "reference (--reference)": estimator != "ukf" and bool(reference),
+    }
+    if wrong := [name for name, is_ignored in ignored.items() if is_ignored]:
+        raise UserError(f"{wrong[0]} has no meaning with the estimator {estimator}")
+    given = load(config, f"{estimator}_node" if live else "")
+    paths, say = _several(bags), progress or _silent
+    settings = Settings(_stages(channels), prior, weighted, process)
+    with contextlib.ExitStack() as stack:
+        if live:
+            records = [read(path, given, progress) for path in paths]
+            many = archive.of_records(records)
+            say("estimating")
+            found = fit_online(records, given, estimator)  # type: ignore[arg-type]
+            if reference:
+                found.more["reference"] = _reference(paths[0], given, reference, say)
+        else:
+            many = stack.enter_context(_opened(paths, given, say, jobs, dask))
+            found = batch_fit.fit_batch(many, given, estimator, settings, say)
+        say("simulating in open loop")
+        found = dataclasses.replace(
+            found, curves=tuple(batch_fit.curves(many, given, found.fitted))
+        )
+        if validate is None:
+            return found
+        judge = stack.enter_context(_opened([Path(validate)], given, say))
+        more = {"validation": batch_fit.validation(judge, given, found.fitted)}
+        judged = tuple(batch_fit.curves(judge, given, found.fitted))
+        return dataclasses.replace(found, more=found.more | more, judged=judged)
+
+
+def _reference(path: Path, config: Config, duration: float, say: Progress) -> dict[str, Any]:
+    """Both unscented filters over the beginning of a bag; effects are held."""
+    from rov_ident.estimation.reference_ukf import compare
+
+    held = config.with_effects_held
+    samples = read(path, held, say).samples
+    samples = samples[samples["t"] < samples["t"][0] + duration]
+    return compare(held, samples, lambda share: say("filterpy's filter", share))
+
+
+def _opened(
+    paths: Sequence[Path], config: Config, say: Progress, jobs: int = 1, dask: str = ""
+) -> contextlib.AbstractContextManager[archive.Archive]:
+    def told(name: str, done: int, total: int) -> None:
+        say(f"read {name}", done / total)
+
+    return archive.opened(paths, config, jobs, dask, told)
+
+
+def _stages(channels: str | Sequence[str] | None) -> tuple[tuple[str, ...], ...]:
+    """Groups of axes to fit one after the other."""
+    groups = [channels] if isinstance(channels, str) else channels or ()
+    return tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
+
+
+def axes(channels: str) -> NDArray[np.bool_]:
+    """Which axes (6,) the names of channels, divided by commas, mean.
+
+    Raises
+    ------
+    UserError
+        If there is no such channel.
+    """
+    wanted = channels.split(",")
+    if unknown := sorted(set(wanted) - set(CHANNELS)):
+        raise UserError(f"no channel {unknown[0]!r}: use {','.join(CHANNELS)}")
+    names = {axis for name in wanted for axis in CHANNELS[name]}
+    return np.array([name in names for name in MOTIONS])
+
+
+@one_blas_thread()
+def explain(
+    bags: Files,
+    config: File | Config,
+    validate: File | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Explanation:
+    """Find what the configured simulation lacks, and what each lacking effect would gain.
+
+    Parameters
+    ----------
+    bags
+        Path of an ``.mcap`` file or a rosbag2 directory, or several.
+    config
+        Path of a parameter file, or a Config: the simulation that is judged.
+    validate
+        Path of a bag to judge on; None: on 30 % of each bag that no fit sees.
+    progress
+        As in :func:`read`.
+
+    Returns
+    -------
+    Explanation
+        ``findings`` with effects, gains [%] and verdict; ``extended``, a Config with them.
+
+    Raises
+    ------
+    UserError
+        If a bag cannot be read or is too short, or the model cannot be simulated at all.
+    """
+    given, say = load(config), progress or _silent
+    read_bags = [_streams(path, given, say) for path in _several(bags)]
+    judge = None if validate is None else _streams(Path(validate), given, say)
+    found = explain_streams(
+        [streams for streams, _ in read_bags], given, judge[0] if judge else None, say
+    )
+    name = given.name if isinstance(config, Config) else Path(config).name
+    made: dict[str, Any] = {"rov_ident": version("rov_ident"), "config": name}
+    made |= {"bags": [source for _, source in read_bags]}
+    made |= {"validate": judge[1]} if judge else {}
+    return dataclasses.replace(found, findings=dataclasses.replace(found.findings, provenance=made))
+
+
+def _streams(path: Path, config: Config, say: Progress) -> tuple[Streams, dict[str, str]]:
+    """A bag's messages in arrays, and its name and sha256."""
+    bag = Bag(path)
+    chosen = topics.select(bag, config)
+    total = topics.total(bag, chosen)
+
+    def counted() -> Iterator[Any]:
+        for done, message in enumerate(topics.messages(bag, chosen, config)):
+            if done % 2000 == 0:
+                say(f"reading {path.name}", done / total)
+            yield message
+
+    streams = gather(counted(), config)
+    if bag.damage:
+        streams = dataclasses.replace(streams, notes=(*streams.notes, bag.damage))
+    return streams, {"name": bag.path.name, "sha256": bag.sha256}
+
+
+@one_blas_thread()
+def check(bag: File, config: File | Config, *, progress: Progress | None = None) -> Check:
+    """Say whether a bag is fit for identification, and what it would tell of each coefficient.
+
+    Parameters
+    ----------
+    bag, config, progress
+        As in :func:`read`.
+
+    Returns
+    -------
+    Check
+        ``fit``, whether a fit makes sense; ``remarks``; ``prospects``, each with the standard
+        deviation that a fit would give, in the coefficient's unit.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read, or has too few messages.
+    """
+    return data_quality.check(Path(bag), load(config), progress)
+
+
+@one_blas_thread()
+def plan(
+    config: File | Config,
+    bag: Files | None = None,
+    *,
+    duration: float = 60.0,
+    tank: Sequence[float] = (6.0, 6.0, 2.0),
+    thrust: float = 1.0,
+    progress: Callable[..., None] | None = None,
+) -> Proposal:
+    """Propose the manoeuvre to run next: safe, and best for the coefficient that is known worst.
+
+    Parameters
+    ----------
+    bag
+        Path, or several, of what has been recorded already.
+    duration
+        Length of the manoeuvre, s.
+    tank
+        Length (north), width (east) and depth (down) of free water about the start, m.
+    thrust
+        The largest wrench on each axis, relative to what holds working speed.
+    config, progress
+        As in :func:`read`.
+
+    Returns
+    -------
+    Proposal
+        ``best``, the manoeuvre; ``before`` and ``after``, what is known of each coefficient.
+
+    Raises
+    ------
+    UserError
+        If a bag cannot be read, or no manoeuvre is safe within these limits.
+    """
+    given, say = load(config), progress or _silent
+    length, width, depth = tank
+    limits = Limits((length, width, depth), thrust)
+    known = contextlib.nullcontext() if bag is None else _opened(_several(bag), given, say)
+    with known as bags:
+        return design.propose(given, bags, duration, limits, say)
+
+
+def coefficients() -> tuple[Coefficient | FinCoefficient, ...]:
+    """Every coefficient a configuration may name, each with ``name``, ``unit``, ``meaning``."""
+    return (*catalogue(), *fin_catalogue())

@@ -1,0 +1,190 @@
+"""Open-loop simulation, of a manoeuvre or beside a bag."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.api.functions import File, Progress, axes, load, read
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array, Message
+from rov_ident.core.threads import one_blas_thread
+from rov_ident.effects import compiled
+from rov_ident.io.write_messages import write_messages
+from rov_ident.reports.result import Shown
+from rov_ident.reports.table import Table
+from rov_ident.sampling.records import (
+    HORIZON,
+    VELOCITIES,
+    Score,
+    numbers,
+    over_ground,
+    predicted,
+    score,
+)
+from rov_ident.simulation.virtual_sensors import Suite, dive, odometry_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_UNITS = ("m/s",) * 3 + ("rad/s",) * 3
+_POINTS = 2000  # of a curve in a picture
+
+
+@dataclass(frozen=True)
+class Simulation(Shown):
+    """A simulated motion: velocities ``nu`` (k, 6) [m/s, rad/s] over ground, in body axes
+    forward-starboard-down, at ``t`` (k,) [s].
+
+    Beside a bag: ``measured`` (k, 6) what the bag has, ``whole`` and ``windows`` the error of the
+    simulation in one run and in windows of HORIZON seconds, and ``free`` (6,) which axes were
+    simulated. Of a manoeuvre, these are None, and ``messages`` are what simulated sensors saw.
+    """
+
+    name: str
+    t: Array
+    nu: Array
+    messages: list[tuple[int, str, Message]] = field(repr=False)
+    measured: Array | None = None
+    free: NDArray[np.bool_] | None = None
+    whole: Score | None = None
+    windows: Score | None = None
+    notes: tuple[str, ...] = ()
+    duration: float = 0.0  # s
+
+    @property
+    def sentence(self) -> str:
+        """What was simulated."""
+        if self.measured is None:
+            return f"{self.name}, {self.t[-1]:.1f} s simulated, {len(self.messages)} messages."
+        return f"Open-loop simulation against {self.name}, {self.t[-1] - self.t[0]:.1f} s."
+
+    @property
+    def _chosen(self) -> list[int]:
+        return [i for i in range(6) if self.free is None or self.free[i]]
+
+    def table(self) -> Table:
+        """Errors against the bag; of a manoeuvre, how the vehicle moves."""
+        if self.whole is None or self.windows is None:
+            rows = [
+                [name, f"{x.min():.3f}", f"{x.max():.3f}", f"{np.sqrt(np.mean(x**2)):.3f}", unit]
+                for name, x, unit in zip(VELOCITIES, self.nu.T, _UNITS)
+            ]
+            return Table(self.sentence, ["", "least", "most", "rms", "unit"], rows, text=(4,))
+        rows = [
+            [VELOCITIES[i], f"{self.whole.r2[i]:.3f}", f"{self.whole.rmse[i]:.4f}",
+             f"{self.windows.rmse[i]:.4f}", _UNITS[i]]
+            for i in self._chosen
+        ]  # fmt: skip
+        head = ["", "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit"]
+        return Table(f"open-loop simulation against {self.name}", head, rows, text=(4,))
+
+    def plot(self) -> "Figure":
+        """The six velocities, simulated and measured."""
+        from rov_ident.reports import plots
+
+        keep = slice(None, None, max(1, len(self.t) // _POINTS))
+        measured = None if self.measured is None else self.measured[keep]
+        return plots.motions(self.t[keep], measured, {"as configured": self.nu[keep]})
+
+    def to_json(self) -> str:
+        """The errors against the bag; of a manoeuvre, its length."""
+        result: dict[str, Any] = {"messages": len(self.messages), "duration_s": self.duration}
+        if self.whole is not None and self.windows is not None:
+            columns = {
+                "r2": numbers(self.whole.r2),
+                "rmse": numbers(self.whole.rmse),
+                "rmse_windows": numbers(self.windows.rmse),
+            }
+            velocities = {
+                VELOCITIES[i]: {k: by[VELOCITIES[i]] for k, by in columns.items()}
+                | {"unit": _UNITS[i]}
+                for i in self._chosen
+            }
+            result = {"bag": self.name, "horizon_s": HORIZON, "velocities": velocities}
+        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+
+    def _writers(self) -> dict[str, Callable[[Path], None]]:
+        return super()._writers() | {".mcap": lambda path: write_messages(path, self.messages)}
+
+
+@one_blas_thread()
+def simulate(
+    config: File | Config,
+    *,
+    bag: File | None = None,
+    manoeuvre: str | None = None,
+    channels: str | None = None,
+    duration: float = 180.0,
+    sensors: Suite | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Simulation:
+    """Simulate the configured vehicle in open loop: driven by a bag's wrench, or in a manoeuvre.
+
+    Parameters
+    ----------
+    bag
+        Path of an ``.mcap`` file or a rosbag2 directory whose wrench drives the simulation.
+    manoeuvre
+        Instead of a bag: ``steps``, ``multisine``, ``single-axis``, ``pilot`` or ``rest``.
+    channels
+        With a bag: simulate these axes alone (``"surge,yaw"``), the others follow the measurement.
+    duration
+        Of a manoeuvre, s.
+    sensors
+        Of a manoeuvre: rates [Hz] and noise of the simulated sensors, a
+        ``rov_ident.simulation.virtual_sensors.Suite``.
+    seed
+        Of a manoeuvre: of its course and of the noise.
+    config, progress
+        As in :func:`rov_ident.read`.
+
+    Returns
+    -------
+    Simulation
+        Velocities (k, 6) [m/s, rad/s] over time, and beside a bag their errors.
+
+    Raises
+    ------
+    UserError
+        If not one of bag and manoeuvre is given, the bag cannot be read, there is no such
+        manoeuvre, or the simulation diverges.
+    """
+    given = load(config)
+    free = None if channels is None else axes(channels)
+    if (bag is None) == (manoeuvre is None):
+        raise UserError("give either a bag or a manoeuvre to simulate")
+    if progress:
+        progress("simulating")
+    if manoeuvre is not None:
+        run = dive(given, manoeuvre, duration, sensors or Suite(), seed)
+        return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
+    assert bag is not None
+    record = read(bag, given, progress)
+    model, effects = given.dynamics, compiled(given.effects)
+    nu = predicted(model, record.samples, math.inf, free, effects)
+    if not np.isfinite(nu).all():
+        raise UserError(
+            f"the simulation diverges on {bag}: check the signs and sizes of the coefficients and "
+            "of the wrench"
+        )
+    t = record.samples["t"]
+    return Simulation(
+        record.path.name,
+        t,
+        nu,
+        odometry_of(t, nu),
+        over_ground(record.samples),
+        free,
+        score(model, record.samples, math.inf, free, effects),
+        score(model, record.samples, HORIZON, free, effects),
+        record.notes,
+        record.duration,
+    )

@@ -1,0 +1,17 @@
+"""The program `rov-ident`: one file a command (or a few that belong together).
+
+Arguments in, sentences and tables out. What a command needs beyond numpy is imported when it runs,
+so that `rov-ident --help` is there at once.
+"""
+
+from collections.abc import Sequence
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command in this process, which is the program's own; the exit status."""
+    from rov_ident.core.threads import limit_process
+
+    limit_process()  # before numpy is loaded
+    from rov_ident.cli.program import main as run
+
+    return run(arguments)

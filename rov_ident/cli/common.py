@@ -1,0 +1,159 @@
+"""What the commands share: consoles, arguments, progress, tables, files."""
+
+import argparse
+import contextlib
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from rich import progress as bars
+from rich.console import Console
+
+from rov_ident.core.errors import UserError
+from rov_ident.core.files import check_output, write_file
+
+if TYPE_CHECKING:
+    from rov_ident.api.functions import Progress
+    from rov_ident.reports.result import Shown
+
+ERR = Console(stderr=True, highlight=False, markup=False)
+OUT = Console(highlight=False, markup=False, soft_wrap=True)
+
+LIVE = ("rls", "ukf")
+LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+_BAG = "an .mcap file or a rosbag2 directory"
+_PATHS: Mapping[str, Mapping[str, Any]] = {
+    "bag": {"metavar": "BAG", "help": _BAG},
+    "bags": {"metavar": "BAG", "nargs": "+", "help": _BAG},
+    "--config": {"required": True, "help": "the vehicle's parameter file"},
+    "--json": {"help": "write the result here"},
+    "--report": {"metavar": "FILE", "help": "write a page with pictures"},
+    "--save": {"metavar": "FILE", "help": "write a configuration with the fitted values"},
+}
+"""Paths that several commands take, each with one meaning."""
+
+
+def command(
+    commands: Commands,
+    name: str,
+    text: str,
+    run: Callable[[argparse.Namespace], None],
+    paths: str = "",
+) -> argparse.ArgumentParser:
+    """A new command and what runs it, with the common ``paths`` of these names."""
+    parser = commands.add_parser(name, help=text)
+    parser.set_defaults(run=run)
+    for path in paths.split():
+        parser.add_argument(path, type=Path, **_PATHS[path])
+    return parser
+
+
+def columns_option(parser: argparse.ArgumentParser, example: str) -> None:
+    parser.add_argument(
+        "--map", nargs="+", action="extend", default=[], metavar="NAME=HEADING",
+        help=f"headings that are called otherwise ({example}), or a YAML file",
+    )  # fmt: skip
+
+
+def _real(meaning: str, good: Callable[[float], bool]) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+        if not good(value):
+            raise argparse.ArgumentTypeError(f"{text} must be {meaning}")
+        return value
+
+    return parse
+
+
+def _whole(meaning: str, low: int, high: float) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meaning}")
+        return int(text)
+
+    return parse
+
+
+number = _real("a number", lambda value: True)
+rate = _real(f"from 0 to {LARGEST:g}", lambda value: 0.0 <= value <= LARGEST)
+share = _real("from 0 to below 1", lambda value: 0.0 <= value < 1.0)
+positive = _real(f"above 0, up to {LARGEST:g}", lambda value: 0.0 < value <= LARGEST)
+seed = _whole("a whole number from 0", 0, math.inf)
+port = _whole("a port, from 0 to 65535", 0, 65535)
+count = _whole("a whole number from 1 to 1024", 1, 1024)
+
+
+def box(text: str) -> tuple[float, ...]:
+    sides = tuple(positive(part) for part in text.split(","))
+    if len(sides) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} must be three lengths: 6,6,2")
+    return sides
+
+
+@contextlib.contextmanager
+def progress(options: argparse.Namespace) -> "Iterator[Progress]":
+    """A line and a bar on standard error; nothing with --quiet, or where nobody looks."""
+    shown = ERR.is_terminal and not options.quiet
+    with bars.Progress(console=ERR, transient=True, disable=not shown) as shown_bars:
+        bar = shown_bars.add_task("", total=None)
+
+        def tell(what: str, share: float | None = None) -> None:
+            total = None if share is None else 1.0
+            # At once: what is done quickly should be seen, too.
+            shown_bars.update(
+                bar, description=what, completed=share or 0.0, total=total, refresh=True
+            )
+
+        yield tell
+
+
+def check_outputs(
+    outputs: Sequence[Path | None], inputs: Sequence[Path | None], bag: Path | None = None
+) -> None:
+    """Refuse, before any work, what could not be written or would replace what is read, or another
+    result; ``bag`` is an output that is a bag."""
+    taken = [path for path in inputs if path]
+    for path in taken:
+        if "\0" in str(path):
+            raise UserError(f"{path!r} cannot be read: no file can have that name")
+    for out in filter(None, (*outputs, bag)):
+        check_output(out, taken, out is bag)
+        taken.append(out)
+
+
+def write_json(path: Path | None, result: Mapping[str, object]) -> None:
+    """The machine-readable result of a command, where it is wanted."""
+    if path:
+        write_file(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+def write_result(
+    result: "Shown", options: argparse.Namespace, tell: "Progress | None" = None
+) -> None:
+    """The page and the JSON of a result, where they are wanted."""
+    if options.report:
+        if tell:
+            tell("drawing")
+        write_file(options.report, result.page())
+    if options.json:
+        write_file(options.json, result.to_json())
+
+
+def say(*sentences: str) -> None:
+    """Sentences on standard error, each on its own line however long it is."""
+    for sentence in sentences:
+        ERR.print(sentence, soft_wrap=True)
+
+
+def show(result: "Shown", notes: Sequence[str] = ()) -> None:
+    """The table of a result on standard output, its notes on standard error."""
+    OUT.print(result.table())
+    say(*notes)

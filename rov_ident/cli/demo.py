@@ -1,0 +1,118 @@
+"""The main job on the shipped bag: two live nodes, the coefficients converging, a report."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from rov_ident import config as configuration
+from rov_ident.cli.common import ERR, LIVE, OUT, Commands, check_outputs, command, rate
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.files import write_file
+
+if TYPE_CHECKING:
+    from rov_ident.estimation.online import Report
+
+_FOLDERS = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "rov_ident")
+
+
+def add(commands: Commands) -> None:
+    demo = command(commands, "demo", "the main job on the shipped bag, live over DDS", _demo)
+    demo.add_argument("--rate", type=rate, default=4.0, help="speed of the replay (default 4)")
+    demo.add_argument(
+        "--out", type=Path, default=Path("out/demo"), help="folder of the report (out/demo)"
+    )
+
+
+def _demo(options: argparse.Namespace) -> None:
+    # Its own pictures are the progress: with --quiet there are none.
+    err = Console(stderr=True, quiet=True) if options.quiet else ERR
+    _play(options.out, options.rate, err, OUT)
+
+
+def shipped(name: str) -> Path:
+    """A file that comes with the project: beside the package, or where it was installed.
+
+    Raises UserError if it is in neither place.
+    """
+    for folder in _FOLDERS:
+        if (folder / name).exists():
+            return folder / name
+    raise UserError(f"{name} is not here: run the demo from a checkout of the project")
+
+
+def _play(out: Path, rate: float, err: Console, console: Console) -> None:
+    """Replay the shipped bag over DDS into both nodes and report against the simulator's truth."""
+    from rov_ident.cli import demo_page as pages
+    from rov_ident.nodes.replay import replay
+    from rov_ident.reports import plots
+    from rov_ident.sampling.records import read_record
+
+    coefficients, path, picture = (
+        out / name for name in ("coefficients.mcap", "report.html", "convergence.png")
+    )
+    check_outputs([path, picture], [], coefficients)
+    bag, start = shipped("bags/demo.mcap"), shipped("config/bluerov2_heavy_demo.yaml")
+    config = configuration.load(start)
+    model = configuration.load(shipped("config/bluerov2_heavy.yaml")).model
+    truth = dict(zip(model.names, model.theta.tolist(), strict=True))
+    seen: dict[str, list[Report]] = {name: [] for name in LIVE}
+
+    err.print(
+        f"Playing {bag.name} over DDS at {rate:g} x into rls_node and ukf_node, which start from "
+        f"{start.name}: coefficients off by up to 50 %."
+    )
+    with Live(console=err, refresh_per_second=4, transient=True) as live:
+
+        def show(name: str, state: "Report") -> None:
+            if state.stamp:
+                seen[name].append(state)
+                live.update(_table(config, truth, seen))
+
+        result = replay(bag, start, LIVE, rate, coefficients, show)
+    console.print(_table(config, truth, seen))
+
+    record = read_record(bag, config)
+    histories = {name: pages.history_of(reports) for name, reports in seen.items()}
+    write_file(path, pages.page(config, truth, histories, record))
+    write_file(picture, plots.to_png(plots.convergence(histories, truth)))
+    for name, history in histories.items():
+        true = np.array([truth[n] for n in history.names])
+        error = np.abs(history.values[-1] / true - 1.0)
+        z = np.abs(history.values[-1] - true) / history.std[-1]
+        console.print(
+            f"{name}: error median {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} "
+            f"% ({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
+            "values inside their 95 % interval"
+        )
+    console.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")
+
+
+def _table(config: Config, truth: dict[str, float], seen: "dict[str, list[Report]]") -> Table:
+    # Lines between the columns would need more than 80 characters.
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("")
+    for column in ("truth", "start", *LIVE, "unit"):
+        table.add_column(column, justify="left" if column == "unit" else "right")
+    latest = {name: reports[-1] for name, reports in seen.items() if reports}
+    for i, name in enumerate(config.estimate):
+        cells = []
+        for estimator in LIVE:
+            state = latest.get(estimator)
+            if state is None:
+                cells.append(Text())
+                continue
+            colour = ("green", "yellow", "red", "dim")[state.levels[i]]
+            cells.append(Text(f"{state.values[i]:.4g} ± {1.96 * state.std[i]:.2g}", colour))
+        start = config.value(name)
+        unit = config.model.coefficients[config.model.names.index(name)].unit
+        table.add_row(name, f"{truth[name]:.4g}", f"{start:.4g}", *cells, unit)
+    return table

@@ -1,0 +1,24 @@
+"""The parameter file of nodes and commands: its keys, and how it is read, checked and written.
+
+Knows the model and the effects; nothing of messages, bags or ROS. A new key is one field in
+`schema`.
+"""
+
+from rov_ident.config.reading import checked, from_parameters, load, thruster_signal
+from rov_ident.config.schema import (
+    LARGEST,
+    PARAMETERS,
+    VEHICLE_PARAMETERS,
+    Config,
+    Inputs,
+    Names,
+    Parameter,
+    Qos,
+    Thrusters,
+    Vector,
+)
+from rov_ident.config.writing import as_file_name, dump, to_parameters
+
+__all__ = ["LARGEST", "PARAMETERS", "VEHICLE_PARAMETERS", "Config", "Inputs", "Names", "Parameter"]
+__all__ += ["Qos", "Thrusters", "Vector", "as_file_name", "checked", "dump", "from_parameters"]
+__all__ += ["load", "thruster_signal", "to_parameters"]

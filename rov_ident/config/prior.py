@@ -1,0 +1,83 @@
+"""What is known before any data: values, standard deviations and bounds of what is estimated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.effects import parameter
+from rov_ident.model.equations import Array, Model
+from rov_ident.model.scales import WORKING_SPEED, authority
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What to estimate, before any data: coefficients, then parameters of effects.
+
+    ``estimated`` (n,) are their indices into theta, behind which the parameters of effects are
+    counted on; mean and std (n,) in their own units. ``negative`` (n,) marks the coefficients that
+    no passive hull has positive; lower and upper (n,) are the bounds of the parameters of effects.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimated: NDArray[np.int64]
+    mean: Array
+    std: Array
+    negative: NDArray[np.bool_]
+    lower: Array
+    upper: Array
+
+
+def prior_of(config: Config, effects: bool = False) -> Prior:
+    """The prior that a configuration states, of its coefficients or of all that it estimates.
+
+    The standard deviation of a coefficient is relative to its value, but not less than a share of
+    what such a term would weigh at working speed: a published zero means "not known", not "exactly
+    zero".
+    """
+    model = config.dynamics
+    index = [model.names.index(name) for name in config.estimate]
+    scale = typical(model)
+    std = np.array(
+        [
+            config.prior.std.get(
+                name, config.prior.relative_std * max(abs(model.theta[i]), 0.2 * scale[i])
+            )
+            for name, i in zip(config.estimate, index, strict=True)
+        ]
+    )
+    chosen = [model.coefficients[i] for i in index]
+    keys = config.estimate_effects if effects else ()
+    more = [parameter(*key) for key in keys]
+    k, none = len(more), np.full(len(chosen), np.inf)
+    return Prior(
+        (*config.estimate, *(".".join(key) for key in keys)),
+        (*(c.unit for c in chosen), *(p.unit for p in more)),
+        np.array([*index, *range(len(model.theta), len(model.theta) + k)], dtype=np.int64),
+        np.concatenate([model.theta[index], [config.effects[name][own] for name, own in keys]]),
+        np.concatenate([std, [p.typical for p in more]]),
+        np.array([c.is_diagonal for c in chosen] + [False] * k, dtype=bool),
+        np.concatenate([-none, [p.lower for p in more]]),
+        np.concatenate([none, [p.upper for p in more]]),
+    )
+
+
+def theta_of(config: Config) -> Array:
+    """(m + k,): the coefficients, then the configured values of the estimated parameters."""
+    effects = [config.effects[effect][name] for effect, name in config.estimate_effects]
+    return np.concatenate([config.model.theta, effects])
+
+
+def typical(model: Model) -> Array:
+    """(m,) the size at which each term alone would take its axis's whole working wrench."""
+    wrench, inertia = authority(model), np.diag(model.body.mass_matrix)
+    speed = np.concatenate([[1.0], WORKING_SPEED, WORKING_SPEED, WORKING_SPEED])
+    sizes = [
+        np.sqrt(inertia[c.row] * inertia[c.column])
+        if c.is_added_mass
+        else wrench[c.row] / (speed[c.left] * speed[c.right])
+        for c in model.coefficients
+    ]
+    return np.array(sizes)

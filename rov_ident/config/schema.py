@@ -1,0 +1,446 @@
+"""The parameter file of nodes and commands, as frozen dataclasses.
+
+Every key is declared once, as a field with :func:`option`: its type, default, unit, bounds and
+meaning. Reading, checking, writing, the declaration of ROS parameters and the documentation all
+follow from the declarations, so that a new key is one new field.
+
+Vectors in the file are in the axes of ``vehicle.frame``; a :class:`Config` holds them in
+forward-starboard-down. Coefficients (SNAME) and effects are forward-starboard-down in the file too.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import FrameDefaults
+from rov_ident.effects import rigid_body
+from rov_ident.model import thruster_allocation as thrusters
+from rov_ident.model.equations import GRAVITY, Model
+
+T = TypeVar("T")
+Vector = tuple[float, ...]
+Names = tuple[str, ...]
+
+POSITIVE = 1e-9
+"""The lower bound of what must be greater than zero."""
+
+ANY = -1
+"""The ``size`` of a list of any length."""
+
+LARGEST = 1e20
+"""No number of a vehicle is larger; below it nothing computed from them overflows."""
+
+
+# ------------------------------------------------------------------ declarations
+
+
+def option(default: T | None, description: str, unit: str = "", **details: Any) -> T:
+    """A key of the file: see :class:`Parameter`. Without a default it is required or computed."""
+    details |= {"default": default, "description": description, "unit": unit}
+    if isinstance(default, tuple):
+        details.setdefault("size", len(default))
+    return field(default=default, metadata=details)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One key of the parameter file.
+
+    ``type`` is float, int, bool, str, Vector (of ``size`` numbers, or ANY) or Names. ``default`` is
+    None for what is required, or ``computed`` from other keys. ``lower`` and ``upper`` are
+    inclusive, for vectors of every element. ``live``: may change while a node runs.
+    """
+
+    key: str
+    type: Any
+    default: Any
+    description: str
+    unit: str = ""
+    lower: float = -math.inf
+    upper: float = math.inf
+    choices: Names = ()
+    size: int = 0
+    live: bool = False
+    computed: bool = False
+
+    @property
+    def required(self) -> bool:
+        return self.default is None and not self.computed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicle:
+    """`vehicle`: the rigid body as the file states it."""
+
+    name: str = option(None, "name of the vehicle")
+    frame: str = option(
+        None,
+        "axes of every vector in the file: forward-right-down (frd, also called fsd) or "
+        "forward-left-up (flu)",
+        choices=("frd", "fsd", "flu"),
+    )
+    mass: float = option(None, "mass in air, with enclosed air", "kg", lower=POSITIVE)
+    weight: float = option(
+        None, "weight; left out: gravity * mass", "N", lower=POSITIVE, computed=True
+    )
+    buoyancy: float = option(None, "weight of the displaced water", "N", lower=POSITIVE)
+    cog: Vector = option(None, "centre of gravity from the body origin", "m", size=3)
+    cob: Vector = option(None, "centre of buoyancy from the body origin", "m", size=3)
+    inertia: Vector = option(
+        None,
+        "entries xx yy zz xy xz yz of the inertia tensor about the centre of gravity",
+        "kg m2",
+        size=6,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """`prior`: how well the coefficients in the file are known before any data."""
+
+    relative_std: float = option(
+        0.5, "standard deviation of a coefficient relative to its value", lower=POSITIVE
+    )
+    std: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of single coefficients by name, in their units; overrides the above."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames(FrameDefaults):
+    """`frames`: axes of the topics whose frame ids do not end in _frd, _fsd or _ned."""
+
+    body: str = option("flu", "body axes of the topics", choices=("flu", "frd"))
+    world: str = option("enu", "world axes of the topics", choices=("enu", "ned"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Topics:
+    """`topics`: which topics of a bag to read; empty: found by name, then by type."""
+
+    odom: str = option("", "topic in a bag of the type inputs.odom")
+    imu: str = option("", "sensor_msgs/Imu topic in a bag")
+    wrench: str = option("", "topic in a bag of the type inputs.wrench")
+    pose: str = option("", "topic in a bag of the type inputs.pose, where inputs.odom is a twist")
+    battery: str = option("", "topic in a bag of the type inputs.battery")
+
+
+ODOMETRY_TYPES = (
+    "nav_msgs/Odometry",
+    "geometry_msgs/TwistStamped",
+    "geometry_msgs/TwistWithCovarianceStamped",
+)
+POSE_TYPES = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped")
+WRENCH_TYPES = ("geometry_msgs/WrenchStamped", "geometry_msgs/Wrench")
+FORCE_TYPES = ("sensor_msgs/JointState", "std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
+BATTERY_TYPE = "sensor_msgs/BatteryState"
+PULSE_TYPES = ("std_msgs/UInt16MultiArray", "std_msgs/Int16MultiArray", "mavros_msgs/RCOut")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """`inputs`: the types in which motion and thrust are published."""
+
+    odom: str = option(
+        "nav_msgs/Odometry",
+        "type of the motion: odometry, or a twist in body axes that is joined with the poses of "
+        "topic pose by their stamps",
+        choices=ODOMETRY_TYPES,
+    )
+    pose: str = option(
+        "geometry_msgs/PoseStamped",
+        "type of the pose that goes with a twist; interpolated to the stamp of the twist",
+        choices=POSE_TYPES,
+    )
+    wrench: str = option(
+        "geometry_msgs/WrenchStamped",
+        "type of the thrust: a wrench, or an array of thruster commands that `thrusters` turns "
+        "into one; a type without a header is stamped on arrival",
+        choices=WRENCH_TYPES + FORCE_TYPES + PULSE_TYPES,
+    )
+    battery: str = option(
+        "none",
+        "type of the supply of the thrusters, for the curve of the T200; none: thrusters.voltage",
+        choices=("none", BATTERY_TYPE),
+    )
+
+    @property
+    def is_twist(self) -> bool:
+        return self.odom != ODOMETRY_TYPES[0]
+
+    @property
+    def is_allocated(self) -> bool:
+        """Whether the thrust comes as commands of single thrusters."""
+        return self.wrench not in WRENCH_TYPES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thrusters(thrusters.Geometry):
+    """`thrusters`: from the commands of single thrusters to a wrench."""
+
+    signal: str = option(
+        "auto",
+        "what a command is: a force (N), a pulse width (us), normalized (-1 to 1, for 1100 to 1900 "
+        "us); auto: a force in arrays of floats, a pulse width in arrays of whole numbers",
+        choices=("auto", *thrusters.SIGNALS),
+    )
+    position: Vector = option(
+        (), "of each thruster from the body origin: x y z of the first, the second and so on", "m",
+        size=ANY,
+    )  # fmt: skip
+    direction: Vector = option(
+        (),
+        "in which each thruster pushes the vehicle at a positive command (a pulse above 1500 us): "
+        "x y z of the first, the second and so on; any length",
+        size=ANY,
+    )
+    allocation: Vector = option(
+        (),
+        "in place of position and direction: X Y Z K M N per newton of the first thruster, the "
+        "second and so on",
+        "1, m",
+        size=ANY,
+    )
+    channels: Vector = option(
+        (), "which element of the array is each thruster, from 1; empty: the first ones", size=ANY
+    )
+    voltage: float = option(
+        16.0,
+        "supply of the thrusters, for the curve of the T200; with inputs.battery until it is heard",
+        "V",
+        lower=POSITIVE,
+    )
+    curve_pwm: Vector = option(
+        (), "pulse widths of another thruster's curve of thrust; empty: the T200's", "us", size=ANY
+    )
+    curve_force: Vector = option((), "thrust at each of curve_pwm", "N", size=ANY)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometrySensor:
+    """`odometry`: the velocity sensor."""
+
+    position: Vector = option((0.0, 0.0, 0.0), "velocity sensor from the body origin", "m")
+    linear_std: float = option(
+        0.01, "noise of a velocity, where the message gives no variance", "m/s", lower=POSITIVE
+    )
+    angular_std: float = option(
+        0.005, "noise of an angular rate, where the message gives none", "rad/s", lower=POSITIVE
+    )
+    attitude_std: float = option(0.005, "noise of an attitude angle", "rad", lower=POSITIVE)
+    gate: float = option(
+        5.0, "a velocity further off the integrated IMU is refused", "sigma", lower=POSITIVE
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuSensor:
+    """`imu`: the inertial measurement unit."""
+
+    position: Vector = option((0.0, 0.0, 0.0), "IMU from the body origin", "m")
+    rotation: Vector = option(
+        (0.0, 0.0, 0.0), "roll, pitch, yaw of the sensor axes from the body axes", "rad"
+    )
+    accelerometer_std: float = option(
+        1.0,
+        "trust in the integrated acceleration between odometry messages: noise, vibration and "
+        "thrust that steps between two samples (docs/samples.md shows how it was chosen)",
+        "m/s2",
+        lower=POSITIVE,
+    )
+    gyro_std: float = option(
+        0.003, "noise of an angular rate, where the message gives none", "rad/s", lower=POSITIVE
+    )
+    accelerometer_bias_std: float = option(
+        0.1, "prior standard deviation of the accelerometer bias", "m/s2", lower=0.0
+    )
+    gyro_bias_std: float = option(
+        0.01, "prior standard deviation of the gyroscope bias", "rad/s", lower=0.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrenchNoise:
+    """`wrench`: how well the thruster wrench is known."""
+
+    relative_std: float = option(0.01, "standard deviation relative to the wrench", lower=0.0)
+    correlation_time: float = option(
+        0.02,
+        "how long an error of the wrench lasts; at least until the next message",
+        "s",
+        lower=POSITIVE,
+    )
+    floor_std: Vector = option(
+        (0.0,) * 6, "standard deviation at zero wrench: X Y Z, K M N", "N, N m", lower=0.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rls:
+    """`rls`: the recursive least-squares estimator."""
+
+    forgetting: str = option(
+        "variable", "how old data lose weight", choices=("variable", "constant")
+    )
+    forgetting_factor: float = option(
+        1.0,
+        "weight kept per 0.1 s by constant forgetting, in directions that move",
+        lower=POSITIVE,
+        upper=1.0,
+        live=True,
+    )
+    gate: float = option(
+        5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ukf:
+    """`ukf`: the unscented Kalman filter."""
+
+    alpha: float = option(0.5, "spread of the sigma points", lower=1e-4, upper=1.0)
+    beta: float = option(2.0, "weight of the centre point: 2 suits a Gaussian", lower=0.0)
+    kappa: float = option(0.0, "secondary spread of the sigma points", lower=0.0)
+    gate: float = option(
+        5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
+    )
+    change_threshold: float = option(
+        3.0,
+        "normalised innovation squared of an axis, over 2 s, from which the vehicle is taken to "
+        "have changed and its coefficients are learnt anew; 1 is expected, higher where the model "
+        "is rough",
+        lower=1.0,
+    )
+    random_walk: float = option(
+        0.0,
+        "drift of a coefficient relative to its value, without any evidence of a change",
+        "1/sqrt(h)",
+        lower=0.0,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Qos:
+    """`qos`: quality of service of the subscriptions."""
+
+    reliability: str = option(
+        "best_effort",
+        "best_effort receives from every publisher",
+        choices=("best_effort", "reliable"),
+    )
+    depth: int = option(1000, "messages queued for a busy node", lower=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """A checked configuration; vectors in forward-starboard-down.
+
+    ``estimate`` names the coefficients to estimate, in the order of ``model.names``; the others
+    are held. ``estimate_effects`` are the parameters of effects to estimate, (effect, parameter);
+    in the file both are names under ``estimate``. ``effects`` are part of the simulation: {effect:
+    {parameter: value}}, complete.
+    ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what really moves.
+    """
+
+    name: str
+    model: Model
+    estimate: Names = option(
+        (),
+        "coefficients to estimate, and parameters of effects such as thruster_lag.time_constant; "
+        "empty: all, of effects what is there from the start and not at its null",
+    )
+    gravity: float = option(GRAVITY, "acceleration of free fall", "m/s2", lower=9.7, upper=9.9)
+    prior: Prior = Prior()
+    frames: Frames = Frames()
+    topics: Topics = Topics()
+    inputs: Inputs = Inputs()
+    thrusters: Thrusters = Thrusters()
+    odometry: OdometrySensor = OdometrySensor()
+    imu: ImuSensor = ImuSensor()
+    wrench: WrenchNoise = WrenchNoise()
+    process_std: Vector = option(
+        (0.0001,) * 6,
+        "least density of the acceleration that the model does not explain, besides the noise of "
+        "the wrench (more is found from the innovations): surge sway heave, roll pitch yaw",
+        "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
+        lower=0.0,
+    )
+    residual_corner: float = option(
+        3.0, "corner of the filter on the published wrench residual", "rad/s", lower=POSITIVE
+    )
+    rls: Rls = Rls()
+    ukf: Ukf = Ukf()
+    qos: Qos = Qos()
+    publish_rate: float = option(
+        5.0, "rate of the published coefficients", "Hz", lower=0.01, upper=1000.0, live=True
+    )
+    timeout: float = option(
+        1.0, "inputs silent for longer are reported as stopped", "s", lower=POSITIVE, live=True
+    )
+    grace: float = option(0.3, "how long a late topic is waited for, in stamp time", "s", lower=0.0)
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    estimate_effects: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def dynamics(self) -> Model:
+        """The model with the effects on the rigid body: that of simulation and estimation."""
+        return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
+
+    def value(self, name: str) -> float:
+        """Of a coefficient, or of a parameter of an effect such as thruster_lag.time_constant."""
+        effect, _, own = name.partition(".")
+        if own:
+            return self.effects[effect][own]
+        return float(self.model.theta[self.model.names.index(name)])
+
+    @property
+    def with_effects_held(self) -> "Config":
+        """The same, with the parameters of effects as they are: samples need not follow them."""
+        return dataclasses.replace(self, estimate_effects=())
+
+    def with_values(self, values: Mapping[str, float]) -> "Config":
+        """The same with other values of coefficients, and of parameters of its effects by names
+        such as thruster_lag.time_constant.
+
+        Raises UserError if there is no such coefficient or parameter.
+        """
+        effects = {name: dict(own) for name, own in self.effects.items()}
+        for key, value in values.items():
+            effect, _, name = key.partition(".")
+            if name and name not in effects.get(effect, {}):
+                raise UserError(f"the configuration has no {key} under effects")
+            if name:
+                effects[effect][name] = value
+        model = self.model.with_values({k: v for k, v in values.items() if "." not in k})
+        return dataclasses.replace(self, model=model, effects=effects)
+
+    def with_model(self, model: Model) -> "Config":
+        """The same with another model: what was held stays held, new coefficients are estimated."""
+        held = set(self.model.names) - set(self.estimate)
+        estimate = tuple(name for name in model.names if name not in held)
+        std = {name: value for name, value in self.prior.std.items() if name in model.names}
+        prior = dataclasses.replace(self.prior, std=std)
+        return dataclasses.replace(self, model=model, estimate=estimate, prior=prior)
+
+
+def _declared(section: type, prefix: str = "") -> tuple[Parameter, ...]:
+    """The keys that a dataclass declares, and those of its sections."""
+    parameters: list[Parameter] = []
+    for item in dataclasses.fields(section):
+        if item.metadata:
+            parameters.append(Parameter(key=prefix + item.name, type=item.type, **item.metadata))
+        elif dataclasses.is_dataclass(item.type) and item.default is not dataclasses.MISSING:
+            inner: Any = item.type
+            parameters.extend(_declared(inner, f"{prefix}{item.name}."))
+    return tuple(parameters)
+
+
+VEHICLE_PARAMETERS = _declared(Vehicle, "vehicle.")
+"""The keys of ``vehicle``; those of ``coefficients`` are the names of the coefficients."""
+
+PARAMETERS = _declared(Config)
+"""Every other key with a fixed name; ``prior.std.*`` and ``effects.*`` are open to names."""
+
+BY_KEY = {p.key: p for p in VEHICLE_PARAMETERS + PARAMETERS}

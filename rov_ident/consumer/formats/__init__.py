@@ -1,0 +1,44 @@
+"""Models into the files of controllers and simulators, and back."""
+
+from pathlib import Path
+
+from rov_ident.config import Config, from_parameters
+from rov_ident.consumer.formats import auv_controllers, gazebo, mss, urdf
+from rov_ident.consumer.formats.base import Written
+from rov_ident.core.errors import UserError
+
+WRITERS = {"auv_controllers": auv_controllers, "gazebo": gazebo, "mss": mss}
+READERS = {"auv_controllers": auv_controllers, "gazebo": gazebo}
+
+__all__ = ["READERS", "WRITERS", "export", "import_model"]
+
+
+def export(config: Config, name: str) -> Written:
+    """The configuration in the format called ``name`` (:data:`WRITERS`)."""
+    return WRITERS[name].write(config)
+
+
+def import_model(path: str | Path, base: Config | None = None) -> tuple[Config, tuple[str, ...]]:
+    """A configuration from a file of another program, and what had to be assumed.
+
+    SDFormat and URDF are told from YAML by their first character, and from each other by the name
+    of their root. ``base`` is what a URDF does not hold.
+
+    Raises UserError if the file cannot be read, or what it says is not a vehicle.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+    is_xml, is_urdf = text.lstrip().startswith("<"), "<robot" in text
+    if base is not None and not (is_xml and is_urdf):
+        raise UserError(f"{path} is no URDF: --config adds to a URDF alone")
+    try:
+        if is_xml and is_urdf:
+            parameters, notes = urdf.read(text, base)
+        else:
+            parameters, notes = READERS["gazebo" if is_xml else "auv_controllers"].read(text)
+        return from_parameters(parameters), notes
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error

@@ -1,0 +1,105 @@
+"""What the files of other programs can hold of a model, and what they cannot.
+
+A format is a module with ``write(config) -> Written`` and, where it can be read, ``read(text) ->
+Read``. Nothing is dropped silently: what a format has no place for is named in ``lost``, and what
+had to be assumed on reading in ``notes``.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rov_ident.config import Config, Thrusters
+from rov_ident.core.errors import UserError
+from rov_ident.effects import EFFECTS
+from rov_ident.model.coefficients import AXES, VELOCITIES, Coefficient
+
+DIAGONAL = {
+    "added_mass": tuple(f"{a}_{b}dot" for a, b in zip(AXES, VELOCITIES, strict=True)),
+    "linear": tuple(f"{a}_{b}" for a, b in zip(AXES, VELOCITIES, strict=True)),
+    "quadratic": tuple(f"{a}_{b}{b}" for a, b in zip(AXES, VELOCITIES, strict=True)),
+}
+"""The eighteen coefficients of a diagonal model, each kind in the order X Y Z K M N."""
+
+INERTIA = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
+"""The place of each element in the tensor, in the order of ``vehicle.inertia``."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file's content, and in words what the configuration says that it cannot."""
+
+    content: str
+    lost: tuple[str, ...] = ()
+
+
+class Read(NamedTuple):
+    """Parameters as `from_parameters` takes them, and what was assumed."""
+
+    parameters: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+
+
+def diagonal(values: Mapping[str, float], kind: str) -> list[float]:
+    """Six numbers of one kind of :data:`DIAGONAL`, zero where the model has no such term."""
+    return [values.get(name, 0.0) for name in DIAGONAL[kind]]
+
+
+def lost_terms(coefficients: Iterable[Coefficient], held: Collection[str]) -> list[str]:
+    """One sentence naming the coefficients outside ``held``, if any."""
+    names = [c.name for c in coefficients if c.name not in held]
+    return [f"the coefficients {', '.join(names)} have no place in it"] if names else []
+
+
+def lost_besides(config: Config, held: Collection[str] = ()) -> list[str]:
+    """What else no format has a place for: the coefficients of fins; the effects that act outside
+    the rigid body and are not in ``held``; where sensors and thrusters sit."""
+    mounted = {
+        "odometry.position": np.any(config.odometry.position),
+        "imu.position": np.any(config.imu.position),
+        "imu.rotation": np.any(config.imu.rotation),
+        "thrusters": config.thrusters != Thrusters(),
+    }
+    outside = [name for name in config.effects if EFFECTS[name].body is None and name not in held]
+    kinds = {
+        "coefficients of fins": config.model.fins,
+        "effects": outside,
+        "settings": [name for name, there in mounted.items() if there],
+    }
+    return [
+        f"the {k} {', '.join(names)} have no place in it" for k, names in kinds.items() if names
+    ]
+
+
+def plain(vector: Any) -> list[float]:
+    """A list of floats, without negative zeros."""
+    return [float(x) for x in np.asarray(vector, dtype=float) + 0.0]
+
+
+def vehicle(
+    name: str, mass: float, weight: float, buoyancy: float, cog: Any, cob: Any, inertia: Any
+) -> dict[str, Any]:
+    """The section `vehicle`: cog and cob (3,) [m], inertia (3, 3) about the centre of gravity."""
+    return {
+        "name": name,
+        "frame": "frd",
+        "mass": mass,
+        "weight": weight,
+        "buoyancy": buoyancy,
+        "cog": plain(cog),
+        "cob": plain(cob),
+        "inertia": plain([inertia[place] for place in INERTIA.values()]),
+    }
+
+
+def xml_root(text: str, kind: str) -> ET.Element:
+    """The root of an XML file; raises UserError if it is none, or declares entities."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise UserError(f"declares XML entities, which no {kind} needs: remove them")
+    try:
+        return ET.fromstring(text)  # nosec B314
+    except ET.ParseError as error:
+        raise UserError(f"is not valid XML: {error}") from error

@@ -1,0 +1,270 @@
+"""A Gazebo model (SDFormat 1.10, Gazebo Harmonic and later), body axes forward-left-up.
+
+Added mass goes into ``<fluid_added_mass>`` of the link, where the physics engine (DART, Gazebo's
+default) takes it up with the rigid body, Coriolis terms included. The hydrodynamics plugin could
+hold it too, but computes it explicitly from the last step's acceleration, which diverges as soon as
+it reaches the rigid body's mass (gz-sim issue 1923), and in gz-sim 7 and 8 its added-mass Coriolis
+terms ``Z_wdot w q`` have the opposite sign to its added mass. The plugin gets the damping, whose
+terms ``c v_j |v_k|`` and ``c v_j v_k`` hold nearly all of our grammar.
+
+Buoyancy is the volume of the link's collision shapes times the density of the water (plugin
+Buoyancy of the world): a box of the right volume about the centre of buoyancy stands for them.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.consumer.formats.base import (
+    INERTIA,
+    Read,
+    Written,
+    lost_besides,
+    plain,
+    vehicle,
+    xml_root,
+)
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import FLIP_BODY, FLIP_WORLD, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.model.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficient, parse
+from rov_ident.model.equations import GRAVITY
+
+DENSITY = 1000.0
+"""kg/m3, what the Buoyancy plugin assumes unless told otherwise."""
+
+_FLIP = np.tile(FLIP_BODY, 2)
+_ADDED = {
+    f"{a}{b}": (i, j) for i, a in enumerate("xyzpqr") for j, b in enumerate("xyzpqr") if i <= j
+}
+"""The place in the added mass of each element of ``<fluid_added_mass>``."""
+_TAG = re.compile(r"([xyzkmn])(?:(Dot)([UVWPQR])|([UVWPQR])(?:(abs)?([UVWPQR]))?)")
+_PLUGIN = "gz::sim::systems::Hydrodynamics"
+
+
+def write(config: Config) -> Written:
+    """A model with one link `base_link`; the world needs Gazebo's Buoyancy plugin."""
+    model, body = config.model, config.dynamics.body
+    gravity = config.gravity
+    lost = lost_besides(config, held=("ocean_current",))
+    # The net force is what floats or sinks the vehicle: it is kept where the weight cannot be.
+    buoyancy = body.buoyancy + (gravity * body.mass - body.weight)
+    if abs(gravity * body.mass - body.weight) > 1e-9 * body.weight:
+        lost.append(
+            f"a weight of {body.weight:g} N (Gazebo takes mass times gravity, "
+            f"{gravity * body.mass:g} N): the buoyancy is changed by the same amount"
+        )
+    if gravity != GRAVITY:
+        lost.append(f"a gravity of {gravity:g} m/s2: it belongs to the world, not to the model")
+    if "ocean_current" in config.effects and np.any(model.added_mass):
+        lost.append(
+            "what ocean_current does to the added mass: in Gazebo it changes the damping alone"
+        )
+
+    sdf = ET.Element("sdf", version="1.10")
+    root = ET.SubElement(sdf, "model", name=config.name)
+    link = ET.SubElement(root, "link", name="base_link")
+    inertial = ET.SubElement(link, "inertial")
+    _text(inertial, "pose", *(FLIP_BODY * body.cog), 0.0, 0.0, 0.0)
+    _text(inertial, "mass", body.mass)
+    tensor = body.inertia * np.outer(FLIP_BODY, FLIP_BODY)
+    inertia = ET.SubElement(inertial, "inertia")
+    for tag, place in INERTIA.items():
+        _text(inertia, tag, tensor[place])
+    water = model.added_mass * np.outer(_FLIP, _FLIP)
+    added = ET.SubElement(inertial, "fluid_added_mass")
+    for tag, place in _ADDED.items():
+        _text(added, tag, water[place])
+
+    collision = ET.SubElement(link, "collision", name="displaced_water")
+    _text(collision, "pose", *(FLIP_BODY * body.cob), 0.0, 0.0, 0.0)
+    box = ET.SubElement(ET.SubElement(collision, "geometry"), "box")
+    edge = float(np.cbrt(buoyancy / (DENSITY * gravity)))
+    _text(box, "size", edge, edge, edge)
+
+    plugin = ET.SubElement(root, "plugin", filename="gz-sim-hydrodynamics-system", name=_PLUGIN)
+    ET.SubElement(plugin, "link_name").text = "base_link"
+    ET.SubElement(plugin, "disable_added_mass").text = "true"
+    ET.SubElement(plugin, "disable_coriolis").text = "true"
+    if current := config.effects.get("ocean_current"):
+        ned = np.array([current[axis] for axis in ("north", "east", "down")])
+        _text(plugin, "default_current", *(FLIP_WORLD @ ned))
+    values, one_sided = model.values, []
+    for c in model.coefficients:
+        if c.is_one_sided:
+            one_sided.append(c.name)
+        elif not c.is_added_mass:
+            tag, sign = _damping_tag(c)
+            _text(plugin, tag, sign * values[c.name])
+    if one_sided:
+        lost.append(f"the coefficients {', '.join(one_sided)}: its damping knows no direction")
+
+    ET.indent(sdf)
+    head = (
+        f"gravity of the world: 0 0 -{gravity:g}; its Buoyancy plugin: uniform_fluid_density "
+        f"{DENSITY:g}; physics engine: dartsim"
+    )
+    text = ET.tostring(sdf, encoding="unicode")
+    return Written(f'<?xml version="1.0"?>\n<!-- {head} -->\n{text}\n', tuple(lost))
+
+
+def _damping_tag(c: Coefficient) -> tuple[str, float]:
+    """The plugin's tag of a damping term, and the sign that turns FRD into FLU."""
+    axis = "xyzkmn"[c.row]
+    b = VELOCITIES[c.velocity].upper()
+    sign = _FLIP[c.row] * _FLIP[c.velocity]
+    if c.left == ONE:
+        return axis + b, sign
+    other = (c.left - PLAIN) % 6
+    if c.left < PLAIN + 6:
+        return axis + VELOCITIES[other].upper() + b, sign * _FLIP[other]
+    return f"{axis}{b}abs{VELOCITIES[other].upper()}", sign
+
+
+def _text(parent: ET.Element, tag: str, *numbers: float) -> None:
+    ET.SubElement(parent, tag).text = " ".join(map(repr, plain(numbers)))
+
+
+# ------------------------------------------------------------------ reading
+
+
+def read(text: str) -> Read:
+    """The model that has the hydrodynamics plugin, in a model or world file.
+
+    Raises UserError if the file is not SDFormat, has no such plugin, or its link lacks mass or
+    inertia.
+    """
+    root = xml_root(text, "SDFormat file")
+    for model in root.iter("model"):
+        for plugin in model.findall("plugin"):
+            if "hydrodynamics" in plugin.get("name", "").lower() + plugin.get("filename", ""):
+                return _read(root, model, plugin)
+    raise UserError(
+        "has no model with the plugin gz::sim::systems::Hydrodynamics: give the file that has it"
+    )
+
+
+def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
+    notes: list[str] = []
+    name = (plugin.findtext("link_name") or "").strip()
+    links = {link.get("name"): link for link in model.findall("link")}
+    if name not in links:
+        raise UserError(f"its hydrodynamics plugin acts on the link {name!r}, which is not there")
+    if len(links) > 1:
+        rest = sum(_numbers(x, "inertial/mass", [0.0])[0] for n, x in links.items() if n != name)
+        notes.append(
+            f"the other {len(links) - 1} links ({rest:g} kg) are not part of the body: add their "
+            "mass and inertia if they move with it"
+        )
+    link = links[name]
+    gravity = float(np.linalg.norm(_numbers(root, "world/gravity", [0.0, 0.0, -GRAVITY])))
+    mass = _numbers(link, "inertial/mass")[0]
+    pose = _numbers(link, "inertial/pose", [0.0] * 6)
+    turn = quaternion_to_matrix(quaternion_from_euler(*pose[3:]))
+    tensor = np.zeros((3, 3))
+    for tag, (i, j) in INERTIA.items():
+        default = None if i == j else [0.0]
+        tensor[i, j] = tensor[j, i] = _numbers(link, f"inertial/inertia/{tag}", default)[0]
+    tensor = (turn @ tensor @ turn.T) * np.outer(FLIP_BODY, FLIP_BODY)
+
+    volume, centre = _displaced(link)
+    if not volume:
+        notes.append(
+            "no collision box, sphere or cylinder tells the buoyancy: the vehicle is taken as "
+            "neutral, with the centre of buoyancy at the body origin"
+        )
+    density = _numbers(root, ".//uniform_fluid_density", [DENSITY])[0]
+    coefficients = damping(plugin, notes)
+    if (plugin.findtext("disable_added_mass") or "").strip() in ("true", "1"):
+        coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
+    coefficients |= _fluid_added_mass(link)
+    buoyancy = density * gravity * volume if volume else mass * gravity
+    body = vehicle(
+        model.get("name") or "vehicle", mass, mass * gravity, buoyancy, FLIP_BODY * pose[:3],
+        FLIP_BODY * centre, tensor,
+    )  # fmt: skip
+    parameters = {"vehicle": body, "coefficients": coefficients}
+    current = _numbers(plugin, "default_current", [0.0, 0.0, 0.0])
+    if np.any(current):
+        ned = plain(FLIP_WORLD @ current)
+        parameters["effects"] = {"ocean_current": dict(zip(("north", "east", "down"), ned))}
+    return Read(parameters, tuple(notes))
+
+
+def damping(plugin: ET.Element, notes: list[str]) -> dict[str, float]:
+    """Damping and, in old files, added mass of the plugin, forward-starboard-down."""
+    found: dict[tuple[int, ...], tuple[str, float]] = {}
+    for element in plugin:
+        match = _TAG.fullmatch(element.tag)
+        if not match:
+            continue
+        value = _numbers(plugin, element.tag)[0]
+        axis, b, c = match[1].upper(), (match[3] or match[4]).lower(), (match[6] or "").lower()
+        name, turned = f"{axis}_{b}{c}", b
+        if match[2]:
+            name += "dot"
+        elif match[5] and b != c:
+            name = f"{axis}_{b}_abs_{c}"
+        elif match[5] and name in EVEN:
+            notes.append(f"<{element.tag}> is left out: symmetry makes it even ({name})")
+            continue
+        elif b == c and not match[5] and name not in EVEN:
+            notes.append(f"<{element.tag}> is taken as <{match[1]}{match[4]}abs{match[6]}>")
+        elif not match[5]:
+            turned = b + c
+        sign = _FLIP[AXES.index(axis)] * np.prod([_FLIP[VELOCITIES.index(x)] for x in turned])
+        if value:
+            known, sum_ = found.get(parse(name).place, (name, 0.0))
+            found[parse(name).place] = (known, float(sum_ + sign * value))
+    coefficients = dict(found.values())
+    added = {n: x for n, x in coefficients.items() if parse(n).is_added_mass}
+    if any(x > 0 for n, x in added.items() if parse(n).is_diagonal):
+        notes.append("positive added mass (before Gazebo Garden) is taken with the SNAME sign")
+        coefficients |= {n: -x for n, x in added.items()}
+    return coefficients
+
+
+def _fluid_added_mass(link: ET.Element) -> dict[str, float]:
+    """Added-mass coefficients of ``<fluid_added_mass>``, forward-starboard-down."""
+    found = {}
+    for tag, (i, j) in _ADDED.items():
+        value = _numbers(link, f"inertial/fluid_added_mass/{tag}", [0.0])[0]
+        if value:
+            found[f"{AXES[i]}_{VELOCITIES[j]}dot"] = -float(value * _FLIP[i] * _FLIP[j])
+    return found
+
+
+def _displaced(link: ET.Element) -> tuple[float, np.ndarray]:
+    """Volume [m3] and its centre (3,) [m] of the collision shapes, forward-left-up."""
+    volume, moment = 0.0, np.zeros(3)
+    for collision in link.findall("collision"):
+        kinds = [kind for kind in collision.findall("geometry/*") if kind.tag in _VOLUMES]
+        shape = sum(_VOLUMES[kind.tag](kind) for kind in kinds[:1])
+        volume += shape
+        moment += shape * np.array(_numbers(collision, "pose", [0.0] * 6)[:3])
+    return volume, moment / volume if volume else moment
+
+
+_VOLUMES: dict[str, Callable[[ET.Element], float]] = {
+    "box": lambda x: float(np.prod(_numbers(x, "size"))),
+    "sphere": lambda x: 4.0 / 3.0 * np.pi * _numbers(x, "radius")[0] ** 3,
+    "cylinder": lambda x: np.pi * _numbers(x, "radius")[0] ** 2 * _numbers(x, "length")[0],
+}
+
+
+def _numbers(parent: ET.Element, path: str, default: list[float] | None = None) -> list[float]:
+    text = parent.findtext(path)
+    if text is None:
+        if default is None:
+            raise UserError(f"<{path.replace('/', '><')}> is missing")
+        return default
+    try:
+        numbers = [float(x) for x in text.split()]
+    except ValueError:
+        numbers = []
+    wanted = len(default) if default else max(len(numbers), 1)
+    if len(numbers) != wanted or not np.isfinite(numbers).all():
+        raise UserError(f"<{path.split('/')[-1]}> is {text.strip()!r}, but must be numbers")
+    return numbers

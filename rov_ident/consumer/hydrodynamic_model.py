@@ -1,0 +1,183 @@
+"""For controllers: the model matrices, kept up to date from `~/coefficients`.
+
+No middleware: a message is anything with the fields of diagnostic_msgs/DiagnosticArray.
+"""
+
+import math
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rov_ident.config import LARGEST, Config, load
+from rov_ident.config.prior import prior_of
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import gravity_direction, quaternion_normalise
+from rov_ident.core.states import Level
+from rov_ident.estimation.physical import is_passive
+from rov_ident.model.equations import Array, Model, build
+
+_SECOND = 1_000_000_000  # ns
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What became of one message.
+
+    ``values`` are the coefficients taken up, ``refused`` says of each other one why it keeps its
+    last good value. Where ``reason`` is not empty, the message was refused as a whole.
+    """
+
+    values: dict[str, float] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+    reason: str = ""
+
+
+class HydrodynamicModel:
+    """M, C(nu), D(nu) and g of the last good coefficients; at first those of the configuration.
+
+    :meth:`take` is given every message; of a message only the converged coefficients are taken up,
+    and only if the whole set is physical with them. Sets are exchanged in one assignment: ``model``
+    is the present one, and a controller thread that needs several matrices of the same set keeps
+    it in a variable. Of the effects in the configuration, those on the rigid body are in the
+    matrices; the others are left out.
+
+    ``config`` is the path of a parameter file, or a Config; ``hold_after`` is the time in seconds
+    without a message after which :meth:`fresh` says no. ``now`` is always a time in seconds on a
+    steady clock of the caller's, such as ``time.monotonic()``. Vectors are SI, body
+    forward-starboard-down; an attitude is either the quaternion (4,) w x y z, body to
+    north-east-down, or the unit vector down (3,) in body axes.
+
+    Raises
+    ------
+    UserError
+        If ``hold_after`` is not positive, or the parameter file is wrong.
+    """
+
+    def __init__(self, config: str | os.PathLike[str] | Config, hold_after: float = 2.0) -> None:
+        if not hold_after > 0.0:
+            raise UserError(f"hold_after is {hold_after} s, but must be positive")
+        config = load(config)
+        self.hold_after = hold_after
+        self._model = config.dynamics
+        self._prior = prior_of(config)
+        self._units = {c.name: c.unit for c in config.model.coefficients}
+        self._stamp: int | None = None  # ns, of the last message in order
+        self._renewed = -math.inf  # s, on the caller's clock
+
+    # ---------------------------------------------------------------- messages in
+
+    def take(self, message: Any, now: float) -> Taken:
+        """Take up what is good in a message; never raises for what is in it.
+
+        A stamp before the last one is refused while the stream is fresh. Once it is not, its
+        source has begun anew (a bag that loops, a simulation reset) and any stamp is accepted.
+        """
+        stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
+        if self._stamp is not None and stamp < self._stamp and self.fresh(now):
+            late = (self._stamp - stamp) / _SECOND
+            return Taken(reason=f"its stamp is {late:.3f} s before the last one")
+        values: dict[str, float] = {}
+        refused: dict[str, str] = {}
+        levels: set[Level] = set()
+        names = [status.name for status in message.status]
+        for status in message.status:
+            if "." in status.name:
+                continue  # a parameter of an effect: no matter of these matrices
+            try:
+                if names.count(status.name) > 1:
+                    raise ValueError("given twice")
+                level, value = self._read(status)
+            except ValueError as error:
+                refused[status.name] = str(error)
+                continue
+            levels.add(level)
+            if level == Level.OK:
+                values[status.name] = value
+            else:
+                refused[status.name] = f"{level.name}: {status.message}"
+        if not levels:
+            return Taken(refused=refused, reason="it has no coefficient that can be read")
+        candidate = self._model.with_values(values)
+        reason = self.why_unphysical(candidate) if values else ""
+        if reason:
+            return Taken(refused=refused | dict.fromkeys(values, reason), reason=reason)
+        self._model = candidate
+        self._stamp = stamp
+        self._renewed = -math.inf if levels == {Level.STALE} else now
+        return Taken(values, refused)
+
+    def fresh(self, now: float) -> bool:
+        """Whether the estimator is at work: heard within ``hold_after``, and not itself stale.
+
+        Otherwise the last good set goes on being used. Whoever may not rely on old coefficients
+        asks here.
+        """
+        return 0.0 <= now - self._renewed <= self.hold_after
+
+    def _read(self, status: Any) -> tuple[Level, float]:
+        """Level and value of one coefficient; raises ValueError with the reason against it."""
+        if status.name not in self._units:
+            raise ValueError("not a coefficient of this model")
+        pairs = {pair.key: pair.value for pair in status.values}
+        for key in ("value", "unit"):
+            if key not in pairs:
+                raise ValueError(f"comes without {key}")
+        if pairs["unit"] != self._units[status.name]:
+            wanted = self._units[status.name]
+            raise ValueError(f"is in {pairs['unit']!r}, but must be in {wanted!r}")
+        try:
+            value = float(pairs["value"])
+        except (TypeError, ValueError):
+            raise ValueError(f"{pairs['value']!r} is not a number") from None
+        if not abs(value) <= LARGEST:
+            raise ValueError(f"{pairs['value']} is not finite or of no sensible size")
+        level = status.level
+        try:  # rclpy gives it as one byte
+            return Level(ord(level) if isinstance(level, bytes) else level), value
+        except (TypeError, ValueError):
+            raise ValueError(f"its level {level!r} is none of OK, WARN, ERROR, STALE") from None
+
+    def why_unphysical(self, candidate: Model) -> str:
+        """Why no passive hull has these coefficients; empty where one may."""
+        try:
+            build(candidate.body, candidate.values)
+        except UserError as error:
+            return str(error)
+        if not is_passive(candidate, self._prior, candidate.theta[self._prior.estimated]):
+            return "the damping would feed energy to the motion"
+        return ""
+
+    # ---------------------------------------------------------------- matrices out
+
+    @property
+    def model(self) -> Model:
+        """The present set, whole: it stays as it is when the next one comes."""
+        return self._model
+
+    @property
+    def M(self) -> Array:
+        """(6, 6): rigid body and added mass."""
+        return self._model.mass_matrix
+
+    def C(self, nu: Array) -> Array:
+        """(6, 6), skew-symmetric."""
+        return self._model.coriolis_matrix(nu)
+
+    def D(self, nu: Array) -> Array:
+        """(6, 6), on the left-hand side: ``D nu`` is the drag that thrust must overcome."""
+        return self._model.damping_matrix(nu)
+
+    def g(self, attitude: Array) -> Array:
+        """(6,): the wrench that holds the vehicle still at this attitude."""
+        return self._model.restoring_force(_down(attitude))
+
+    def wrench(self, nu: Array, nu_dot: Array, attitude: Array) -> Array:
+        """(6,): ``M nu_dot + C(nu) nu + D(nu) nu + g``, the thrust that this motion takes."""
+        return self._model.wrench(nu, nu_dot, _down(attitude))
+
+
+def _down(attitude: Array) -> Array:
+    attitude = np.asarray(attitude, dtype=float)
+    return gravity_direction(quaternion_normalise(attitude)) if len(attitude) == 4 else attitude

@@ -1,0 +1,134 @@
+"""Where a file may be written, and writing it whole or not at all."""
+
+import contextlib
+import hashlib
+import os
+import secrets
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+
+from rov_ident.core.errors import UserError
+
+Place = str | os.PathLike[str]
+
+_LONGEST = 255  # bytes of a name, in all file systems of Linux
+_BAG = b"\x89MCAP"  # how a bag begins, whatever its name and version
+
+
+def check_output(path: Place, inputs: Iterable[Place | None] = (), bag: bool = False) -> None:
+    """Refuse a place where a result must not or cannot be written; nothing is touched.
+
+    A result replaces nothing but a regular file, none of the ``inputs`` (files, or rosbag2
+    directories with all that is in them), and no bag unless it is a ``bag`` itself.
+
+    Raises UserError: one sentence naming the path and what to change.
+    """
+    try:
+        refusal = _refusal(Path(path), [Path(given) for given in inputs if given is not None], bag)
+    except ValueError:  # a NUL character, or half of one in UTF-16
+        refusal = "no file can have that name"
+    if refusal:
+        raise UserError(f"{_shown(path)} cannot be written: {refusal}")
+
+
+def write_file(path: Place, content: str | bytes) -> None:
+    """Write a file whole or not at all, text in UTF-8; its folder is made where there is none.
+
+    Raises UserError if it cannot be written there.
+    """
+    check_output(path)
+    try:
+        replace_file(path, content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def replace_file(path: Place, content: bytes) -> None:
+    """Put a file in its place, in one piece, so that it outlives a loss of power.
+
+    Raises OSError; what was there before then still is.
+    """
+    place = Path(os.path.realpath(path))  # a link stays one
+    place.parent.mkdir(parents=True, exist_ok=True)
+    part = part_of(place)
+    try:
+        with part.open("xb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(place)
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+    folder = os.open(place.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the name, too
+    finally:
+        os.close(folder)
+
+
+def part_of(path: Path) -> Path:
+    """A hidden name in the same folder, which nobody else uses, for a file in the making.
+
+    What a process that was killed has left of this file goes.
+    """
+    name = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:12]  # short, whatever the path's
+    for old in path.parent.glob(f".{name}.*.part"):
+        with contextlib.suppress(OSError, ValueError):
+            if not Path(f"/proc/{int(old.name.split('.')[2])}").exists():
+                old.unlink()
+    return path.with_name(f".{name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+
+
+def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
+    """Why a file must not or cannot be written there; empty where it may."""
+    place = Path(os.path.realpath(path))
+    home = path.parts[0] if len(path.parts) > 1 else ""
+    if home.startswith("~") and not os.path.lexists(home):
+        return f"the shell knows no folder {home}, so write it in full"
+    if any(len(os.fsencode(part)) > _LONGEST for part in place.parts):
+        return f"a name in it is longer than {_LONGEST} bytes"
+    try:
+        kind = place.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        kind = 0
+    except OSError as error:
+        return error.strerror or str(error)
+    for given in inputs:
+        source = Path(os.path.realpath(given))
+        if place == source or (kind and source.exists() and place.samefile(source)):
+            return "the result would replace what it is made from, so choose another name"
+        if source.is_dir() and place.is_relative_to(source):
+            return f"it lies within the bag {_shown(given)}, so choose another folder"
+    if kind and bag and place.suffix != ".mcap":
+        return "it exists already, so remove it or choose another name"
+    if stat.S_ISDIR(kind):
+        return "it is a folder, so give the name of a file"
+    if kind and not stat.S_ISREG(kind):
+        return "there is a device, a pipe or a socket, so give the name of a file"
+    try:
+        if kind and not bag and _is_bag(place):
+            return "there is a bag, so choose another name"
+    except OSError as error:
+        return error.strerror or str(error)
+    folder = place.parent
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir():
+        return f"{folder} is not a folder"
+    if not os.access(place if kind else folder, os.W_OK):
+        return f"{place if kind else folder} is not yours to write in"
+    return ""
+
+
+def _is_bag(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(len(_BAG)) == _BAG
+
+
+def _shown(path: Place) -> str:
+    """A path within a sentence."""
+    text = str(path).replace("\0", "\\0")
+    return text if len(text) <= 200 else f"{text[:197]}..."

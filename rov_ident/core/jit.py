@@ -1,0 +1,238 @@
+"""Compiled kernels: how each is compiled, where the machine code is kept, who compiles it and when.
+
+The only module that knows numba's insides. A kernel is a function with one of these decorators:
+
+=========  ============  ==================  =====================================================
+decorator  makes arrays  called from         for
+=========  ============  ==================  =====================================================
+kernel     yes           Python and kernels  the general case
+lean       no            Python and kernels  short calls: nobody counts references to arrays
+released   no            Python and kernels  calls of milliseconds: other threads run meanwhile
+inner      no            kernels             compiles in two thirds of the time of ``lean``
+reordered  no            kernels             long sums: vector instructions, other rounding
+inlined    as caller     kernels             loops whose length is a constant of the caller
+=========  ============  ==================  =====================================================
+
+A slice that is copied counts as an array that is made. ``released`` is not the rule because giving
+up Python's lock and taking it again costs microseconds. ``reordered`` is not for functions that ask
+whether a number is finite: ``x - x`` may be taken for zero. ``inlined`` is also right for a
+function with a single caller: numba optimises whatever a kernel calls once more with each kernel.
+
+numba compiles a cached function again when its own file changes, but not when a function it calls
+or a constant of another module changes. The cache therefore lies in a folder that is named after
+the source of the whole package and the versions of all that makes the machine code: a kernel of
+another version is never run, and a new version does not disturb one that is running.
+"""
+
+import contextlib
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+from llvmlite import binding
+from numba.core.registry import CPUDispatcher, cpu_target
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+def _cache_folder() -> Path:
+    """A writable folder for these exact kernels; ``ROV_IDENT_CACHE`` overrides its root."""
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(path.read_bytes())
+    for version in (sys.version, np.__version__, numba.__version__, binding.get_host_cpu_name()):
+        digest.update(version.encode())
+    root = Path(
+        os.environ.get("ROV_IDENT_CACHE")
+        or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rov_ident"
+    )
+    folder = root / digest.hexdigest()[:16]
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid():
+            return folder
+    except OSError:
+        pass
+    # Compiled code is run as it is found: never from a folder that others could have made.
+    return Path(tempfile.mkdtemp(prefix="rov_ident-"))
+
+
+# A folder given by NUMBA_CACHE_DIR is used as it is. We do not set that variable for ourselves:
+# a child process that runs another version of the package would inherit it.
+if not os.environ.get("NUMBA_CACHE_DIR"):
+    numba.config.CACHE_DIR = str(_cache_folder())
+
+CACHE = Path(numba.config.CACHE_DIR)
+"""The folder of the compiled kernels, for this version of everything."""
+
+
+def _decorator(**options: Any) -> Callable[[F], F]:
+    def compiled(function: F) -> F:
+        dispatcher: F = numba.njit(error_model="numpy", **options)(function)
+        return dispatcher
+
+    return compiled
+
+
+# `_nrt` is numba's reference counting: whenever an array is taken out of a tuple or a record, and
+# given back, it counts with locked instructions of 6 ns (docs/speed.md). It is set in every case:
+# otherwise a function inherits it from whichever caller is compiled first.
+_LEAN: dict[str, bool] = {"cache": True, "_nrt": False}
+_INNER: dict[str, bool] = {**_LEAN, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+kernel = _decorator(cache=True, _nrt=True)
+lean = _decorator(**_LEAN)
+released = _decorator(nogil=True, **_LEAN)
+inner = _decorator(**_INNER)
+reordered = _decorator(fastmath={"contract", "reassoc", "nsz"}, **_INNER)
+inlined = _decorator(inline="always")
+
+
+def only_run() -> None:
+    """Set numba up for a process that runs what others have compiled: 30 MB less, and faster.
+
+    To be called before the first kernel is. Otherwise scipy's linear algebra is loaded in case a
+    kernel with products of matrices has to be compiled, and the helpers that numba compiles for
+    itself at each start are optimised, though only newly compiled kernels would use them. Kernels
+    without such products can still be compiled afterwards.
+    """
+    blas, level = "scipy.linalg.cython_blas", numba.config.OPT
+    try:
+        sys.modules.setdefault(blas, None)  # type: ignore[arg-type]  # None: its import fails
+        context = cpu_target.target_context
+        numba.config.OPT = type(level)(0)
+        context.refresh()
+    finally:
+        numba.config.OPT = level
+        if sys.modules[blas] is None:
+            del sys.modules[blas]
+
+
+def interpret() -> None:
+    """Run kernels as the Python functions they are: a thousandth of the speed, but at once.
+
+    Until :func:`stop_interpreting`, and everywhere in this process. numpy's numbers raise nothing
+    when divided by zero, as in compiled code; Python's own would.
+    """
+    CPUDispatcher.__call__ = lambda self, *arguments: self.py_func(*arguments)
+    np.seterr(all="ignore")
+
+
+def stop_interpreting() -> None:
+    """Compile kernels again on their first call, or read them from the cache."""
+    if interpreting():
+        del CPUDispatcher.__call__
+        np.seterr(all="warn", under="ignore")
+
+
+def interpreting() -> bool:
+    return "__call__" in vars(CPUDispatcher)
+
+
+class Compiler:
+    """The kernels that one job needs, compiled by a process of its own for all who run them.
+
+    A process does not run the same machine code after compiling it as after reading it from the
+    cache, where each kernel holds its own copy of the functions it calls, optimised once more. Sums
+    differ in their last bits then, and the same bag has to give the same numbers.
+
+    ``exercise`` is a function at the top level of a module; called with ``arguments`` it runs every
+    kernel of the job. The other process finds it by its name.
+    """
+
+    def __init__(self, exercise: Callable[..., object], *arguments: str) -> None:
+        self._exercise, self._arguments = exercise, arguments
+        self._mark = CACHE / "-".join((exercise.__module__, *arguments))
+        self._process: subprocess.Popen[bytes] | None = None
+        self._stopped = False
+        self._lock = threading.Lock()
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a process has compiled everything and left its mark in the cache."""
+        return self._mark.exists()
+
+    def start(self) -> None:
+        """Compile in another process, without waiting; not after :meth:`stop`.
+
+        The process ends with this one, however this one ends: the pipe between them is closed then.
+        An interrupt from the terminal does not reach it.
+        """
+        command = [sys.executable, "-c", _AS_CHILD, self._exercise.__module__]
+        command += [self._exercise.__name__, *self._arguments]
+        cache = {"NUMBA_CACHE_DIR": str(CACHE)}  # it may be a temporary folder of this process
+        with self._lock:
+            if not self._stopped:
+                self._process = subprocess.Popen(
+                    command, stdin=subprocess.PIPE, start_new_session=True, env=os.environ | cache
+                )
+
+    def poll(self) -> int | None:
+        """The exit status of the process that was started; None while it runs."""
+        return None if self._process is None else self._process.poll()
+
+    def ensure(self) -> bool:
+        """Wait until all is compiled; False if that failed, or :meth:`stop` was called."""
+        if not self.compiled:
+            self.start()
+            if self._process is None or self._process.wait():
+                return False
+        return not self._stopped
+
+    def load(self, *more: object) -> None:
+        """Read all kernels from the cache by the exercise; what is missing is compiled here."""
+        stop_interpreting()
+        self._exercise(*self._arguments, *more)
+
+    def stop(self) -> None:
+        """End the process, and start no other: for any thread."""
+        with self._lock:
+            self._stopped = True
+            if self._process is not None:
+                self._process.terminate()
+
+
+_AS_CHILD = "import sys; from rov_ident.core import jit; jit.compile_as_child(*sys.argv[1:])"
+
+
+def compile_as_child(module: str, exercise: str, *arguments: str) -> None:
+    """What the process of a :class:`Compiler` does; it ends at once if standard input is closed."""
+
+    def end_with_parent() -> None:
+        os.read(0, 1)  # not sys.stdin, for which an ordinary end would wait
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    compiler = Compiler(getattr(import_module(module), exercise), *arguments)
+    compiler.load()
+    with contextlib.suppress(OSError):  # a full disk: the next start compiles again
+        compiler._mark.touch()
+
+
+def record(fields: Any) -> np.dtype[np.void]:
+    """The dtype of a record whose fields can be read as attributes: compiled, and interpreted."""
+    return np.dtype((np.record, np.dtype(fields, align=True)))
+
+
+def floats(shape: tuple[int, ...], names: str) -> list[tuple[str, str, tuple[int, ...]]]:
+    """Fields of a :func:`record` that have one shape."""
+    return [(name, "f8", shape) for name in names.split()]
+
+
+@inner
+def copy(a: Any, b: Any) -> None:
+    """Into matrix b from a, as far as both go: ``b[:] = a`` allocates and is slow to compile."""
+    for i in range(min(len(a), len(b))):
+        for j in range(min(a.shape[1], b.shape[1])):
+            b[i, j] = a[i, j]

@@ -1,0 +1,79 @@
+"""The three input messages, and what else they are made from, free of middleware.
+
+The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
+forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
+the estimators through one path.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
+"""The roles of the three inputs."""
+
+
+class Odometry(NamedTuple):
+    """nav_msgs/Odometry: pose of the body in the world, velocity in body axes."""
+
+    stamp: int  # ns
+    frame_id: str  # world
+    child_frame_id: str  # body
+    position: Array  # (3,) m
+    orientation: Array  # (4,) w x y z, body -> world
+    linear: Array  # (3,) m/s, body axes
+    angular: Array  # (3,) rad/s, body axes
+    twist_variance: Array  # (6,) diagonal of the twist covariance; zeros: not given
+
+
+class Imu(NamedTuple):
+    """sensor_msgs/Imu: angular velocity and specific force in sensor axes."""
+
+    stamp: int  # ns
+    frame_id: str
+    orientation: Array  # (4,) w x y z, sensor -> world
+    angular_velocity: Array  # (3,) rad/s
+    linear_acceleration: Array  # (3,) m/s2, specific force: +9.81 upward at rest
+    angular_variance: Array  # (3,); zeros: not given
+    acceleration_variance: Array  # (3,); zeros: not given
+
+
+class Wrench(NamedTuple):
+    """geometry_msgs/WrenchStamped: thruster wrench about the body origin, body axes."""
+
+    stamp: int  # ns
+    frame_id: str
+    force: Array  # (3,) N
+    torque: Array  # (3,) N m
+
+
+class Twist(NamedTuple):
+    """geometry_msgs/Twist(WithCovariance)Stamped: velocity in body axes."""
+
+    stamp: int  # ns
+    frame_id: str  # body
+    linear: Array  # (3,) m/s
+    angular: Array  # (3,) rad/s
+    variance: Array  # (6,) diagonal of the covariance; zeros: not given
+
+
+class Pose(NamedTuple):
+    """geometry_msgs/Pose(WithCovariance)Stamped: the body in the world."""
+
+    stamp: int  # ns
+    frame_id: str  # world
+    position: Array  # (3,) m
+    orientation: Array  # (4,) w x y z, body -> world
+
+
+class Commands(NamedTuple):
+    """One number for each thruster, or each output of an autopilot."""
+
+    stamp: int  # ns; 0: the message has none
+    values: Array  # (k,)
+
+
+Message = Odometry | Imu | Wrench

@@ -1,0 +1,294 @@
+"""`explain`: from bags and a configuration to findings, an extended configuration and the series
+that the report draws."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from rov_ident import config as configuration
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.discrepancy import sensor_consistency
+from rov_ident.discrepancy.findings import (
+    changes,
+    finding,
+    is_certain,
+    residuals,
+    sensor_findings,
+    with_parameters,
+)
+from rov_ident.discrepancy.held_out import (
+    PRACTICAL,
+    Judge,
+    blocks,
+    is_practical,
+    split,
+    thinned,
+    windows,
+)
+from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis
+from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
+from rov_ident.discrepancy.results import Finding, Findings, Residual, Verdict
+from rov_ident.discrepancy.screening import HULL_DAMPING
+from rov_ident.discrepancy.search import Search, Trials
+from rov_ident.discrepancy.selection import VERY_STRONG
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.model.equations import Array
+from rov_ident.reports.result import Shown
+from rov_ident.reports.table import Tables
+from rov_ident.sampling.raw_streams import Streams, joined
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
+
+CUT_SHORT = (
+    "the search was cut short after as much simulation as it may take: not all further effects, or "
+    "rivals of those found, were tried; a configuration that fits better (rov-ident fit) helps"
+)
+_NO_TORQUE = (
+    "the wrench of these bags never holds a moment: how the vehicle turns is taken from the "
+    "measurement, not simulated, and nothing is said about it"
+)
+_ONLY_FITTED = (
+    "the extended model cannot be simulated through all of the data: its values are those of the "
+    "part that the search fitted"
+)
+
+Sensors = Mapping[str, Mapping[str, float]]
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Explanation(Shown):
+    """Everything that `explain` made of the bags: the configuration that was judged and the same
+    with what was found; measured velocities (N, 6) at ``t`` (N,) and, by label ("as configured",
+    "retuned", "extended"), open-loop simulations (N, 6) in windows of held_out.BLOCK seconds (NaN:
+    diverged); the spans [s] that no fit saw."""
+
+    findings: Findings
+    given: Config
+    extended: Config
+    t: Array
+    measured: Array
+    simulated: Mapping[str, Array]
+    held: Sequence[tuple[float, float]]
+
+    @property
+    def sentence(self) -> str:
+        """What the simulation lacks, and what that gains."""
+        return report().verdict(self.findings)
+
+    def table(self) -> Tables:
+        """The error of the three models, and every effect found with its gain."""
+        return report().tables(self.findings)
+
+    def plot(self) -> "Figure":
+        """Motion, gain and departure of the velocity that gains most."""
+        return report().picture(self)
+
+    def to_json(self) -> str:
+        """The findings."""
+        return self.findings.to_json()
+
+    def page(self) -> str:
+        """The report as one HTML document."""
+        return report().page(self)
+
+    def _writers(self) -> dict[str, Callable[[Path], None]]:
+        more: dict[str, Callable[[Path], None]] = {
+            ".yaml": lambda path: report().write_extended(self, path),
+            "": lambda path: report().write(self, path),
+        }
+        return super()._writers() | more
+
+
+def report() -> ModuleType:
+    """The module of the report, which knows this one and loads matplotlib."""
+    return import_module("rov_ident.discrepancy.report")
+
+
+@dataclass
+class _Model:
+    """The extended model as it takes shape: fitted to the part of the data that fits may see."""
+
+    final: Fitted
+    trials: Trials
+    found: list[Finding] = dataclasses.field(default_factory=list)
+    minor: list[Finding] = dataclasses.field(default_factory=list)
+
+
+def explain(
+    bags: Sequence[Streams],
+    config: Config,
+    validate: Streams | None = None,
+    progress: Progress | None = None,
+) -> Explanation:
+    """Find what the configured simulation lacks; ``progress(what, share)`` is called now and then
+    with the share that is done. UserError if the bags are too short, or the model cannot be
+    simulated at all."""
+    say = progress or (lambda what, share: None)
+    streams, to_fit, held = _divided(bags, validate)
+    judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
+
+    say("comparing the sensors", 0.05)
+    sensors, std = sensor_consistency.search(streams, config, to_fit)
+    of_sensors = sensor_findings(streams, judged, config, sensors, std, to_fit, to_judge)
+    sensors = {f.effect: sensors[f.effect] for f in of_sensors if is_practical(f.gain)}
+    streams = sensor_consistency.corrected(streams, sensors)
+    judged = sensor_consistency.corrected(judged, sensors)
+
+    say("refitting the coefficients", 0.1)
+    search = Search(streams, config, thinned(to_fit))
+    retuned, model, residual = _searched(search, say)
+    say("judging on held-out data", 0.9)
+    judge = Judge(WindowedProblem(judged, to_judge))
+    _judge_effects(search, judge, retuned, model)
+    last, notes = _with_all_data(search, streams, model)
+    found = [f for f in of_sensors if is_practical(f.gain)]
+    found += [with_parameters(search, last, f) for f in model.found]
+    minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
+    verdict: Verdict = "unexplained" if residual else "explained" if found else "agrees"
+    if verdict == "agrees" and is_practical(judge.gain(search.given, retuned.hypothesis)):
+        verdict = "retuned"
+    best = model.final.hypothesis
+    compared = {"as configured": search.given, "retuned": retuned.hypothesis, "extended": best}
+    everything = WindowedProblem(streams, blocks(streams))
+    notes += [_NO_TORQUE] if streams.guided.any() else []
+    notes += [CUT_SHORT] if search.cut_short else []
+    say("done", 1.0)
+    rmse = [judge.rmse(h) for h in compared.values()]
+    findings = Findings(
+        rmse[0],
+        rmse[1],
+        rmse[2],
+        changes(config, retuned),
+        tuple(sorted(found, key=lambda f: -f.gain.percent)),
+        tuple(f for f in minor if f.gain.low > 0.0 or f.gain.percent >= 100.0 * PRACTICAL),
+        tuple(residual),
+        verdict,
+        (*streams.notes, *notes),
+    )
+    return Explanation(
+        findings,
+        config,
+        _extended(config, last.hypothesis, sensors),
+        everything.times,
+        everything.measured,
+        {label: everything.measured - everything.errors(h) for label, h in compared.items()},
+        to_judge if validate is None else [],
+    )
+
+
+def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams, Spans, Spans]:
+    """The bags joined, the spans to fit, and those to judge on. UserError if they are too short."""
+    total, (streams, begins) = sum(bag.duration for bag in bags), joined(bags)
+    if total < _SHORTEST:
+        raise UserError(
+            f"the bags hold {total:.0f} s of data: at least {_SHORTEST:.0f} s are needed to find "
+            "anything"
+        )
+    of_all: tuple[Spans, Spans] = [], []  # to fit, and held out
+    for bag, begin in zip(bags, begins, strict=True):
+        own = split(bag.duration) if validate is None else (windows(0.0, bag.duration), [])
+        for spans, mine in zip(of_all, own, strict=True):
+            spans += [(begin + a, begin + b) for a, b in mine]
+    return streams, *of_all
+
+
+def _searched(search: Search, say: Progress) -> tuple[Fitted, _Model, list[Residual]]:
+    """The retuned model, the extended one, and what is left that has no name. UserError if the
+    configured model cannot be simulated."""
+    path = search.run(lambda what: say("searching: " + what, 0.3))
+    if not path:
+        raise UserError(
+            "the configured model diverges within seconds of simulation: check the signs and sizes "
+            "of its coefficients and the axes of the bag"
+        )
+    say("trying rivals", 0.6)
+    final, trials = search.try_rivals(path[-1], lambda what: say("trying rivals: " + what, 0.7))
+    say("looking at what is left", 0.8)
+    left = search.unexplained(final)
+    if left:
+        final, trials = search.try_rivals(left[-1])
+    return path[0], _Model(final, trials), residuals(final, trials)
+
+
+def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> None:
+    """Turn the effects of a model into findings, and take those of no practical weight out of it.
+    Two effects that do the same on the held-out data gain nothing beside each other, and all
+    together: the slightest leaves, and the rest is judged anew."""
+    while True:
+        known = {n: t for n, t in model.trials.items() if not n.startswith(UNKNOWN)}
+        found = [finding(search, judge, model.final, name, trial) for name, trial in known.items()]
+        slight = [f for f in found if not is_practical(f.gain)]
+        slight = [f for f in slight if not _supports_another(search, judge, model, f.effect)]
+        if len(slight) < 2:
+            break
+        least = min(slight, key=lambda f: f.gain.percent)
+        model.final = known[least.effect].rest
+        model.trials = search.trials(model.final)
+    model.minor = slight
+    model.found = [f for f in found if f not in slight]
+    gone = [k for f in slight for k in search.keys_of(model.final, f.effect)]
+    gone += [k for k in model.final.hypothesis.keys if k[0] == UNKNOWN]
+    if gone:
+        kept = model.final.hypothesis.without(gone)
+        if kept.keys == retuned.hypothesis.keys:  # and not another optimum of the same
+            model.final = retuned
+        else:
+            model.final = refit(kept, model.final.linearisation) or retuned
+
+
+def _supports_another(search: Search, judge: Judge, model: _Model, name: str) -> bool:
+    """Whether a term that every hull has is what makes another effect show: worth nothing without
+    the term, so what both gain together counts."""
+    final, rest = model.final, model.trials[name].rest
+    for other in model.trials if name in HULL_DAMPING else ():
+        if other == name or other.startswith(UNKNOWN):
+            continue
+        keys = [k for n in (name, other) for k in search.keys_of(final, n)]
+        neither = refit(final.hypothesis.without(keys), final.linearisation)
+        if neither is None or search.improvement(neither, rest, final) >= VERY_STRONG:
+            continue
+        if is_practical(judge.gain(neither.hypothesis, final.hypothesis)):
+            return True
+    return False
+
+
+def _with_all_data(search: Search, streams: Streams, model: _Model) -> tuple[Fitted, list[str]]:
+    """The extended model fitted to all of the data, and notes; effects that all of the data do not
+    support become minor."""
+    halves = [s for a, b in blocks(streams) for s in windows(a, b)]
+    last = fit(WindowedProblem(streams, thinned(halves)), model.final.hypothesis)
+    notes = [] if last is not None else [_ONLY_FITTED]
+    last = with_best_onsets(last or model.final)
+    for f in [f for f in model.found if not is_certain(search, last, f.effect)]:
+        model.found.remove(f)
+        model.minor.append(f)
+        gone = search.keys_of(model.final, f.effect)
+        kept = model.final.hypothesis.without(gone)
+        model.final = refit(kept, model.final.linearisation) or model.final
+        kept = last.hypothesis.without(gone)
+        last = refit(kept, last.linearisation, update_noise=True) or last
+    return last, notes
+
+
+def _extended(config: Config, h: Hypothesis, sensors: Sensors) -> Config:
+    """The configuration with what was found."""
+    document = configuration.to_parameters(config)
+    document["coefficients"] = {**document["coefficients"], **h.coefficients}
+    if effects := h.effects | {name: dict(values) for name, values in sensors.items()}:
+        document["effects"] = effects
+    chosen = document.pop("estimate", None)
+    extended = configuration.from_parameters(document)
+    if chosen is not None:  # what was found is to be estimated live, too
+        own = set(config.model.names) - set(config.estimate)
+        names = tuple(n for n in extended.model.names if n not in own)
+        extended = dataclasses.replace(extended, estimate=names)
+    return extended

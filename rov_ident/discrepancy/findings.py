@@ -1,0 +1,242 @@
+"""Findings: effects with their parameters, gains and rivals, in numbers and in sentences."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.discrepancy import sensor_consistency
+from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved
+from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
+    UNKNOWN,
+    Key,
+    at_bound,
+    bounds,
+    role_of,
+    unit_of,
+)
+from rov_ident.discrepancy.output_error import Fitted, onset_std
+from rov_ident.discrepancy.results import Alternative, Change, Finding, Gain, Residual, Value
+from rov_ident.discrepancy.screening import HULL_DAMPING
+from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
+from rov_ident.discrepancy.selection import VERY_STRONG
+from rov_ident.discrepancy.windowed_problem import Spans, within
+from rov_ident.effects import EFFECTS
+from rov_ident.model.coefficients import AXES, VELOCITIES, parse
+from rov_ident.model.equations import Array
+from rov_ident.model.scales import authority
+from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.raw_streams import Streams
+
+_ALL = 0.98  # share of what a finding explains that counts as all of it: 2 % is no practical weight
+_ACTS = 0.2  # of the wrench on the axis it acts on most, over the authority: acts on this one, too
+_PARTIAL = "fitted in its stead, it explains only {:.0f} % of this"
+_COSTLY = "fitted in its stead, it needs more parameters to explain as much"
+_EQUAL = "fits this bag as well"
+_EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
+
+
+def finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Trial) -> Finding:
+    """An effect of the final model, judged against the model without it and against its rivals."""
+    keys = search.keys_of(final, name)
+    parameters = parameters_of(final, keys)
+    onset, except_for = parameters.get("onset"), None
+    if onset is not None:  # where it begins, between two windows, nothing can be predicted
+        except_for = onset.value - 2.0 * onset.std, onset.value + 2.0 * onset.std
+    axes = _axes(search, final, keys)
+    gain = judge.gain(trial.rest.hypothesis, final.hypothesis, except_for, axes)
+    alternatives, separable = _alternatives(search, judge, final, trial, except_for)
+    stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
+    values = final.hypothesis.values
+    separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)
+    manoeuvre, begin = EFFECTS[name].manoeuvre, None if onset is None else onset.value
+    return Finding(
+        name, axes, parameters, begin, gain, separable, None if separable else manoeuvre,
+        alternatives, sentence(name, parameters, gain),
+    )  # fmt: skip
+
+
+def _alternatives(
+    search: Search,
+    judge: Judge,
+    final: Fitted,
+    trial: Trial,
+    except_for: tuple[float, float] | None,
+) -> tuple[tuple[Alternative, ...], bool]:
+    """The rivals, the closest first, and whether the effect can be told from all of them; where it
+    cannot, only those that it cannot be told from."""
+    best = search.cost(final, final)
+    explained = trial.rest.rss - final.rss
+    found, separable = [], trial.rivals is not None
+    for rival, fitted in (trial.rivals or {}).items():
+        if rival.startswith(UNKNOWN):
+            separable = separable and search.cost(fitted, final) > best - VERY_STRONG
+            continue
+        share = (trial.rest.rss - fitted.rss) / max(explained, 1e-9)
+        close = search.cost(fitted, final) - best < VERY_STRONG
+        if close or judge.better(fitted.hypothesis, final.hypothesis, except_for):
+            separable = False
+            why = _EQUAL
+        else:
+            why = _COSTLY if share > _ALL else _PARTIAL.format(100 * share)
+        found.append((share, Alternative(rival, why)))
+    told = [a for _, a in sorted(found, key=lambda x: -x[0]) if separable or a.why_not == _EQUAL]
+    return tuple(told), separable
+
+
+def is_certain(search: Search, last: Fitted, name: str) -> bool:
+    """Whether all of the data support an effect as surely as it takes to join a model."""
+    rest = search.rest(last, name)
+    asked = HULL_DAMPING_ASKED if name in HULL_DAMPING else VERY_STRONG
+    return rest is None or search.improvement(rest, last, last) >= asked
+
+
+def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
+    """The finding with the values that all of the data give."""
+    parameters = parameters_of(last, search.keys_of(last, found.effect))
+    onset = parameters.get("onset")
+    return possibly_earlier(
+        dataclasses.replace(
+            found,
+            parameters=parameters,
+            onset_s=None if onset is None else onset.value,
+            sentence=sentence(found.effect, parameters, found.gain),
+        )
+    )
+
+
+def possibly_earlier(found: Finding) -> Finding:
+    """Not separable from what lasts, where the effect may have begun before the bag did."""
+    onset, lasting = found.parameters.get("onset"), EFFECTS[found.effect].lasting
+    if onset is None or not lasting or onset.value - 2.0 * onset.std > 0.0:
+        return found
+    kept = tuple(a for a in found.alternatives if a.why_not == _EQUAL)
+    equal = {a.effect for a in kept}
+    earlier = tuple(Alternative(name, _EARLIER) for name in lasting if name not in equal)
+    run, others = EFFECTS[found.effect].manoeuvre, kept + earlier
+    return dataclasses.replace(found, separable=False, manoeuvre=run, alternatives=others)
+
+
+def parameters_of(final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:
+    """Parameters with their standard deviations; damping for negative velocity is told as the
+    coefficient that holds there, not as its difference from the other."""
+    h, linear, wide = final.hypothesis, final.linear, final.covariance
+    out = {}
+    for key in keys:
+        at = linear.index([key])[0]
+        value, variance = h.values[key], wide[at, at]
+        name = key[1]
+        if role_of(key) == "onset":
+            variance = onset_std(final, key) ** 2
+        positive = name.removesuffix("_neg")
+        if positive != name:
+            name, other = positive, (COEFFICIENTS, positive)
+            value += h.coefficients.get(positive, 0.0)
+            if other in h.values:
+                o = linear.index([other])[0]
+                variance += wide[o, o] + 2.0 * wide[at, o]
+        out[name] = Value(float(value), float(np.sqrt(max(variance, 0.0))), unit_of(key))
+    return out
+
+
+def _axes(search: Search, final: Fitted, keys: Sequence[Key]) -> tuple[str, ...]:
+    """The axes on which an effect acts, by what it does to the wrench."""
+    h = final.hypothesis
+    force = search.problem.columns(h, final.linearisation.motion, keys)
+    change = force @ np.array([h.values[k] - bounds(k)[0] for k in keys])
+    power = np.sqrt(np.mean(change**2, axis=0)) / authority(search.config.model)
+    return tuple(a for a, p in zip(AXES, power, strict=True) if p > _ACTS * power.max() > 0.0)
+
+
+def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
+    values = ", ".join(
+        f"{n} = {v.value:.3g}{'' if v.unit == '1' else ' ' + v.unit} (± {NORMAL * v.std:.2g}, 95 %)"
+        for n, v in parameters.items()
+    )
+    return f"{EFFECTS[name].summary} {values}. The {improved(gain)}."
+
+
+def residuals(final: Fitted, trials: Trials) -> list[Residual]:
+    """What the patterns in a model say: on which axis something is left that has no name. Windows
+    are predicted by fits to the others; as a pattern was chosen by all windows, from many, it must
+    surely gain what an effect must gain at all. The share is one of squares."""
+    found = []
+    for name, trial in trials.items():
+        if not name.startswith(UNKNOWN):
+            continue
+        axis, depends_on, frequency = name.removeprefix(f"{UNKNOWN} ").split("|")
+        i = AXES.index(axis)
+        before, after = without_most_favourable(
+            *(f.leave_one_out()[:, [i]] for f in (trial.rest, final))
+        )
+        gain = gain_of([VELOCITIES[i]], before, after, 1.0) if len(before) > 1 else None
+        if gain is not None and gain.low >= 100.0 * PRACTICAL:
+            share = float(1.0 - after.sum() / before.sum())
+            found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
+    return sorted(found, key=lambda r: -r.share)
+
+
+def without_most_favourable(before: Array, after: Array) -> tuple[Array, Array]:
+    """Squared residuals (W, 1) of all windows but the one that gains most: one alone can be
+    predicted badly by chance, where hardly another one determines some parameter."""
+    most = int(np.argmax(before - after))
+    return np.delete(before, most, axis=0), np.delete(after, most, axis=0)
+
+
+def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
+    """The coefficients that refitting moves by more than two standard deviations."""
+    changed, stds = {}, np.sqrt(np.diag(retuned.covariance)).tolist()
+    for ((_, name), value), std in zip(retuned.hypothesis.values.items(), stds, strict=True):
+        before = float(config.model.theta[config.model.names.index(name)])
+        if abs(value - before) > 2.0 * std:
+            changed[name] = Change(before, float(value), std, parse(name).unit)
+    return changed
+
+
+def sensor_findings(
+    streams: Streams,
+    judged: Streams,
+    config: Config,
+    found: Mapping[str, Mapping[str, float]],
+    std: Mapping[Key, float],
+    fit: Spans,
+    held: Spans,
+) -> list[Finding]:
+    """Findings of the sensor effects ``found`` in the spans ``fit`` of the streams, by how much
+    better the sensors agree in the spans ``held`` of the streams ``judged``."""
+    findings = []
+    after = sensor_consistency.comparisons(judged, config, found)
+    for name in found:
+        rest, _ = sensor_consistency.search(streams, config, fit, [n for n in found if n != name])
+        before = sensor_consistency.comparisons(judged, config, rest)
+        sums = [_common(*pair, held) for pair in zip(before, after, strict=True)]
+        last = max(map(len, sums))
+        of = np.stack([np.pad(s, ((0, last - len(s)), (0, 0))) for s in sums], axis=2)
+        of = of[of[:, 2].any(axis=1)][:, :, of[:, 2].any(axis=0)]
+        gain = gain_of(["kinematic"] * of.shape[2], of[:, 0], of[:, 1], of[:, 2].sum(axis=0))
+        parameters = {
+            p.name: Value(found[name][p.name], std[name, p.name], p.unit)
+            for p in EFFECTS[name].parameters
+        }
+        words = sentence(name, parameters, gain)
+        findings.append(Finding(name, (), parameters, None, gain, True, None, (), words))
+    return findings
+
+
+def _common(
+    before: sensor_consistency.Comparison, after: sensor_consistency.Comparison, spans: Spans
+) -> Array:
+    """Squared innovations of two corrections of the sensors, in units of the later one's noise, and
+    how many instants they are of where both count, all summed over chunks of time: (C, 3)."""
+    times = [np.round(c.t, 6) for c in (before, after)]
+    x, y = (t[within(spans, c.t)] for t, c in zip(times, (before, after), strict=True))
+    common = np.intersect1d(x, y)
+    last = int(common[-1] / CHUNK) + 1 if len(common) else 0
+    sums = []
+    for c, t in zip((before, after), times, strict=True):
+        use = np.isin(t, common)
+        squares = (c.r[use] * (c.scale / after.scale)) ** 2
+        sums.append(np.bincount((t[use] / CHUNK).astype(int), squares, last))
+    return np.stack([*sums, np.bincount((common / CHUNK).astype(int), minlength=last)], axis=1)

@@ -1,0 +1,179 @@
+"""Which data fits may see, and what an effect gains on the others: they are simulated in open loop,
+with it and without."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.discrepancy.hypothesis import Hypothesis
+from rov_ident.discrepancy.results import Gain
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.model.coefficients import AXES, VELOCITIES
+from rov_ident.model.equations import Array
+from rov_ident.sampling.raw_streams import Streams
+
+BLOCK = 10.0
+"""Seconds; held-out data are whole blocks, and windows for judging are as long (the contract)."""
+
+WINDOW = 5.0
+"""Seconds; of the windows that are fitted.
+
+Half of a block: long enough that drag shows, short enough that a vehicle that is not stable does
+not run away from its measured motion.
+"""
+
+_MARGIN = 0.25  # s cut off beside held-out blocks: five odometry messages at 20 Hz
+_ENOUGH = 600.0  # s of data to fit; an hour is explained in less than a minute so
+MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
+
+CHUNK = 2.5
+"""Seconds; of the chunks that the bootstrap resamples: four to a block."""
+
+PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
+_DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
+_FAILED = 3.0  # standard deviations of the motion: a simulation further off counts as so far off
+
+
+def split(duration: float) -> tuple[Spans, Spans]:
+    """Spans to fit and spans to judge on: of ten blocks the second, sixth and ninth are held out,
+    of a bag of less than four blocks the last third."""
+    fit: Spans = []
+    held: Spans = []
+    count = round(duration / BLOCK)
+    if count < 4:
+        edge = 0.7 * duration
+        return windows(0.0, edge - _MARGIN), [(edge + _MARGIN, duration)]
+    for i in range(count):
+        begin, end = i * BLOCK, (i + 1) * BLOCK if i + 1 < count else duration
+        if (3 * i + 7) // 10 > (3 * i + 4) // 10:
+            held.append((begin, end))
+        else:
+            fit += windows(begin + _MARGIN, end - _MARGIN)
+    return fit, held
+
+
+def windows(begin: float, end: float) -> Spans:
+    """Windows to fit between two times [s]."""
+    edges = np.linspace(begin, end, max(1, round((end - begin) / WINDOW)) + 1)
+    return list(itertools.pairwise(edges.tolist()))
+
+
+def blocks(streams: Streams) -> Spans:
+    """The whole bag in blocks."""
+    count = max(1, int(streams.t[-1] // BLOCK))
+    edges = [*(BLOCK * i for i in range(count)), float(streams.t[-1]) + 1e-6]
+    return list(itertools.pairwise(edges))
+
+
+def thinned(spans: Spans) -> Spans:
+    """As many of the spans, evenly spread, as a fit needs: more would cost time and tell little."""
+    every = sum(end - begin for begin, end in spans) / _ENOUGH
+    if every <= 1.0:
+        return spans
+    return [spans[int(i)] for i in np.arange(0.0, len(spans), every)]
+
+
+class Judge:
+    """Open-loop simulation on data that no fit has seen."""
+
+    def __init__(self, problem: WindowedProblem) -> None:
+        self._problem = problem
+        self._guided = problem.guided
+        self._limit = _FAILED * problem.measured.std(axis=0) + 1e-9
+        chunk = (problem.times / CHUNK).astype(int)
+        self._number, self._chunk = np.unique(chunk, return_inverse=True)
+
+    def squares(self, h: Hypothesis) -> Array:
+        """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
+        error = np.abs(self._problem.errors(h))
+        capped: Array = np.where(error < self._limit, error, self._limit) ** 2
+        return capped
+
+    def rmse(self, h: Hypothesis) -> dict[str, float]:
+        error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
+        return dict(zip(VELOCITIES, error.tolist(), strict=True))
+
+    def gain(
+        self,
+        before: Hypothesis,
+        after: Hypothesis,
+        except_for: tuple[float, float] | None = None,
+        axes: Sequence[str] = (),
+    ) -> Gain:
+        """Of the component that gains most, of those that surely gain if any do. Windows that reach
+        into the time ``except_for`` do not count. Where none surely gains, those of the ``axes`` on
+        which an effect acts are looked at alone: an interval for six components is wide."""
+        free, use = np.flatnonzero(~self._guided), self._used(except_for)
+        a, b = (self.summed(h)[use] for h in (before, after))
+        count = int(use[self._chunk].sum())
+        own = np.array([i for i in free if AXES[i] in axes], dtype=int)
+        sets = [of for of in (free, own) if len(of)]
+        gains = [gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count) for of in sets]
+        return next((g for g in gains if g.low > 0.0), gains[0])
+
+    def _used(self, except_for: tuple[float, float] | None) -> NDArray[np.bool_]:
+        """Which chunks count."""
+        e, use = self._problem, np.ones(len(self._number), dtype=bool)
+        if except_for is not None:
+            begin, end = e.steps.t[e.first], e.steps.t[e.last]
+            out = (end > except_for[0]) & (begin < except_for[1])
+            use[self._chunk[out[e.window]]] = False
+        return use if use.any() else ~use
+
+    def better(
+        self, rival: Hypothesis, h: Hypothesis, except_for: tuple[float, float] | None = None
+    ) -> bool:
+        """Whether a rival predicts better, all velocities taken together."""
+        free, use = ~self._guided, self._used(except_for)
+        a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
+        return bool(_log_ratio(a, b).sum() < 0.0)
+
+    def summed(self, h: Hypothesis) -> Array:
+        """Squared errors (C, 6) summed over chunks of time."""
+        return np.stack([np.bincount(self._chunk, x) for x in self.squares(h).T], axis=1)
+
+
+def predicted(component: str) -> str:
+    """What a velocity component's error is measured on, in words."""
+    return f"{BLOCK:.0f} s prediction of {MOTIONS[component]}"
+
+
+def improved(gain: Gain) -> str:
+    """What a gain is of and how large, in words."""
+    what = gain.component
+    what = "agreement of the sensors" if what == "kinematic" else predicted(what)
+    return f"{what} improves by {gain.percent:.0f} %"
+
+
+def is_practical(gain: Gain) -> bool:
+    """Whether a gain is sure, and large enough to matter."""
+    return gain.percent >= 100.0 * PRACTICAL and gain.low > 0.0
+
+
+def gain_of(components: Sequence[str], before: Array, after: Array, count: float | Array) -> Gain:
+    """Gain of one of K components, from squared errors summed over chunks of time, (C, K).
+
+    The intervals come from resampled chunks and hold for all components at once: no deviation from
+    its component's gain, in units of its spread, is larger in 95 % of the draws (Romano and Wolf
+    2005). So the component that gains most of those that surely gain may be picked. ``count`` are
+    the errors of each.
+    """
+    chunks = len(before)
+    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    change = _log_ratio(after.sum(axis=0), before.sum(axis=0))
+    drawn = _log_ratio(draws @ after, draws @ before)
+    std = drawn.std(axis=0) + 1e-12
+    widest = np.quantile(np.abs((drawn - change) / std).max(axis=1), 0.95) * std
+    percent, low, high = (
+        100.0 * (1.0 - np.exp(0.5 * x)) for x in (change, change + widest, change - widest)
+    )
+    rmse = (np.sqrt(x.sum(axis=0) / count) for x in (before, after))
+    best = int(np.argmax(np.where(low > 0.0, percent, -np.inf if (low > 0.0).any() else percent)))
+    return Gain(components[best], *(float(x[best]) for x in (*rmse, percent, low, high)))
+
+
+def _log_ratio(a: Array, b: Array) -> Array:
+    ratio: Array = np.log(np.maximum(a, 1e-300)) - np.log(np.maximum(b, 1e-300))
+    return ratio

@@ -1,0 +1,213 @@
+"""A hypothesis about what the vehicle is: a configuration with free parameters.
+
+Each parameter is named by a key (section, name): a coefficient ``("coefficients", "X_uu")`` or a
+parameter of an effect ``("thruster_lag", "time_constant")``.
+"""
+
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.config.prior import typical
+from rov_ident.discrepancy.multiple_shooting import Equations, equations
+from rov_ident.effects import EFFECTS, compiled
+from rov_ident.effects.base import Effect, EffectParameter
+from rov_ident.model.coefficients import AXES, parse
+from rov_ident.model.equations import Array, Model
+
+Key = tuple[str, str]
+COEFFICIENTS = "coefficients"
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A configuration with free parameters: ``values`` (in the order of ``keys``) replace its own.
+    Effects and coefficients that it lacks are added; parameters of an added effect that are not
+    among the keys stay at their null."""
+
+    config: Config
+    values: Mapping[Key, float]
+    constants: Mapping[Key, float] = field(default_factory=dict)
+    """Parameters that are known, such as the duration of the bag, where their effect is there."""
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        return tuple(self.values)
+
+    def having(self, values: Mapping[Key, float]) -> "Hypothesis":
+        """The same with other values, or further parameters."""
+        return self.at({**self.values, **values})
+
+    def at(self, values: Mapping[Key, float]) -> "Hypothesis":
+        """The same with just these free parameters; damping that differs for negative velocity is
+        kept dissipative."""
+        kept = dict(values)
+        for section, name in values:
+            if section == COEFFICIENTS and name.endswith("_neg"):
+                both = (COEFFICIENTS, parse(name).symmetric)
+                limit = -values.get(both, centre(self.config, both))
+                kept[section, name] = min(kept[section, name], limit)
+        return Hypothesis(self.config, kept, self.constants)
+
+    def without(self, keys: Iterable[Key]) -> "Hypothesis":
+        gone = set(keys)
+        return self.at({k: v for k, v in self.values.items() if k not in gone})
+
+    def value(self, key: Key) -> float:
+        """Of a parameter, free or not, there or not."""
+        section, name = key
+        if key in self.values:
+            return self.values[key]
+        if section == COEFFICIENTS:
+            return self.coefficients.get(name, 0.0)
+        return self.effects.get(section, {}).get(name, bounds(key)[0])
+
+    @cached_property
+    def effects(self) -> dict[str, dict[str, float]]:
+        effects = {name: dict(values) for name, values in self.config.effects.items()}
+        for (section, name), value in self.values.items():
+            if section in EFFECTS:
+                effects.setdefault(section, self.nulls(section))[name] = value
+        return effects
+
+    def nulls(self, effect: str) -> dict[str, float]:
+        """The parameters of an effect that does nothing."""
+        nulls = {p.name: p.null for p in EFFECTS[effect].parameters}
+        return nulls | {n: v for (section, n), v in self.constants.items() if section == effect}
+
+    @cached_property
+    def coefficients(self) -> dict[str, float]:
+        own = dict(zip(self.config.model.names, self.config.model.theta.tolist(), strict=True))
+        added = {n: v for (section, n), v in self.values.items() if section == COEFFICIENTS}
+        return {**own, **added}
+
+    @cached_property
+    def model(self) -> Model:
+        """The equations of motion; unphysical values are not refused here."""
+        values = self.coefficients
+        found = sorted((parse(n) for n in values), key=lambda c: not c.is_added_mass)
+        body = self.config.model.body
+        for name, parameters in self.effects.items():
+            change = EFFECTS[name].body
+            if change is not None:
+                body = change(body, **parameters)
+        theta = np.array([values[c.name] for c in found])
+        return Model(body, tuple(found), theta, self.config.model.fins)
+
+    @cached_property
+    def equations(self) -> Equations:
+        return equations(self.model, compiled(self.effects))
+
+
+UNKNOWN = "unknown"
+"""Section of the keys of patterns (`basis_functions`): wrenches of no known cause."""
+
+
+def bounds(key: Key) -> tuple[float, float, float]:
+    """Null, lower and upper bound of a parameter."""
+    section, name = key
+    if section == COEFFICIENTS:
+        return 0.0, -np.inf, 0.0 if parse(name).is_diagonal else np.inf
+    if section not in EFFECTS:
+        return 0.0, -np.inf, np.inf
+    p = parameter(key)
+    return p.null, p.lower, p.upper
+
+
+def parameter(key: Key) -> EffectParameter:
+    return next(p for p in EFFECTS[key[0]].parameters if p.name == key[1])
+
+
+def centre(config: Config, key: Key) -> float:
+    """The prior's mean of a parameter."""
+    section, name = key
+    if section == COEFFICIENTS and name in config.model.names:
+        return float(config.model.theta[config.model.names.index(name)])
+    return bounds(key)[0]
+
+
+def coefficient_sizes(model: Model) -> dict[Key, float]:
+    """How large each coefficient is, at least a fifth of what is typical of such a vehicle."""
+    sizes = np.maximum(np.abs(model.theta), 0.2 * typical(model)).tolist()
+    return {(COEFFICIENTS, name): size for name, size in zip(model.names, sizes, strict=True)}
+
+
+def precision(h: Hypothesis) -> Array:
+    """Prior precision (P,): wide, so that it decides only where the data say nothing."""
+    width = coefficient_sizes(h.config.model)
+    width |= {key: 1e3 * parameter(key).typical for key in h.keys if key[0] in EFFECTS}
+    return np.array([width.get(key, np.inf) for key in h.keys]) ** -2.0
+
+
+def largest_step(key: Key) -> float:
+    """How far one step of a fit may go in a parameter that is not linear: an onset by the distance
+    at which better ones are tried [s], a frequency by half the width of a spectral peak of three
+    minutes [Hz], a phase by what keeps a sine linear within 4 % [rad]."""
+    if key[0] not in EFFECTS:
+        return np.inf
+    p = parameter(key)
+    steps = {"onset": 2.0, "frequency": 0.003, "phase": 0.5, "place": 2.0 * p.typical}
+    return steps.get(p.role, np.inf)
+
+
+def role_of(key: Key) -> str:
+    """What a parameter says of its effect (`EffectParameter`). The wrench is (nearly) linear in an
+    amplitude, however far it moves; so it is in a coefficient and in a pattern."""
+    return parameter(key).role if key[0] in EFFECTS else "amplitude"
+
+
+def onsets(h: Hypothesis) -> list[Key]:
+    """Parameters that say when something begins."""
+    return [k for k in h.keys if role_of(k) == "onset"]
+
+
+def may_leave_null(limits: tuple[float, float, float], change: float) -> bool:
+    """Whether a parameter with these null, lower and upper bound may change from null this way."""
+    null, lower, upper = limits
+    return not ((null == lower and change < 0.0) or (null == upper and change > 0.0))
+
+
+def at_bound(key: Key, value: float, std: float) -> bool:
+    """Whether a parameter of an effect is within two standard deviations of the end of its range:
+    then it stands for something else.
+
+    Zero is no such end: a thruster may fail altogether.
+    """
+    if key[0] not in EFFECTS or parameter(key).role != "amplitude":
+        return False
+    margin = max(2.0 * std, 1e-3 * abs(value))
+    return any(b != 0.0 and abs(value - b) < margin for b in bounds(key)[1:])
+
+
+def effect_of(key: Key) -> str:
+    """The effect that a parameter belongs to; of a pattern its axis and dependence."""
+    section, name = key
+    if section == UNKNOWN:
+        return f"{UNKNOWN} " + name.rpartition("|")[0]
+    if section != COEFFICIENTS:
+        return section
+    return next((e.name for e in EFFECTS.values() if name in e.coefficients), "coupled_damping")
+
+
+def axis_of(key: Key) -> str:
+    """The axis of XYZKMN that a parameter belongs to; empty if it acts on several."""
+    section, name = key
+    return AXES[parse(name).row] if section == COEFFICIENTS else parameter(key).axis
+
+
+def units(effect: Effect, h: Hypothesis, roles: Container[str]) -> list[tuple[Key, ...]]:
+    """The parameters of an effect that ``h`` lacks, in the groups in which they may join."""
+    if effect.coefficients:
+        have = {parse(n).place for n in h.coefficients}
+        return [((COEFFICIENTS, n),) for n in effect.coefficients if parse(n).place not in have]
+    mine = [(effect.name, p.name) for p in effect.parameters if p.role in roles]
+    if any(p.axis for p in effect.parameters):
+        return [(key,) for key in mine if key not in h.values]
+    return [] if effect.name in h.effects else [tuple(mine)]
+
+
+def unit_of(key: Key) -> str:
+    return parse(key[1]).unit if key[0] == COEFFICIENTS else parameter(key).unit

@@ -1,0 +1,209 @@
+"""A hypothesis linearised about its simulated motion: residuals and their sensitivities.
+
+The initial velocity of each window is a nuisance. It is eliminated here (residuals and
+sensitivities are projected on the complement of what it explains), so that any number of further
+parameters can be tried on a :class:`Linearisation` without simulating again.
+"""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.core.linalg import scaled_solve, unit_diagonal
+from rov_ident.discrepancy.hypothesis import Hypothesis, Key
+from rov_ident.discrepancy.multiple_shooting import Motion, adjoint, tangent
+from rov_ident.discrepancy.windowed_problem import MAX_STEP, WindowedProblem
+from rov_ident.model.equations import Array, Indices
+
+_OUTLIER = 8.0
+"""Robust standard deviations beyond which a residual is an outlier.
+
+Well beyond the 3 of Hampel (1974): what is missing from a model makes large residuals, too.
+"""
+
+_HIGHEST = 2.0  # Hz; of forces that are looked for: surface waves lie far below
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """Least squares in the neighbourhood of a hypothesis, in units of the noise: ``normal`` (P, P)
+    = J'J over the parameters ``keys``, ``gradient`` (W, P) = J'r of each window, ``rss`` (W,) its
+    squared residuals, ``count`` the residuals less initial velocities."""
+
+    keys: tuple[Key, ...]
+    normal: Array
+    gradient: Array
+    rss: Array
+    count: int
+
+    def index(self, keys: Iterable[Key]) -> Indices:
+        place = {key: i for i, key in enumerate(self.keys)}
+        return np.array([place[key] for key in keys], dtype=np.int64)
+
+
+class Linearisation:
+    """A hypothesis simulated through all windows: residuals ``error`` (6 N,), initial velocities
+    eliminated, divided by the standard deviations ``noise`` (6,), and sensitivities; ``starts`` (W,
+    6) are the initial velocities."""
+
+    def __init__(
+        self, problem: WindowedProblem, h: Hypothesis, starts: Array, noise: Array, motion: Motion
+    ) -> None:
+        self.problem, self.hypothesis, self.starts = problem, h, starts
+        self.noise, self.motion = noise, motion
+        error = (problem.measured - motion.nu[problem.nodes]) / noise
+        spread = 1.4826 * np.median(np.abs(error), axis=0)  # the standard deviation if normal
+        self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
+        self._weight[:, problem.guided] = 0.0
+        error = error * (self._weight > 0.0)
+        self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
+        j0 = tangent(motion, problem.first, problem.last, problem.nodes)
+        j0 = j0[:, :, ~problem.guided] * self._weight[:, :, None]
+        self._q, self._r = [], []
+        for a, b in self._spans():
+            q, r = np.linalg.qr(j0[a:b].reshape(6 * (b - a), -1))
+            self._q.append(q)
+            self._r.append(r)
+        spans = zip(self._q, self._spans(), strict=True)
+        self._start_error = [q.T @ error[a:b].ravel() for q, (a, b) in spans]
+        self.error = self._projected(error.reshape(-1, 1))[:, 0]
+        self._squares = np.add.reduceat(self.error**2, self.first)
+        self._sensitivities: tuple[list[Array], Array, LinearProblem] | None = None
+
+    def sensitivities(self) -> tuple[list[Array], Array, LinearProblem]:
+        """With respect to the parameters of the hypothesis; computed when first asked for, as of a
+        trial that is no better only the residuals count. No cached_property: all threads share its
+        lock in Python 3.11."""
+        if self._sensitivities is None:
+            keys = self.hypothesis.keys
+            raw = self._unprojected(self.problem.columns(self.hypothesis, self.motion, keys))
+            spans = zip(self._q, self._spans(), strict=True)
+            starts = [q.T @ raw[6 * a : 6 * b] for q, (a, b) in spans]
+            columns = self._projected(raw)
+            count = int(np.count_nonzero(self._weight)) - 6 * len(self.first)
+            normal = columns.T @ columns
+            gradient = np.add.reduceat(columns * self.error[:, None], self.first)
+            linear = LinearProblem(tuple(keys), normal, gradient, self._squares, count)
+            self._sensitivities = starts, columns, linear
+        return self._sensitivities
+
+    @property
+    def columns(self) -> Array:
+        return self.sensitivities()[1]
+
+    @property
+    def linear(self) -> LinearProblem:
+        return self.sensitivities()[2]
+
+    @property
+    def rss(self) -> float:
+        """Squared residuals; an outlier counts as the least residual that is one, or a fit could
+        improve by losing a window."""
+        out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0)
+        return float(self._squares.sum() + _OUTLIER**2 * out)
+
+    @property
+    def first(self) -> Indices:
+        """Where each window begins in the residuals (6 N,)."""
+        return 6 * self._rows
+
+    def _spans(self) -> Iterable[tuple[int, int]]:
+        edges = [*self._rows.tolist(), len(self.problem.nodes)]
+        return itertools.pairwise(edges)
+
+    def _projected(self, raw: Array) -> Array:
+        """Columns (6 N, P) without what the initial velocities explain, in place."""
+        for q, (a, b) in zip(self._q, self._spans(), strict=True):
+            part = raw[6 * a : 6 * b]
+            part -= q @ (q.T @ part)
+        return raw
+
+    def sensitivity_to(self, force: Array) -> Array:
+        """Sensitivities (6 N, C) of the simulated velocities to wrenches (K, 6, C)."""
+        return self._projected(self._unprojected(force))
+
+    def _unprojected(self, force: Array) -> Array:
+        """The same (6 N, C) with the initial velocities held."""
+        e = self.problem
+        j = tangent(self.motion, e.first, e.last, e.nodes, force)
+        return (j * self._weight[:, :, None]).reshape(-1, force.shape[2])
+
+    def having(self, keys: Sequence[Key], columns: Array) -> LinearProblem:
+        """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
+        cross = self.columns.T @ columns
+        gradient = np.add.reduceat(columns * self.error[:, None], self.first)
+        own = self.linear
+        normal = np.block([[own.normal, cross], [cross.T, columns.T @ columns]])
+        both = np.hstack([own.gradient, gradient])
+        return LinearProblem((*own.keys, *keys), normal, both, own.rss, own.count)
+
+    def jackknife(self, at: Indices) -> Array:
+        """How the estimate (W, A) of the parameters ``at`` (A,) moves as each window is left out;
+        the other parameters are taken as known."""
+        linear = self.linear
+        normal, gradient = linear.normal[np.ix_(at, at)], linear.gradient[:, at]
+        _, size = unit_diagonal(normal)
+        edges = [*self.first.tolist(), len(self.columns)]
+        moves = np.empty_like(gradient)
+        for w, (a, b) in enumerate(itertools.pairwise(edges)):
+            own = self.columns[a:b, at]
+            moves[w] = scaled_solve(normal - own.T @ own, gradient[w], 1e-9, size)
+        return moves
+
+    def leave_one_out(self, at: Indices) -> Array:
+        """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""
+        moves = self.jackknife(at)
+        window = np.repeat(np.arange(len(moves)), np.diff([*self.first, len(self.columns)]))
+        error = self.error + np.einsum("rp,rp->r", self.columns[:, at], moves[window])
+        return np.add.reduceat(error.reshape(-1, 6) ** 2, self._rows)
+
+    def starts_after(self, change: Array) -> Array:
+        """The initial velocities (W, 6) that suit a change (P,) of the parameters."""
+        parts = zip(self._r, self._start_error, self.sensitivities()[0], strict=True)
+        moves = [np.linalg.solve(r, e - a @ change) for r, e, a in parts]
+        starts = self.starts.copy()
+        starts[:, ~self.problem.guided] += moves
+        return starts
+
+    def residual_std(self) -> Array:
+        """Standard deviation (6,) of the residuals, outliers left out."""
+        good = self._weight > 0.0
+        residual = self.problem.measured - self.motion.nu[self.problem.nodes]
+        power = np.sum(np.where(good, residual, 0.0) ** 2, axis=0)
+        std: Array = np.sqrt(np.maximum(power / np.maximum(good.sum(axis=0), 1), 1e-16))
+        return std
+
+    def frequencies(self, count: int, axis: int | None = None) -> list[float]:
+        """Frequencies [Hz] at which a force in the world, or along a body axis, would help most:
+        peaks, over the median of their neighbourhood, in the spectrum of the gradient of the
+        squared residuals with respect to a wrench at each step (by the adjoint equations)."""
+        e = self.problem
+        error = self.error.reshape(-1, 6) * self._weight
+        wrench = adjoint(self.motion, e.first, e.last, error, e.nodes)
+        in_world = np.einsum("kij,kj->ki", e.steps.middle, wrench[:, :3])
+        force = in_world if axis is None else wrench[:, axis : axis + 1]
+        t = 0.5 * (e.steps.t[1:] + e.steps.t[:-1])
+        step = 2.0 * MAX_STEP
+        bins = ((t - t[0]) / step).astype(int)
+        size = 4 * (bins[-1] + 1)  # padded: a peak between two frequencies shows
+        power = np.zeros(size // 2 + 1)
+        for column in force.T:
+            power += np.abs(np.fft.rfft(np.bincount(bins, column), size)) ** 2
+        frequency = np.fft.rfftfreq(size, step)
+        power[(frequency < 1.0 / (t[-1] - t[0])) | (frequency > _HIGHEST)] = 0.0
+        from scipy.ndimage import median_filter  # here: the monitor in a node does not need 13 MB
+
+        level = median_filter(power, max(5, size // 64)) + 1e-3 * power.max()
+        peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+        strongest = peaks[np.argsort(-power[peaks] / np.maximum(level[peaks], 1e-300))]
+        return [float(frequency[i]) for i in strongest[:count]]
+
+
+def linearise(
+    problem: WindowedProblem, h: Hypothesis, starts: Array, noise: Array
+) -> Linearisation | None:
+    """Simulate a hypothesis from initial velocities (W, 6); None where that diverges."""
+    motion = problem.motion(h, starts)
+    return None if motion is None else Linearisation(problem, h, starts, noise, motion)

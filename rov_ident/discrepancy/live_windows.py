@@ -1,0 +1,211 @@
+"""What a live monitor remembers of the last minutes: windows of motion as normal equations.
+
+Each window of a few seconds is simulated with the coefficients as they are estimated then, and the
+sensitivities of the simulated velocity to every watched parameter, at its null, are taken against
+what the simulation leaves unexplained (`linearisation`, the same as the offline search). Windows of
+different coefficients theta_w add up, because what is remembered of one are its normal equations
+about a common origin::
+
+    J'J,  J'(r + J theta_w),  r'r + 2 r'J theta_w + (J theta_w)'(J theta_w)
+
+Effects on sensors are not watched: they do not act on the wrench, and what gives them away is that
+two sensors disagree. Nor is a wave, whose frequency takes a search, nor the slow fade of a battery,
+which in the memory of some minutes looks like a thruster gain. Effects with an onset are watched as
+if they had always been there; the memory is short enough for that.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.config.prior import typical
+from rov_ident.core.messages import Array
+from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
+    Hypothesis,
+    Key,
+    coefficient_sizes,
+    parameter,
+    role_of,
+    units,
+)
+from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
+from rov_ident.discrepancy.multiple_shooting import Motion
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import Effect
+from rov_ident.model.coefficients import parse
+from rov_ident.model.equations import Model
+from rov_ident.model.scales import authority
+from rov_ident.sampling.raw_streams import Streams
+
+WINDOW = 5.0  # s; as long as those that `explain` fits
+MEMORY = 36  # windows: three minutes, the length of a bag of the study (docs/explain-bench.md)
+
+_SPACING = 0.045  # s; closer measurements (above 20 Hz) add cost, hardly information
+_FEWEST = 8  # measurements in a window, as in `windowed_problem`
+_NOISE_TIME = 60.0  # s; over which the size of the residual is followed: twelve windows
+
+
+class Window(NamedTuple):
+    """What is remembered of a window; P parameters: the estimated ones, then those watched."""
+
+    t: float  # s, of its end
+    normal: Array  # (P, P)
+    moment: Array  # (P,): J'(r + J theta), theta zero for those watched
+    power: float  # of r + J theta
+    residuals: int  # so many of them
+    strength: Array  # (6, C) squared wrenches of a unit of each watched one, over the authority
+
+
+class Task(NamedTuple):
+    config: Config
+    base: tuple[Key, ...]
+    units: tuple[tuple[Key, ...], ...]
+    prior: Array  # (B,) precision of the base about its values in the configuration
+    centre: Array  # (B,)
+    sizes: Mapping[Key, float]  # at which a watched parameter matters
+
+    @property
+    def watched(self) -> tuple[Key, ...]:
+        return tuple(key for unit in self.units for key in unit)
+
+
+class State(NamedTuple):
+    """All that the next window needs."""
+
+    windows: tuple[Window, ...]
+    noise: Array  # (6,): standard deviation of what a window leaves unexplained
+
+
+def is_watched(effect: Effect) -> bool:
+    """Whether an effect can be scored as it stands: it acts on the wrench, and at once."""
+    searched = {"frequency", "fixed"}
+    return effect.sense is None and not any(p.role in searched for p in effect.parameters)
+
+
+def task_of(config: Config) -> Task:
+    """What is to be watched in the model of a configuration."""
+    base = (*((COEFFICIENTS, name) for name in config.estimate), *config.estimate_effects)
+    size, given = coefficient_sizes(config.model), Hypothesis(config, {})
+    prior = [size[k] if k in size else parameter(k).typical for k in base]
+    lacking = [e for e in EFFECTS.values() if is_watched(e) and e.name not in config.effects]
+    groups = [u for e in lacking for u in units(e, given, ("amplitude", "place"))]
+    values = [given.value(key) for key in base]
+    sizes = _sizes(config, [key for unit in groups for key in unit])
+    return Task(config, base, tuple(groups), np.array(prior) ** -2.0, np.array(values), sizes)
+
+
+def _sizes(config: Config, keys: Sequence[Key]) -> dict[Key, float]:
+    """The size at which each parameter matters; of a place times its amplitude."""
+    found = tuple(parse(name) for section, name in keys if section == COEFFICIENTS)
+    absent = typical(Model(config.model.body, found, np.zeros(len(found)))).tolist()
+    sizes = {(COEFFICIENTS, c.name): size for c, size in zip(found, absent, strict=True)}
+    for key in keys:
+        if key[0] != COEFFICIENTS:
+            amplitude = next(p for p in EFFECTS[key[0]].parameters if p.role == "amplitude")
+            unit = amplitude.typical if role_of(key) == "place" else 1.0
+            sizes[key] = unit * parameter(key).typical
+    return sizes
+
+
+def init(task: Task) -> State:
+    odometry, imu = task.config.odometry, task.config.imu
+    angular = min(odometry.angular_std, imu.gyro_std)
+    return State((), np.repeat([odometry.linear_std, angular], 3))
+
+
+def step(
+    task: Task, state: State, samples: NDArray[np.void], demands: Array, values: Mapping[str, float]
+) -> State:
+    """Take in a window: samples (k,) of SAMPLE, the commands (d, 7) [t, wrench] that led to them,
+    and the estimated coefficients; the same state where it says nothing."""
+    streams = _streams(samples, demands)
+    if streams is None:
+        return state
+    problem = WindowedProblem(streams, [(float(streams.t[0]), float(streams.t[-1]) + 1e-6)])
+    if len(problem.first) != 1:
+        return state
+    names = [n if section == COEFFICIENTS else f"{section}.{n}" for section, n in task.base]
+    h = Hypothesis(task.config, {k: values[n] for k, n in zip(task.base, names, strict=True)})
+    linearisation = linearise(problem, h, problem.measured_starts(), state.noise)
+    if linearisation is None:
+        return state
+    force = _columns(task, problem, h, linearisation.motion)
+    linear, seen = _without_tilt(task, linearisation, force)
+    theta = np.array(list(h.values.values()))
+    b = len(theta)
+    through = linear.normal[:, :b] @ theta
+    gradient = linear.gradient[0]
+    window = Window(
+        float(streams.t[-1]),
+        linear.normal,
+        gradient + through,
+        float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b]),
+        linear.count,
+        np.sum((force / authority(h.model)[:, None]) ** 2, axis=0),
+    )
+    blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
+    noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
+    return State((*state.windows[-(MEMORY - 1) :], window), noise)
+
+
+def _without_tilt(
+    task: Task, linearisation: Linearisation, force: Array
+) -> tuple[LinearProblem, Array]:
+    """A window with an error of its attitude eliminated, and the size (6,) of its residuals. A
+    filtered attitude is off by about as much throughout a window, and the righting moment of that
+    turns a vehicle that is lightly damped: each window has a rotation of unknown size, with the
+    attitude's noise as its prior, beside what is watched, whose wrenches ``force`` are (K, 6, C).
+    """
+    problem, h = linearisation.problem, linearisation.hypothesis
+    down = problem.steps.middle[:, 2, :]
+    tilted = np.cross(np.eye(3)[None], down[:, None, :]) @ h.model.body.restoring.T  # (K, 3, 6)
+    both = np.concatenate([force, tilted.transpose(0, 2, 1)], axis=2)
+    columns = linearisation.sensitivity_to(both)
+    whole = linearisation.having((*task.watched, *(("tilt", a) for a in "xyz")), columns)
+    p = len(whole.keys) - 3
+    kept = np.eye(3) / task.config.odometry.attitude_std**2 + whole.normal[p:, p:]
+    onto = np.linalg.solve(kept, whole.normal[p:, :p])
+    turn = np.linalg.solve(kept, whole.gradient[0, p:])
+    left = (linearisation.error - columns[:, -3:] @ turn).reshape(-1, 6) * linearisation.noise
+    normal = whole.normal[:p, :p] - whole.normal[:p, p:] @ onto
+    gradient = whole.gradient[:, :p] - whole.gradient[:, p:] @ onto
+    rss = whole.rss - whole.gradient[0, p:] @ turn
+    linear = LinearProblem(whole.keys[:p], normal, gradient, rss, whole.count)
+    return linear, np.sqrt(np.mean(left**2, axis=0))
+
+
+def _columns(task: Task, problem: WindowedProblem, h: Hypothesis, motion: Motion) -> Array:
+    """The wrench (K, 6, C) of a unit of each watched parameter; of a place of attachment that of
+    the effect's amplitude times each coordinate."""
+    plain = [key for key in task.watched if role_of(key) != "place"]
+    found = dict(zip(plain, problem.columns(h, motion, plain).transpose(2, 0, 1), strict=True))
+    for key in task.watched:
+        if role_of(key) == "place":
+            amplitude = next(k for k in plain if k[0] == key[0])
+            arm = parameter(key).typical
+            there = Hypothesis(h.config, h.values, {key: arm})
+            vars(there).update(model=h.model, equations=h.equations)  # the same, and slow to make
+            column = problem.columns(there, motion, [amplitude])[:, :, 0]
+            found[key] = (column - found[amplitude]) / arm
+    return np.stack([found[key] for key in task.watched], axis=2)
+
+
+def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
+    """The measured part of the samples as the offline search has it, over ground."""
+    kept, last = [], -np.inf
+    for i in np.flatnonzero(samples["measured"]).tolist():
+        if samples["t"][i] - last >= _SPACING:
+            kept.append(i)
+            last = samples["t"][i]
+    if len(kept) < _FEWEST or len(demands) == 0:
+        return None
+    t, orientation, nu, water = (samples[n][kept] for n in ("t", "orientation", "nu", "water"))
+    nu[:, :3] += water
+    unknown, none = np.zeros((len(t), 3)), np.zeros((0, 3))
+    held = demands[:, 0].copy(), demands[:, 1:].copy()
+    return Streams(t, unknown, orientation, nu, np.zeros(0), none, none, *held)

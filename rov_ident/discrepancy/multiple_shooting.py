@@ -1,0 +1,394 @@
+"""Output error over short windows (multiple shooting), with its sensitivities.
+
+Each window starts from a velocity of its own, which is estimated with the parameters and eliminated
+(it is a nuisance). Inside, the velocity is integrated from the equations of motion; the attitude
+is taken as measured. Sensitivities solve the linearised equations along that motion::
+
+    d(nu)[k+1] = Phi[k] d(nu)[k] + Gamma[k] dF[k]
+
+for any change dF of the wrench, so that a hundred candidate causes cost little more than one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.jit import copy, inner, record, released
+from rov_ident.core.runge_kutta import NODES, runge_kutta
+from rov_ident.effects import Acting, act, add_surroundings, memory, surroundings
+from rov_ident.model.coefficients import EXTENDED_SIZE
+from rov_ident.model.equations import (
+    CURRENT,
+    Array,
+    Model,
+    Structure,
+    columns,
+    generalized_force,
+    momentum_columns,
+    six,
+    symmetric_product,
+)
+
+Indices = NDArray[np.int64]
+
+_NEARBY = 1e-4  # m/s, rad/s; of the difference quotients
+
+
+class Steps(NamedTuple):
+    """The time axis: steps k = 0 .. K - 1 from node k to node k + 1. The demand is held over
+    pieces; the pieces of step k begin at ``piece[k]``."""
+
+    t: Array  # (K + 1,) s
+    rotation: Array  # (K + 1, 3, 3), body -> world
+    middle: Array  # (K, 3, 3), half-way through the step
+    piece_t: Array  # (J + 1,) s
+    demand: Array  # (J, 6)
+    piece: Indices  # (K,)
+    given: Array  # (K, 6) accelerations that guided axes are measured to have, else 0; or (0, 6)
+
+
+class Equations(NamedTuple):
+    """The equations of motion, their numbers as the kernels take them."""
+
+    structure: Structure
+    mass: Array  # (6, 6, 1)
+    added: Array  # (6, 6, 1)
+    inverse: Array  # (6, 6); zeros in the rows and columns of axes that are guided
+    theta: Array  # (n, 1)
+    restoring: Array  # (6, 3)
+    acting: Acting
+
+
+class Motion(NamedTuple):
+    """A shot through all windows; rows outside every window hold nothing of meaning."""
+
+    nu: Array  # (K + 1, 6) at the nodes
+    middle: Array  # (K, 6) half-way through each step
+    nu_dot: Array  # (K, 6) its derivative there
+    phi: Array  # (K, 6, 6)
+    gamma: Array  # (K, 6, 6)
+
+
+def equations(model: Model, acting: Acting) -> Equations:
+    mass = model.mass_matrix
+    lanes = (mass, mass - model.body.mass_matrix, model.theta)
+    mass, added, theta = (np.ascontiguousarray(x[..., None]) for x in lanes)
+    inverse: Array = np.asarray(np.linalg.inv(model.mass_matrix), dtype=np.float64)
+    return Equations(model.structure, mass, added, inverse, theta, model.body.restoring, acting)
+
+
+def guided_by(eq: Equations, guided: NDArray[np.bool_]) -> Equations:
+    """The same where some axes (6,) follow the measurement."""
+    if not guided.any():
+        return eq
+    free = np.ix_(~guided, ~guided)
+    inverse = np.zeros((6, 6))
+    inverse[free] = np.linalg.inv(eq.mass[:, :, 0][free])
+    return eq._replace(inverse=inverse)
+
+
+def thrust(steps: Steps, acting: Acting) -> Array:
+    """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
+    wrench = steps.demand.copy()
+    if acting.inputs.any():
+        _thrust(acting, memory(), steps.piece_t, wrench)
+    share = np.diff(steps.piece_t)[:, None] * wrench
+    length = np.diff(steps.t)[:, None]
+    mean = np.add.reduceat(share, steps.piece) / length
+    middle, of_step = (0.5 * (t[1:] + t[:-1]) for t in (steps.piece_t, steps.t))
+    late = middle - np.repeat(of_step, np.diff(np.append(steps.piece, len(wrench))))
+    slope = 12.0 / length**3 * np.add.reduceat(share * late[:, None], steps.piece)
+    return np.stack([mean, slope])
+
+
+def shoot(
+    eq: Equations, steps: Steps, wrench: Array, first: Indices, last: Indices, start: Array
+) -> Motion:
+    """Integrate each window from node ``first`` to ``last`` (W,), beginning at start (W, 6)."""
+    k = wrench.shape[1]
+    zeros = [np.zeros(shape) for shape in 2 * [(k, 6)] + 2 * [(k, 6, 6)]]
+    motion = Motion(np.full((k + 1, 6), np.nan), *zeros)
+    _shoot(
+        *surroundings(eq.acting), eq.structure, eq.mass, eq.added, eq.inverse,
+        eq.theta, np.repeat(eq.theta, _LANES, axis=1), eq.restoring, steps, wrench, first, last,
+        start, np.zeros(1, _SCRATCH), motion,
+    )  # fmt: skip
+    return motion
+
+
+def tangent(
+    motion: Motion, first: Indices, last: Indices, nodes: Indices, force: Array | None = None
+) -> Array:
+    """Sensitivities (N, 6, P) at ``nodes`` (N,) to each column of wrenches (K, 6, P); without, to
+    the start of the window (N, 6, 6)."""
+    begin = np.eye(6) if force is None else np.zeros((6, force.shape[2]))
+    force = None if force is None else np.ascontiguousarray(force)
+    out, work = np.zeros((len(nodes), *begin.shape)), np.empty((2, *begin.shape))
+    _tangent(motion.phi, motion.gamma, first, last, force, begin, nodes, work, out)
+    return out
+
+
+def adjoint(motion: Motion, first: Indices, last: Indices, error: Array, nodes: Indices) -> Array:
+    """The transpose of :func:`tangent`: errors (N, 6) at the nodes to wrenches (K, 6)."""
+    out = np.zeros((len(motion.middle), 6))
+    _adjoint(motion.phi, motion.gamma, first, last, error, nodes, np.empty((2, 6)), out)
+    return out
+
+
+def regressors(eq: Equations, motion: Motion) -> Array:
+    """What a unit of each coefficient adds to the wrench side of the equations, (K, 6, n)."""
+    n, extended = len(eq.theta), np.empty((EXTENDED_SIZE, 1))
+    out, work = np.empty((len(motion.middle), 6, n)), np.empty((3, 6, n))
+    _regressors(eq.structure, motion.middle, motion.nu_dot, work, extended, out)
+    return out
+
+
+def wrenches(eq: Equations, steps: Steps, motion: Motion) -> Array:
+    """Wrench effects and current (K, 6) along a motion."""
+    out, (around, current) = np.zeros((len(motion.middle), 6)), surroundings(eq.acting)
+    if around is not None:
+        _wrenches(
+            around, current, eq.structure, eq.added, eq.theta, steps, motion.middle,
+            np.zeros(1, CURRENT), out,
+        )  # fmt: skip
+    return out
+
+
+@released
+def _thrust(acting, state, t, wrench):
+    for k in range(len(wrench)):
+        act(acting, state, t[k], t[k + 1] - t[k], wrench[k])
+
+
+@released
+def _wrenches(around, current, structure, added, theta, steps, nu, scratch, out):
+    t, middle, s = steps.t, steps.middle, scratch[0]
+    for k in range(len(nu)):
+        now = 0.5 * (t[k] + t[k + 1])
+        add_surroundings(around, current, structure, added, theta, now, nu[k], middle[k], s, out[k])
+
+
+_LANES = 8  # six axes, none, and one more to fill the vectors
+
+_SCRATCH = record(
+    [
+        ("nu", "f8", (6, 1)),
+        ("push", "f8", (6,)),  # wrench of thrusters, weight and effects
+        ("slope", "f8", (4, 6)),  # of Runge and Kutta's stages
+        ("h", "f8", (6, 1)),
+        ("extended", "f8", (EXTENDED_SIZE, 1)),
+        ("mass", "f8", (6, 6, 1)),
+        ("inverse", "f8", (6, 6, 1)),
+        ("velocity", "f8", (6,)),
+        ("begin", "f8", (6,)),  # of the step: nu
+        ("end", "f8", (6,)),
+        ("nearby", "f8", (6, _LANES)),
+        ("nearby_h", "f8", (6, _LANES)),
+        ("nearby_extended", "f8", (EXTENDED_SIZE, _LANES)),
+        ("nearby_mass", "f8", (6, 6, _LANES)),
+        ("by_velocity", "f8", (6, 6)),
+        ("jacobian", "f8", (6, 6)),
+        ("square", "f8", (6, 6)),
+        ("current", CURRENT),
+    ]
+)
+
+
+@inner
+def _acceleration(around, current, structure, added, theta, restoring, t, rotation, given, s, out):
+    """nu_dot (6,) at s.nu into out, ``given`` on guided axes; s.push (6,) is the thrusters'."""
+    for i in range(6):
+        s.velocity[i] = s.nu[i, 0]
+        for j in range(3):
+            s.push[i] += restoring[i, j] * rotation[2, j]
+    if around is not None:  # numba leaves this out where it is None
+        add_surroundings(
+            around, current, structure, added, theta, t, s.velocity, rotation, s.current, s.push
+        )
+    h = s.h
+    generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
+    for i in range(6):
+        h[i, 0] = s.push[i] - h[i, 0]
+    for j in range(len(given)):
+        for i in range(6):
+            h[i, 0] -= s.mass[i, j, 0] * given[j]
+    nu_dot = symmetric_product(s.inverse, six(h, 0), 0)
+    for i in range(6):
+        out[i] = nu_dot[i]
+    for i in range(len(given)):
+        out[i] += given[i]
+
+
+@inner
+def _differentiate(around, current, structure, added, theta, wide, t, rotation, s):
+    """s.by_velocity (6, 6): the derivative of the wrench on the vehicle by its velocity s.nu. Lane
+    j is a little faster along axis j, the last along none; ``wide`` (n, _LANES) is theta in each.
+    """
+    nearby, h, last = s.nearby, s.nearby_h, _LANES - 1
+    for i in range(6):
+        for k in range(_LANES):
+            nearby[i, k] = s.nu[i, 0]
+        nearby[i, i] += _NEARBY
+    generalized_force(_LANES, structure, s.nearby_mass, wide, nearby, h, s.nearby_extended)
+    if around is not None:
+        for k in (0, 1, 2, 3, 4, 5, last):
+            for i in range(6):
+                s.velocity[i], s.push[i] = nearby[i, k], 0.0
+            add_surroundings(
+                around, current, structure, added, theta, t, s.velocity, rotation, s.current,
+                s.push,
+            )  # fmt: skip
+            for i in range(6):
+                h[i, k] -= s.push[i]
+    for i in range(6):
+        for j in range(6):
+            s.by_velocity[i, j] = (h[i, last] - h[i, j]) / _NEARBY
+
+
+@inner
+def _times(a, b, scale, out):
+    """out = scale a @ b, all (6, 6): quicker than BLAS by what a call of it costs."""
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = 0.0
+        for k in range(6):
+            for j in range(6):
+                out[i, j] += scale * a[i, k] * b[k, j]
+
+
+@inner
+def _advance(inverse, dt, s, phi, gamma):
+    """How a change of nu and of the wrench reaches the end of a step, phi and gamma (6, 6)."""
+    _times(inverse, s.by_velocity, dt, s.jacobian)
+    _times(s.jacobian, s.jacobian, 1.0, s.square)
+    for i in range(6):
+        for j in range(6):
+            unit = 1.0 if i == j else 0.0
+            phi[i, j] = unit + s.jacobian[i, j] + 0.5 * s.square[i, j]
+            s.square[i, j] = unit + 0.5 * s.jacobian[i, j] + s.square[i, j] / 6.0
+    _times(s.square, inverse, dt, gamma)
+
+
+@released
+def _shoot(
+    around, current, structure, mass, added, inverse, theta, wide, restoring, steps, wrench, first,
+    last, start, scratch, motion,
+):  # fmt: skip
+    s = scratch[0]
+    for i in range(6):
+        for j in range(6):
+            s.mass[i, j, 0], s.inverse[i, j, 0] = mass[i, j, 0], inverse[i, j]
+            for k in range(_LANES):
+                s.nearby_mass[i, j, k] = mass[i, j, 0]
+    slope, nu, given = s.slope, s.end, s.end[:0]
+    node, rotations, middles, guided = steps.t, steps.rotation, steps.middle, steps.given
+    reached, halfway, nu_dots = motion.nu, motion.middle, motion.nu_dot
+    phi, gamma = motion.phi, motion.gamma
+    for w in range(len(first)):
+        for i in range(6):
+            nu[i] = reached[first[w], i] = start[w, i]
+        for k in range(first[w], last[w]):
+            t, dt = node[k], node[k + 1] - node[k]
+            if len(guided) > 0:
+                given = guided[k]
+            for i in range(6):
+                s.nu[i, 0] = s.begin[i] = nu[i]
+            for stage in range(4):
+                ahead = NODES[stage] * dt
+                for i in range(6):
+                    s.push[i] = wrench[0, k, i] + (ahead - 0.5 * dt) * wrench[1, k, i]
+                rotation = middles[k]
+                if stage == 0:
+                    rotation = rotations[k]
+                elif stage == 3:
+                    rotation = rotations[k + 1]
+                _acceleration(
+                    around, current, structure, added, theta, restoring, t + ahead, rotation,
+                    given, s, slope[stage],
+                )  # fmt: skip
+                runge_kutta(stage, dt, s.begin, slope[stage], s.nu[:, 0], nu)
+            worst = 0.0
+            for i in range(6):
+                worst = max(worst, abs(nu[i]))
+                half = 0.5 * (s.begin[i] + nu[i])  # of a cubic
+                half += 0.125 * dt * (slope[0, i] - slope[3, i])
+                reached[k + 1, i], halfway[k, i], s.nu[i, 0] = nu[i], half, half
+                s.push[i] = wrench[0, k, i]
+            t += 0.5 * dt
+            _acceleration(
+                around, current, structure, added, theta, restoring, t, middles[k], given, s,
+                nu_dots[k],
+            )  # fmt: skip
+            _differentiate(around, current, structure, added, theta, wide, t, middles[k], s)
+            _advance(inverse, dt, s, phi[k], gamma[k])
+            if not worst < 50.0:  # no vehicle moves so; NaN too
+                for n in range(k + 1, last[w] + 1):
+                    for i in range(6):
+                        reached[n, i] = np.nan
+                break
+
+
+@released
+def _tangent(phi, gamma, first, last, force, begin, nodes, work, out):
+    """work (2, 6, P)."""
+    now, new = work[0], work[1]
+    n = 0
+    for w in range(len(first)):
+        copy(begin, now)
+        while n < len(nodes) and nodes[n] < first[w]:
+            n += 1
+        for k in range(first[w], last[w] + 1):
+            if n < len(nodes) and nodes[n] == k:
+                copy(now, out[n])
+                n += 1
+            if k == last[w]:
+                break
+            for i in range(6):
+                for c in range(begin.shape[1]):
+                    new[i, c] = 0.0
+                for j in range(6):
+                    f, g = phi[k, i, j], gamma[k, i, j]
+                    for c in range(begin.shape[1]):
+                        if force is None:  # numba leaves out what is not so
+                            new[i, c] += f * now[j, c]
+                        else:
+                            new[i, c] += f * now[j, c] + g * force[k, j, c]
+            copy(new, now)
+
+
+@released
+def _adjoint(phi, gamma, first, last, error, nodes, work, out):
+    """work (2, 6)."""
+    mu, before = work[0], work[1]
+    n = len(nodes) - 1
+    for w in range(len(first) - 1, -1, -1):
+        for i in range(6):
+            mu[i] = 0.0
+        for k in range(last[w], first[w] - 1, -1):
+            while n >= 0 and nodes[n] > k:
+                n -= 1
+            if n >= 0 and nodes[n] == k:
+                for i in range(6):
+                    mu[i] += error[n, i]
+            if k > first[w]:
+                for i in range(6):
+                    before[i], out[k - 1, i] = 0.0, 0.0
+                for j in range(6):
+                    for i in range(6):
+                        before[i] += phi[k - 1, j, i] * mu[j]
+                        out[k - 1, i] += gamma[k - 1, j, i] * mu[j]
+                for i in range(6):
+                    mu[i] = before[i]
+
+
+@released
+def _regressors(structure, nu, nu_dot, work, extended, out):
+    """work (3, 6, n)."""
+    of_nu_dot, momentum, force = work[0], work[1], work[2]
+    for k in range(len(nu)):
+        momentum_columns(structure, nu_dot[k], of_nu_dot)
+        columns(structure, nu[k], momentum, force, extended)
+        for i in range(6):
+            for j in range(out.shape[2]):
+                out[k, i, j] = -of_nu_dot[i, j] - force[i, j]

@@ -1,0 +1,292 @@
+"""Output-error fits: the parameters of a hypothesis that minimise its squared residuals.
+
+Gauss-Newton over short windows whose initial velocities are estimated along with the parameters
+(multiple shooting, Bock 1983), within the bounds of the parameters. Onset times, in which the
+residuals are not smooth, are searched for separately.
+"""
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import stdtrit
+
+from rov_ident.core.linalg import scaled_inverse, scaled_solve
+from rov_ident.discrepancy.hypothesis import (
+    Hypothesis,
+    Key,
+    bounds,
+    centre,
+    largest_step,
+    onsets,
+    precision,
+    role_of,
+)
+from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
+from rov_ident.discrepancy.selection import variance_inflation
+from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
+from rov_ident.model.equations import Array, Indices
+
+_FEWEST_CLUSTERS = 8  # windows; from fewer a variance is uncertain by more than half (chi-squared)
+_ITERATIONS = 15  # of Gauss-Newton; a guard: fits of the study end after at most ten
+_TOLERANCE = 1e-4  # squared residuals per residual; a step that gains less ends the fit
+_STEP_FACTOR = 0.4  # by which a step that gains nothing is shortened ...
+_SHORTEST = 0.05  # ... until it is so short: then the minimum is reached within rounding
+_NOISE_UPDATES = 4  # of the noise in turn with the parameters, and ...
+_NOISE_SETTLED = 0.05  # ... the relative change of it that ends them: far below its own error
+_FIRST_NOISE = 0.02  # m/s and rad/s, before the first estimate of it; its size hardly matters
+_ONSET_RANGE = 14.0  # s to either side in which a better onset is looked for: a window and a
+# held-out block beside it (5 + 10 s) may hide it
+_ONSET_TRIALS = 7  # to either side, every 2 s: as far apart as two onsets look alike
+_ONSET_RSS = 4.0  # scaled squared residuals: likelihood-ratio interval of two standard deviations
+_ONSET_UNKNOWN = 30.0  # s; an onset less certain than that is not known at all
+_UNPREDICTED = 2.0  # simulated over predicted squared residuals: beyond it linearity has failed
+_STRAY = 10.0  # standard deviations of a window's initial velocity from what was measured there
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The best values of a hypothesis on the windows of a :class:`WindowedProblem`."""
+
+    hypothesis: Hypothesis
+    linearisation: Linearisation
+    converged: bool
+
+    def __post_init__(self) -> None:
+        # now, because the patterns of the problem may be replaced later
+        self.linearisation.sensitivities()
+
+    @property
+    def linear(self) -> LinearProblem:
+        return self.linearisation.linear
+
+    @property
+    def noise(self) -> Array:
+        return self.linearisation.noise
+
+    @property
+    def rss(self) -> float:
+        return self.linearisation.rss
+
+    @cached_property
+    def inflation(self) -> float:
+        """The variance inflation over all parameters."""
+        return variance_inflation(self.linear, np.arange(len(self.linear.keys)))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (P, P), with correlated residuals allowed for: the mean of that of white
+        residuals times their common inflation, which varies little, and the jackknife over windows,
+        which knows where each parameter comes from. Onsets are taken as known (:func:`onset_std`).
+        """
+        linear, at = self.linear, self._smooth
+        wide = variance_inflation(linear, at) * scaled_inverse(linear.normal[np.ix_(at, at)])
+        moves = self.linearisation.jackknife(at)
+        w = len(moves)
+        if w >= _FEWEST_CLUSTERS:
+            few = (stdtrit(w - 1, 0.975) / 1.96) ** 2  # Student's: the scatter of few is uncertain
+            wide = 0.5 * (wide + few * (w - 1) / w * moves.T @ moves)
+        out = np.zeros_like(linear.normal)
+        out[np.ix_(at, at)] = wide
+        return out
+
+    def leave_one_out(self) -> Array:
+        """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""
+        return self.linearisation.leave_one_out(self._smooth)
+
+    @property
+    def _smooth(self) -> Indices:
+        """The parameters in which the residuals are smooth: all but onsets."""
+        dates = onsets(self.hypothesis)
+        return self.linear.index(k for k in self.linear.keys if k not in dates)
+
+
+def fit(problem: WindowedProblem, h: Hypothesis) -> Fitted | None:
+    """Fit a hypothesis from its own values and the measured initial velocities, with its noise;
+    None where it cannot be simulated."""
+    begin = linearise(problem, h, problem.measured_starts(), np.full(6, _FIRST_NOISE))
+    return None if begin is None else _with_noise(_gauss_newton(begin))
+
+
+def refit(
+    h: Hypothesis, start: Linearisation, iterations: int = _ITERATIONS, update_noise: bool = False
+) -> Fitted | None:
+    """Fit a hypothesis on the windows of ``start``, from its initial velocities and its noise; None
+    where it cannot be simulated."""
+    begin = _adapted(h, start)
+    if begin is None:
+        return None
+    fitted = _gauss_newton(begin, iterations)
+    return _with_noise(fitted) if update_noise else fitted
+
+
+def _with_noise(fitted: Fitted) -> Fitted:
+    """Noise and parameters estimated in turn until the noise settles."""
+    problem = fitted.linearisation.problem
+    for _ in range(_NOISE_UPDATES):
+        h, before = fitted.hypothesis, fitted.linearisation
+        noise = before.residual_std()
+        starts = _without_strays(problem, before.starts, noise)
+        settled = np.abs(np.log(noise / fitted.noise)).max() < _NOISE_SETTLED
+        settled = settled and starts is before.starts
+        again = linearise(problem, h, starts, noise)
+        if again is None:  # from where it was it can be simulated
+            again = linearise(problem, h, before.starts, noise)
+        assert again is not None
+        if settled:
+            return Fitted(h, again, fitted.converged)
+        fitted = _gauss_newton(again)
+    return fitted
+
+
+def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -> Fitted:
+    """Gauss-Newton with step shortening at fixed noise."""
+    h, problem = linearisation.hypothesis, linearisation.problem
+    prior, mean = precision(h), np.array([centre(h.config, key) for key in h.keys])
+    for _ in range(iterations):
+        linear = linearisation.linear
+        value = np.array(list(h.values.values()))
+        slope = linear.gradient.sum(axis=0) + prior * (mean - value)
+        change = _solve_bounded(linear.normal + np.diag(prior), slope, *_step_limits(h, h.keys))
+        if slope @ change < _TOLERANCE * linear.count:
+            return Fitted(h, linearisation, True)
+        cost = linearisation.rss + prior @ (mean - value) ** 2
+        factor = 1.0
+        while factor > _SHORTEST:
+            there = h.at(dict(zip(h.keys, (value + factor * change).tolist(), strict=True)))
+            starts = linearisation.starts_after(factor * change)
+            found = linearise(problem, there, starts, linearisation.noise)
+            if found is not None:
+                new = found.rss + prior @ (mean - value - factor * change) ** 2
+                if new < cost:
+                    break
+            factor *= _STEP_FACTOR
+        else:
+            return Fitted(h, linearisation, True)
+        assert found is not None
+        h, linearisation = there, found
+        if cost - new < _TOLERANCE * linear.count:
+            return Fitted(h, linearisation, True)
+    return Fitted(h, linearisation, False)
+
+
+def _without_strays(problem: WindowedProblem, starts: Array, noise: Array) -> Array:
+    """Initial velocities (W, 6); those far from the measured ones are measured again: where a
+    vehicle tumbles, a poor model can push one so far that a better model does not find the way
+    back."""
+    measured = problem.measured_starts()
+    far: Array = np.max(np.abs(starts - measured) / noise, axis=1, keepdims=True)
+    return np.where(far > _STRAY, measured, starts) if far.max() > _STRAY else starts
+
+
+def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
+    """A hypothesis simulated after the parameters it shares with ``start`` have been refitted
+    (linearly) to those that are new or gone: a drag term that joins or leaves else throws the
+    simulation far off, or into another minimum."""
+    before, problem = start.hypothesis, start.problem
+    added = [k for k in h.keys if k not in before.values]
+    linear_in = [k for k in (*before.keys, *added) if role_of(k) == "amplitude"]
+    moves = {k: d for k in linear_in if (d := h.value(k) - before.value(k)) != 0.0}
+    begin = _without_strays(problem, start.starts, start.noise)
+    if not moves:
+        return linearise(problem, h, begin, start.noise)
+    linear = start.linear
+    if added:
+        without = before.having({k: (before if k in linear_in else h).value(k) for k in added})
+        columns = problem.columns(without, start.motion, added)
+        linear = start.having(added, start.sensitivity_to(columns))
+    follow = [k for k in before.keys if h.values.get(k) == before.values[k]]
+    at, moved = linear.index(follow), linear.index(moves)
+    far = np.array(list(moves.values()))
+    slope = linear.gradient.sum(axis=0)
+    normal = linear.normal[np.ix_(at, at)]
+    change = np.zeros(len(linear.keys))
+    change[moved] = far
+    change[at] = _solve_bounded(
+        normal + np.diag(precision(h.at({k: h.values[k] for k in follow}))),
+        slope[at] - linear.normal[np.ix_(at, moved)] @ far,
+        *_step_limits(h, follow),
+    )
+    there = h.having({k: h.values[k] + change[i] for k, i in zip(follow, at, strict=True)})
+    starts = start.starts_after(change[: len(before.keys)])
+    starts = _without_strays(problem, starts, start.noise)
+    adapted = linearise(problem, there, starts, start.noise)
+    predicted = start.rss - 2.0 * slope @ change + change @ linear.normal @ change
+    if adapted is not None and adapted.rss < _UNPREDICTED * predicted:
+        return adapted
+    both = (adapted, linearise(problem, h, begin, start.noise))
+    return min(filter(None, both), key=lambda x: x.rss, default=None)
+
+
+def _step_limits(h: Hypothesis, keys: Sequence[Key]) -> tuple[Array, Array]:
+    """How far parameters may move in one step, downwards and upwards."""
+    value = np.array([h.values[k] for k in keys])
+    lower, upper = np.array([bounds(k)[1:] for k in keys]).reshape(-1, 2).T
+    limit = np.array([largest_step(k) for k in keys])
+    return np.maximum(lower - value, -limit), np.minimum(upper - value, limit)
+
+
+def _solve_bounded(normal: Array, slope: Array, lower: Array, upper: Array) -> Array:
+    """The change that solves ``normal change = slope`` within bounds (active set)."""
+    free = np.ones(len(slope), dtype=bool)
+    change = np.zeros(len(slope))
+    for _ in range(len(slope)):
+        rest = slope - normal[:, ~free] @ change[~free]
+        change[free] = scaled_solve(normal[np.ix_(free, free)], rest[free], 1e-10)
+        beyond = free & ((change < lower) | (change > upper))
+        if not beyond.any():
+            break
+        change[beyond] = np.clip(change[beyond], lower[beyond], upper[beyond])
+        free &= ~beyond
+    return change
+
+
+def with_best_onsets(fitted: Fitted, keys: Container[Key] | None = None) -> Fitted:
+    """The same with the best onset near by, of all effects or of these parameters: between two
+    windows no gradient tells how to move it."""
+    for key in onsets(fitted.hypothesis):
+        if keys is not None and key not in keys:
+            continue
+        now = fitted.hypothesis.values[key]
+        near = now + np.arange(-_ONSET_RANGE, _ONSET_RANGE + 0.1, _ONSET_RANGE / _ONSET_TRIALS)
+        rss = [_rss_at(fitted, key, float(max(onset, 0.0))) for onset in near]
+        best = int(np.argmin(rss))
+        if rss[best] < _rss_at(fitted, key, now):
+            there = fitted.hypothesis.having({key: float(max(near[best], 0.0))})
+            again = refit(there, fitted.linearisation)
+            if again is not None and again.rss < fitted.rss:
+                fitted = again
+    return fitted
+
+
+def onset_std(fitted: Fitted, key: Key) -> float:
+    """Standard deviation [s] of an onset, from the likelihood ratio: its residuals are far from
+    quadratic, flat between windows and steep where thrust steps."""
+    now, limit = fitted.hypothesis.values[key], _ONSET_RSS * fitted.inflation
+    base = _rss_at(fitted, key, now)
+    ends = []
+    for side in (-1.0, 1.0):
+        near, far = 0.0, ONSET_STEP
+        while far < _ONSET_UNKNOWN and _rss_at(fitted, key, now + side * far) < base + limit:
+            near, far = far, 2.0 * far
+        for _ in range(4):  # bisection: to a sixteenth of the distance
+            middle = 0.5 * (near + far)
+            excluded = _rss_at(fitted, key, now + side * middle) >= base + limit
+            near, far = (near, middle) if excluded else (middle, far)
+        ends.append(far)
+    return max(ends) / np.sqrt(_ONSET_RSS)
+
+
+def _rss_at(fitted: Fitted, key: Key, value: float) -> float:
+    """Squared residuals with one parameter moved and the others refitted (linearly)."""
+    before = fitted.linearisation
+    there = fitted.hypothesis.having({key: value})
+    moved = linearise(before.problem, there, before.starts, fitted.noise)
+    if moved is None:
+        return np.inf
+    linear = moved.linear
+    others = linear.index(k for k in linear.keys if k != key)
+    normal = linear.normal[np.ix_(others, others)]
+    slope = linear.gradient.sum(axis=0)[others]
+    return float(moved.rss - slope @ scaled_solve(normal, slope, 1e-6))

@@ -1,0 +1,471 @@
+"""What `explain` found, told: the page, and the sentences that page and terminal share."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rov_ident import config as configuration
+from rov_ident.config import Config
+from rov_ident.core.files import write_file
+from rov_ident.discrepancy.explain import Explanation
+from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, predicted
+from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Value
+from rov_ident.effects import EFFECTS
+from rov_ident.model.coefficients import AXES, VELOCITIES, parse
+from rov_ident.model.equations import Array
+from rov_ident.reports import html as report
+from rov_ident.reports import plots
+from rov_ident.reports.result import NORMAL
+from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate, number
+
+UNITS = dict(zip(VELOCITIES, ("m/s",) * 3 + ("rad/s",) * 3))
+_SIDES = ("to port", "to starboard")
+_SENSES = (("astern", "forward"), _SIDES, ("up", "down"), _SIDES, ("bow down", "bow up"), _SIDES)
+SENSES = dict(zip(VELOCITIES, _SENSES))
+"""What a negative and a positive velocity mean."""
+
+_TOLD = 3  # parameters of an effect in the verdict
+_SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
+_STRETCH = 30.0  # s of motion that is shown
+_BIN = 5.0  # s; of the error over time
+_MOST_BINS = 60
+_SPEED_BINS = 11
+_LEAST = 20  # samples in a bin, below which its error means nothing
+_STILL = 0.05  # of the largest motion: below it an axis counts as not moved
+_GAP = 1.0  # s without a measurement: curves break
+
+
+def with_unit(text: str, unit: str) -> str:
+    return text if unit == "1" else f"{text} {unit}"
+
+
+def valued(name: str, v: Value) -> str:
+    value, half = estimate(v.value, NORMAL * v.std)
+    return with_unit(f"{name} {value} ± {half}", v.unit)
+
+
+def called(effect: str) -> str:
+    return effect.replace("_", " ").replace("imu", "IMU").replace("cog", "CG")
+
+
+def listed(items: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(items[:-1]), *items[-1:]]))
+
+
+def verdict(findings: Findings) -> str:
+    """The whole result in two or three sentences."""
+    if findings.verdict == "agrees":
+        return "The simulation agrees with the measurement: there is nothing to change."
+    if findings.verdict == "retuned":
+        before = findings.baseline.items()
+        gains = {c: 1.0 - findings.retuned[c] / max(x, 1e-12) for c, x in before}
+        best = max(gains, key=lambda c: gains[c])
+        return (
+            "The structure of the simulation is right, its coefficients are off. Retuned, the "
+            f"{predicted(best)} improves by {100.0 * gains[best]:.0f} %."
+        )
+    named, left = _named(findings.effects), "; ".join(map(dependence, findings.residual))
+    if findings.verdict == "explained":
+        return named
+    return f"Something is left that no effect of the library explains: {left}. {named}".strip()
+
+
+def _named(effects: Sequence[Finding]) -> str:
+    if not effects:
+        return ""
+    sensors = [brief(f) for f in effects if EFFECTS[f.effect].sense is not None]
+    others = [brief(f) for f in effects if EFFECTS[f.effect].sense is None]
+    parts = [f"The simulation lacks {listed(others)}"] if others else []
+    parts += [f"{'the' if others else 'The'} sensors show {listed(sensors)}"] if sensors else []
+    if len(effects) == 1:
+        return f"{'; '.join(parts)}. With it, the {improved(effects[0].gain)}."
+    gains = listed([f"the {improved(f.gain)} with {called(f.effect)}" for f in effects])
+    return f"{'; '.join(parts)}. {gains[0].upper() + gains[1:]}."
+
+
+def brief(finding: Finding) -> str:
+    """An effect with the parameters that matter most, in the middle of a sentence."""
+    declared = {p.name: p for p in EFFECTS[finding.effect].parameters}
+    size = {}  # how far from nothing, in typical sizes; coefficients are not told apart
+    for name, v in finding.parameters.items():
+        p = declared.get(name)
+        if p is None or p.role in ("amplitude", "place"):
+            size[name] = 1.0 if p is None else abs(v.value - p.null) / p.typical
+    told = [name for name, s in size.items() if s > _SMALL * max(size.values())][:_TOLD]
+    told += [p.name for p in declared.values() if p.role in ("onset", "frequency")]
+    values = [
+        with_unit(f"{n.replace('_', ' ') if n in declared else n} {number(v.value, 2)}", v.unit)
+        for n, v in finding.parameters.items()
+        if n in told
+    ]
+    others = listed([called(a.effect) for a in finding.alternatives])
+    doubt = f"this run cannot tell it from {others}" if others else "not surely told from all else"
+    doubt = "" if finding.separable else f"; {doubt}"
+    return f"{called(finding.effect)} ({', '.join(values)}{doubt})"
+
+
+def dependence(r: Residual) -> str:
+    """What is left on an axis, in words."""
+    kind = "force" if r.axis in AXES[:3] else "moment"
+    at = "" if r.frequency_hz is None else f" at {number(r.frequency_hz, 2)} Hz"
+    return (
+        f"a {kind} {r.axis} that depends on {r.depends_on}{at} "
+        f"({100.0 * r.share:.0f} % of what is left on {r.axis})"
+    )
+
+
+def interval(gain: Gain) -> str:
+    """A gain with its interval, on what it was measured, from what to what."""
+    if gain.component == "kinematic":
+        what, unit = "disagreement of the sensors", "times their noise"
+    else:
+        what, unit = predicted(gain.component), UNITS[gain.component]
+    return (
+        f"{gain.percent:.1f} % (95 %: {gain.low:.1f} to {gain.high:.1f} %) on the {what}: RMSE "
+        f"{number(gain.rmse_before)} without it, {number(gain.rmse_after)} {unit} with it"
+    )
+
+
+def tables(findings: Findings) -> Tables:
+    """The error of the three models, and every effect found with its parameters and its gain."""
+    models = (findings.baseline, findings.retuned, findings.extended)
+    rmse = [[name, *(number(by[name]) for by in models), unit] for name, unit in UNITS.items()]
+    head = ["", "as configured", "retuned", "extended", "unit"]
+    errors = Table(f"RMSE of the {BLOCK:g} s open-loop prediction", head, rmse, text=(4,))
+    if not findings.effects:
+        return Tables((errors,))
+    rows = []
+    for f in findings.effects:
+        effect = called(f.effect)
+        gain = f"{f.gain.percent:.0f} % ({f.gain.low:.0f} to {f.gain.high:.0f})"
+        for name, v in f.parameters.items():
+            unit = "" if v.unit == "1" else v.unit
+            rows.append([effect, name, *estimate(v.value, NORMAL * v.std), unit, gain])
+            effect = gain = ""
+    head = ["", "parameter", "value", PLUS_MINUS, "unit", "gain (95 %)"]
+    return Tables((errors, Table("what the simulation lacks", head, rows, text=(1, 4))))
+
+
+def write(explanation: Explanation, folder: Path) -> None:
+    """findings.json, report.html and extended.yaml. UserError if they cannot be written."""
+    html = page(explanation)
+    write_file(folder / "findings.json", explanation.to_json())
+    write_file(folder / "report.html", html)
+    write_extended(explanation, folder / "extended.yaml")
+
+
+def write_extended(explanation: Explanation, path: Path) -> None:
+    """The configuration with what was found; its head says what that is, and from which bags."""
+    bags = _plain(explanation.findings.provenance.get("bags", []))
+    comment = f"{explanation.sentence}\nFound by rov-ident explain in {bags}."
+    configuration.dump(explanation.extended, path, comment)
+
+
+def page(explanation: Explanation) -> str:
+    f, before = explanation.findings, explanation.given
+    rmse, shown = _shown(explanation)
+    key = _legend(shown)
+    sections = [
+        report.beside(
+            [report.heading("What to change"), *_change(before, explanation)],
+            [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))],
+        ),
+        report.heading("Measured and simulated"),
+        _legend([plots.MEASURED, *shown]),
+        *_motion(explanation, shown),
+        report.heading("Where and when it departs"),
+        report.paragraph(_worst(explanation, f.baseline)),
+        key,
+        *_departures(explanation, shown),
+    ]
+    if f.effects:
+        sections.append(report.heading("What is missing, and how sure that is"))
+        sections += [_card(finding) for finding in f.effects]
+    if f.minor:
+        values = [", ".join(valued(n, v) for n, v in m.parameters.items()) for m in f.minor]
+        gains = [f"{m.gain.percent:.1f} %" for m in f.minor]
+        rows = zip([called(m.effect) for m in f.minor], values, gains, strict=True)
+        sections += [
+            report.heading("Minor effects"),
+            report.paragraph("Seen in the data, but of less than 2 % gain or not surely of any."),
+            report.table(["effect", "parameters", "gain"], [*map(list, rows)], text=(1,)),
+        ]
+    sections.append(report.heading("What is left"))
+    if f.residual:
+        sections += [
+            report.bullets([f"{dependence(r)[2:]}." for r in f.residual]),
+            report.paragraph(
+                "No effect of the library has this form: look for a cause that depends on the "
+                "same thing, on the vehicle or in the recording."
+            ),
+        ]
+    else:
+        sections.append(report.paragraph("Nothing that depends on motion, place or time."))
+    sections += _retuned(f)
+    if f.notes:
+        sections += [report.heading("Notes"), report.bullets(f.notes)]
+    origin = " · ".join(f"{key}: {_plain(value)}" for key, value in f.provenance.items())
+    title = f"{before.name}: what the simulation lacks"
+    return report.page(title, verdict(f), sections, origin)
+
+
+def _shown(explanation: Explanation) -> tuple[dict[str, dict[str, float]], dict[str, Array]]:
+    """Errors and simulations by label; without effects nothing extends the retuned model."""
+    f = explanation.findings
+    rmse = {"as configured": f.baseline, "retuned": f.retuned}
+    if f.effects:
+        rmse["extended"] = f.extended
+    return rmse, {label: explanation.simulated[label] for label in rmse}
+
+
+def _legend(labels: Iterable[str]) -> str:
+    entries = {plots.MEASURED: ("currentColor", "none", 0.35)}
+    for label, (colour, dashes) in plots.MODELS.items():
+        pattern = " ".join(f"{3.0 * d:g}" for d in dashes) or "none"
+        entries[label] = plots.css(colour), pattern, 1.0
+    return report.legend({label: entries[label] for label in labels})
+
+
+def _change(before: Config, explanation: Explanation) -> list[str]:
+    old = configuration.to_parameters(before)
+    new = configuration.to_parameters(explanation.extended)
+    news = {k: new[k] for k in sorted(new, key=lambda k: k != "effects")}  # what is new first
+    lines = _lines(old, news)
+    if explanation.findings.verdict == "agrees" or not lines:
+        nothing = "Nothing. extended.yaml holds the refitted coefficients, which predict no better."
+        return [report.paragraph(nothing)]
+    width = max(len(line) for line, _ in lines)
+    text = "\n".join(f"{line:<{width}}  {was}".rstrip() for line, was in lines)
+    return [
+        report.code(text),
+        report.paragraph("extended.yaml has these lines in full and is ready for every command."),
+    ]
+
+
+def _lines(old: Any, new: Mapping[str, Any], depth: int = 0) -> list[tuple[str, str]]:
+    """What differs, as lines of YAML, each with a comment that tells what was there."""
+    lines = []
+    for key, value in new.items():
+        was = old.get(key) if isinstance(old, Mapping) else None
+        start = "  " * depth + f"{key}:"
+        if isinstance(value, Mapping):
+            inside = _lines(was, value, depth + 1)
+            lines += [(start, ""), *inside] if inside else []
+        elif value != was:
+            comment = "# new" if was is None else f"# was {_yaml(was)}"
+            lines.append((f"{start} {_yaml(value)}", comment))
+    return lines
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, float):
+        return number(value, 4)
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_yaml, value)) + "]"
+    return str(value)
+
+
+def _gains(rmse: Mapping[str, Mapping[str, float]], held: bool) -> list[str]:
+    pictures = []
+    for name, group in (("linear", VELOCITIES[:3]), ("angular", VELOCITIES[3:])):
+        values = {label: np.array([by[c] for c in group]) for label, by in rmse.items()}
+        figure = plots.bars([MOTIONS[c] for c in group], values, "", f"RMSE [{UNITS[group[0]]}]")
+        pictures.append(plots.to_svg(figure, f"bars-{name}-"))
+    where = "data that no fit has seen" if held else "the bag given by --validate"
+    caption = f"Error of the {BLOCK:.0f} s open-loop prediction on {where}; lower is better."
+    return [report.panels(pictures, caption)]
+
+
+def _motion(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
+    t, measured, runs = _stretch(explanation, shown)
+    pictures = []
+    for i, c in enumerate(VELOCITIES):
+        figure = plots.curves(
+            t, {label: run[:, i] for label, run in runs.items()}, MOTIONS[c], "time [s]",
+            f"{c} [{UNITS[c]}]", measured=measured[:, i], shaded=explanation.held,
+        )  # fmt: skip
+        pictures.append(plots.to_svg(figure, f"motion-{c}-"))
+    block = "held-out block (shaded: seen by no fit)" if explanation.held else "block"
+    length = min(_STRETCH, explanation.t[-1] - explanation.t[0])
+    caption = (
+        f"{length:.0f} s around the {block} in which the simulation as "
+        f"configured is furthest off. Every {BLOCK:.0f} s each simulation starts anew from the "
+        "measured state; from there the recorded wrench alone drives it."
+    )
+    return [report.panels(pictures, caption, wide=True)]
+
+
+def _stretch(
+    explanation: Explanation, shown: Mapping[str, Array]
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Times (k,), measured motion (k, 6) and simulations of it around the held-out block in which
+    today's simulation is worst; NaN where a curve breaks."""
+    t = explanation.t
+    error = explanation.measured - explanation.simulated["as configured"]
+    size = explanation.measured.std(axis=0) + 1e-9
+    relative = np.nan_to_num(np.minimum(np.abs(error / size), 3.0), nan=3.0) ** 2
+    spans = explanation.held or [(b, b + BLOCK) for b in np.arange(t[0], t[-1], BLOCK)]
+    parts = [(t >= begin) & (t < end) for begin, end in spans]
+    begin, end = spans[int(np.argmax([relative[p].mean() if p.any() else 0.0 for p in parts]))]
+    first = BLOCK * round((0.5 * (begin + end) - 0.5 * _STRETCH) / BLOCK)
+    first = max(float(t[0]), min(first, float(t[-1]) - _STRETCH))
+    part = (t >= first) & (t < first + _STRETCH)
+    t = t[part]
+    pauses = (np.diff(t, prepend=t[0]) > _GAP)[:, None]
+    # a simulation starts anew from the measurement in every window: no line joins two of them
+    starts = pauses | (np.diff(t // BLOCK, prepend=-1.0) != 0.0)[:, None]
+    runs = {label: np.where(starts, np.nan, run[part]) for label, run in shown.items()}
+    return t, np.where(pauses, np.nan, explanation.measured[part]), runs
+
+
+def _worst(explanation: Explanation, baseline: Mapping[str, float]) -> str:
+    size = explanation.measured.std(axis=0)
+    largest = np.repeat([size[:3].max(), size[3:].max()], 3)
+    moving = {c: float(s) for c, s, m in zip(VELOCITIES, size, largest) if s > _STILL * m}
+    if not moving:
+        return "The vehicle does not move."
+    worst = max(moving, key=lambda c: baseline[c] / moving[c])
+    error, size = (f"{number(of[worst], 2)} {UNITS[worst]}" for of in (baseline, moving))
+    return (
+        f"As configured it is furthest off in {MOTIONS[worst]}, measured by how much the vehicle "
+        f"moves: an error of {error} on a motion of {size} (RMS)."
+    )
+
+
+def _departures(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
+    t, measured = explanation.t, explanation.measured
+    errors = {label: run - measured for label, run in shown.items()}
+    step = max(_BIN, float(t[-1]) / _MOST_BINS)
+    edges = np.arange(0.0, float(t[-1]) + step, step)
+    over_time, over_speed = [], []
+    for i, c in enumerate(VELOCITIES):
+        unit, slots = UNITS[c], 0.5 * (edges[1:] + edges[:-1])
+        by_time = {label: binned(t, e[:, i], edges) for label, e in errors.items()}
+        figure = plots.curves(
+            slots, by_time, MOTIONS[c], "time [s]", f"RMS error [{unit}]", shaded=explanation.held
+        )
+        over_time.append(plots.to_svg(figure, f"time-{c}-"))
+        slots, by_speed = _by_speed(explanation, shown, i)
+        figure = plots.curves(
+            slots, by_speed, MOTIONS[c], _directions(c), f"RMS error [{unit}]", marker="o"
+        )
+        over_speed.append(plots.to_svg(figure, f"speed-{c}-"))
+    return [
+        report.panels(over_time, f"Over the time of the bag, in steps of {step:.0f} s."),
+        report.panels(
+            over_speed,
+            "Over the vehicle's own velocity: an error that grows with speed points to damping or "
+            "thrust, one that differs left and right of zero to an asymmetry, one at rest to "
+            "weight, current or deadband. All data, fitted and held out.",
+        ),
+    ]
+
+
+def _by_speed(
+    explanation: Explanation, shown: Mapping[str, Array], i: int
+) -> tuple[Array, dict[str, Array]]:
+    """RMS errors of component i over its own velocity: the middles of the bins, and by label."""
+    own = explanation.measured[:, i]
+    low, high = np.quantile(own, [0.01, 0.99])
+    edges = np.linspace(low, high, _SPEED_BINS + 1)
+    errors = {label: binned(own, run[:, i] - own, edges) for label, run in shown.items()}
+    return 0.5 * (edges[1:] + edges[:-1]), errors
+
+
+def _directions(component: str) -> str:
+    backward, forward = SENSES[component]
+    space = "\u2003\u2003"
+    return f"\u2190 {backward}{space}{component} [{UNITS[component]}]{space}{forward} \u2192"
+
+
+def binned(x: Array, error: Array, edges: Array) -> Array:
+    """Root mean square error (n,) between the edges (n + 1,) of x; NaN where there is little."""
+    place = np.digitize(x, edges) - 1
+    n = len(edges) - 1
+    inside = (place >= 0) & (place < n) & np.isfinite(error)
+    count = np.bincount(place[inside], minlength=n)
+    total = np.bincount(place[inside], error[inside] ** 2, n)
+    out: Array = np.sqrt(np.where(count >= _LEAST, total, np.nan) / np.maximum(count, 1))
+    return out
+
+
+def _card(finding: Finding) -> str:
+    effect, name = EFFECTS[finding.effect], called(finding.effect)
+    meanings = {p.name: p.meaning for p in effect.parameters}
+    rows = []
+    for symbol, v in finding.parameters.items():
+        meaning = meanings.get(symbol) or parse(symbol).meaning
+        rows.append([symbol, *estimate(v.value, v.std), "" if v.unit == "1" else v.unit, meaning])
+    parts = [
+        report.paragraph(effect.summary),
+        report.table(["", "value", "std", "unit", "meaning"], rows, text=(3, 4)),
+        report.paragraph(f"Gain on data that no fit has seen: {interval(finding.gain)}."),
+    ]
+    if finding.axes:
+        parts.append(report.paragraph(f"It acts on {listed(finding.axes)}."))
+    why = "What else might do the same has no name, or was not all tried (see the notes)."
+    if finding.alternatives:
+        why = "This bag cannot tell them apart."
+        tried = [f"{called(a.effect)}: {a.why_not}" for a in finding.alternatives]
+        heard = "Why nothing else" if finding.separable else "What else it may be"
+        parts += [report.paragraph(f"{heard}:"), report.bullets(tried)]
+    if not finding.separable:
+        run = finding.manoeuvre or effect.manoeuvre
+        parts.append(report.paragraph(f"{why} The run that would tell: {run}."))
+    return report.card(name[0].upper() + name[1:], parts)
+
+
+def _retuned(f: Findings) -> list[str]:
+    if not f.changed:
+        return []
+    rows = []
+    for name, c in f.changed.items():
+        after, std = estimate(c.after, c.std)
+        sigma = number(abs(c.after - c.before) / c.std, 2) if c.std > 0.0 else "-"
+        rows.append([name, number(c.before, 4), after, std, c.unit, sigma, parse(name).meaning])
+    bent = (
+        " Where an effect is missing they bend to make up for it: the values to use are those of "
+        "extended.yaml, refitted together with the effects."
+    )
+    return [
+        report.heading("Retuned coefficients"),
+        report.paragraph(
+            "What refitting the coefficients that the simulation already has makes of them, "
+            f"before any effect is added.{bent if f.effects else ' extended.yaml has them.'}"
+        ),
+        report.table(["", "from", "to", "std", "unit", "off by [std]", "meaning"], rows, (4, 6)),
+    ]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return " ".join(map(_plain, value.values()))
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    return str(value)
+
+
+@plots.styled
+def picture(explanation: Explanation) -> Figure:
+    """The report in one picture: motion, gain and departure of the velocity that gains most."""
+    gains = [f.gain.component for f in explanation.findings.effects]
+    c = next((c for c in gains if c in VELOCITIES), "u")
+    i = VELOCITIES.index(c)
+    rmse, shown = _shown(explanation)
+    figure, (motion, linear, angular, speed) = plots.overview(verdict(explanation.findings))
+    t, measured, runs = _stretch(explanation, shown)
+    motion.set(xlabel="time [s]", ylabel=f"{MOTIONS[c]} [{UNITS[c]}]")
+    curves = {label: run[:, i] for label, run in runs.items()}
+    plots.draw_curves(motion, t, curves, measured=measured[:, i], shaded=explanation.held)
+    for ax, group in ((linear, VELOCITIES[:3]), (angular, VELOCITIES[3:])):
+        values = {label: np.array([by[c] for c in group]) for label, by in rmse.items()}
+        plots.draw_bars(ax, [MOTIONS[c] for c in group], values)
+        ax.set_ylabel(f"RMSE, {BLOCK:.0f} s ahead [{UNITS[group[0]]}]")
+    slots, errors = _by_speed(explanation, shown, i)
+    plots.draw_curves(speed, slots, errors, marker="o")
+    speed.set(xlabel=_directions(c), ylabel=f"RMS error [{UNITS[c]}]")
+    plots.outside_legend(figure, motion)
+    return figure

@@ -1,0 +1,123 @@
+"""What `explain` found, as plain results: written to findings.json, told in the report."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+Verdict = Literal["agrees", "retuned", "explained", "unexplained"]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter with its standard deviation."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What an effect gains on data that no fit has seen: ``component`` is a velocity component or
+    "kinematic"; rmse in its unit (kinematic: in units of the noise); ``percent`` with its 95 %
+    interval."""
+
+    component: str
+    rmse_before: float
+    rmse_after: float
+    percent: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another effect that was fitted in this one's place."""
+
+    effect: str
+    why_not: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One effect that the simulation lacks; ``onset_s`` from the first message. Not ``separable``
+    where the bag cannot tell it from its ``alternatives``, from what has no name, or from what was
+    not tried; ``manoeuvre`` is then the run that would."""
+
+    effect: str
+    axes: tuple[str, ...]
+    parameters: dict[str, Value]
+    onset_s: float | None
+    gain: Gain
+    separable: bool
+    manoeuvre: str | None
+    alternatives: tuple[Alternative, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What no effect explains: on which axis, how it depends on what, and the share of the axis's
+    residual power that the dependence explains."""
+
+    axis: str
+    depends_on: str
+    frequency_hz: float | None
+    share: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """A coefficient before and after refitting."""
+
+    before: float
+    after: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The whole result; RMSE by velocity component, open loop, on held-out data."""
+
+    baseline: dict[str, float]
+    retuned: dict[str, float]
+    extended: dict[str, float]
+    changed: dict[str, Change]
+    effects: tuple[Finding, ...]
+    minor: tuple[Finding, ...]
+    residual: tuple[Residual, ...]
+    verdict: Verdict
+    notes: tuple[str, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """As the contract has it; numbers that do not exist are null."""
+        changed = {
+            name: {"from": c.before, "to": c.after, "std": c.std, "unit": c.unit}
+            for name, c in self.changed.items()
+        }
+        document = {
+            "baseline": {"rmse": self.baseline},
+            "retuned": {"rmse": self.retuned, "changed": changed},
+            "effects": [asdict(f) for f in self.effects],
+            "minor": [asdict(f) for f in self.minor],
+            "residual": [asdict(r) for r in self.residual],
+            "extended": {"rmse": self.extended},
+            "verdict": self.verdict,
+            "notes": list(self.notes),
+            "provenance": dict(self.provenance),
+        }
+        return json.dumps(_finite(document), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(x: Any) -> Any:
+    if isinstance(x, float):
+        return x if math.isfinite(x) else None
+    if isinstance(x, Mapping):
+        return {k: _finite(v) for k, v in x.items()}
+    if isinstance(x, list | tuple):
+        return [_finite(v) for v in x]
+    return x

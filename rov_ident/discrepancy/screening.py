@@ -1,0 +1,232 @@
+"""Which effects of the library may be missing from a fit, by their penalised scores.
+
+All effects are scored on the linearisation of the fit, its own parameters refitted along. What is
+not linear in a parameter (an onset, a place of attachment, a frequency) is scanned.
+"""
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
+    Hypothesis,
+    Key,
+    axis_of,
+    bounds,
+    parameter,
+    units,
+)
+from rov_ident.discrepancy.output_error import Fitted
+from rov_ident.discrepancy.selection import PENALTY, scores_of
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import Effect
+from rov_ident.model.coefficients import AXES
+from rov_ident.model.equations import Array
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+HULL_DAMPING = ("quadratic_damping", "linear_damping")
+"""Terms that every hull has: what a model lacks of them is the likeliest cause."""
+
+THREADS = 2  # that fit: more would wait for each other, as some of a fit is Python
+FARTHEST = 3.0  # typical sizes from null at which a fit of an input effect begins, as the wrench is
+# not linear in a lag or a deadband; and of the distance of a place of attachment from the origin
+_ONSETS = 24  # scanned evenly over the bag: every 7 s of three minutes, about a window apart
+_FINE_ONSETS = 17  # scanned around the best of them, to an eighth of that distance
+_ONSET_RANGE = 0.04  # of the bag to either side: the distance of the even ones
+_PEAKS = 3  # of the spectrum that are tried as the frequency of a wave; effort
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing: the parameters to add with their first values, its penalised
+    score, and the same as if the residuals that it leaves were white: where a model is far off,
+    only a fit shows what there is."""
+
+    name: str
+    start: Mapping[Key, float]
+    score: float
+    white_score: float
+
+
+class Workers:
+    """Threads that fit; an interrupt does not wait for their fits."""
+
+    def __init__(self, problem: WindowedProblem) -> None:
+        self._problem, self._pool = problem, ThreadPoolExecutor(THREADS, "fit")
+
+    def map(self, function: Callable[[T], R], of: Iterable[T]) -> list[R]:
+        """The function of each of several things, in their order."""
+        try:
+            return list(self._pool.map(function, of))
+        except BaseException:
+            self._problem.stop()
+            raise
+
+
+class Screening:
+    """The candidates for what a fit lacks."""
+
+    def __init__(self, problem: WindowedProblem, workers: Workers) -> None:
+        self._problem, self._workers = problem, workers
+        self._known: dict[frozenset[Key], list[Candidate]] = {}
+
+    def candidates(self, now: Fitted) -> list[Candidate]:
+        """The best first; remembered for each set of parameters."""
+        keys = frozenset(now.hypothesis.keys)
+        if keys not in self._known:
+            self._known[keys] = self._screened(now)
+        return self._known[keys]
+
+    def _screened(self, now: Fitted) -> list[Candidate]:
+        h, linearisation = now.hypothesis, now.linearisation
+        linear = {
+            e.name: self.units(e, h)
+            for e in EFFECTS.values()
+            if all(p.role in ("amplitude", "fixed") for p in e.parameters)
+        }
+        extra = list(dict.fromkeys(k for groups in linear.values() for u in groups for k in u))
+        force = self._problem.columns(h, linearisation.motion, extra)
+        scores = scores_of(linearisation, extra, linearisation.sensitivity_to(force))
+        candidates = []
+        for name, groups in linear.items():
+            found, score, white = scores.select(groups, bounds, name in HULL_DAMPING)
+            keys, change = found.keys, found.change
+            if name in HULL_DAMPING and score == -np.inf:
+                keys = [k for unit in groups for k in unit]
+                change = scores.solve(keys, bounds)[0]
+            if keys:
+                start = first_values(dict(zip(keys, change.tolist(), strict=True)))
+                candidates.append(Candidate(name, start, score, white))
+        others = [e for e in EFFECTS.values() if e.name not in h.effects]
+        scanned = self._workers.map(lambda effect: self._scanned(now, effect), others)
+        candidates += [c for c in scanned if c is not None]
+        return sorted(candidates, key=lambda c: (-c.score, -c.white_score))
+
+    def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
+        """Parameters of an effect that h lacks, on axes that are simulated, in the groups in which
+        they may join."""
+        groups = [] if effect.sense is not None else units(effect, h, ("amplitude",))
+        return [unit for unit in groups if all(map(self._is_simulated, unit))]
+
+    def lacks_plainer(self, name: str, h: Hypothesis) -> bool:
+        """Whether an effect imitates another that every vehicle has (``Effect.beyond``), and the
+        model lacks that one on an axis that is simulated."""
+        plainer = EFFECTS[name].beyond if name in EFFECTS else ""
+        own = [(COEFFICIENTS, c) for c in EFFECTS[plainer].coefficients[:3]] if plainer else []
+        return any(k[1] not in h.coefficients and self._is_simulated(k) for k in own)
+
+    def _is_simulated(self, key: Key) -> bool:
+        axis = axis_of(key)
+        return not (axis and self._problem.guided[AXES.index(axis)])
+
+    def _scanned(self, now: Fitted, effect: Effect) -> Candidate | None:
+        """An effect with parameters in which the wrench is not linear: an onset, coarsely, then
+        around the best; the neighbourhood of the origin for a place of attachment."""
+        roles = {p.role for p in effect.parameters}
+        if "onset" in roles:
+            duration = self._problem.streams.duration
+            coarse = np.linspace(_ONSET_RANGE, 1.0 - _ONSET_RANGE, _ONSETS)
+            best = self._best_shape(now, effect, [{"onset": t * duration} for t in coarse])
+            if best is None:
+                return None
+            near = np.linspace(-_ONSET_RANGE, _ONSET_RANGE, _FINE_ONSETS) * duration
+            onsets = best.start[effect.name, "onset"] + near
+            return self._best_shape(now, effect, [{"onset": float(t)} for t in onsets]) or best
+        if "place" in roles:
+            places = [p for p in effect.parameters if p.role == "place"]
+            signs = itertools.product((-1.0, 0.0, 1.0), repeat=len(places))
+            grid = [
+                {p.name: s * p.typical for p, s in zip(places, of, strict=True)} for of in signs
+            ]
+            return self._best_shape(now, effect, grid)
+        return self._oscillating(now, effect) if "frequency" in roles else None
+
+    def _best_shape(
+        self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]
+    ) -> Candidate | None:
+        """The shape (onset, place) of an effect that scores best, with its linear amplitudes. Where
+        a place is not part of the shape, the moments that it makes are fitted as well."""
+        linearisation = now.linearisation
+        keys = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        places = [p for p in effect.parameters if p.role == "place" and p.name not in shapes[0]]
+        moments = [(f"{effect.name} moment", p.name) for p in places]
+        best: Candidate | None = None
+        for shape in shapes:
+            at_origin = self._force(now, effect, shape, keys)
+            moved = [
+                self._force(now, effect, {**shape, p.name: 1.0}, keys) - at_origin for p in places
+            ]
+            columns = linearisation.sensitivity_to(np.concatenate([at_origin, *moved], axis=2))
+            scores = scores_of(linearisation, [*keys, *moments], columns)
+            groups = [(*keys, *moments)] if moments else [(k,) for k in keys]
+            selected, score, white = scores.select(groups, bounds)
+            both = score - PENALTY, white - PENALTY
+            if selected.keys and (best is None or both > (best.score, best.white_score)):
+                found = dict(zip(selected.keys, selected.change.tolist(), strict=True))
+                start = first_values({k: found[k] for k in keys if k in found})
+                there = dict(shape)
+                for p, m in zip(places, moments, strict=True):
+                    limit = FARTHEST * p.typical
+                    there[p.name] = float(np.clip(found[m] / found[keys[0]], -limit, limit))
+                names = [p.name for p in effect.parameters if p.name in there]
+                start |= {(effect.name, name): there[name] for name in names}
+                best = Candidate(effect.name, start, *both)
+        return best
+
+    def _force(
+        self, now: Fitted, effect: Effect, shape: Mapping[str, float], keys: Sequence[Key]
+    ) -> Array:
+        """The wrench (K, 6, P) of a unit of each amplitude of an effect of this shape."""
+        h = now.hypothesis.having({(effect.name, n): v for n, v in shape.items()})
+        return self._problem.columns(h, now.linearisation.motion, keys)
+
+    def _oscillating(self, now: Fitted, effect: Effect) -> Candidate | None:
+        """Sinusoidal forces in the world, at the peaks of the spectrum of what is missing."""
+        linearisation = now.linearisation
+        keys = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        candidates = []
+        _, lowest, highest = bounds((effect.name, "frequency"))
+        for frequency in linearisation.frequencies(_PEAKS):
+            if not lowest <= frequency <= highest:
+                continue
+            columns = [
+                self._force(now, effect, {"frequency": frequency, "phase": phase}, keys)
+                for phase in (0.5 * np.pi, 0.0)
+            ]
+            labels = [(f"{effect.name} {part}", k[1]) for part in ("cos", "sin") for k in keys]
+            sensitivity = linearisation.sensitivity_to(np.concatenate(columns, axis=2))
+            scores = scores_of(linearisation, labels, sensitivity)
+            change, gain = scores.solve(labels)
+            # one phase for all directions: the best approximation of rank one
+            cosine, sine = change[: len(keys)], change[len(keys) :]
+            turn = 0.5 * np.arctan2(2.0 * cosine @ sine, cosine @ cosine - sine @ sine)
+            amplitude = np.cos(turn) * cosine + np.sin(turn) * sine
+            start = dict(zip(keys, amplitude.tolist(), strict=True))
+            start[effect.name, "frequency"] = frequency
+            start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
+            inflations = scores.inflation_with(labels, change), scores.white_inflation(gain, labels)
+            both = (gain / inflation - PENALTY * len(start) for inflation in inflations)
+            candidates.append(Candidate(effect.name, start, *both))
+        return max(candidates, key=lambda c: c.score, default=None)
+
+
+def first_values(change: Mapping[Key, float]) -> dict[Key, float]:
+    """First values from a linear estimate, inside the bounds and not too far for input effects."""
+    start = {}
+    for key, delta in change.items():
+        null, lower, upper = bounds(key)
+        if key[0] in EFFECTS and EFFECTS[key[0]].act is not None:
+            farthest = FARTHEST * parameter(key).typical
+            if parameter(key).unit in ("N", "N m"):
+                farthest = np.inf
+            delta = float(np.clip(delta, -farthest, farthest))
+        start[key] = float(np.clip(null + delta, lower, upper))
+    return start

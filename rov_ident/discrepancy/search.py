@@ -1,0 +1,333 @@
+"""The search for what a model of the dynamics lacks.
+
+1. The coefficients that the model has are refitted: what that gains is tuning, not physics.
+2. Every effect of the library is scored on the linearisation of that fit (`screening`); the best
+   few are fitted in full, and the best of them, if it is significant, joins the model. This repeats
+   until nothing is left, or the simulation budget is spent.
+3. Each named effect is compared with its rivals, the others in place: other effects, and patterns
+   of no known cause (`pattern_search`). An effect that does not earn its place leaves.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.core.linalg import scaled_inverse
+from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
+    UNKNOWN,
+    Hypothesis,
+    Key,
+    at_bound,
+    bounds,
+    effect_of,
+    onsets,
+)
+from rov_ident.discrepancy.linearisation import linearise
+from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
+from rov_ident.discrepancy.patterns import PatternSearch, choice_penalty
+from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening, Workers
+from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.effects import EFFECTS
+from rov_ident.model.coefficients import parse
+from rov_ident.sampling.raw_streams import Streams
+
+Progress = Callable[[str], None]
+
+LATE_THRUST = ("thruster_lag", "actuation_delay")
+"""What every thruster has a little of."""
+
+# What is likelier beforehand needs less evidence. The rates in docs/explain-bench.md were measured
+# with these.
+HULL_DAMPING_ASKED = 0.0  # penalised score; of other effects VERY_STRONG is asked
+_MORE_THAN_DAMPING = 0.5  # of what hull damping explains: a rival of it must explain as much more
+_MORE_THAN_NAMED = 0.05  # of what a named effect explains: a pattern must explain as much more
+_OWN_DRAG = 0.5  # of the hull's drag that must remain beside an effect that imitates it
+
+# Effort: the times and rates in docs/explain-bench.md were measured with these.
+_FITTED = 6  # candidates that are fitted in full at each step, ...
+_FITTED_WHITE = 3  # ... and those with the best scores as if what they leave were white
+_LEAST_SHARE = 0.3  # of the best score: a candidate with less is not fitted
+_MOST_EFFECTS = 6
+_MOST_PATTERNS = 3
+_ROUNDS = 3  # in which effects may give way to rivals
+BUDGET = 24_000  # steps simulated for each second of data (docs/explain.md, the card of an effect)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A named effect put to the test: the model without it, and with each rival in its place (None
+    where the budget was spent before)."""
+
+    rest: Fitted
+    rivals: Mapping[str, Fitted] | None
+
+
+Trials = dict[str, Trial]
+
+
+class Search:
+    """A bag searched for what a configuration lacks."""
+
+    def __init__(
+        self, streams: Streams, config: Config, spans: Sequence[tuple[float, float]]
+    ) -> None:
+        self.config, self.problem = config, WindowedProblem(streams, spans)
+        base = {
+            (COEFFICIENTS, name): float(value)
+            for name, value in zip(config.model.names, config.model.theta, strict=True)
+            if name in config.estimate and not streams.guided[parse(name).row]
+        }
+        parameters = [(e.name, p) for e in EFFECTS.values() for p in e.parameters]
+        duration = {(e, p.name): streams.duration for e, p in parameters if p.role == "fixed"}
+        self.given = Hypothesis(config, base, duration)
+        self._workers = Workers(self.problem)
+        self.screening = Screening(self.problem, self._workers)
+        self.patterns = PatternSearch(self.problem, self._workers)
+        self.cut_short = False  # whether something was left untried
+
+    def _budget_spent(self) -> bool:
+        """Whether nothing further is tried; ``cut_short`` from then on. Steps are counted, not
+        timed: a bag gives the same findings however busy the computer is."""
+        self.cut_short = self.problem.steps_simulated > BUDGET
+        return self.cut_short
+
+    def run(self, progress: Progress | None = None) -> list[Fitted]:
+        """The fit of the model as it is, then that of each larger one."""
+        start = fit(self.problem, self.given)
+        if start is None:
+            return []
+        path = [start]
+        while len(path) <= _MOST_EFFECTS and not self._budget_spent():
+            larger = self.extended(path[-1], progress)
+            if larger is None:
+                break
+            path.append(larger)
+        return path
+
+    def extended(self, now: Fitted, progress: Progress | None = None) -> Fitted | None:
+        """The model with the one effect more that explains most; None where nothing is left."""
+        candidates = self._candidates(now, now.hypothesis)
+        if progress is not None:
+            progress(", ".join(f"{c.name} {c.score:.0f}" for c in candidates[:5]))
+        fits = self.fit_best(now, candidates)
+        best = self._best(now, fits) or self._damping_and_another(now, candidates)
+        if best is None:
+            damping = [f for f in fits if added_effect(now, f) in HULL_DAMPING]
+            best = self._best(now, damping, HULL_DAMPING_ASKED)
+        return best and (refit(best.hypothesis, best.linearisation, update_noise=True) or best)
+
+    def _candidates(self, now: Fitted, h: Hypothesis) -> list[Candidate]:
+        """But for those that imitate a term that every vehicle has and ``h`` lacks."""
+        found = self.screening.candidates(now)
+        return [c for c in found if not self.screening.lacks_plainer(c.name, h)]
+
+    def _best(
+        self, now: Fitted, fits: Sequence[Fitted], asked: float = VERY_STRONG
+    ) -> Fitted | None:
+        """The fit with the best penalised score, if it is as good as asked; hull damping first."""
+        if not fits:
+            return None
+        closest = min(fits, key=lambda f: f.rss)
+        good = [f for f in fits if self.improvement(now, f, closest) >= asked]
+        good = [f for f in good if self.is_determined(now, f)]
+        damping = [f for f in good if added_effect(now, f) in HULL_DAMPING]
+        return min(damping or good, key=lambda f: self.cost(f, closest), default=None)
+
+    def _damping_and_another(self, now: Fitted, candidates: Sequence[Candidate]) -> Fitted | None:
+        """Hull damping with one effect more, where neither shows without the other; late thrust
+        whatever its score: the linearisation of a model without drag does not show it."""
+        for candidate in candidates:
+            if candidate.name not in HULL_DAMPING:
+                continue
+            units = self.screening.units(EFFECTS[candidate.name], now.hypothesis)
+            zeros = dict.fromkeys((k for u in units for k in u), 0.0)
+            begin = now.hypothesis.having({**zeros, **candidate.start})
+            damped = refit(begin, now.linearisation)
+            if damped is None:
+                continue
+            fits = self.fit_best(damped, self._candidates(damped, now.hypothesis))
+            for name in LATE_THRUST:
+                if name not in now.hypothesis.effects:
+                    (p,) = EFFECTS[name].parameters
+                    late = {(name, p.name): p.null + FARTHEST * p.typical}
+                    there = refit(damped.hypothesis.having(late), damped.linearisation)
+                    fits += [there] if there is not None else []
+            pruned = [self._pruned(f, now) for f in fits]
+            both = [f for f in pruned if f and set(zeros) & set(f.hypothesis.keys)]
+            best = self._best(now, both)
+            if best is not None:
+                return best
+        return None
+
+    def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
+        """Full fits of the best candidates, and of hull damping, whatever its score: a model that
+        lacks it can be too far off for its linearisation to show it."""
+        least = max(_LEAST_SHARE * candidates[0].score, 0.0) if candidates else 0.0
+        chosen = [c for c in candidates[:_FITTED] if c.score >= least]
+        white = sorted((c for c in candidates if c.white_score > 0.0), key=lambda c: -c.white_score)
+        chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
+        chosen += [c for c in candidates if c.name in HULL_DAMPING and c not in chosen]
+        fits = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
+        return [f for f in fits if f is not None]
+
+    def _fit_candidate(self, now: Fitted, candidate: Candidate) -> Fitted | None:
+        there = refit(now.hypothesis.having(candidate.start), now.linearisation)
+        if there is not None and candidate.name in HULL_DAMPING:
+            there = self._pruned(there, now)
+        if there is None or there.hypothesis.keys == now.hypothesis.keys:
+            return None
+        return with_best_onsets(there, candidate.start)
+
+    def _pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
+        """Without the coefficients beyond ``base`` that are not worth their penalty."""
+        while fitted is not None:
+            h, linear = fitted.hypothesis, fitted.linear
+            added = [k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS]
+            variance = np.diag(scaled_inverse(linear.normal))
+            std = np.sqrt(np.where(variance > 0.0, variance, np.inf))  # zero: nothing is known
+            gains = [
+                (h.values[k] - bounds(k)[0]) ** 2 / std[linear.index([k])[0]] ** 2 for k in added
+            ]
+            if min(gains, default=np.inf) > PENALTY * fitted.inflation:
+                return fitted
+            fitted = refit(h.without([added[int(np.argmin(gains))]]), fitted.linearisation)
+        return None
+
+    def try_rivals(self, final: Fitted, progress: Progress | None = None) -> tuple[Fitted, Trials]:
+        """Every effect against its rivals, the others in place, until nothing changes."""
+        trials: Trials = {}
+        for last in (False,) * _ROUNDS + (True,):
+            trials, better = {}, None
+            for name in self.named(final):
+                rest = self.rest(final, name)
+                if rest is None:
+                    continue
+                trials[name] = self._trial(rest, name)
+                better = self._better(final, name, trials[name])
+                if better is not None and (last or self._budget_spent()):
+                    better = None  # it would go on for ever, or cannot be tried: nothing changes
+                elif better is not None:
+                    if progress is not None:
+                        progress(f"{name} gives way")
+                    break
+            if better is None:
+                break
+            final = refit(better.hypothesis, better.linearisation, update_noise=True) or better
+            final = (None if self._budget_spent() else self.extended(final)) or final
+        return final, trials
+
+    def trials(self, final: Fitted) -> Trials:
+        names = self.named(final)
+        rests = self._workers.map(lambda n: self.rest(final, n), names)
+        pairs = zip(names, rests, strict=True)
+        return {n: self._trial(rest, n) for n, rest in pairs if rest is not None}
+
+    def _trial(self, rest: Fitted, name: str) -> Trial:
+        return Trial(rest, None if self._budget_spent() else self._rivals(rest, name))
+
+    def rest(self, fitted: Fitted, name: str) -> Fitted | None:
+        """The fit without an effect."""
+        rest = fitted.hypothesis.without(self.keys_of(fitted, name))
+        return refit(rest, fitted.linearisation)
+
+    def _rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
+        """What else might explain what ``name`` explains: fits by the name of the rival."""
+        lacking, h = self.screening.lacks_plainer, rest.hypothesis
+        candidates = [
+            c
+            for c in self.screening.candidates(rest)
+            if c.name != name and (EFFECTS[c.name].beyond == name or not lacking(c.name, h))
+        ]
+        fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
+        return fits | self.patterns.fits(rest)
+
+    def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
+        """What should stand in place of ``name``, if anything. A pattern can imitate any cause, and
+        what a model should have anyway is likelier than what few vehicles meet: such a rival must
+        explain clearly more, unless it is in the model anyway."""
+        now = self.cost(final, final)
+        there = self.named(final)
+        explained = max(trial.rest.rss - final.rss, 1e-9)
+        choices = [trial.rest]
+        for rival, fitted in (trial.rivals or {}).items():
+            margin = 0.0
+            if rival in EFFECTS and EFFECTS[rival].beyond == name:
+                continue
+            if rival.startswith(UNKNOWN) and not name.startswith(UNKNOWN):
+                margin = 0.0 if rival in there else _MORE_THAN_NAMED
+            elif name in HULL_DAMPING and rival not in HULL_DAMPING:
+                margin = _MORE_THAN_DAMPING
+            clear = now - self.cost(fitted, final) > 3.0 * VERY_STRONG
+            clear = clear and final.rss - fitted.rss > margin * explained
+            if (margin == 0.0 or clear) and self.is_determined(trial.rest, fitted):
+                choices.append(fitted)
+        best = min(choices, key=lambda f: self.cost(f, final))
+        return best if self.cost(best, final) < now else None
+
+    def unexplained(self, final: Fitted) -> list[Fitted]:
+        """Fits with the patterns that are left, one after the other."""
+        found: list[Fitted] = []
+        while len(found) < _MOST_PATTERNS and not (found and self._budget_spent()):
+            asked = VERY_STRONG + choice_penalty(self.patterns.patterns(final))
+            tried = self.patterns.fits(final).values()
+            fits = [f for f in tried if self.improvement(final, f, f) >= asked]
+            if not fits:
+                break
+            final = min(fits, key=lambda f: self.cost(f, fits[0]))
+            found.append(final)
+        return found
+
+    def improvement(self, now: Fitted, larger: Fitted, best: Fitted) -> float:
+        """The penalised score of what a larger model has more, in the units of ``best``; also by
+        the variance inflation of that alone (but for onsets, known from one window), whichever is
+        less."""
+        gain = self.cost(now, best) - self.cost(larger, best)
+        new = [k for k in larger.hypothesis.keys if k not in now.hypothesis.values]
+        dates = onsets(larger.hypothesis)
+        own = variance_inflation_of(larger.linearisation, [k for k in new if k not in dates])
+        return min(gain, (now.rss - larger.rss) / max(own, 1e-9) - PENALTY * len(new))
+
+    def is_determined(self, now: Fitted, larger: Fitted) -> bool:
+        """Whether the data, not the bounds, determine the parameters that a larger model has more:
+        no effect took over most of the drag of the hull, and no failure at a time was there from
+        the start."""
+        h, variance = larger.hypothesis, np.diag(larger.covariance)
+        std = dict(zip(larger.linear.keys, np.sqrt(np.maximum(variance, 0.0)), strict=True))
+        new = [k for k in h.keys if k not in now.hypothesis.values]
+        name = added_effect(now, larger)
+        plainer = EFFECTS[name].beyond if name in EFFECTS else ""
+        own = [(COEFFICIENTS, c) for c in EFFECTS[plainer].coefficients] if plainer else []
+        left = [(h.values[k], now.hypothesis.values[k]) for k in own if k in h.values]
+        begun = [k for k in onsets(h) if k in new and len(EFFECTS[k[0]].lasting) == 1]
+        is_drag = any(abs(after) < _OWN_DRAG * abs(before) for after, before in left)
+        is_gain = any(h.values[k] <= 0.0 for k in begun)
+        return not (is_drag or is_gain or any(at_bound(k, h.values[k], std[k]) for k in new))
+
+    def cost(self, fitted: Fitted, best: Fitted) -> float:
+        """Squared residuals in the units of ``best``, and the penalty of the added parameters."""
+        extra, rss = len(fitted.hypothesis.keys) - len(self.given.keys), fitted.rss
+        if not np.allclose((fitted.noise / best.noise) ** 2, 1.0):
+            starts = fitted.linearisation.starts
+            there = linearise(self.problem, fitted.hypothesis, starts, best.noise)
+            assert there is not None
+            rss = there.rss
+        return rss / best.inflation + PENALTY * extra
+
+    def named(self, fitted: Fitted) -> list[str]:
+        """The effects (and patterns) that a model has beyond the given one."""
+        own = set(self.given.keys)
+        return list(dict.fromkeys(effect_of(k) for k in fitted.hypothesis.keys if k not in own))
+
+    def keys_of(self, fitted: Fitted, name: str) -> list[Key]:
+        own = set(self.given.keys)
+        return [k for k in fitted.hypothesis.keys if k not in own and effect_of(k) == name]
+
+
+def added_effect(rest: Fitted, larger: Fitted) -> str:
+    """The effect (or pattern) that a larger model has more."""
+    old = set(rest.hypothesis.keys)
+    return next(effect_of(k) for k in larger.hypothesis.keys if k not in old)

@@ -1,0 +1,329 @@
+"""Whether the sensors agree with each other: pose against velocity, velocity against IMU.
+
+No model of the vehicle is needed for this, so what a sensor does wrong is found before the
+dynamics are looked at. Two kinds of dead reckoning in the world frame are compared with what is
+measured directly (Titterton and Weston 2004, ch. 3)::
+
+    position:  x(t) - integral of R v dt            velocity:  R v(t) - integral of (R f + g) dt
+
+and the odometry's angular rate with the gyro. A dead-reckoned difference is a random walk plus
+white noise; the one-step innovations of that local-level model (Durbin and Koopman 2012, ch. 2) are
+white, and every regressor goes through the same filter: generalised least squares. All sensor
+effects are linear to first order, and the fit is repeated about its own result.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+from rov_ident.config import Config
+from rov_ident.core.frames import acceleration_of_arm, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.jit import kernel
+from rov_ident.core.linalg import scaled_inverse
+from rov_ident.core.quaternions import turned
+from rov_ident.discrepancy.hypothesis import Key
+from rov_ident.discrepancy.linearisation import LinearProblem
+from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
+from rov_ident.discrepancy.windowed_problem import within
+from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import Reading
+from rov_ident.model.equations import Array
+from rov_ident.sampling.raw_streams import Streams, integral, interpolated, orientation_at
+
+# Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
+# which the white noise is nothing, about a factor of three apart.
+_GAINS = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.95)
+_OUTLIER = 24.0  # robust standard deviations; wide, as what a sensor does wrong is still in them
+_SMOOTHING = 0.2  # s; of angular rates: shorter than a vehicle turns, longer than noise
+_DRIFT = 1.0  # s; from which the pose tells velocity better than the IMU
+_STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
+_ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
+_MAX_GAP = 0.5  # s without a message: no step of dead reckoning reaches across
+_FEWEST_IMU = 8  # messages of the IMU; fewer are none
+_FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
+_CLUSTER = 5.0  # s; of which residuals are correlated, as long as the windows of the dynamics
+_ROUNDS = 6  # of linearisation; each adds an effect or ends where changes are below ...
+_SETTLED = 0.05  # ... this share of their standard deviations
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """White innovations r (N,) in units of their noise at times t (N,); ``columns`` (N, P): how
+    much of r each parameter makes."""
+
+    name: str
+    t: Array
+    r: Array
+    columns: Array
+    scale: float  # standard deviation of the noise, in the unit of the comparison
+
+
+THRUST_TIMING = tuple(("thrust held", axis) for axis in "XYZ")
+"""Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
+
+To the accelerations of thrust that is a time offset of milliseconds, the drag that answers to them
+is not offset: together they would pass for a velocity scale of up to two percent.
+"""
+
+
+def sensor_parameters() -> list[Key]:
+    """Keys of all parameters of the effects of the velocity sensor and the IMU."""
+    return [(e.name, p.name) for e in EFFECTS.values() if e.sense for p in e.parameters]
+
+
+def comparisons(
+    streams: Streams, config: Config, effects: Mapping[str, Mapping[str, float]]
+) -> list[Comparison]:
+    """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
+    keys = sensor_parameters()
+    here, there, rate = _corrected_readings(streams, config, effects)
+    r = quaternion_to_matrix(streams.orientation)
+    inertial = _DeadReckoning(streams, config, there, rate) if _has_imu(streams) else None
+
+    # A regressor made of the very readings that it explains shares their noise: what the velocity
+    # sensor's errors are made of is taken from the other sensors where there are any.
+    width = _SMOOTHING / float(np.median(np.diff(streams.t)))
+    turning, gyrating = (gaussian_filter1d(x, width, axis=0) for x in (here.angular, here.gyro))
+    velocity = None if inertial is None else inertial.velocity
+    moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
+    reading = Reading(moving, turning, gyrating, here.specific_force)
+    moved = [_unit_change(reading, key) for key in keys]
+    made: list[tuple[str, Array, Array, list[Array]]] = []
+    if streams.has_pose:
+        way, *ways = (
+            integral(streams.t, np.einsum("kij,kj->ki", r, m.linear)) for m in (here, *moved)
+        )
+        y, columns = streams.position - way, [-w for w in ways]
+        made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
+    if inertial is not None:
+        shift = [_unit_change(there, key) for key in keys]
+        inside = (streams.t >= streams.imu_t[0]) & (streams.t <= streams.imu_t[-1])
+        t = streams.t[inside]
+        y = (np.einsum("kij,kj->ki", r, here.linear) - inertial.velocity)[inside]
+        columns = [
+            (np.einsum("kij,kj->ki", r, m.linear) - inertial.integrated(s.specific_force))[inside]
+            for m, s in zip(moved, shift, strict=True)
+        ]
+        held = np.clip(np.searchsorted(streams.demand_t, t, side="right") - 1, 0, None)
+        thrust = streams.demand[held, :3] / config.model.body.mass
+        columns += [r[inside][:, :, i] * thrust[:, i : i + 1] for i in range(3)]
+        made.append(("imu", t, y, columns))
+        y = here.angular[inside] - here.gyro[inside]
+        columns = [m.angular[inside] - m.gyro[inside] for m in moved]
+        made.append(("gyro", t, y, [*columns, *[np.zeros_like(y)] * 3]))
+    return [
+        Comparison(name, *_whitened(t, y, columns, walk=name != "gyro"))
+        for name, t, y, columns in made
+        if len(t) > _FEWEST
+    ]
+
+
+def _has_imu(streams: Streams) -> bool:
+    return len(streams.imu_t) > _FEWEST_IMU
+
+
+def _corrected_readings(
+    streams: Streams, config: Config, effects: Mapping[str, Mapping[str, float]]
+) -> tuple[Reading, Reading, Array]:
+    """Odometry at its times and IMU at its own, corrected; angular rates (M, 3) as odometry reads
+    them, at the times of the IMU."""
+    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    gyro, nothing = streams.gyro @ mounting.T, np.zeros_like(streams.nu[:, 3:])
+    rate = interpolated(streams.t, streams.nu[:, 3:], streams.imu_t)
+    gyro_at = interpolated(streams.imu_t, gyro, streams.t) if _has_imu(streams) else nothing
+    here = Reading(streams.nu[:, :3], streams.nu[:, 3:], gyro_at, nothing)
+    there = Reading(np.zeros_like(gyro), rate, gyro, streams.specific_force @ mounting.T)
+    return _undone(here, effects), _undone(there, effects), rate
+
+
+def _undone(reading: Reading, effects: Mapping[str, Mapping[str, float]]) -> Reading:
+    """A reading without what effects did to it."""
+    for name, values in reversed(list(effects.items())):
+        correct = EFFECTS[name].correct
+        if correct is not None:
+            reading = correct(reading, **values)
+    return reading
+
+
+def _unit_change(reading: Reading, key: Key) -> Reading:
+    """What one unit of a parameter adds to a reading."""
+    effect = EFFECTS[key[0]]
+    nulls = {p.name: p.null for p in effect.parameters}
+    step = next(1e-4 * p.typical for p in effect.parameters if p.name == key[1])
+    assert effect.sense is not None
+    moved = effect.sense(reading, **{**nulls, key[1]: nulls[key[1]] + step})
+    return Reading(*((b - a) / step for a, b in zip(reading, moved, strict=True)))
+
+
+class _DeadReckoning:
+    """Velocity in the world from the IMU alone, at the times of the odometry: ``velocity`` (N, 3),
+    the integral of what the IMU read, gravity included; it drifts."""
+
+    def __init__(self, streams: Streams, config: Config, imu: Reading, rate: Array) -> None:
+        self._t, self._at = streams.imu_t, streams.t
+        q = orientation_at(streams, streams.imu_t)
+        self._rotation = quaternion_to_matrix(_attitude(q, streams.imu_t, imu.gyro, rate))
+        lever, force = np.array(config.imu.position), imu.specific_force
+        if lever.any():
+            turn = np.gradient(imu.gyro, streams.imu_t, axis=0)
+            force = force - acceleration_of_arm(imu.gyro, turn, lever)
+        fallen = np.outer(streams.t, [0.0, 0.0, config.gravity])
+        self.velocity = self.integrated(force) + fallen
+
+    def integrated(self, force: Array) -> Array:
+        """The integral (N, 3) of specific forces (M, 3) turned into the world."""
+        total = integral(self._t, np.einsum("kij,kj->ki", self._rotation, force))
+        return interpolated(self._t, total, self._at)
+
+
+def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | None) -> Array:
+    """Velocity (N, 3) in the world: long term from the pose, short term from the IMU, ``inertial``
+    (N, 3), whose integral drifts. The velocity sensor stands in for either where it is missing."""
+    t = streams.t
+    even = np.arange(t[0], t[-1], float(np.median(np.diff(t))))
+    width = (_STEADY if inertial is None else _DRIFT) / (even[1] - even[0])
+    inertial = np.zeros_like(measured) if inertial is None else inertial
+    if streams.has_pose:
+        drifted = interpolated(t, streams.position - integral(t, inertial), even)
+        correction = gaussian_filter1d(drifted, width, axis=0, order=1) / (even[1] - even[0])
+    else:
+        drifted = np.einsum("kij,kj->ki", r, measured) - inertial
+        correction = gaussian_filter1d(interpolated(t, drifted, even), width, axis=0)
+    return inertial + interpolated(even, correction, t)
+
+
+def _attitude(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:
+    """Attitudes (M, 4): short term from the gyro (M, 3), long term as measured (complementary
+    filter). A bias of the gyro would tilt them all: it is estimated first, from the odometry's
+    ``rate`` (M, 3), then, finer, from the tilt itself."""
+    true = gyro - np.median(gyro - rate, axis=0)
+    for _ in range(2):
+        q = measured.copy()
+        _filter_attitude(q, t, true)
+        a, b = q[:, 1:], measured[:, 1:]
+        tilt = 2.0 * (q[:, :1] * b - measured[:, :1] * a - np.cross(a, b))
+        true = true + tilt.mean(axis=0) / _ATTITUDE_TIME
+    return q
+
+
+@kernel
+def _filter_attitude(q, t, rate):
+    """Attitudes q (M, 4) become those of the gyro's rate (M, 3), drawn to the given ones slowly."""
+    for i in range(1, len(t)):
+        dt = t[i] - t[i - 1]
+        if dt > _MAX_GAP:
+            continue
+        ahead = turned(q[i - 1], 0.5 * (rate[i - 1] + rate[i]) * dt)
+        gain = dt / (_ATTITUDE_TIME + dt)
+        size = 0.0
+        for j in range(4):
+            q[i, j] = ahead[j] + gain * (q[i, j] - ahead[j])
+            size += q[i, j] ** 2
+        q[i] /= np.sqrt(size)
+
+
+def _whitened(
+    t: Array, y: Array, columns: Sequence[Array], walk: bool
+) -> tuple[Array, Array, Array, float]:
+    """Innovations of the local-level model with the gain that leaves the least of them: times,
+    innovations and columns, in units of the noise, of what is no outlier, and the noise. Without a
+    ``walk`` y is white as it is."""
+    gap = np.diff(t, prepend=t[0]) > _MAX_GAP
+    gap[0] = True
+    use = [c for c in columns if c.any()]
+    best, least = None, np.inf
+    for gain in _GAINS if walk else (None,):
+        e = _innovations(y, gain, gap)
+        if use:
+            a = np.stack([_innovations(c, gain, gap) for c in use], axis=-1).reshape(-1, len(use))
+        else:
+            a = np.zeros((y.size, 0))
+        left = e.ravel() - a @ np.linalg.lstsq(a, e.ravel(), rcond=None)[0]
+        spread = 1.4826 * float(np.median(np.abs(left)))
+        if spread < least:
+            least, best = spread, gain
+    e = _innovations(y, best, gap)
+    full = np.stack([_innovations(c, best, gap) for c in columns], axis=-1)
+    least = max(least, 1e-9)
+    keep = np.abs(e - np.median(e, axis=0)) < _OUTLIER * least
+    keep[gap & walk] = False
+    return np.broadcast_to(t[:, None], e.shape)[keep], e[keep] / least, full[keep] / least, least
+
+
+def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
+    """Of the local-level filter with a gain, begun anew after each gap; x itself without."""
+    if gain is None:
+        return x
+    steps = np.diff(x, axis=0, prepend=x[:1])
+    steps[gap] = 0.0
+    out: Array = lfilter([1.0], [1.0, gain - 1.0], steps, axis=0)
+    return out
+
+
+def _linear_problem(
+    found: Sequence[Comparison], spans: Sequence[tuple[float, float]]
+) -> LinearProblem:
+    """The rows whose time is in the spans, in clusters of _CLUSTER seconds."""
+    keys = (*sensor_parameters(), *THRUST_TIMING)
+    last = max((int(b.t[-1] / _CLUSTER) for b in found if len(b.t)), default=0) + 1
+    normal, gradient = np.zeros((len(keys), len(keys))), np.zeros((last, len(keys)))
+    rss, count = np.zeros(last), 0
+    for comparison in found:
+        keep = within(spans, comparison.t)
+        at = (comparison.t[keep] / _CLUSTER).astype(int)
+        columns, r = comparison.columns[keep], comparison.r[keep]
+        normal += columns.T @ columns
+        np.add.at(gradient, at, columns * r[:, None])
+        np.add.at(rss, at, r**2)
+        count += len(r)
+    filled = rss > 0.0
+    return LinearProblem(keys, normal, gradient[filled], rss[filled], count)
+
+
+def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
+    """The streams as good sensors would have given them."""
+    nothing = np.zeros_like(streams.nu[:, :3])
+    here = _undone(Reading(streams.nu[:, :3], streams.nu[:, 3:], nothing, nothing), effects)
+    return dataclasses.replace(streams, nu=np.hstack([here.linear, here.angular]))
+
+
+def search(
+    streams: Streams,
+    config: Config,
+    spans: Sequence[tuple[float, float]],
+    allowed: Iterable[str] | None = None,
+) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
+    """The sensor effects that the data in the spans (from and to [s]) support, and the standard
+    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score."""
+    library = [e.name for e in EFFECTS.values() if e.sense]
+    library = library if allowed is None else [n for n in library if n in set(allowed)]
+    found: dict[str, dict[str, float]] = {}
+    std: dict[Key, float] = {}
+    for _ in range(_ROUNDS):
+        linear = _linear_problem(comparisons(streams, config, found), spans)
+        chosen = [key for key in linear.keys if key[0] in found]
+        units = [[k for k in linear.keys if k[0] == n] for n in library if n not in found]
+        added = [k for unit in units for k in unit]
+        if allowed is None:
+            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units)
+            added = best.keys if score > VERY_STRONG else []
+        both = [*chosen, *added]
+        if not both:
+            break
+        change, _ = Scores(linear, THRUST_TIMING).solve(both)
+        for (name, parameter), delta in zip(both, change.tolist(), strict=True):
+            nulls = {p.name: p.null for p in EFFECTS[name].parameters}
+            found.setdefault(name, nulls)[parameter] += delta
+        at = linear.index([*both, *THRUST_TIMING])
+        covariance = scaled_inverse(linear.normal[np.ix_(at, at)])
+        variance = np.maximum(np.diag(covariance), 0.0) * variance_inflation(linear, at)
+        width = np.sqrt(variance)[: len(both)]
+        std = dict(zip(both, width.tolist(), strict=True))
+        if not added and (np.abs(change) < _SETTLED * width).all():
+            break
+    return found, std

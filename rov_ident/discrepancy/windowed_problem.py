@@ -1,0 +1,282 @@
+"""Bags cut into short windows, on which a hypothesis is simulated.
+
+:class:`WindowedProblem` holds the measured velocities, the wrench and the attitude of all windows,
+simulates a hypothesis through them, and says how the wrench on the vehicle changes with each of
+its parameters.
+"""
+
+import contextlib
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import CancelledError
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_to_matrix
+from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key
+from rov_ident.discrepancy.multiple_shooting import (
+    Motion,
+    Steps,
+    equations,
+    guided_by,
+    regressors,
+    shoot,
+    thrust,
+    wrenches,
+)
+from rov_ident.effects import EFFECTS, compiled
+from rov_ident.effects.base import Effect, EffectParameter
+from rov_ident.model.coefficients import AXES, parse
+from rov_ident.model.equations import Array, Model, RigidBody
+from rov_ident.sampling.raw_streams import Streams, interpolated, orientation_at
+from rov_ident.simulation.open_loop import Guide, simulate
+
+MAX_STEP = 0.05  # s; of integration, where odometry is slower
+_MAX_GAP = 0.5  # s without odometry: no window reaches across; stated in the error message below
+_FEWEST = 8  # odometry messages in a window: the initial velocity takes one
+ONSET_STEP = 0.2  # s; of the difference quotient: several messages, as thrust acts in steps
+_AMPLITUDE_STEP = 0.05  # typical sizes; the same for an input effect, whose thrust has kinks
+_SMALL_STEP = 1e-3  # typical sizes; the same where the wrench is smooth
+_COUNTED_RATE = 50.0  # Hz; the search allows more time for data that are denser (docs/explain.md)
+_REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
+
+
+Spans = list[tuple[float, float]]
+"""From and to [s] each."""
+
+
+class WindowedProblem:
+    """The windows of one or more bags on which hypotheses are simulated.
+
+    ``measured`` (N, 6) are the velocities at ``times`` (N,), which are the ``nodes`` (N,) of the
+    time axis ``steps``; ``window`` (N,) says in which window each lies, ``first`` and ``last``
+    (W,) are the nodes where windows begin and end. ``guided`` (6,): axes that follow the
+    measurement. ``patterns``: wrenches (K, 6) of no known cause, by key.
+    """
+
+    def __init__(self, streams: Streams, spans: Sequence[tuple[float, float]]) -> None:
+        """``spans``: from and to [s] of each window. UserError if there is not enough odometry in
+        any."""
+        self.streams = streams
+        keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
+        keep &= within(spans, streams.t)
+        t = streams.t[keep]
+        nodes = _subdivided(t)
+        pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
+        pieces = pieces[(pieces >= nodes[0]) & (pieces <= nodes[-1])]
+        held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
+        self.orientation, self.guided = orientation_at(streams, nodes), streams.guided
+        given = np.empty((0, 6))  # accelerations of the guided axes, from each node to the next
+        if self.guided.any():
+            nu_dot = np.diff(self._measured_at(nodes), axis=0) / np.diff(nodes)[:, None]
+            given = np.where(self.guided, nu_dot, 0.0)
+        self.steps = Steps(
+            nodes,
+            quaternion_to_matrix(self.orientation),
+            quaternion_to_matrix(orientation_at(streams, 0.5 * (nodes[1:] + nodes[:-1]))),
+            pieces,
+            streams.demand[held],
+            np.searchsorted(pieces, nodes[:-1]),
+            given,
+        )
+        at = np.searchsorted(nodes, t)
+        first, last = [], []
+        for begin, end in spans:
+            inside = np.flatnonzero((t >= begin) & (t < end))
+            for run in np.split(inside, np.flatnonzero(np.diff(t[inside]) > _MAX_GAP) + 1):
+                if len(run) >= _FEWEST:
+                    first.append(at[run[0]])
+                    last.append(at[run[-1]])
+        if not first:
+            raise UserError(
+                f"odometry with a wrench comes nowhere for {_FEWEST} messages without a gap of "
+                f"more than {_MAX_GAP} s where it is needed: record it at 4 Hz or more, in a "
+                "longer bag"
+            )
+        self.first, self.last = np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
+        window = np.searchsorted(self.first, at, side="right") - 1
+        inside = (window >= 0) & (at <= self.last[np.maximum(window, 0)])
+        self.nodes, self.window = at[inside], window[inside]
+        self.measured = streams.nu[keep][inside]
+        self.times = t[inside]
+        self.patterns: dict[Key, Array] = {}
+        self._simulations = 0  # of all windows, so far
+        self._stopped = False
+        self._thrusts: dict[object, Array] = {}
+        self._remembered = threading.local()  # wrenches along a motion
+        self._counting = threading.Lock()
+
+    def _measured_at(self, t: Array) -> Array:
+        """Velocities (k, 6) between those measured."""
+        good = np.isfinite(self.streams.nu).all(axis=1)
+        return interpolated(self.streams.t[good], self.streams.nu[good], t)
+
+    @property
+    def steps_simulated(self) -> float:
+        """For each second of data, so far; data count as if they came at _COUNTED_RATE at most."""
+        t, first, last = self.steps.t, self.first, self.last
+        rate = float(np.sum(last - first) / np.sum(t[last] - t[first]))
+        return self._simulations * min(rate, _COUNTED_RATE)
+
+    def stop(self) -> None:
+        """Every further simulation, in any thread, raises CancelledError."""
+        self._stopped = True
+
+    def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+        """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
+        inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
+        key = tuple(sorted(inputs.items()))
+        known = self._thrusts.get(key)
+        if known is None:
+            if len(self._thrusts) > _REMEMBERED_THRUSTS:
+                self._thrusts = {}
+            known = self._thrusts[key] = thrust(self.steps, compiled(effects))
+        return known
+
+    def motion(self, h: Hypothesis, starts: Array) -> Motion | None:
+        """Simulate from initial velocities (W, 6); None where that diverges, or where the mass
+        matrix is not positive definite."""
+        mass = h.model.mass_matrix
+        if not np.isfinite(list(h.values.values())).all() or np.linalg.eigvalsh(mass)[0] <= 0.0:
+            return None
+        wrench = self.thrust(h.effects)
+        for key, value in h.values.items():
+            if key in self.patterns:
+                wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
+        if self._stopped:
+            raise CancelledError
+        with self._counting:
+            self._simulations += 1
+        equations = guided_by(h.equations, self.guided)
+        motion = shoot(equations, self.steps, wrench, self.first, self.last, starts)
+        return motion if np.isfinite(motion.nu[self.nodes]).all() else None
+
+    def columns(self, h: Hypothesis, motion: Motion, keys: Sequence[Key]) -> Array:
+        """How the wrench on the vehicle changes with each parameter, (K, 6, P)."""
+        out = np.zeros((len(motion.middle), 6, len(keys)))
+        place = {key: i for i, key in enumerate(keys)}
+        names = [n for section, n in keys if section == COEFFICIENTS]
+        if names:
+            found = sorted((parse(n) for n in names), key=lambda c: not c.is_added_mass)
+            model = Model(h.model.body, tuple(found), np.zeros(len(found)))
+            at, eq = [place[COEFFICIENTS, c.name] for c in found], h.equations.acting
+            out[:, :, at] = regressors(equations(model, eq), self._relative(h, motion))
+        for key in keys:
+            if key in self.patterns:
+                out[:, :, place[key]] = self.patterns[key]
+        for section in dict.fromkeys(s for s, _ in keys if s in EFFECTS):
+            effect = EFFECTS[section]
+            mine = [p for p in effect.parameters if (section, p.name) in place]
+            # parameters of single axes act apart: one difference quotient for all of them
+            groups = [[p] for p in mine if not p.axis] + [[p for p in mine if p.axis]]
+            for group in filter(None, groups):
+                change = self._difference(h, motion, effect, group)
+                for p in group:
+                    axes = AXES.index(p.axis) if p.axis else slice(None)
+                    out[:, axes, place[section, p.name]] = change[:, axes]
+        return out
+
+    def _relative(self, h: Hypothesis, motion: Motion) -> Motion:
+        """The motion through the water, where there is a current."""
+        water = h.equations.acting.water
+        if not water.any():
+            return motion
+        drift = np.einsum("kji,j->ki", self.steps.middle, water)
+        turning = np.cross(motion.middle[:, 3:], drift)
+        zero = np.zeros_like(drift)
+        return motion._replace(
+            middle=motion.middle - np.hstack([drift, zero]),
+            nu_dot=motion.nu_dot + np.hstack([turning, zero]),
+        )
+
+    def _wrenches(
+        self, h: Hypothesis, effects: Mapping[str, Mapping[str, float]], motion: Motion
+    ) -> Array:
+        """Wrench effects and current (K, 6) along a motion; remembered for the last one."""
+        acting = compiled(effects)
+        key = (acting.wrench_parameters.tobytes(), acting.water.tobytes())
+        mine = self._remembered
+        if getattr(mine, "along", None) is not motion.middle:
+            mine.along, mine.wrenches = motion.middle, {}
+        known: dict[object, Array] = mine.wrenches
+        if key not in known:
+            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, motion)
+        return known[key]
+
+    def _difference(
+        self, h: Hypothesis, motion: Motion, effect: Effect, group: Sequence[EffectParameter]
+    ) -> Array:
+        """Change (K, 6) of the wrench per unit of some parameters, all moved at once."""
+        now = h.effects.get(effect.name) or h.nulls(effect.name)
+        moved, per_unit = dict(now), np.ones(6)
+        for p in group:
+            step = ONSET_STEP if p.role == "onset" else _SMALL_STEP * p.typical
+            if effect.act is not None and p.role == "amplitude":
+                step = _AMPLITUDE_STEP * p.typical
+            step = step if now[p.name] + step <= p.upper else -step
+            moved[p.name] = now[p.name] + step
+            per_unit[AXES.index(p.axis) if p.axis else slice(None)] = step
+        before, after = {**h.effects, effect.name: now}, {**h.effects, effect.name: moved}
+        if effect.act is not None:
+            change = self.thrust(after)[0] - self.thrust(before)[0]
+        elif effect.body is not None:
+            base = h.model.body
+            there = effect.body(base, **{k: moved[k] - now[k] for k in now})
+            change = _of_body(there, motion, self.steps) - _of_body(base, motion, self.steps)
+        else:
+            change = self._wrenches(h, after, motion) - self._wrenches(h, before, motion)
+        return change / per_unit
+
+    def errors(self, h: Hypothesis) -> Array:
+        """Measured minus simulated velocity (N, 6) in open loop, each window from its measured
+        state; NaN where that diverges."""
+        mean, slope = self.thrust(h.effects)
+        acting, guide = compiled(h.effects), None
+        nu = self._measured_at(self.steps.t)
+        simulated = np.full((len(self.steps.t), 6), np.nan)
+        for first, last, start in zip(self.first, self.last, self.measured_starts(), strict=True):
+            nodes = slice(first, last + 1)
+            at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
+            if self.guided.any():
+                guide = Guide(~self.guided, nu[nodes], self.orientation[nodes])
+            with contextlib.suppress(UserError):
+                simulated[nodes] = simulate(
+                    h.model, self.steps.t[nodes], mean[at], start,
+                    orientation=self.orientation[first], wrench_slope=slope[at], guide=guide,
+                    effects=acting,
+                ).nu  # fmt: skip
+        return self.measured - simulated[self.nodes]
+
+    def measured_starts(self) -> Array:
+        """The measured velocity (W, 6) at the beginning of each window."""
+        at = np.flatnonzero(np.diff(self.window, prepend=-1))
+        return self.measured[at].copy()
+
+
+def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:
+    """What the rigid body adds to the wrench side of the equations, (K, 6)."""
+    mass, (v, omega) = body.mass_matrix, np.hsplit(motion.middle, 2)
+    linear, angular = np.hsplit(motion.middle @ mass.T, 2)
+    coriolis = np.hstack([np.cross(omega, linear), np.cross(omega, angular) + np.cross(v, linear)])
+    wrench: Array = steps.middle[:, 2] @ body.restoring.T - motion.nu_dot @ mass.T - coriolis
+    return wrench
+
+
+def _subdivided(t: Array) -> Array:
+    """The instants t and as many between them that no step is longer than MAX_STEP, gaps aside."""
+    length = np.diff(t)
+    count = np.where(length > _MAX_GAP, 1, np.ceil(length / MAX_STEP - 1e-6)).astype(int)
+    count = np.maximum(count, 1)
+    at = np.repeat(np.arange(len(length)), count)
+    part = np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)
+    return np.append(t[at] + part * length[at] / count[at], t[-1])
+
+
+def within(spans: Iterable[tuple[float, float]], t: Array) -> NDArray[np.bool_]:
+    """Which of the instants t (k,) lie in one of the spans (from and to [s])."""
+    out: NDArray[np.bool_] = np.zeros(len(t), dtype=bool)
+    for begin, end in spans:
+        out |= (t >= begin) & (t < end)
+    return out

@@ -1,0 +1,97 @@
+"""What the innovations of an estimator tell about noise, outliers and changes of the vehicle.
+
+One monitor an axis, the same for both estimators. It takes in each normalised innovation, in its
+standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mean if all is well.
+
+* *Process noise.* The density of an unexplained acceleration is found from the innovations (Mehra
+  1972; Myers and Tapley 1976): a wrong structure then widens the intervals instead of being learnt
+  as a coefficient. It starts high and comes down: what an estimator learns with too little process
+  noise weighs too much for ever. Innovations are added up over a second: what they have in common
+  is process noise, while each alone is nearly all the sensor's.
+* *A change of the vehicle* is a NIS that stays large in the average over two seconds.
+* *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
+  it was the wrench: the velocity is lost, and begun anew from the measurement.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.jit import inlined, record
+
+# "Constants of the process noise" and "Forgetting" are tables of docs/accuracy.md.
+SUM_TIME = 1.0  # s; over which innovations are added up ("Constants of the process noise")
+FIRST_TIME, TIME = 1.0, 20.0  # s; twice the power doubles the density: at first, later (same table)
+_FASTEST = 0.1  # the most by which one innovation moves an average: ten are needed for anything
+STEADY = 4.0  # a squared sum counts for at most this: 2 sigma, beyond which 5 % of normal ones are
+LARGEST = 3.0  # sigma that one innovation counts for at most: 0.3 % of normal ones are larger
+NIS_TIME = 2.0  # s; over which the NIS is averaged ("Forgetting")
+_LOST = 2  # outliers in a row: by chance as rare as the square of the share of outliers
+
+MONITOR = record(
+    [
+        ("density", "f8"),  # of the unexplained acceleration, (m/s2)^2/Hz or (rad/s2)^2/Hz
+        ("acting", "f8"),  # the same with the noise of the wrench: set by the estimator; 0: unknown
+        ("summed", "f8"),  # normalised innovations added up with fading memory
+        ("expected", "f8"),  # variance of that
+        ("since", "f8"),  # s since this velocity was measured: counted by the estimator
+        ("seen", "f8"),  # s of innovations so far
+        ("nis", "f8"),  # averaged: 1 is expected
+        ("outliers", "i8"),  # in a row: of linear and of angular velocity, with their first axes
+    ]
+)
+"""What is known of one axis."""
+
+
+def first_monitor(process: NDArray[np.void]) -> NDArray[np.void]:
+    """(6,) of MONITOR, before any innovation; ``process`` (1,) of PROCESS."""
+    out = np.zeros(6, dtype=MONITOR)
+    out["density"] = np.maximum(process["first"][0], process["floor"][0])
+    out["nis"] = 1.0
+    return out
+
+
+@inlined
+def interrupt(m):
+    """After a gap the sum of innovations begins anew; density and NIS stay."""
+    m.summed = 0.0
+    m.expected = 0.0
+    m.since = 0.0
+
+
+@inlined
+def watch(m, process, i, room, moving, gate, innovation):
+    """Take in a normalised innovation of axis i; whether it is an outlier.
+
+    ``room`` is the power of summed innovations from which process noise is added; 1 is expected.
+    Noise that is added by chance does not go below the floor by chance: the less room, the more
+    information is lost to that, and the better the intervals where the model is wrong. Where no
+    velocity is ``moving`` (on the ground, on deck), what holds the vehicle says nothing of a dive.
+    """
+    nis = innovation * innovation
+    # a single kick counts for no more than LARGEST: what has changed shows again and again
+    counted = min(nis if moving else 1.0, LARGEST**2)
+    m.nis += min(m.since / NIS_TIME, 1.0) * (counted - m.nis)
+    if moving:
+        keep = np.exp(-m.since / SUM_TIME)
+        m.seen += m.since
+        m.summed = keep * m.summed + min(max(innovation, -LARGEST), LARGEST)
+        m.expected = keep * keep * m.expected + 1.0
+        excess = min(m.summed * m.summed / m.expected, STEADY) - room
+        blend = min(m.since / min(FIRST_TIME + 0.25 * m.seen, TIME), _FASTEST)
+        density = max(m.density + blend * excess * m.acting, process.floor[i])
+        m.density = min(density, process.largest[i])
+        m.since = 0.0
+    else:
+        interrupt(m)
+    return nis > gate * gate
+
+
+@inlined
+def lost(monitor, first, outlier):
+    """Whether the linear (first = 0) or angular velocity (3) is lost, after one more measurement.
+
+    ``outlier``: whether that is refused, as one of its components is an outlier.
+    """
+    m = monitor[first]
+    m.outliers = m.outliers + 1 if outlier else 0
+    return m.outliers >= _LOST

@@ -1,0 +1,342 @@
+"""An online estimator as node, replay and offline fit use it: messages in, reports out."""
+
+import math
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config, load
+from rov_ident.config.prior import prior_of
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array, Message
+from rov_ident.core.states import CONTRADICTED, Level, State, is_known
+from rov_ident.core.threads import one_blas_thread
+from rov_ident.effects import EFFECTS
+from rov_ident.estimation import rls, ukf
+from rov_ident.estimation.physical import Estimate, physical
+from rov_ident.estimation.shared import INFO
+from rov_ident.sampling.sample import believed
+from rov_ident.sampling.sampler import Sampler
+
+Kind = Literal["rls", "ukf"]
+
+CENTRING_TIME = 1.0
+"""s; the sampler takes over the estimated parameters of effects this often. A choice: these take
+many seconds to be learnt, and each time costs a report, which is slower than a step."""
+EXCITATION_TIME = 20.0
+"""s; the present excitation is that of this window and of the one before. A definition, published:
+long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
+_EXCITED = 0.05  # of the prior variance that this motion alone would remove; page.js has the same
+_QUANTILE = 1.959963984540054  # of the normal distribution, 97.5 %
+
+
+ESTIMATORS: dict[Kind, ModuleType] = {"rls": rls, "ukf": ukf}
+"""Each has problem, init, fold, step, estimate, variance and condition; and REASONS, USED and
+REFUSALS for the ``reason`` of INFO."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The coefficients as they may be published: finite, and physical as a whole.
+
+    Arrays are (n,) in the order of ``names``; covariance (n, n). ``stamp`` [ns] is the time of the
+    last sample used, 0 before the first. ``excitation`` is the share of the prior variance that the
+    motion of the last 20 to 40 seconds would remove by itself. ``condition`` is that of the
+    information's root in prior units: 1 before any data, and an estimate has some
+    ``16 - log10(condition)`` digits; NaN where it is not known.
+    """
+
+    stamp: int
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    std: Array
+    lower: Array
+    upper: Array
+    covariance: Array
+    excitation: Array
+    states: tuple[State, ...]
+    messages: tuple[str, ...]
+    condition: float = math.nan
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        return tuple(state.level for state in self.states)
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        return dict(zip(self.names, self.values.tolist(), strict=True))
+
+    @property
+    def effects(self) -> dict[str, float]:
+        """The parameters of effects, by names such as thruster_lag.time_constant."""
+        return {name: value for name, value in self.by_name.items() if "." in name}
+
+
+class Memory(NamedTuple):
+    """All that is learnt: the estimator's State, what :class:`OnlineEstimator` keeps beside it,
+    the kinematic filter's state; and the ``stamp`` [ns] of the last sample used."""
+
+    state: Any
+    gained: Array
+    window: Array
+    variance: Array
+    safe: Array
+    kinematics: NDArray[np.void]
+    stamp: int
+
+
+class Monitor(Protocol):
+    """What looks for effects that the model lacks: see :mod:`rov_ident.discrepancy.monitor`."""
+
+    @property
+    def suspicions(self) -> Sequence[Any]: ...
+    def reset(self) -> None: ...
+    def take(
+        self, samples: NDArray[np.void], commands: list[tuple[float, Array]]
+    ) -> tuple[NDArray[np.void], Array] | None: ...
+    def look(self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float]) -> None: ...
+
+
+class OnlineEstimator:
+    """Sampler and estimator in one: :meth:`push` messages, ask for a :meth:`report` at any time.
+
+    ``config`` is the path of a parameter file, or a Config; ``kind`` is "rls" or "ukf". ``counts``
+    tells how many messages and samples were used and, by reason, refused.
+
+    Raises
+    ------
+    UserError
+        If the parameter file is wrong, or there is no such estimator.
+    """
+
+    def __init__(self, config: str | os.PathLike[str] | Config, kind: Kind) -> None:
+        config = load(config)
+        if kind not in ESTIMATORS:
+            raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")
+        self.config = config
+        self.kind = kind
+        self.prior = prior_of(config, effects=True)
+        self._module = ESTIMATORS[kind]
+        self._task = self._module.problem(config)
+        self.sampler = Sampler(config)
+        self.monitor: Monitor | None = None
+        self._enabled = True
+        self._paused = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the prior; the input buffers and counts go on."""
+        self._state = self._module.init(self._task)
+        self._last_t = math.nan
+        self._recalled = 0  # ns: the stamp before the first sample
+        self._centred = -math.inf
+        # information over the prior's: in the window that is filling, and in the one before
+        self._gained = np.zeros((2, len(self.prior.names)))
+        self._window = np.zeros(1)  # s of the window that is filling
+        estimate: Estimate = self._module.estimate(self._task, self._state, self.prior)
+        self._variance = estimate.std**2
+        self._sample_counts: Counter[str] = Counter()
+        self._safe = self.prior.mean.copy()
+        if self.config.estimate_effects:
+            self.sampler.recentre(self.config)
+        if self.monitor is not None:
+            self.monitor.reset()
+        self._origin = self.memory()
+
+    def configure(self, config: Config) -> None:
+        """Take other settings of the same model and coefficients; what is learnt stays."""
+        self.config = config
+        self._task = self._module.problem(config)
+        self.sampler.configure(config)
+        self._centred = -math.inf
+
+    def attach(self, monitor: Monitor) -> None:
+        """Let a monitor see from now on what the estimator sees."""
+        self.sampler.commands = []
+        self.monitor = monitor
+
+    @property
+    def enabled(self) -> bool:
+        """Whether samples are used; the inputs are followed all the same."""
+        return self._enabled
+
+    @enabled.setter
+    def enabled(self, value: bool) -> None:
+        self._paused = self._paused or not value
+        self._enabled = value
+
+    @property
+    def counts(self) -> Counter[str]:
+        return self.sampler.counts + self._sample_counts
+
+    @property
+    def state(self) -> object:
+        """The estimator's state, for a comparison."""
+        return self._state
+
+    def push(self, role: str, message: Message) -> NDArray[np.void]:
+        """Take one message as it is on the wire; INFO (k,) of the samples this completed.
+
+        ``role`` is "odom" with an Odometry, "imu" with an Imu, "wrench" with a Wrench; their axes
+        follow from their frame ids and the configuration, as under ROS. What is wrong with a
+        message is counted, not raised.
+        """
+        return self.take(self.sampler.push(role, message))
+
+    def flush(self) -> NDArray[np.void]:
+        """The input has ended or stopped: use what still waits for a late topic."""
+        return self.take(self.sampler.flush())
+
+    @one_blas_thread()
+    def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
+        """Fold samples (k,) into the estimate unless disabled; INFO (k,)."""
+        if len(samples) == 0 or not self._enabled:
+            return np.zeros(0, dtype=INFO)
+        if samples["anew"].any():
+            samples = believed(samples)
+            self._begin_with(self._origin)
+            if self.monitor is not None:
+                self.monitor.reset()
+        if self._paused:
+            samples = samples.copy()
+            samples["restart"][0] = True
+            self._paused = False
+        self._state, info = self._module.fold(self._task, self._state, samples)
+        self._last_t = float(samples["t"][-1])
+        for reason in self._module.REFUSALS:
+            if count := int(np.count_nonzero(info["reason"] == reason)):
+                self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
+        self._follow_excitation(float(samples["dt"].sum()))
+        if self.config.estimate_effects and abs(self._last_t - self._centred) >= CENTRING_TIME:
+            self._centred = self._last_t
+            self._recentre()
+        if self.monitor is not None and self.sampler.commands is not None:
+            window = self.monitor.take(samples, self.sampler.commands)
+            if window is not None:
+                self.monitor.look(window, self.report().by_name)
+        return info
+
+    def _recentre(self) -> None:
+        """Have the sampler take over the parameters of effects as they are estimated now."""
+        # The rigid body is the estimator's own, and what acts on it all but linear.
+        found = {
+            name: value
+            for name, value in self.report().effects.items()
+            if EFFECTS[name.partition(".")[0]].body is None
+        }
+        self.sampler.recentre(self.config.with_values(found))
+
+    def memory(self) -> Memory:
+        """What is learnt so far, for `checkpoint`. The arrays are not to be changed.
+
+        The velocity is not worth keeping: who recalls it begins with a measured one.
+        """
+        return Memory(
+            self._state,
+            self._gained.copy(),
+            self._window.copy(),
+            self._variance,
+            self._safe,
+            self.sampler.kinematic_filter.state.copy(),
+            self.stamp,
+        )
+
+    def recall(self, memory: Memory) -> None:
+        """Go on from what another run of the same configuration has learnt.
+
+        Raises
+        ------
+        UserError
+            If the numbers make no estimate; then nothing has changed.
+        """
+        estimate: Estimate = self._module.estimate(self._task, memory.state, self.prior)
+        if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
+            raise UserError("its numbers are not finite")
+        self.reset()
+        self._origin, self._recalled = memory, memory.stamp
+        self._begin_with(memory)
+        self.sampler.kinematic_filter.begin_with(memory.kinematics)
+        self._paused = True  # whatever has happened in between
+        if self.config.estimate_effects:
+            self._recentre()
+
+    def _begin_with(self, memory: Memory) -> None:
+        """Know what is in the memory and nothing else."""
+        self._state, self._centred = memory.state, -math.inf
+        self._gained, self._window = memory.gained.copy(), memory.window.copy()
+        self._variance, self._safe = memory.variance, memory.safe
+
+    def _follow_excitation(self, elapsed: float) -> None:
+        """Information gained per coefficient, in windows of EXCITATION_TIME."""
+        variance: Array = self._module.variance(self._task, self._state)
+        gained = self.prior.std**2 * (1.0 / variance - 1.0 / self._variance)
+        self._gained[0] += np.maximum(gained, 0.0)
+        self._variance = variance
+        self._window += elapsed
+        if self._window >= EXCITATION_TIME:
+            self._gained[1], self._gained[0] = self._gained[0], 0.0
+            self._window[0] = 0.0
+
+    @one_blas_thread()
+    def report(self) -> Report:
+        """The present coefficients, made physical, with their state in words."""
+        raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
+        values = physical(self.config.dynamics, self.prior, raw)
+        diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
+        if diverged:
+            values, std = self._safe, self.prior.std
+            covariance = np.diag(std**2)
+        else:
+            self._safe, std, covariance = values, raw.std, raw.covariance
+        gained = self._gained.sum(axis=0)
+        excitation = gained / (1.0 + gained)
+        judged = [
+            (State.DIVERGED, "diverged: the last good value is held, call reset")
+            if diverged
+            else self._judge(i, values, std, raw.values, excitation)
+            for i in range(len(values))
+        ]
+        # A bound cuts the interval too: no part of it is physically possible.
+        upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
+        upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
+        return Report(
+            self.stamp,
+            self.prior.names,
+            self.prior.units,
+            values,
+            std,
+            np.maximum(values - _QUANTILE * std, self.prior.lower),
+            upper,
+            covariance,
+            excitation,
+            tuple(state for state, _ in judged),
+            tuple(text for _, text in judged),
+            self._module.condition(self._task, self._state),
+        )
+
+    @property
+    def stamp(self) -> int:
+        """Of the last sample used [ns], also before a checkpoint; 0: of none."""
+        if math.isnan(self._last_t) or self.sampler.origin is None:
+            return self._recalled
+        return self.sampler.origin + round(self._last_t * 1e9)
+
+    def _judge(
+        self, i: int, values: Array, std: Array, raw: Array, excitation: Array
+    ) -> tuple[State, str]:
+        """The state of a coefficient, and a message that begins with the word for it."""
+        if abs(raw[i] - values[i]) > CONTRADICTED * std[i]:
+            return State.AT_BOUND, "at bound: held at its physical bound, the data contradict it"
+        excited = excitation[i] >= _EXCITED
+        if is_known(values[i], std[i], self.prior.std[i]):
+            return State.CONVERGED, "converged" if excited else "converged: not excited now"
+        if excited:
+            return State.CONVERGING, "converging"
+        return State.HELD, "held: not excited, the motion does not show it"

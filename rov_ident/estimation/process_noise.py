@@ -1,0 +1,57 @@
+"""What moves the vehicle besides the model, as process noise: one definition for both estimators.
+
+Two parts. The noise of the thruster wrench is configured (``wrench``). What the model lacks is not
+known beforehand: it starts high and follows the innovations (``innovation_monitor``).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.jit import inlined, record
+from rov_ident.model.scales import authority
+
+# docs/accuracy.md: "The floor of the process noise and its first value"
+FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
+LARGEST_FORCE = 0.3  # at most: with more, 30 % of a coefficient would not show in a second
+
+PROCESS = record(
+    [
+        ("first", "f8", (6,)),  # variance density of the unexplained acceleration to begin with
+        ("floor", "f8", (6,)),  # its least
+        ("largest", "f8", (6,)),  # and its most
+        ("relative", "f8"),  # variance of the wrench relative to its square
+        ("least", "f8", (6,)),  # its variance at zero wrench
+        ("lasting", "f8"),  # s; how long an error of it lasts, at least
+    ]
+)
+"""What does not change: see :func:`process`."""
+
+
+def process(config: Config) -> NDArray[np.void]:
+    """The constants (1,) of PROCESS that a configuration asks for."""
+    model, wrench = config.dynamics, config.wrench
+    out = np.zeros(1, dtype=PROCESS)
+    # the acceleration of a force that lasts a second has this density
+    working = authority(model) / np.diag(model.mass_matrix)
+    out["first"] = np.square(FIRST_FORCE * working)
+    out["floor"] = np.square(config.process_std)
+    out["largest"] = np.maximum(out["floor"], np.square(LARGEST_FORCE * working))
+    out["relative"] = wrench.relative_std**2
+    out["least"] = np.square(wrench.floor_std)
+    out["lasting"] = wrench.correlation_time
+    return out
+
+
+@inlined
+def wrench_noise(constants, sample, out):
+    """out (6,): variance density [N2 s, (N m)2 s] of the wrench; an error lasts as long as it.
+
+    Whether some of the wrench is in doubt, so that nothing about noise can be learnt.
+    """
+    lasting, doubtful = max(constants.lasting, sample.hold), False
+    for i in range(6):
+        known = constants.relative * sample.wrench[i] ** 2 + constants.least[i]
+        out[i] = lasting * (known + sample.wrench_doubt[i])
+        doubtful |= sample.wrench_doubt[i] > 0.0
+    return doubtful

@@ -1,0 +1,144 @@
+"""What the two recursive estimators share beside their process noise and the published residual."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.config.prior import prior_of, theta_of
+from rov_ident.core.jit import inlined, inner, record
+from rov_ident.core.messages import Array
+from rov_ident.estimation.process_noise import process
+from rov_ident.model.equations import Structure
+
+MAX_STEP = 0.05  # s; of one step of the prediction
+LIGHTEST = 0.2  # of the rigid body's own inertia: no model that is tried is lighter
+FASTEST = 50.0  # m/s, rad/s; no sane model gets there
+LAG = 4.0  # s; of the window over the score's correlation
+RELEARNING_TIME = 20.0  # s; after a change: coefficients become as uncertain as at first
+REACH = 10.0  # prior standard deviations, which no coefficient is off; for RLS's observer alone
+
+INFO = record(
+    [
+        ("t", "f8"),
+        ("reason", "i8"),  # index into the estimator's REASONS
+        ("residual", "f8", (6,)),  # N, N m: filtered wrench, measured minus model
+        ("nis", "f8", (6,)),  # normalised innovation squared: 1 in the mean is expected
+        ("forgetting", "f8"),
+        ("condition", "f8"),  # as of condition(), before the sample; NaN: not looked at
+    ]
+)
+"""What happened to a sample."""
+
+
+class Problem(NamedTuple):
+    """What does not change from sample to sample."""
+
+    settings: NDArray[np.void]  # (1,) of the estimator's own record
+    process: NDArray[np.void]  # (1,) of PROCESS
+    structure: Structure
+    estimated: NDArray[np.int64]  # (n,) indices into theta
+    theta: Array  # (m,) values of all coefficients: the prior of the estimated, the held others;
+    # behind them the estimated parameters of effects
+    scale: Array  # (n,) prior standard deviations
+    start: Array  # (n,) prior means over those
+    highest: Array  # (n,) scaled deviation that the coefficients of RLS's observer do not exceed
+    walk: Array  # (n,) variance density of the UKF's random walk of scaled coefficients, 1/s
+    rigid_body: Array  # (6, 6)
+    restoring: Array  # (6, 3)
+    lightest: Array  # (6,) least pivots of a mass matrix: no hull with added mass is touched
+
+
+def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Problem:
+    """The constants that a configuration asks for; ``settings`` are the fields of ``record``."""
+    body, structure, prior = config.dynamics.body, config.dynamics.structure, prior_of(config, True)
+    values = np.zeros(1, dtype=record)
+    for name, value in {**settings, "corner": config.residual_corner}.items():
+        values[name] = value
+    start = prior.mean / prior.std
+    return Problem(
+        values,
+        process(config),
+        structure,
+        prior.estimated,
+        theta_of(config),
+        prior.std,
+        start,
+        np.where(prior.negative, np.minimum(-start, REACH), REACH),
+        (config.ukf.random_walk * prior.mean / prior.std) ** 2 / 3600.0,
+        body.mass_matrix,
+        body.restoring,
+        LIGHTEST * np.diag(np.linalg.cholesky(body.mass_matrix)) ** 2,
+    )
+
+
+@inner
+def begin(info, sample):
+    """Nothing has happened yet to the sample: whether nothing in it would spoil a state.
+
+    NaN where not measured is no harm.
+    """
+    info.t = sample.t
+    info.forgetting = 1.0
+    info.condition = np.nan
+    for i in range(6):
+        info.residual[i] = np.nan
+        info.nis[i] = np.nan
+    total = sample.t + sample.dt
+    for i in range(6):
+        total += sample.nu[i] + sample.wrench[i] + sample.wrench_slope[i]
+    for i in range(3):
+        total += sample.down[i] + sample.down_slope[i]
+    return np.isfinite(total)
+
+
+@inlined
+def measure(sample, z, r):
+    """Measured velocities z (6,), NaN where there is none, and their variances r (6,).
+
+    Where there is a gyro, the odometry's own rates are not used: mostly they are the same gyro.
+    """
+    for i in range(6):
+        z[i], r[i] = sample.odometry[i], sample.odometry_variance[i]
+        if i >= 3 and np.isfinite(sample.gyro[i - 3]):
+            z[i], r[i] = sample.gyro[i - 3], sample.gyro_variance
+        if not (np.isfinite(z[i]) and np.isfinite(r[i])):
+            z[i] = np.nan
+
+
+@inlined
+def wrench_of(theta, sample, side, wrench):
+    """wrench (6,) that acts, with the parameters of effects, the last of theta (m, 1), as they are.
+
+    ``side`` (13, k) is how the sample depends on these (:func:`rov_ident.sampling.sample.parts`).
+    """
+    k = side.shape[1]
+    first = len(theta) - k
+    for i in range(6):
+        wrench[i] = sample.wrench[i]
+        for j in range(k):
+            wrench[i] += side[i, j] * (theta[first + j, 0] - side[12, j])
+
+
+@inlined
+def steps_of(dt):
+    """Into how many steps an interval is divided."""
+    return max(1, int(np.ceil(dt / MAX_STEP - 1e-9)))
+
+
+@inlined
+def add_score(g, lagged, score, since):
+    """Add g (n,) to the covariance (n, n) of the summed score, its correlation in time included.
+
+    With an exponential lag window (Newey and West 1987), of which ``lagged`` (n,) holds the past;
+    the last g was ``since`` seconds ago.
+    """
+    n, decay = len(lagged), np.exp(-since / LAG)
+    for a in range(n):
+        lagged[a] *= decay
+    for a in range(n):
+        for b in range(n):
+            score[a, b] += g[a] * (g[b] + lagged[b]) + lagged[a] * g[b]
+    for a in range(n):
+        lagged[a] += g[a]

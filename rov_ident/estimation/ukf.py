@@ -1,0 +1,622 @@
+"""Unscented Kalman filter over body velocities and coefficients: ``init``, ``step``, ``fold``.
+
+State ``x = [nu (6), xi (n)]`` with ``theta = scale xi``, the scale being the prior's standard
+deviation: linear, or early information would be reinterpreted whenever xi moves. Signs are for what
+leaves the filter (`physical`); inside, a sigma point's mass matrix is kept positive definite.
+
+Prediction: scaled sigma points (van der Merwe 2004; as in filterpy) through Runge-Kutta steps of
+the equations of motion, LANES points side by side. The coefficients do not move and the measurement
+is linear, so of the 2 (6 + n) + 1 points only the velocities are summed, as differences from the
+centre point: with e = mean - centre and W the weight of an outer point
+
+    cov = W sum(delta delta') + (beta - alpha^2) e e'
+
+in which the huge central weight has cancelled exactly.
+
+Update: odometry and gyro measure nu with independent noise, so one component after another is the
+same as all at once; the covariance takes three of them together.
+
+Coefficients whose motion is not well above its noise are *considered*, not estimated (Schmidt
+1966): they stay what they are, their uncertainty is carried along. The others walk only on
+evidence: while the innovations are larger than they should be, variances grow, up to the prior's.
+(``ukf.random_walk`` lets them walk all the time.)
+
+*Standard deviations* do not assume white innovations: the covariance of their summed influence on
+the coefficients, with its correlation in time, stands between two covariances of the filter (the
+sandwich of Newey and West 1987, with an exponential lag window).
+"""
+
+from collections import namedtuple
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.config.prior import Prior, prior_of
+from rov_ident.core.jit import copy, floats, inlined, inner, kernel, record, reordered
+from rov_ident.core.messages import Array
+from rov_ident.core.runge_kutta import NODES, runge_kutta
+from rov_ident.estimation.innovation_monitor import first_monitor, interrupt, lost, watch
+from rov_ident.estimation.mass_inverse import invert_mass
+from rov_ident.estimation.observer import force_of
+from rov_ident.estimation.physical import Estimate, calibrated
+from rov_ident.estimation.process_noise import wrench_noise
+from rov_ident.estimation.shared import (
+    FASTEST,
+    INFO,
+    RELEARNING_TIME,
+    Problem,
+    add_score,
+    begin,
+    measure,
+    problem_of,
+    steps_of,
+    wrench_of,
+)
+from rov_ident.estimation.square_root import cholesky, cholesky_solve, multiply
+from rov_ident.estimation.wrench_residual import filtered_residual
+from rov_ident.model.coefficients import EXTENDED_SIZE
+from rov_ident.model.equations import (
+    add_added_mass,
+    generalized_force,
+    in_motion,
+    symmetric_product,
+)
+from rov_ident.sampling.sample import parts
+
+USED, RESTARTED, GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE = range(6)
+REASONS = (
+    "used", "restarted after a gap", "outlier", "not finite", "covariance repaired",
+    "no model moves so",
+)  # fmt: skip
+REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
+
+LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
+_PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
+_ROOM = 1.5  # for innovation_monitor.watch ("Constants of the process noise" in docs/accuracy.md)
+
+# square root of the state's size + lambda (van der Merwe 2004), weight of an outer sigma point,
+# beta - alpha^2; gate, NIS from which the vehicle has changed; corner of the residual [rad/s]
+_SETTINGS = record(floats((), "spread weight centre gate changed corner"))
+# s; "since" is the time since the coefficients walked
+_SCALARS = record([*floats((), "t since"), ("started", "?")])
+
+
+class State(NamedTuple):
+    """All that the next step needs."""
+
+    x: Array  # (6 + n,)
+    p: Array  # (6 + n, 6 + n)
+    residual: Array  # (4, 6): stage 1, stage 2, last input, last momentum of the published residual
+    monitor: NDArray[np.void]  # (6,) of MONITOR: of the innovations
+    score: Array  # (n, n): covariance of the summed influence of the innovations, and of the prior
+    lagged: Array  # (n,): that influence of late, under the lag window
+    before: Array  # (n,): xi when it was last summed
+    scalars: NDArray[np.void]  # (1,)
+
+
+def problem(config: Config) -> Problem:
+    """The constants of the estimation that a configuration asks for."""
+    u = config.ukf
+    reach = u.alpha**2 * (6 + len(prior_of(config, effects=True).names) + u.kappa)
+    return problem_of(
+        config, _SETTINGS, spread=np.sqrt(reach), weight=0.5 / reach, centre=u.beta - u.alpha**2,
+        gate=u.gate, changed=u.change_threshold,
+    )  # fmt: skip
+
+
+def init(task: Problem) -> State:
+    """Nothing learnt: the prior; the velocity is taken from the first measurement."""
+    n = len(task.scale)
+    return State(
+        np.concatenate([np.zeros(6), task.start]),
+        np.eye(6 + n),
+        np.zeros((4, 6)),
+        first_monitor(task.process),
+        np.eye(n),
+        np.zeros(n),
+        task.start.copy(),
+        np.zeros(1, dtype=_SCALARS),
+    )
+
+
+def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
+    """:func:`step` over samples (k,) of SAMPLE; info (k,) of INFO. The given state is unchanged."""
+    state = State(*(part.copy() for part in state))
+    info = np.zeros(len(samples), dtype=INFO)
+    _fold(task, state, *parts(samples), info)
+    return state, info
+
+
+def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
+    """One sample (1,) of SAMPLE; the next state and what happened (1,) of INFO."""
+    assert len(sample) == 1
+    return fold(task, state, sample)
+
+
+def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
+    """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
+    return Estimate(
+        prior.names,
+        task.scale * state.x[6:],
+        calibrated(state.p[6:, 6:], state.score) * np.outer(task.scale, task.scale),
+        float(state.scalars["t"][0]),
+    )
+
+
+def variance(task: Problem, state: State) -> Array:
+    """Variances (n,) of the filter, in squared units: what excitation is judged by."""
+    variances: Array = np.diag(state.p)[6:] * task.scale**2
+    return variances
+
+
+def condition(task: Problem, state: State) -> float:
+    """Condition number of the information's root as `condition` has it."""
+    return float(np.sqrt(np.linalg.cond(state.p[6:, 6:], 1)))
+
+
+# ------------------------------------------------------------------ kernels
+
+_SCRATCH = record(
+    [
+        # sigma points, and the forces on them; "push" is the wrench that parameters of effects add
+        *floats((6, LANES), "nu h stage nu_dot total push"),
+        *floats((6, 6, LANES), "mass inverse"),  # of the inverse the lower half
+        *floats((EXTENDED_SIZE, LANES), "extended"),
+        ("centre_inverse", "f8", (6, 6)),
+        # nu of the centre point, mean minus centre; wrench minus restoring in mid-interval, and its
+        # slope; variance density of the wrench; nu as measured, its variance
+        *floats((6,), "centre shift force slope strength z r"),
+        # of the estimate, for the residual
+        *floats((6,), "wrench"),
+        *floats((6, 1), "one_nu one_h"),
+        *floats((6, 6, 1), "one_mass"),
+        *floats((EXTENDED_SIZE, 1), "one_extended"),
+    ]
+)
+
+
+Work = namedtuple("Work", "p upper root moved cross gain block free moves theta mean scratch")
+"""Scratch for all samples of a fold. Zeros fill the rows of matrices to a multiple of LANES."""
+
+
+@inlined
+def _work(task, state):
+    size, m = len(state.x), len(task.theta)
+    columns = LANES * (size // LANES + 1)
+    work = Work(
+        np.zeros((size, columns)),  # the covariance
+        np.zeros((size, columns)),
+        np.zeros((size, columns)),  # lower root of p; a column of zeros is the centre point
+        np.empty((2, 6, columns)),  # nu of the points on the + and - side of each column
+        np.zeros((3, columns)),
+        np.zeros((3, columns)),
+        np.zeros((3, size - 6, columns)),  # for the covariance of the coefficients alone
+        np.zeros(columns),  # 1 where a state is estimated, 0 where it is only considered
+        np.empty(m, dtype=np.bool_),
+        np.empty((m, LANES)),
+        np.empty((m, 1)),
+        np.empty(1, dtype=_SCRATCH),  # in one record, whose parts the compiler knows apart
+    )
+    copy(state.p, work.p)
+    for j in range(m):
+        work.mean[j, 0] = task.theta[j]
+        for k in range(LANES):
+            work.theta[j, k] = task.theta[j]
+    mass = work.scratch[0].mass
+    for i in range(6):
+        for j in range(6):
+            for k in range(LANES):
+                mass[i, j, k] = task.rigid_body[i, j]
+    return work
+
+
+@kernel
+def _fold(task, state, samples, sides, info):
+    work = _work(task, state)
+    _steps(task, state, work, samples, sides, info)
+    copy(work.p, state.p)
+
+
+@inner
+def _steps(task, state, work, samples, sides, infos):
+    """The fold itself, apart from what makes its arrays (:func:`rov_ident.core.jit.lean`)."""
+    c = state.scalars[0]
+    for k in range(len(samples)):
+        sample, info, side = samples[k], infos[k], sides[k if sides.shape[2] > 0 else 0]
+        if not begin(info, sample):
+            info.reason = NOT_FINITE
+            continue
+        c.t = sample.t
+        info.reason = USED
+        if sample.restart or not c.started or not sample.dt > 0.0:
+            _restart(state, work.p, sample)
+            for i in range(6):
+                state.monitor[i].nis = 1.0
+            info.reason = RESTARTED
+        else:
+            _take_root(task, work, info)
+            _move(task, state.x, work, sample, side)
+            if not _collect(task, state, work, sample):
+                info.reason = UNPREDICTABLE
+                c.started = False
+                continue
+            in_motion(task.structure, sample.moving, work.moves)
+            for e in range(len(task.theta) - side.shape[1], len(task.theta)):
+                work.moves[e] = True
+            for i in range(len(state.x)):
+                work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
+            _update(task, state, work, sample, side, info)
+            _look_back(task, state, work, sample.dt)
+        _residual(task, state, work, sample, side, info)
+
+
+@inner
+def _restart(state, p, sample):
+    """The velocity is lost, the coefficients are not: begin from the measurement."""
+    for i in range(6):
+        for j in range(len(state.x)):
+            p[i, j] = 0.0
+            p[j, i] = 0.0
+        state.x[i] = sample.nu[i]
+        variance = sample.odometry_variance[i]
+        p[i, i] = variance if variance < 1.0 else 1.0
+        interrupt(state.monitor[i])
+        state.monitor[i].outliers = 0
+    state.scalars[0].started = True
+
+
+# ---------------------------------------------------------------- prediction
+
+
+@inlined
+def _take_root(task, work, out):
+    """work.root of work.p, which is repaired where rounding has made a direction negative."""
+    p, size = work.p, len(work.p)
+    for attempt in range(3):
+        if cholesky(p, work.upper, work.root):
+            break
+        out.reason = REPAIRED
+        for i in range(size):
+            if attempt == 0:  # a little of the prior
+                p[i, i] += 1e-9
+            else:
+                for j in range(i):
+                    p[i, j] = 0.0
+                    p[j, i] = 0.0
+                p[i, i] = max(p[i, i], 1e-9)
+
+
+@inlined
+def _move(task, x, work, sample, side):
+    """Move the sigma points to the sample's time: work.moved, and the centre's inverse mass."""
+    s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
+    force_of(sample, sample.wrench, task.restoring, s.force, s.slope)
+    steps = steps_of(sample.dt)
+    dt = sample.dt / steps
+    for sign in range(2):
+        for first in range(0, columns, LANES):
+            _spread(task, x, work, first, spread if sign == 0 else -spread)
+            _push(task, work, side)
+            for k in range(steps):
+                _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt)
+            for i in range(6):
+                row = work.moved[sign, i, first : first + LANES]
+                for k in range(LANES):
+                    row[k] = s.nu[i, k]
+    for i in range(6):  # the last column is one of zeros
+        s.centre[i] = s.nu[i, LANES - 1]
+        for j in range(i + 1):
+            s.centre_inverse[i, j] = s.inverse[i, j, LANES - 1]
+            s.centre_inverse[j, i] = s.inverse[i, j, LANES - 1]
+
+
+@reordered
+def _spread(task, x, work, first, spread):
+    """Sigma points x + spread * column: their velocities, coefficients, mass matrices."""
+    s, theta, structure = work.scratch[0], work.theta, task.structure
+    for i in range(6):
+        root = work.root[i, first : first + LANES]
+        for k in range(LANES):
+            s.nu[i, k] = x[i] + spread * root[k]
+    for j in range(len(task.scale)):
+        root = work.root[6 + j, first : first + LANES]
+        e, scale, mean = task.estimated[j], task.scale[j], x[6 + j]
+        for k in range(LANES):
+            theta[e, k] = scale * (mean + spread * root[k])
+    for i in range(6):
+        for k in range(LANES):
+            s.mass[i, i, k] = task.rigid_body[i, i]
+    for c in range(len(structure.mass_row)):
+        i, j = structure.mass_row[c], structure.mass_column[c]
+        for k in range(LANES):
+            s.mass[i, j, k] = task.rigid_body[i, j]
+            s.mass[j, i, k] = task.rigid_body[i, j]
+    add_added_mass(structure, theta, s.mass)
+    invert_mass(LANES, s.mass, task.lightest, s.inverse)
+
+
+@inlined
+def _push(task, work, side):
+    """What the parameters of effects add to the wrench on the sigma points."""
+    s, first = work.scratch[0], len(task.theta) - side.shape[1]
+    for i in range(6):
+        for k in range(LANES):
+            s.push[i, k] = 0.0
+        for j in range(side.shape[1]):
+            for k in range(LANES):
+                s.push[i, k] += side[i, j] * (work.theta[first + j, k] - side[12, j])
+
+
+@reordered
+def _propagate(structure, work, late, dt):
+    """One Runge-Kutta step of the sigma points, beginning ``late`` seconds after mid-interval."""
+    s = work.scratch[0]
+    nu, reached, h, force, slope, push = s.nu, s.stage, s.h, s.force, s.slope, s.push
+    for i in range(6):
+        for k in range(LANES):
+            reached[i, k] = nu[i, k]
+            s.total[i, k] = nu[i, k]
+    for stage in range(4):
+        generalized_force(LANES, structure, s.mass, work.theta, reached, h, s.extended)
+        at = late + NODES[stage] * dt
+        a, b, c = force[0] + at * slope[0], force[1] + at * slope[1], force[2] + at * slope[2]
+        d, e, f = force[3] + at * slope[3], force[4] + at * slope[4], force[5] + at * slope[5]
+        for k in range(LANES):
+            rest = (
+                a + push[0, k] - h[0, k], b + push[1, k] - h[1, k], c + push[2, k] - h[2, k],
+                d + push[3, k] - h[3, k], e + push[4, k] - h[4, k], f + push[5, k] - h[5, k],
+            )  # fmt: skip
+            nu_dot = symmetric_product(s.inverse, rest, k)
+            for i in range(6):
+                s.nu_dot[i, k] = nu_dot[i]
+        for i in range(6):
+            runge_kutta(stage, dt, nu[i], s.nu_dot[i], reached[i], s.total[i])
+    for i in range(6):
+        for k in range(LANES):
+            nu[i, k] = s.total[i, k]
+
+
+@reordered
+def _collect(task, state, work, sample):
+    """Mean and covariance of the moved points: of nu, and of nu with the coefficients.
+
+    False where the model takes a point out of all reason.
+    """
+    s, c = work.scratch[0], task.settings[0]
+    x, p, root, plus, minus = state.x, work.p, work.root, work.moved[0], work.moved[1]
+    size, columns = p.shape
+    doubtful = wrench_noise(task.process[0], sample, s.strength)
+    speed = 0.0
+    for i in range(6):
+        total = 0.0
+        for k in range(columns):
+            speed += plus[i, k] ** 2 + minus[i, k] ** 2
+            plus[i, k] -= s.centre[i]
+            minus[i, k] -= s.centre[i]
+            total += plus[i, k] + minus[i, k]
+        s.shift[i] = c.weight * total
+    if not speed < 2 * columns * FASTEST**2:  # NaN too
+        return False
+    for i in range(6):
+        x[i] = s.centre[i] + s.shift[i]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(columns):
+                total += plus[i, k] * plus[j, k] + minus[i, k] * minus[j, k]
+            noise = state.monitor[i].density if i == j else 0.0
+            for a in range(6):
+                noise += s.centre_inverse[i, a] * s.centre_inverse[j, a] * s.strength[a]
+            # the last one stays: of the axis itself
+            state.monitor[i].acting = 0.0 if doubtful else noise
+            total = c.weight * total + c.centre * s.shift[i] * s.shift[j] + noise * sample.dt
+            p[i, j] = total
+            p[j, i] = total
+    for i in range(6):
+        for k in range(columns):
+            plus[i, k] = c.weight * c.spread * (plus[i, k] - minus[i, k])
+    for j in range(6, size):
+        for i in range(0, 6, 3):
+            u, v, w = 0.0, 0.0, 0.0
+            for k in range(columns):
+                u += plus[i, k] * root[j, k]
+                v += plus[i + 1, k] * root[j, k]
+                w += plus[i + 2, k] * root[j, k]
+            p[i, j], p[i + 1, j], p[i + 2, j] = u, v, w
+            p[j, i], p[j, i + 1], p[j, i + 2] = u, v, w
+    return True
+
+
+# ---------------------------------------------------------------- update
+
+
+@inlined
+def _update(task, state, work, sample, side, out):
+    """Linear and angular velocity, each behind its own gate."""
+    s, scratch = task.settings[0], work.scratch[0]
+    x, p, z, r = state.x, work.p, scratch.z, scratch.r
+    measure(sample, z, r)
+    moving, anew = False, False
+    for i in range(6):
+        for j in range(side.shape[1]):
+            z[i] += side[6 + i, j] * side[12, j]
+        state.monitor[i].since += sample.dt
+        moving |= sample.moving[i] != 0
+    for first in (0, 3):
+        if not np.isfinite(z[first] + z[first + 1] + z[first + 2]):
+            continue
+        outlier = False
+        for i in range(first, first + 3):
+            predicted, spread = _seen(task, x, p, side, i)
+            innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
+            out.nis[i] = innovation**2
+            outlier |= watch(
+                state.monitor[i], task.process[0], i, _ROOM, moving, s.gate, innovation
+            )
+        anew |= lost(state.monitor, first, outlier)
+        if outlier:
+            out.reason = GATED
+        else:
+            _absorb(task, x, work, side, first)
+    if anew:
+        _restart(state, p, sample)
+
+
+@inlined
+def _seen(task, x, p, side, i):
+    """A velocity as measured, with what parameters of effects add to it, and its variance."""
+    predicted, spread, k = x[i], p[i, i], side.shape[1]
+    first, scale = len(x) - k, len(task.scale) - k
+    for j in range(k):
+        f = side[6 + i, j] * task.scale[scale + j]
+        predicted += f * x[first + j]
+        spread += 2.0 * f * p[i, first + j]
+        for l in range(k):
+            spread += f * side[6 + i, l] * task.scale[scale + l] * p[first + j, first + l]
+    return predicted, spread
+
+
+@reordered
+def _absorb(task, x, work, side, first):
+    """Take in three measured velocities, from ``first`` on, one after the other.
+
+    With w the covariance with the innovation over its standard deviation, p loses w w', but for the
+    block of the states that are only considered: they tell nothing of one another.
+    """
+    p, cross, gain, free = work.p, work.cross, work.gain, work.free
+    s, size, columns = work.scratch[0], p.shape[0], p.shape[1]
+    last = len(task.scale) - side.shape[1]  # so many coefficients, then parameters of effects
+    for c in range(3):
+        i = first + c
+        for k in range(columns):
+            cross[c, k] = p[i, k]
+        for j in range(side.shape[1]):
+            f = side[6 + i, j] * task.scale[last + j]
+            for k in range(columns):
+                cross[c, k] += f * p[6 + last + j, k]
+        for b in range(c):
+            f = cross[b, i]
+            for j in range(side.shape[1]):
+                f += side[6 + i, j] * task.scale[last + j] * cross[b, 6 + last + j]
+            for k in range(columns):
+                cross[c, k] -= f * cross[b, k]
+        total, predicted = cross[c, i], x[i]
+        for j in range(side.shape[1]):
+            f = side[6 + i, j] * task.scale[last + j]
+            total += f * cross[c, 6 + last + j]
+            predicted += f * x[6 + last + j]
+        f = 1.0 / np.sqrt(total + s.r[i])
+        innovation = f * (s.z[i] - predicted)
+        for k in range(columns):
+            cross[c, k] *= f
+            gain[c, k] = cross[c, k] * free[k]
+        for j in range(size):
+            x[j] += gain[c, j] * innovation
+    for i in range(size):
+        w = cross if free[i] != 0.0 else gain
+        f, g, h = cross[0, i], cross[1, i], cross[2, i]
+        for k in range(columns):
+            p[i, k] -= f * w[0, k] + g * w[1, k] + h * w[2, k]
+
+
+# ---------------------------------------------------------------- looking back
+
+
+@inlined
+def _look_back(task, state, work, dt):
+    """Every _PERIOD: what the innovations did to the coefficients, and the random walk of these."""
+    c = state.scalars[0]
+    c.since += dt
+    if c.since < _PERIOD:
+        return
+    _sum_up(state, work, c.since)
+    changed = False
+    for i in range(6):
+        changed |= state.monitor[i].nis > task.settings[0].changed
+    _walk(task, state, work, changed, c.since)
+    c.since = 0.0
+
+
+@reordered
+def _sum_up(state, work, since):
+    """With ``change = P g``, g is what innovations have added to the information's right side."""
+    n, p = len(state.before), work.p
+    matrix, upper, root = work.block[0], work.block[1], work.block[2]
+    for j in range(n):
+        for k in range(n):
+            matrix[j, k] = p[6 + j, 6 + k]
+    if not cholesky(matrix, upper, root):
+        return
+    g = work.gain[0]
+    for j in range(n):
+        g[j] = state.x[6 + j] - state.before[j]
+        state.before[j] = state.x[6 + j]
+    cholesky_solve(root, n, g)
+    add_score(g, state.lagged, state.score, since)
+
+
+@reordered
+def _walk(task, state, work, changed, elapsed):
+    """Variances grow by G, less and less up to the prior's; the sandwich P S P grows alike.
+
+    Hence with ``W = P_new^-1 G``, ``S_new = (1 - W) S (1 - W)' + W P_new^-1``.
+    """
+    n, p = len(state.before), work.p
+    matrix, upper, root = work.block[0], work.block[1], work.block[2]
+    grown, most = work.cross[0], 0.0
+    for j in range(n):
+        walk = task.walk[j]
+        if changed:
+            walk = max(walk, 1.0 / RELEARNING_TIME)
+        grown[j] = elapsed * walk * max(1.0 - p[6 + j, 6 + j], 0.0)
+        most = max(most, grown[j])
+    if most == 0.0:
+        return
+    for j in range(n):
+        p[6 + j, 6 + j] += grown[j]
+        for k in range(n):
+            matrix[j, k] = p[6 + j, 6 + k]
+    if not cholesky(matrix, upper, root):
+        return
+    inverse, score, lagged = upper, state.score, state.lagged
+    for j in range(n):
+        for k in range(n):
+            inverse[j, k] = 1.0 if j == k else 0.0
+        cholesky_solve(root, n, inverse[j])
+    # T = 1 - W, then T S into matrix, then T S T' + W P_new^-1
+    for j in range(n):
+        for k in range(n):
+            root[j, k] = (1.0 if j == k else 0.0) - inverse[j, k] * grown[k]
+    multiply(root, score, n, matrix)
+    for j in range(n):
+        for k in range(n):
+            total = 0.0
+            for a in range(n):
+                total += matrix[j, a] * root[k, a] + inverse[j, a] * grown[a] * inverse[a, k]
+            score[j, k] = total
+    for j in range(n):
+        total = 0.0
+        for k in range(n):
+            total += root[j, k] * lagged[k]
+        grown[j] = total
+    for j in range(n):
+        lagged[j] = grown[j]
+
+
+# ---------------------------------------------------------------- residual
+
+
+@inlined
+def _residual(task, state, work, sample, side, out):
+    """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
+    s, theta, mass = work.scratch[0], work.mean, work.scratch[0].one_mass
+    for j in range(len(task.scale)):
+        theta[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
+    wrench_of(theta, sample, side, s.wrench)
+    for i in range(6):
+        for j in range(6):
+            mass[i, j, 0] = task.rigid_body[i, j]
+    add_added_mass(task.structure, theta, mass)
+    restarted = out.reason == RESTARTED
+    filtered_residual(task, theta, s, state.residual, sample, restarted, out.residual)

@@ -1,0 +1,229 @@
+"""Which manoeuvre to run next: safe, and best for the coefficient that is known worst.
+
+Candidates (`closed_loop_manoeuvres`) are simulated with the present coefficients, and with some
+that their uncertainty allows; those that leave the tank are made smaller. The information that each
+adds is predicted along its simulated motion, and the one after which the worst coefficient is known
+best is proposed.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.config.prior import prior_of, typical
+from rov_ident.core.errors import UserError
+from rov_ident.estimation.physical import is_passive
+from rov_ident.experiment import closed_loop_manoeuvres
+from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Flight, Limits
+from rov_ident.experiment.data_quality import Prospect, prospects
+from rov_ident.io.write_messages import write_messages
+from rov_ident.model.equations import Array
+from rov_ident.offline.archive import Archive
+from rov_ident.offline.batch_fit import predicted_information
+from rov_ident.offline.maximum_likelihood import LIKELY, assumed, inverse_of, one_pass
+from rov_ident.reports.result import NORMAL, Shown
+from rov_ident.reports.table import PLUS_MINUS, Table
+from rov_ident.sampling.records import samples_of
+from rov_ident.sampling.smoothing import smoothed
+from rov_ident.simulation.virtual_sensors import Dive, Suite
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Limits", "Proposal", "propose"]
+
+_TILT = 1.0  # rad; a vehicle must not lean further: the attitude of many filters fails near 90 deg
+_DRAWS = 3  # vehicles within the present uncertainty, for which a manoeuvre must be safe as well:
+# four safe of four exclude, at 95 %, that more than half of such vehicles leave the tank
+_SHRINK = 0.75  # of a manoeuvre that is not safe; seven times until it is the smallest
+_SMALLEST = 0.15  # of the size in the library: smaller ones move a vehicle hardly more than noise
+_SHORTEST = 10.0  # s
+_OTHERS = 0.05  # weight of the mean over all coefficients, which decides where the worst is alike
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A safe manoeuvre and the information (n, n) that it is predicted to add."""
+
+    manoeuvre: AlternatingTargets
+    flight: Flight
+    information: Array
+    duration: float
+    limits: Limits
+
+    def dive(self, config: Config, seed: int = 0) -> Dive:
+        """Simulate it on a vehicle."""
+        return closed_loop_manoeuvres.dive(
+            config, self.manoeuvre, self.duration, self.limits, Suite(), seed
+        )
+
+
+@dataclass(frozen=True)
+class Proposal(Shown):
+    """The best candidate, what is known before it and what is predicted after it."""
+
+    config: Config = field(repr=False)
+    best: Candidate
+    worst: str
+    before: tuple[Prospect, ...]
+    after: tuple[Prospect, ...]
+    others: tuple[tuple[str, float], ...]
+    """Every candidate's name and the relative standard deviation of its worst coefficient."""
+    left_out: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        pairs = zip(self.before, self.after, strict=True)
+        now, then = next(pair for pair in pairs if pair[0].name == self.worst)
+        f = self.best.flight
+        return (
+            f"{self.best.manoeuvre.name}, {self.best.duration:g} s: {self.worst}, known worst, "
+            f"goes from ± {NORMAL * now.std:.2g} to ± {NORMAL * then.std:.2g} {now.unit} (95 %); "
+            f"stays within {f.reach[0]:.1f} m north, {f.reach[1]:.1f} m east, {f.reach[2]:.1f} m "
+            f"down of the start and leans {np.degrees(f.tilt):.0f} deg at most"
+        )
+
+    def table(self) -> Table:
+        """What is known of every coefficient now, and what after the manoeuvre."""
+        rows = [
+            [b.name, f"{b.value:.4g}", *(f"{NORMAL * p.std:.2g}" for p in (b, a)), b.unit]
+            for b, a in zip(self.before, self.after, strict=True)
+        ]
+        head = ["", "configured", f"{PLUS_MINUS} now", f"{PLUS_MINUS} after it", "unit"]
+        return Table("what the manoeuvre would tell", head, rows, text=(4,))
+
+    def plot(self) -> "Figure":
+        """How well each coefficient is known, now and after the manoeuvre."""
+        from rov_ident.experiment.report import plan_picture
+
+        return plan_picture(self)
+
+    def page(self) -> str:
+        """A self-contained HTML document."""
+        from rov_ident.experiment.report import of_plan
+
+        return of_plan(self)
+
+    def to_json(self) -> str:
+        """The manoeuvre, and what is predicted of each coefficient and of each candidate."""
+        best, described = self.best, closed_loop_manoeuvres.described
+        document = {
+            "manoeuvre": described(best.manoeuvre, best.duration, best.limits, best.flight),
+            "worst": self.worst,
+            "sentence": self.sentence,
+            "coefficients": {
+                b.name: {"std_now": b.std, "std_after": a.std, "unit": b.unit}
+                for b, a in zip(self.before, self.after, strict=True)
+            },
+            "candidates": [
+                {"name": n, "worst_relative_std": s if np.isfinite(s) else None}
+                for n, s in self.others
+            ],
+            "left_out": list(self.left_out),
+        }
+        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+    def _writers(self) -> dict[str, Callable[[Path], None]]:
+        def messages(path: Path) -> None:
+            write_messages(path, self.best.dive(self.config, seed=0).messages)
+
+        return super()._writers() | {".mcap": messages}
+
+
+def propose(
+    config: Config,
+    bags: Archive | None = None,
+    duration: float = 60.0,
+    limits: Limits | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Proposal:
+    """The manoeuvre to run next, after ``bags`` or, without, from the prior alone. UserError if no
+    manoeuvre is safe within the limits."""
+    limits = limits or Limits()
+    tell = say or (lambda what: None)
+    if duration < _SHORTEST:
+        raise UserError(
+            f"a manoeuvre of {duration:g} s shows nothing: {_SHORTEST:g} s are the least"
+        )
+    n = len(config.estimate)
+    now = predicted_information(bags, config) if bags is not None else np.zeros((n, n))
+    before = prospects(config, now)
+    size = _sizes(config)
+    worst = before[int(np.argmax(np.array([p.std for p in before]) / size))].name
+    vehicles = _vehicles(config, now)
+    candidates, left_out, scores = [], [], []
+    for one in closed_loop_manoeuvres.library(limits):
+        tell(one.name)
+        found = _safe(config, vehicles, one, duration, limits)
+        if found is None:
+            left_out.append(f"{one.name}: not safe within the limits, however small")
+            continue
+        information = _information(config, *found, duration, limits)
+        std = np.array([p.std for p in prospects(config, now + information)])
+        candidates.append(Candidate(*found, information, duration, limits))
+        scores.append(float((std / size).max() * (1.0 + _OTHERS * np.mean(std / size))))
+    if not candidates:
+        raise UserError("no manoeuvre is safe within these limits: allow more room or less thrust")
+    best = int(np.argmin(scores))
+    after = prospects(config, now + candidates[best].information)
+    others = [(c.manoeuvre.name, s) for c, s in zip(candidates, scores, strict=True)]
+    return Proposal(
+        config, candidates[best], worst, before, after, tuple(sorted(others, key=lambda o: o[1])),
+        tuple(left_out), tuple(candidates),
+    )  # fmt: skip
+
+
+def _sizes(config: Config) -> Array:
+    """What a standard deviation is compared with (n,): the value, or a share of what matters."""
+    prior, model = prior_of(config), config.dynamics
+    size: Array = np.maximum(np.abs(prior.mean), 0.2 * typical(model)[prior.estimated])
+    return size
+
+
+def _vehicles(config: Config, information: Array) -> list[Config]:
+    """The configured vehicle and some that what is known allows."""
+    prior = prior_of(config)
+    covariance = inverse_of(information + np.diag(prior.std**-2.0))
+    rng = np.random.default_rng(0)
+    found = [config]
+    for values in rng.multivariate_normal(prior.mean, covariance, 30 * _DRAWS):
+        if len(found) > _DRAWS:
+            break
+        values = np.where(prior.negative, np.minimum(values, 0.0), values)
+        if is_passive(config.dynamics, prior, values):
+            named = dict(zip(prior.names, values.tolist(), strict=True))
+            found.append(config.with_model(config.model.with_values(named)))
+    return found
+
+
+def _safe(
+    config: Config, vehicles: list[Config], one: AlternatingTargets, duration: float, limits: Limits
+) -> tuple[AlternatingTargets, Flight] | None:
+    """The manoeuvre as large as is safe with every vehicle."""
+    factor = 1.0
+    while factor >= _SMALLEST:
+        trial = one.scaled(factor)
+        try:
+            flights = [closed_loop_manoeuvres.fly(v, trial, duration, limits) for v in vehicles]
+        except UserError:
+            flights = []
+        if flights and all((f.reach <= limits.half).all() and f.tilt <= _TILT for f in flights):
+            reach, tilt = np.max([f.reach for f in flights], axis=0), max(f.tilt for f in flights)
+            return trial, replace(flights[0], reach=reach, tilt=tilt)
+        factor *= _SHRINK
+    return None
+
+
+def _information(
+    config: Config, one: AlternatingTargets, flight: Flight, duration: float, limits: Limits
+) -> Array:
+    run = closed_loop_manoeuvres.dive(config, one, duration, limits, Suite())
+    samples = smoothed(np.concatenate(list(samples_of(config, run))))
+    estimated, noise = prior_of(config).estimated, assumed(config, LIKELY)
+    return one_pass(samples, config.dynamics, estimated, noise).information

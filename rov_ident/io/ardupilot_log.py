@@ -1,0 +1,286 @@
+"""ArduSub's logs, dataflash (`.BIN`) and telemetry (`.tlog`), into a bag of the three topics.
+
+Velocity and position are the EKF's (`XKF1`, `LOCAL_POSITION_NED`), the attitude is its quaternion
+or what the autopilot reports, rates and specific force are the first IMU's. The pulses to the
+thrusters (`RCOU`, `SERVO_OUTPUT_RAW`) become a wrench by the configuration's `thrusters`, at the
+battery's measured voltage. All of it is in ArduPilot's axes, forward-starboard-down and
+north-east-down, and stamped with the time since the autopilot's start plus one second (no stamp is
+zero). Nothing is resampled but attitude and rates: they are brought to the times of the velocity.
+"""
+
+import contextlib
+import io
+import itertools
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_between, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
+from rov_ident.io.write_messages import write_messages
+from rov_ident.model.thruster_allocation import PWM, Allocator, check
+
+SUFFIXES = (".bin", ".log", ".tlog")
+
+_WORLD, _BODY = "world_ned", "base_link_frd"
+_MAGIC = b"\xa3\x95"  # of every record of a dataflash log
+_START = 1_000_000  # us
+_WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
+_LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
+_LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
+_OUTPUTS = 16
+_STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """What became of a log: messages written, and in words what was assumed or left out."""
+
+    odometry: int
+    imu: int
+    wrench: int
+    duration: float  # s
+    notes: tuple[str, ...]
+
+
+@dataclass
+class _Track:
+    """Numbers over the autopilot's time; backward and repeated times are dropped and counted."""
+
+    t: list[int] = field(default_factory=list)  # us
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    dropped: int = 0
+
+    def add(self, t: int, *row: float) -> None:
+        if self.t and t <= self.t[-1]:
+            self.dropped += 1
+        else:
+            self.t.append(t)
+            self.rows.append(row)
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+class _Log:
+    """What a log says, by what it is."""
+
+    def __init__(self) -> None:
+        self.motion = _Track()  # velocity 3 [m/s], position 3 [m], NED
+        self.attitude = _Track()  # w x y z
+        self.angles = _Track()  # roll, pitch, yaw [rad]: where there is no quaternion
+        self.rates = _Track()  # body [rad/s]: where there is no IMU
+        self.imu = _Track()  # gyro 3 [rad/s], specific force 3 [m/s2], body
+        self.outputs = _Track()  # pulses [us]
+        self.voltage = _Track()  # V
+
+
+def import_log(
+    path: str | Path, out: str | Path, config: Config,
+    progress: Callable[[float], None] | None = None,
+) -> LogReport:  # fmt: skip
+    """Write an ArduSub log as a bag of `odom`, `imu/data` and `thruster_wrench`.
+
+    Args:
+        path: a dataflash log (`.BIN`, also as text, `.log`) or a telemetry log (`.tlog`).
+        out: the bag, see `BagWriter`.
+        config: its `thrusters` make the wrench.
+        progress: called with the share that has been read.
+
+    Raises UserError: the log cannot be read, or lacks what a bag needs, or there is no allocation.
+    """
+    path = Path(path)
+    check(config.thrusters, PWM)
+    allocator = Allocator(config.thrusters, PWM)
+    log = _read(path, progress or (lambda share: None))
+    for name, track in (
+        ("velocity of an EKF (XKF1 or LOCAL_POSITION_NED)", log.motion),
+        ("thruster output (RCOU or SERVO_OUTPUT_RAW)", log.outputs),
+        ("attitude (XKQ, ATT or ATTITUDE)", log.attitude or log.angles),
+    ):
+        if len(track) < 2:
+            raise UserError(
+                f"{path} holds no {name}: log it (LOG_BITMASK, or the stream rates of telemetry), "
+                "and give the EKF a source of velocity"
+            )
+    notes: list[str] = []
+    messages = [*_wrenches(log, allocator, config.thrusters.voltage, notes), *_inertial(log)]
+    odometry = list(_odometry(log, notes))
+    if not odometry:
+        raise UserError(f"{path} has no attitude at the times of its velocity: log both")
+    messages += odometry
+    # The wrench first: at equal stamps it already acts on the velocity that follows.
+    messages.sort(key=lambda row: (row[0], row[1] != WRENCH))
+    write_messages(out, messages)
+    dropped = sum(track.dropped for track in vars(log).values())
+    if dropped:
+        notes.append(f"{dropped} messages with backward or repeated times are left out")
+    duration = (odometry[-1][0] - odometry[0][0]) * 1e-9
+    return LogReport(len(odometry), len(log.imu), len(log.outputs), duration, tuple(notes))
+
+
+_Row = tuple[int, str, Message]
+
+
+def _ns(t: int) -> int:
+    return 1000 * (t + _START)
+
+
+def _wrenches(log: _Log, allocator: Allocator, usual: float, notes: list[str]) -> list[_Row]:
+    """The wrench of every change of the outputs, at the voltage last measured before it."""
+    volts = [row[0] for row in log.voltage.rows]
+    known = bool(volts) and max(volts) >= _LEAST_VOLTAGE
+    if known:
+        notes.append(f"battery from {min(volts):.1f} to {max(volts):.1f} V, as measured")
+    else:
+        notes.append(f"no voltage of the battery: taken as {usual:g} V (thrusters.voltage)")
+    rows: list[_Row] = []
+    for t, pulses in zip(log.outputs.t, log.outputs.rows, strict=True):
+        i = max(bisect_right(log.voltage.t, t) - 1, 0) if known else 0
+        voltage = volts[i] if known and volts[i] >= _LEAST_VOLTAGE else usual
+        try:
+            tau = allocator.wrench(pulses, voltage)
+        except ValueError as error:
+            raise UserError(f"the thruster outputs hold {error}") from error
+        rows.append((_ns(t), WRENCH, Wrench(_ns(t), _BODY, tau[:3], tau[3:])))
+    return rows
+
+
+def _inertial(log: _Log) -> Iterator[_Row]:
+    none, zero = np.zeros(4), np.zeros(3)
+    for t, row in zip(log.imu.t, log.imu.rows, strict=True):
+        gyro, force = np.array(row[:3]), np.array(row[3:])
+        yield _ns(t), IMU, Imu(_ns(t), "imu_frd", none, gyro, force, zero, zero)
+
+
+def _odometry(log: _Log, notes: list[str]) -> Iterator[_Row]:
+    if len(log.attitude) >= 2:
+        times, quaternions = log.attitude.t, np.array(log.attitude.rows)
+    else:
+        times, quaternions = log.angles.t, quaternion_from_euler(*np.array(log.angles.rows).T)
+        notes.append("no quaternion of the EKF: the attitude is the autopilot's angles")
+    rates = log.imu if len(log.imu) >= 2 else log.rates
+    if len(rates) < 2:
+        raise UserError("the log holds no angular rates: log the IMU (IMU, RAW_IMU or ATTITUDE)")
+    rate_t, rate = np.array(rates.t, dtype=float), np.array(rates.rows)[:, :3]
+    lost = 0
+    for t, row in zip(log.motion.t, log.motion.rows, strict=True):
+        attitude = _attitude_at(t, times, quaternions)
+        if attitude is None or not rate_t[0] <= t <= rate_t[-1]:
+            lost += 1
+            continue
+        linear = quaternion_to_matrix(attitude).T @ np.array(row[:3])
+        angular = np.array([np.interp(t, rate_t, column) for column in rate.T])
+        odometry = Odometry(
+            _ns(t), _WORLD, _BODY, np.array(row[3:]), attitude, linear, angular, np.zeros(6)
+        )
+        yield _ns(t), ODOMETRY, odometry
+    if lost:
+        notes.append(f"{lost} velocities without attitude or rates around them are left out")
+
+
+def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
+    i = bisect_right(times, t)
+    if i and times[i - 1] == t:
+        found: Array = quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
+        return found
+    if i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP:
+        return None
+    share = (t - times[i - 1]) / (times[i] - times[i - 1])
+    between = quaternion_between(quaternions[i - 1], quaternions[i], share)
+    return between / np.linalg.norm(between)
+
+
+def _read(path: Path, progress: Callable[[float], None]) -> _Log:
+    try:
+        from pymavlink import DFReader, mavutil
+    except ImportError as error:
+        raise UserError(f"{path} needs pymavlink: pip install 'rov_ident[ardupilot]'") from error
+    log, kind = _Log(), path.suffix.lower()
+    # What pymavlink thinks of a damaged log it prints, wherever that may go.
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            if kind == ".bin" and path.read_bytes()[:2] != _MAGIC:
+                raise ValueError("it does not begin like one")
+            if kind == ".tlog":
+                with contextlib.closing(mavutil.mavlink_connection(str(path))) as reader:
+                    _telemetry(reader, log, progress)
+            else:
+                read = DFReader.DFReader_text if kind == ".log" else DFReader.DFReader_binary
+                _dataflash(read(str(path)), log, progress)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}): check the path") from error
+    except Exception as error:  # pymavlink raises whatever the bytes make it
+        raise UserError(f"{path} is no log of ArduPilot, or a damaged one: {error}") from error
+    return log
+
+
+def _received(reader: Any, kinds: list[str], progress: Callable[[float], None]) -> Iterator[Any]:
+    """The messages of these kinds."""
+    for count in itertools.count(1):
+        message = reader.recv_match(type=kinds)
+        if message is None:
+            return
+        if count % 2000 == 0:
+            progress(float(getattr(reader, "percent", 0.0)) / 100.0)
+        yield message
+
+
+def _dataflash(reader: Any, log: _Log, progress: Callable[[float], None]) -> None:
+    kinds = ["XKF1", "NKF1", "XKQ", "XKQ1", "NKQ", "NKQ1", "ATT", "IMU", "RCOU", "BAT", "CURR"]
+    for m in _received(reader, kinds, progress):
+        kind, t = m.get_type(), int(m.TimeUS)
+        # Several EKF cores, IMUs and batteries log under one name: the first counts.
+        if any(getattr(m, name, 0) for name in ("C", "I", "Inst", "Instance")):
+            continue
+        if kind in ("XKF1", "NKF1"):
+            log.motion.add(t, m.VN, m.VE, m.VD, m.PN, m.PE, m.PD)
+        elif kind in ("XKQ", "XKQ1", "NKQ", "NKQ1"):
+            log.attitude.add(t, m.Q1, m.Q2, m.Q3, m.Q4)
+        elif kind == "ATT":
+            log.angles.add(t, *np.radians([m.Roll, m.Pitch, m.Yaw]).tolist())
+        elif kind == "IMU":
+            log.imu.add(t, m.GyrX, m.GyrY, m.GyrZ, m.AccX, m.AccY, m.AccZ)
+        elif kind == "RCOU":
+            names = [n for n in m.get_fieldnames() if n.lower().startswith("c") and n[-1].isdigit()]
+            log.outputs.add(t, *(float(getattr(m, name)) for name in names))
+        else:
+            log.voltage.add(t, float(m.Volt))
+
+
+def _telemetry(reader: Any, log: _Log, progress: Callable[[float], None]) -> None:
+    kinds = ["ATTITUDE", "LOCAL_POSITION_NED", "RAW_IMU", "SERVO_OUTPUT_RAW", "SYS_STATUS"]
+    vehicle: int | None = None
+    now: int | None = None  # us, of the autopilot; until it is known nothing is taken
+    for m in _received(reader, kinds, progress):
+        vehicle = m.get_srcSystem() if vehicle is None else vehicle
+        if m.get_srcSystem() != vehicle:
+            continue  # a ground station, or another vehicle
+        kind = m.get_type()
+        if kind in ("ATTITUDE", "LOCAL_POSITION_NED"):
+            now = 1000 * int(m.time_boot_ms)
+        if now is None:
+            continue
+        if kind == "ATTITUDE":
+            log.angles.add(now, m.roll, m.pitch, m.yaw)
+            log.rates.add(now, m.rollspeed, m.pitchspeed, m.yawspeed)
+        elif kind == "LOCAL_POSITION_NED":
+            log.motion.add(now, m.vx, m.vy, m.vz, m.x, m.y, m.z)
+        elif kind == "RAW_IMU":  # ArduPilot's are not raw: mrad/s and thousandths of g
+            gyro = (1e-3 * v for v in (m.xgyro, m.ygyro, m.zgyro))
+            force = (1e-3 * _STANDARD_GRAVITY * v for v in (m.xacc, m.yacc, m.zacc))
+            log.imu.add(int(m.time_usec), *gyro, *force)
+        elif kind == "SERVO_OUTPUT_RAW" and m.port == 0:
+            # 32 bits of microseconds: the turn of the clock is the one nearest to the others'.
+            t = int(m.time_usec) + _WRAP * round((now - int(m.time_usec)) / _WRAP)
+            names = [f"servo{i}_raw" for i in range(1, _OUTPUTS + 1)]
+            log.outputs.add(t, *(float(getattr(m, name, 0)) for name in names))
+        elif kind == "SYS_STATUS" and m.voltage_battery not in (0, 65535):
+            log.voltage.add(now, 1e-3 * m.voltage_battery)

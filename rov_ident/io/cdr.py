@@ -1,0 +1,208 @@
+"""Input messages from CDR bytes, and the three of the core to them, without middleware.
+
+Layout (XCDR1, little-endian): four bytes of encapsulation header, then the fields, each aligned to
+its size counted from behind that header. The three messages of the core are a `std_msgs/Header`
+(and a second string for Odometry) followed by nothing but float64: one `frombuffer` reads the rest.
+"""
+
+import struct
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.messages import Array, Commands, Imu, Message, Odometry, Pose, Twist, Wrench
+
+ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+IMU_TYPE = "sensor_msgs/msg/Imu"
+WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
+ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
+
+_ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian, no options
+_STAMP = struct.Struct("<iI")
+_LENGTH = struct.Struct("<I")
+_SECOND = 1_000_000_000  # ns
+
+
+class _Layout(NamedTuple):
+    """Where the kept numbers are among the float64 of a message."""
+
+    size: int  # float64 in the message
+    kept: NDArray[np.intp]  # (n,) their indices, in the order of the fields of the core type
+
+
+# Quaternions are x y z w on the wire; of a covariance only the diagonal is kept.
+_ODOMETRY = _Layout(
+    85, np.r_[0:3, 6, 3:6, 43:46, 46:49, 49:85:7]
+)  # pose 7, its covariance 36, twist 6, its covariance 36
+_IMU = _Layout(
+    37, np.r_[3, 0:3, 13:16, 25:28, 16:25:4, 28:37:4]
+)  # orientation 4 + 9, angular velocity 3 + 9, acceleration 3 + 9
+_WRENCH = _Layout(6, np.r_[0:6])
+_IMU_ORIENTATION_COVARIANCE = 4
+_TWIST = _Layout(6, np.r_[0:6])
+TWIST_WITH_COVARIANCE = _Layout(42, np.r_[0:6, 6:42:7])
+_POSE = _Layout(7, np.r_[0:3, 6, 3:6])
+POSE_WITH_COVARIANCE = _Layout(43, _POSE.kept)
+
+
+class _Fields:
+    """The fields of a message, one after the other. Raises ValueError where the bytes end."""
+
+    def __init__(self, data: bytes) -> None:
+        if data[:2] != _ENCAPSULATION[:2]:
+            header = bytes(data[:4]).hex()
+            raise ValueError(f"not little-endian CDR: encapsulation header {header!r}")
+        self._data, self._at = data, len(_ENCAPSULATION)
+
+    def _pass(self, size: int, count: int, what: str) -> int:
+        """Where the next ``count`` values of ``size`` bytes begin; goes on behind them."""
+        start = self._at + -(self._at - len(_ENCAPSULATION)) % size
+        self._at = start + size * count
+        if len(self._data) < self._at:
+            raise ValueError(f"{len(self._data)} bytes end within {what}")
+        return start
+
+    def stamp(self) -> int:
+        """In ns."""
+        seconds, nanoseconds = _STAMP.unpack_from(self._data, self._pass(4, 2, "the stamp"))
+        if nanoseconds >= _SECOND:
+            raise ValueError(f"{nanoseconds} nanoseconds are no part of a second")
+        return int(seconds * _SECOND + nanoseconds)
+
+    def length(self) -> int:
+        return int(_LENGTH.unpack_from(self._data, self._pass(4, 1, "a length"))[0])
+
+    def string(self) -> str:
+        length = self.length()
+        start = self._pass(1, length, f"a string of {length}")
+        return str(self._data[start : start + length], "utf-8").rstrip("\0")
+
+    def numbers(self, kind: str, count: int) -> Array:
+        """The next numbers of NumPy's ``kind`` as float64 (count,)."""
+        start = self._pass(int(kind[-1]), count, f"{count} numbers")
+        return np.frombuffer(self._data, kind, count, start).astype(float, copy=False)
+
+    def kept(self, layout: _Layout) -> Array:
+        return self.numbers("<f8", layout.size).take(layout.kept)
+
+    def sequence(self, kind: str) -> Array:
+        length = self.length()
+        return self.numbers(kind, length) if length else np.zeros(0)  # without padding then
+
+
+# Each raises ValueError on malformed bytes; axes are those on the wire.
+
+
+def decode_odometry(data: bytes) -> Odometry:
+    """A nav_msgs/msg/Odometry."""
+    fields = _Fields(data)
+    stamp, frame_id, child_frame_id = fields.stamp(), fields.string(), fields.string()
+    n = fields.kept(_ODOMETRY)
+    return Odometry(stamp, frame_id, child_frame_id, n[:3], n[3:7], n[7:10], n[10:13], n[13:])
+
+
+def decode_imu(data: bytes) -> Imu:
+    """A sensor_msgs/msg/Imu.
+
+    A first variance of -1 says that the driver does not measure that quantity; it is passed on.
+    """
+    fields = _Fields(data)
+    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(_IMU)
+    return Imu(stamp, frame_id, n[:4], n[4:7], n[7:10], n[10:13], n[13:])
+
+
+def decode_wrench(data: bytes) -> Wrench:
+    """A geometry_msgs/msg/WrenchStamped."""
+    fields = _Fields(data)
+    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(_WRENCH)
+    return Wrench(stamp, frame_id, n[:3], n[3:])
+
+
+def decode_bare_wrench(data: bytes) -> Wrench:
+    """A geometry_msgs/msg/Wrench: no stamp (0), no frame."""
+    n = _Fields(data).kept(_WRENCH)
+    return Wrench(0, "", n[:3], n[3:])
+
+
+def decode_twist(data: bytes, layout: _Layout = _TWIST) -> Twist:
+    """A geometry_msgs/msg/TwistStamped, or TwistWithCovarianceStamped with that layout."""
+    fields = _Fields(data)
+    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(layout)
+    return Twist(stamp, frame_id, n[:3], n[3:6], n[6:] if len(n) > 6 else np.zeros(6))
+
+
+def decode_pose(data: bytes, layout: _Layout = _POSE) -> Pose:
+    """A geometry_msgs/msg/PoseStamped, or PoseWithCovarianceStamped with that layout."""
+    fields = _Fields(data)
+    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(layout)
+    return Pose(stamp, frame_id, n[:3], n[3:7])
+
+
+def decode_joint_state(data: bytes) -> Commands:
+    """The efforts of a sensor_msgs/msg/JointState."""
+    fields = _Fields(data)
+    stamp, _ = fields.stamp(), fields.string()
+    for _ in range(fields.length()):
+        fields.string()  # the name of a joint
+    _, _, effort = (fields.sequence("<f8") for _ in range(3))  # position, velocity, effort
+    return Commands(stamp, effort)
+
+
+def decode_channels(data: bytes) -> Commands:
+    """A mavros_msgs/msg/RCOut: header and uint16[]."""
+    fields = _Fields(data)
+    stamp, _ = fields.stamp(), fields.string()
+    return Commands(stamp, fields.sequence("<u2"))
+
+
+def decode_multi_array(data: bytes, kind: str) -> Commands:
+    """A std_msgs/msg/...MultiArray of NumPy's ``kind``: no stamp."""
+    fields = _Fields(data)
+    for _ in range(fields.length()):  # dimensions: label, size, stride
+        fields.string(), fields.length(), fields.length()
+    fields.length()  # data_offset
+    return Commands(0, fields.sequence(kind))
+
+
+def decode_voltage(data: bytes) -> float:
+    """The voltage [V] of a sensor_msgs/msg/BatteryState."""
+    fields = _Fields(data)
+    fields.stamp(), fields.string()
+    return float(fields.numbers("<f4", 1)[0])
+
+
+DECODERS: dict[str, Callable[[bytes], Message]] = {
+    ODOMETRY_TYPE: decode_odometry,
+    IMU_TYPE: decode_imu,
+    WRENCH_TYPE: decode_wrench,
+}
+
+
+def encode(message: Message) -> bytes:
+    """The bytes `rclpy.serialization.serialize_message` gives, with zeros as padding.
+
+    Covariances are zero beside the diagonal, and altogether for pose and orientation, which the
+    core types do not carry. An Imu with a zero quaternion has no attitude: its orientation
+    covariance begins with -1, as sensor_msgs asks.
+
+    Raises ValueError: a stamp outside the range of builtin_interfaces/Time.
+    """
+    strings, layout = [message.frame_id], _IMU if isinstance(message, Imu) else _WRENCH
+    if isinstance(message, Odometry):
+        strings, layout = [message.frame_id, message.child_frame_id], _ODOMETRY
+    numbers = np.zeros(layout.size, dtype="<f8")
+    numbers[layout.kept] = np.concatenate(message[1 + len(strings) :])
+    if isinstance(message, Imu) and not message.orientation.any():
+        numbers[_IMU_ORIENTATION_COVARIANCE] = -1.0
+
+    try:
+        body = bytearray(_STAMP.pack(*divmod(message.stamp, _SECOND)))
+    except struct.error as error:
+        raise ValueError(f"the stamp {message.stamp} ns does not fit a ROS time") from error
+    for text in strings:
+        raw = text.encode() + b"\0"
+        body += bytes(-len(body) % 4) + _LENGTH.pack(len(raw)) + raw
+    body += bytes(-len(body) % 8) + numbers.tobytes()
+    return _ENCAPSULATION + bytes(body)

@@ -1,0 +1,344 @@
+"""A plain log (CSV) into a bag of the topics `odom` and `thruster_wrench`.
+
+Nothing is resampled or filtered. What the log does not tell (an attitude, a position) is filled in
+so that it agrees with the velocities, and said in the report.
+"""
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core import frames
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Message, Odometry, Wrench
+from rov_ident.core.yaml_file import parse_file
+from rov_ident.io.csv_table import read_csv
+from rov_ident.io.write_messages import write_messages
+
+_VELOCITIES = ("u", "v", "w", "p", "q", "r")
+_WRENCH = ("X", "Y", "Z", "K", "M", "N")
+_POSITIONS = ("x", "y", "z")
+_ANGLES = ("roll", "pitch", "yaw")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_REQUIRED = ("t_s", *_VELOCITIES, *_WRENCH)
+NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION)
+
+_FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
+_SECOND = 1_000_000_000  # ns
+_LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
+_WRAP_JUMP = 1.0  # rad within one row, and back in the next: no vehicle does that
+
+
+Prepare = Callable[
+    [Mapping[str, Array], Mapping[str, Array]],
+    tuple[dict[str, Array], NDArray[np.bool_], list[str]],
+]
+"""From columns (n,) by our names and by other headings: the first changed, which rows (n,) to keep,
+and what was done, in words."""
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What became of a log."""
+
+    rows: int
+    odometry: int  # messages written
+    masked: int  # rows without odometry: a rate above the limit
+    wrapped: int  # rows without odometry: Euler angles averaged across their wrap
+    duration: float  # s
+    notes: tuple[str, ...]  # what was assumed, in words
+
+
+def import_csv(
+    paths: Sequence[str | Path], out: str | Path, columns: Mapping[str, str] | None = None,
+    body_frame: str = "frd", mask_rates_above: float | None = None, wrench_timing: str = "held",
+    prepare: Prepare | None = None, depths: Sequence[str] = (),
+) -> ImportReport:  # fmt: skip
+    """Writes the rows of one or several CSV files (in the order of time) as a bag.
+
+    A message is stamped `t_s` + 1 s (no stamp is zero); a log that begins before zero is moved to
+    begin at 1 s. A wrench message holds from its stamp until the next.
+
+    Args:
+        paths: files with the columns `NAMES`; the position, angles and quaternion may be absent.
+        out: the bag, see `BagWriter`.
+        columns: our name -> heading in the files; or a number, for what was not logged (`w=0`).
+        body_frame: `frd` (the world is then NED) or `flu` (ENU).
+        mask_rates_above: rad/s. Odometry with |p|, |q| or |r| above is left out: motion capture
+            that flickers. The wrench of the row stays.
+        wrench_timing: `held`: a row's velocity and pose are samples at its time, its wrench begins
+            there. `mean`: the wrench is the mean over the time around the row; it changes midway
+            between the rows. `bin`: the whole row is the mean from its time to that of the next
+            row, so that the wrench begins at the row's time, and velocity and pose, which are
+            means too, are stamped in the middle.
+        prepare: what is done to the columns before (`sampling.preprocess.Preparation`).
+        depths: further headings, of columns that `prepare` is given; their cells may be empty.
+
+    Raises UserError: a file, column or cell that cannot be used, or a unit that cannot be right.
+    """
+    if body_frame not in _FRAME_IDS:
+        raise UserError(f"The body frame must be `frd` or `flu`, not `{body_frame}`.")
+    if wrench_timing not in ("held", "mean", "bin"):
+        raise UserError(
+            f"The wrench timing must be `held`, `mean` or `bin`, not `{wrench_timing}`."
+        )
+    if mask_rates_above is not None and not mask_rates_above > 0.0:
+        raise UserError(f"The limit of the rates must be positive, not {mask_rates_above}.")
+    log = _Log.read([Path(path) for path in paths], columns or {}, depths)
+    log.check_time()
+    log.check_angles()
+    notes = log.prepare(prepare) if prepare else []
+
+    time = log.data["t_s"]
+    start = min(0.0, float(time[0]))
+    if start < 0.0:
+        notes.append(f"times begin at {start} s: moved to begin at 1 s")
+    stamps = np.rint((time - start) * _SECOND).astype(np.int64) + _SECOND
+    linear, angular = log.matrix(_VELOCITIES[:3]), log.matrix(_VELOCITIES[3:])
+    orientation, wrapped = _attitude(log, angular, notes)
+    position = _position(log, linear, orientation, notes)
+
+    limit = np.inf if mask_rates_above is None else mask_rates_above
+    masked = np.abs(angular).max(axis=1) > limit
+    kept = ~(masked | wrapped)
+    if wrapped.any():
+        notes.append(
+            f"{np.count_nonzero(wrapped)} rows have Euler angles averaged across their wrap: "
+            "their odometry is left out"
+        )
+    if not kept.any():
+        raise UserError(f"All rows have a rate above {mask_rates_above} rad/s: raise the limit.")
+
+    wrench_stamps = stamps.copy()
+    if wrench_timing == "mean":
+        wrench_stamps[1:] = stamps[:-1] + np.diff(stamps) // 2
+    elif wrench_timing == "bin":
+        stamps = stamps + _bin_widths(stamps) // 2
+    world, body = _FRAME_IDS[body_frame]
+    force, torque = log.matrix(_WRENCH[:3]), log.matrix(_WRENCH[3:])
+
+    def messages() -> Iterator[tuple[int, str, Message]]:
+        for k, (at, acts) in enumerate(zip(stamps.tolist(), wrench_stamps.tolist(), strict=True)):
+            # The wrench first: at equal stamps it already acts on the velocity that follows.
+            yield acts, WRENCH, Wrench(acts, body, force[k], torque[k])
+            if kept[k]:
+                motion = position[k], orientation[k], linear[k], angular[k], np.zeros(6)
+                yield at, ODOMETRY, Odometry(at, world, body, *motion)
+
+    write_messages(out, messages())
+    odometry, left_out, averaged = (int(np.count_nonzero(n)) for n in (kept, masked, wrapped))
+    duration = float(time[-1] - time[0])
+    return ImportReport(len(stamps), odometry, left_out, averaged, duration, tuple(notes))
+
+
+def _bin_widths(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The width (ns) of the bin that begins at each stamp: until the next, but for gaps."""
+    steps = np.diff(stamps)
+    usual = int(np.median(steps))
+    return np.append(np.where(steps > 2 * usual, usual, steps), usual)
+
+
+def parse_columns(items: Sequence[str]) -> dict[str, str]:
+    """The columns of `--map`: each item is `name=heading`, or a YAML file of such pairs.
+
+    Raises UserError: neither of the two.
+    """
+    columns: dict[str, str] = {}
+    for item in items:
+        name, equals, heading = item.partition("=")
+        if equals:
+            columns[name.strip()] = heading.strip()
+            continue
+        try:
+            pairs = parse_file(Path(item))
+        except UserError as error:
+            raise UserError(
+                f"{item} is neither name=heading nor a YAML file of such pairs: it {error}"
+            ) from error
+        if not isinstance(pairs, dict):
+            raise UserError(f"{item} must hold pairs, as in `u: surge_speed`.")
+        columns.update({str(key): str(value) for key, value in pairs.items()})
+    return columns
+
+
+def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDArray[np.bool_]]:
+    """Quaternions (n, 4), and which rows have none because their angles were averaged."""
+    none = np.zeros(len(angular), dtype=bool)
+    if log.has(_QUATERNION):
+        quaternion = log.matrix(_QUATERNION)
+        length = np.linalg.norm(quaternion, axis=1)
+        if (bad := np.flatnonzero(np.abs(length - 1.0) > 0.1)).size:
+            raise UserError(
+                f"{log.place(bad[0])}: qw qx qy qz have length {length[bad[0]]:.3g}, "
+                "but a quaternion has length 1: check their columns."
+            )
+        return frames.quaternion_normalise(quaternion), none
+
+    roll, pitch = (log.data.get(name, np.zeros(len(angular))) for name in ("roll", "pitch"))
+    if "yaw" in log.data:
+        yaw = log.data["yaw"]
+    else:
+        rate = (angular[:, 1] * np.sin(roll) + angular[:, 2] * np.cos(roll)) / np.cos(pitch)
+        yaw = _integrated(log.data["t_s"], rate)
+        notes.append("no yaw is given: it is integrated from the rates, from 0")
+    if missing := [name for name in ("roll", "pitch") if name not in log.data]:
+        notes.append(f"no {' and '.join(missing)} given: taken as 0")
+    quaternion = frames.quaternion_from_euler(roll, pitch, yaw)
+    return quaternion, _wrapped(quaternion)
+
+
+def _wrapped(quaternion: Array) -> NDArray[np.bool_]:
+    """Rows whose attitude jumps away and back at once.
+
+    A log that averages Euler angles over a bin turns +179 and -179 degrees into 0.
+    """
+    step = _angle_between(quaternion[1:], quaternion[:-1])
+    bridge = _angle_between(quaternion[2:], quaternion[:-2])
+    jump = np.minimum(step[1:], step[:-1])
+    wrapped = np.zeros(len(quaternion), dtype=bool)
+    wrapped[1:-1] = (jump > _WRAP_JUMP) & (bridge < 0.5 * jump)
+    return wrapped
+
+
+def _angle_between(p: Array, q: Array) -> Array:
+    return 2.0 * np.arccos(np.minimum(np.abs(np.sum(p * q, axis=-1)), 1.0))
+
+
+def _position(log: "_Log", linear: Array, orientation: Array, notes: list[str]) -> Array:
+    """Positions (n, 3); a component not given is dead-reckoned, to agree with the velocity."""
+    velocity = np.einsum("nij,nj->ni", frames.quaternion_to_matrix(orientation), linear)
+    if missing := [name for name in _POSITIONS if name not in log.data]:
+        notes.append(
+            f"no {' '.join(missing)} given: dead-reckoned from the velocities, so that comparing "
+            "pose with velocity tells nothing"
+        )
+    dead_reckoned = {
+        name: _integrated(log.data["t_s"], column)
+        for name, column in zip(_POSITIONS, velocity.T, strict=True)
+    }
+    return np.column_stack([log.data.get(name, dead_reckoned[name]) for name in _POSITIONS])
+
+
+def _integrated(time: Array, rate: Array) -> Array:
+    """The integral of a sampled rate by the trapezoidal rule, from 0."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
+
+
+@dataclass
+class _Log:
+    """The columns in our names, and where each row stands."""
+
+    data: dict[str, Array]  # name: (n,)
+    headings: dict[str, str]  # name: heading in the file
+    places: list[tuple[Path, int]]  # of each row: file, line
+    more: dict[str, Array]  # further columns by heading: (n,), NaN where empty
+
+    @classmethod
+    def read(
+        cls, paths: Sequence[Path], columns: Mapping[str, str], more: Sequence[str] = ()
+    ) -> "_Log":
+        if unknown := [name for name in columns if name not in NAMES]:
+            raise UserError(f"`{unknown[0]}` cannot be mapped: use one of {' '.join(NAMES)}.")
+        tables: list[dict[str, Array]] = []
+        places: list[tuple[Path, int]] = []
+        headings: dict[str, str] = {}
+        for path in paths:
+            table = read_csv(path)
+            found = _headings(path, table.cells, columns)
+            if tables and found.keys() != headings.keys():
+                raise UserError(f"{path} has other columns than {paths[0]}: import them apart.")
+            headings = found
+            if missing := [name for name in more if name not in table.cells]:
+                raise UserError(
+                    f"{path} has no column `{missing[0]}`: it has {', '.join(table.cells)}."
+                )
+            tables.append(
+                {
+                    name: table.numbers(heading)
+                    if heading in table.cells
+                    else np.full(len(table.lines), float(heading))
+                    for name, heading in found.items()
+                }
+                | {name: table.numbers(name, blank=True) for name in more}
+            )
+            places += [(path, line) for line in table.lines]
+        if len(places) < 3:
+            files = " ".join(map(str, paths))
+            raise UserError(f"{files}: {len(places)} rows are too few for a log.")
+        data = {name: np.concatenate([part[name] for part in tables]) for name in tables[0]}
+        return cls(data, headings, places, {name: data.pop(name) for name in more})
+
+    def prepare(self, how: Prepare) -> list[str]:
+        """Change the columns, leave rows out; what was done, in words."""
+        data, kept, notes = how(self.data, self.more)
+        self.data = {name: column[kept] for name, column in data.items()}
+        self.places = [place for place, keep in zip(self.places, kept, strict=True) if keep]
+        return notes
+
+    def has(self, names: Sequence[str]) -> bool:
+        return all(name in self.data for name in names)
+
+    def matrix(self, names: Sequence[str]) -> Array:
+        """Columns side by side, (n, len(names))."""
+        return np.column_stack([self.data[name] for name in names])
+
+    def place(self, row: int) -> str:
+        path, line = self.places[row]
+        return f"{path}, line {line}"
+
+    def check_time(self) -> None:
+        time, heading = self.data["t_s"], self.headings["t_s"]
+        steps = np.diff(time)
+        if (bad := np.flatnonzero(steps <= 0.0)).size:
+            row = int(bad[0]) + 1
+            raise UserError(
+                f"{self.place(row)}: {heading} goes from {time[row - 1]:g} to {time[row]:g}, but "
+                "time must increase: sort the rows, or import files of separate dives apart."
+            )
+        if np.median(steps) > _LONGEST_STEP or time[-1] - min(0.0, time[0]) > 2**31 - 2:
+            raise UserError(
+                f"{self.place(0)}: {heading} has steps of {np.median(steps):g} and ends at "
+                f"{time[-1]:g}; it must be in seconds."
+            )
+
+    def check_angles(self) -> None:
+        """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates."""
+        for name in _ANGLES:
+            angle = self.data.get(name, np.zeros(1))
+            large = np.flatnonzero(np.abs(angle) > 2.0 * np.pi)
+            if not large.size:
+                continue
+            turned = np.linalg.norm(self.matrix(_VELOCITIES[3:]), axis=1)
+            path_of_rates = _integrated(self.data["t_s"], turned)[-1]
+            if name != "yaw" or np.abs(np.diff(angle)).sum() > 10.0 * path_of_rates:
+                raise UserError(
+                    f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
+                    "looks like degrees: convert it to rad."
+                )
+
+
+def _headings(path: Path, header: Collection[str], columns: Mapping[str, str]) -> dict[str, str]:
+    """The heading of each of our names that the file (or a constant) provides."""
+    headings = {}
+    for name in NAMES:
+        heading = columns.get(name, name)
+        if heading in header or _constant(heading):
+            headings[name] = heading
+        elif name in columns or name in _REQUIRED:
+            raise UserError(
+                f"{path} has no column `{heading}`: it has {', '.join(header) or 'none'}; name "
+                f"the right one with --map {name}=HEADING (or a number, if it was not logged)."
+            )
+    return headings
+
+
+def _constant(heading: str) -> bool:
+    """Whether a heading stands for a number instead of a column."""
+    try:
+        return math.isfinite(float(heading))
+    except ValueError:
+        return False

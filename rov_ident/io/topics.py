@@ -1,0 +1,287 @@
+"""What vehicles publish, into the three messages of the core: one definition for topics and bags.
+
+The types are the configuration's (``inputs``). A :class:`Reader` takes messages as bytes and gives
+what the sampler takes:
+
+* a wrench as it is; one without a stamp, and any array without a header, is stamped on arrival (in
+  a bag: its log time), which presumes that the computer's clock is that of the sensors;
+* commands of single thrusters through `Allocator`, pulses at the
+  voltage of the battery that was last heard;
+* a twist and the poses around it joined into odometry at the stamp of the twist: the position
+  straight in between, the attitude along the shortest rotation.
+"""
+
+from bisect import bisect_left
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rov_ident.config import Config, Inputs, schema, thruster_signal
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import from_core, quaternion_between
+from rov_ident.core.messages import Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.io import cdr
+from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
+from rov_ident.model.thruster_allocation import Allocator, knows
+
+ODOMETRY, IMU, WRENCH, POSE, BATTERY = "odom", "imu", "wrench", "pose", "battery"
+
+_STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
+_LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
+_HELD = 1000  # poses and twists that wait for each other
+_NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
+_FRAME = "base_link"  # of a wrench that comes without a frame: the axes are those of frames.body
+
+_DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "nav_msgs/Odometry": cdr.decode_odometry,
+    "sensor_msgs/Imu": cdr.decode_imu,
+    "geometry_msgs/WrenchStamped": cdr.decode_wrench,
+    "geometry_msgs/Wrench": cdr.decode_bare_wrench,
+    "geometry_msgs/TwistStamped": cdr.decode_twist,
+    "geometry_msgs/TwistWithCovarianceStamped": partial(
+        cdr.decode_twist, layout=cdr.TWIST_WITH_COVARIANCE
+    ),
+    "geometry_msgs/PoseStamped": cdr.decode_pose,
+    "geometry_msgs/PoseWithCovarianceStamped": partial(
+        cdr.decode_pose, layout=cdr.POSE_WITH_COVARIANCE
+    ),
+    "sensor_msgs/JointState": cdr.decode_joint_state,
+    "std_msgs/Float64MultiArray": partial(cdr.decode_multi_array, kind="<f8"),
+    "std_msgs/Float32MultiArray": partial(cdr.decode_multi_array, kind="<f4"),
+    "std_msgs/UInt16MultiArray": partial(cdr.decode_multi_array, kind="<u2"),
+    "std_msgs/Int16MultiArray": partial(cdr.decode_multi_array, kind="<i2"),
+    "mavros_msgs/RCOut": cdr.decode_channels,
+    schema.BATTERY_TYPE: cdr.decode_voltage,
+}
+_CHOICES = {
+    ODOMETRY: schema.ODOMETRY_TYPES,
+    POSE: schema.POSE_TYPES,
+    WRENCH: schema.WRENCH_TYPES + schema.FORCE_TYPES + schema.PULSE_TYPES,
+}
+
+
+class Source(NamedTuple):
+    """A topic that is listened to: its relative name and its type, as `geometry_msgs/Wrench`."""
+
+    topic: str
+    type_name: str
+
+
+def sources(inputs: Inputs) -> dict[str, Source]:
+    """The topics by role: `odom`, `imu`, `wrench`; `pose` where the motion is a twist; `battery`
+    where there is one."""
+    thrust = ROLE_NAMES[WRENCH]
+    if inputs.is_allocated:
+        thrust = "thruster_forces" if inputs.wrench in schema.FORCE_TYPES else "thruster_pwm"
+    found = {
+        ODOMETRY: Source("velocity" if inputs.is_twist else ROLE_NAMES[ODOMETRY], inputs.odom),
+        IMU: Source(ROLE_NAMES[IMU], "sensor_msgs/Imu"),
+        WRENCH: Source(thrust, inputs.wrench),
+    }
+    if inputs.is_twist:
+        found[POSE] = Source("pose", inputs.pose)
+    if inputs.battery != "none":
+        found[BATTERY] = Source("battery", inputs.battery)
+    return found
+
+
+class Reader:
+    """Bytes of the configured topics into messages of the core, axes as on the wire.
+
+    ``counts`` holds, by role and reason, what could not be used. ``on_arrival`` tells whether the
+    thrust comes without a stamp.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.counts: Counter[str] = Counter()
+        self._frames = config.frames
+        self._is_twist = config.inputs.is_twist
+        self._types = {role: source.type_name for role, source in sources(config.inputs).items()}
+        self.on_arrival = config.inputs.wrench not in _STAMPED
+        self._allocator = None
+        if config.inputs.is_allocated:
+            signal = thruster_signal(config.inputs, config.thrusters)
+            self._allocator = Allocator(config.thrusters, signal)
+        self._voltage = config.thrusters.voltage
+        self._poses: deque[Pose] = deque(maxlen=_HELD)
+        self._twists: deque[Twist] = deque()
+
+    def read(self, role: str, data: bytes, arrival: int) -> list[tuple[str, Message]]:
+        """What the sampler is to take, (role, message); ``arrival`` [ns] stamps what has none."""
+        type_name = self._types[role]
+        try:
+            message = _DECODERS[type_name](data)
+        except ValueError:
+            self.counts[f"{role}: bytes that are no {_full(type_name)}"] += 1
+            return []
+        if role == BATTERY:
+            if knows(message):
+                self._voltage = message
+            else:
+                self.counts["battery: a voltage for which the T200 has no curve"] += 1
+            return []
+        if role == WRENCH:
+            return self._wrench(message, arrival)
+        if not self._is_twist or role == IMU:
+            return [(role, message)]
+        return self._joined(message)
+
+    def flush(self) -> None:
+        """The input has ended: twists still without a pose are given up."""
+        if self._twists:
+            self.counts["odom: a twist without a pose around it"] += len(self._twists)
+            self._twists.clear()
+
+    def _wrench(self, message: Wrench | Commands, arrival: int) -> list[tuple[str, Message]]:
+        if isinstance(message, Wrench):
+            if self.on_arrival:
+                message = message._replace(stamp=arrival, frame_id=_FRAME)
+            return [(WRENCH, message)]
+        assert self._allocator is not None
+        try:
+            tau = self._allocator.wrench(message.values, self._voltage)
+        except ValueError as reason:
+            self.counts[f"{WRENCH}: {reason}"] += 1
+            return []
+        stamp = arrival if self.on_arrival else message.stamp
+        wrench = Wrench(stamp, _FRAME, tau[:3], tau[3:])
+        return [(WRENCH, from_core(wrench, self._frames.body, self._frames.world))]
+
+    # -------------------------------------------------------------- twist and pose
+
+    def _joined(self, message: Twist | Pose) -> list[tuple[str, Message]]:
+        if isinstance(message, Pose):
+            if self._poses and message.stamp <= self._poses[-1].stamp:
+                if self._poses[-1].stamp - message.stamp < 1_000_000_000:
+                    self.counts["pose: duplicate or backward stamp"] += 1
+                    return []
+                self._poses.clear()  # a bag that starts over
+                self._twists.clear()
+            self._poses.append(message)
+        else:
+            self._twists.append(message)
+            if len(self._twists) > _HELD:
+                self._twists.popleft()
+                self.counts["odom: a twist without a pose around it"] += 1
+        done: list[tuple[str, Message]] = []
+        while self._twists and self._poses and self._poses[-1].stamp >= self._twists[0].stamp:
+            twist = self._twists.popleft()
+            pose = self._pose_at(twist.stamp)
+            if pose is None:
+                self.counts["odom: a twist without a pose around it"] += 1
+                continue
+            variance = twist.variance
+            if not twist.angular.any():  # a velocity log (DVL) that has no rates to say
+                variance = np.concatenate([variance[:3], _NOT_MEASURED])
+            attitude, velocity = pose.orientation, (twist.linear, twist.angular)
+            frames = pose.frame_id, twist.frame_id
+            odometry = Odometry(twist.stamp, *frames, pose.position, attitude, *velocity, variance)
+            done.append((ODOMETRY, odometry))
+        return done
+
+    def _pose_at(self, stamp: int) -> Pose | None:
+        """Between the poses before and after; None where there are none close enough."""
+        i = bisect_left(self._poses, stamp, key=lambda pose: pose.stamp)
+        after = self._poses[i]
+        if after.stamp == stamp:
+            return after
+        if i == 0 or after.stamp - self._poses[i - 1].stamp > _LONGEST_GAP:
+            return None
+        before = self._poses[i - 1]
+        share = (stamp - before.stamp) / (after.stamp - before.stamp)
+        return after._replace(
+            stamp=stamp,
+            position=before.position + share * (after.position - before.position),
+            orientation=quaternion_between(before.orientation, after.orientation, share),
+        )
+
+
+# ------------------------------------------------------------------ bags
+
+
+def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, str]:
+    """The topic of each role that the bag has; given ``roles``, of these alone.
+
+    Raises UserError if a role is missing, ambiguous or of another type than ``inputs`` says.
+    """
+    wanted = vars(config.topics)
+    chosen = {}
+    for role, (name, type_name) in sources(config.inputs).items():
+        if roles and role not in roles:
+            continue
+        try:
+            topic = select_topic(bag, role, name, _full(type_name), wanted[role])
+        except UserError as error:
+            raise UserError(f"{error}{_hint(bag, role, type_name, wanted[role])}") from error
+        if topic:
+            chosen[role] = topic
+    return chosen
+
+
+def _hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
+    """Which other type the role could have in this bag."""
+    named = "/" + wanted.lstrip("/")
+    others = [
+        (topic, other)
+        for other in _CHOICES.get(role, ())
+        for topic, info in bag.topics.items()
+        if other != type_name and info.type_name == _full(other) and info.message_count
+        if not wanted or topic == named
+    ]
+    if not others:
+        return ""
+    topic, other = others[0]
+    return f" Or is it {topic}? Then set inputs.{role} to {other}."
+
+
+def messages(
+    bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None = None
+) -> Iterator[tuple[str, Message]]:
+    """(role, message) in the order of log times, axes as on the wire; ``topics`` of :func:`select`.
+
+    What cannot be used is added to ``counts`` at the end.
+    """
+    for role, message, _ in _read(bag, topics, config, counts):
+        yield role, message
+
+
+def as_played(
+    bag: Bag, topics: Mapping[str, str], config: Config
+) -> Iterator[tuple[str, RawMessage]]:
+    """(role, message as bytes) of the three types that the estimators know, whatever the bag's.
+
+    A message without a stamp could not be stamped on arrival when it is played at another speed.
+    """
+    if config.inputs == Inputs():
+        roles = {topic: role for role, topic in topics.items()}
+        for raw in bag.iter_raw(roles):
+            yield roles[raw.topic], raw
+        return
+    for role, message, raw in _read(bag, topics, config, None):
+        yield role, raw._replace(type_name=cdr.ROLE_TYPES[role], data=cdr.encode(message))
+
+
+def _read(
+    bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None
+) -> Iterator[tuple[str, Message, RawMessage]]:
+    reader = Reader(config)
+    roles = {topic: role for role, topic in topics.items()}
+    for raw in bag.iter_raw(roles):
+        for role, message in reader.read(roles[raw.topic], raw.data, raw.log_time):
+            yield role, message, raw
+    reader.flush()
+    if counts is not None:
+        counts.update(reader.counts)
+
+
+def total(bag: Bag, topics: Mapping[str, str]) -> int:
+    """How many messages there are on the topics."""
+    return sum(bag.topics[topic].message_count for topic in topics.values())
+
+
+def _full(type_name: str) -> str:
+    package, _, name = type_name.partition("/")
+    return f"{package}/msg/{name}"

@@ -1,0 +1,246 @@
+"""Names of the hydrodynamic coefficients: the grammar, and each name's place in the equations.
+
+SNAME derivatives with their usual signs (SNAME 1950; Fossen 2021, ch. 6 and 8):
+
+=============  ==========================================  ============================
+name           term on the hydrodynamic side of the axis    example
+=============  ==========================================  ============================
+``A_bdot``     added mass, ``M = M_RB - sym(A_bdot)``       ``X_udot``, ``Y_rdot``
+``A_b``        linear damping ``A_b b``                     ``X_u``, ``N_v``
+``A_bb``       ``|b| b``, or ``b b`` where mirror symmetry  ``X_uu``; ``X_vv``, ``M_rr``
+               makes the term even
+``A_bc``       plain product ``b c``                        ``Y_uv``
+``A_b_abs_c``  ``b |c|``                                    ``Y_v_abs_r``
+``A_b_neg``    ``min(b, 0)``, added to ``A_b b``; only      ``Z_w_neg``
+               where b is the axis's own velocity
+``A_bb_neg``   ``|b| min(b, 0)``, added to ``A_bb |b| b``   ``Z_ww_neg``
+``A_uudr``     fin ``u^2 dr``; with ``ds``, ``da`` alike;   ``N_uudr``, ``X_uudsds``
+               ``A_uudrdr``: ``u^2 |dr| dr``, or plain
+               square where even; ``A_udr``, ``A_dr``:
+               behind a propeller, where not u^2 decides
+=============  ==========================================  ============================
+
+A *term* is the product of two entries of the extended velocity ``[1, nu, |nu|, min(nu, 0)]``, so
+that every velocity coefficient is a row and two indices: simulator, regressor and Kalman filter
+loop over one table, and a new name in the grammar needs no new equation. Fin angles are an input,
+not a state: their coefficients (:class:`FinCoefficient`) make a wrench outside of that table.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+
+from rov_ident.core.errors import UserError
+
+AXES = "XYZKMN"
+VELOCITIES = "uvwpqr"
+MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+
+# Even under port-starboard or up-down mirror symmetry, hence a plain square.
+EVEN = frozenset("X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split())
+
+# Places in the extended velocity [1, nu, |nu|, min(nu, 0)] of model.extend.
+ONE = 0
+PLAIN = 1
+ABSOLUTE = 7
+NEGATIVE = 13
+EXTENDED_SIZE = 19
+
+_GRAMMAR = re.compile(
+    r"(?P<axis>[XYZKMN])_(?P<first>[uvwpqr])"
+    r"(?:(?P<dot>dot)|_abs_(?P<abs>[uvwpqr])|(?P<second>[uvwpqr])?(?P<neg>_neg)?)"
+)
+
+FINS = "sra"
+"""Equivalent cross-tail angles: stern plane, rudder, aileron (:mod:`rov_ident.model.fins`)."""
+
+_FIN_GRAMMAR = re.compile(
+    r"(?P<axis>[XYZKMN])_(?P<speed>u{0,2})d(?P<fin>[sra])(?P<square>d(?P=fin))?"
+)
+_FIN_EVEN = {"X": "sra", "Z": "ra", "M": "ra"}  # by the same symmetries as EVEN
+_FIN_NAMES = {"s": "stern plane", "r": "rudder", "a": "aileron"}
+
+
+@dataclass(frozen=True)
+class FinCoefficient:
+    """A force per fin angle: ``u^power delta``, with ``square`` ``u^power |delta| delta``, or
+    ``u^power delta^2`` where it is ``even``. ``row`` is the axis (0..5), ``fin`` one of FINS."""
+
+    name: str
+    row: int
+    power: int
+    fin: str
+    square: bool
+    even: bool
+    unit: str
+    meaning: str
+
+    def factor(self, u: float, delta: float) -> float:
+        """What the coefficient multiplies, at surge speed u [m/s] and angle delta [rad]."""
+        angle = delta if not self.square else delta * (delta if self.even else abs(delta))
+        return u**self.power * angle
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One coefficient: its place in the model, unit and meaning.
+
+    ``row`` is the axis (0..5). For added mass ``column`` is the velocity it multiplies and
+    ``left = right = -1``; otherwise the term is ``extended[left] * extended[right]``.
+    """
+
+    name: str
+    row: int
+    column: int
+    left: int
+    right: int
+    unit: str
+    meaning: str
+
+    @property
+    def is_added_mass(self) -> bool:
+        return self.left < 0
+
+    @property
+    def is_diagonal(self) -> bool:
+        """Of an axis's own motion (``X_udot``, ``X_u``, ``X_uu``): never positive for a hull."""
+        if self.is_added_mass:
+            return self.row == self.column
+        own = PLAIN + self.row
+        return (self.left, self.right) in ((ONE, own), (ABSOLUTE + self.row, own))
+
+    @property
+    def velocity(self) -> int:
+        """The component of nu (0..5) in the second factor; every term has one."""
+        return (self.right - PLAIN) % 6
+
+    @property
+    def is_one_sided(self) -> bool:
+        """Acts only where the axis's own velocity is negative (``Z_ww_neg``)."""
+        return self.right >= NEGATIVE
+
+    @property
+    def symmetric(self) -> str:
+        """The name of the same term for both directions: ``Z_ww`` of ``Z_ww_neg``."""
+        return self.name.removesuffix("_neg")
+
+    @property
+    def place(self) -> tuple[int, ...]:
+        """Equal for two names of the same term (``Y_rdot``/``N_vdot``, ``Y_uv``/``Y_vu``)."""
+        if self.is_added_mass:
+            return (-1, min(self.row, self.column), max(self.row, self.column))
+        return (self.row, min(self.left, self.right), max(self.left, self.right))
+
+
+@cache
+def parse(name: str) -> Coefficient:
+    """The coefficient called ``name``.
+
+    Raises UserError if the name is not in the grammar.
+    """
+    match = _GRAMMAR.fullmatch(name)
+    if match is None:
+        raise UserError(
+            f"'{name}' is not a hydrodynamic coefficient: use names such as X_udot, X_u, X_uu, "
+            "Y_uv or Y_v_abs_r (`rov-ident coefficients` prints them all)"
+        )
+    row = AXES.index(match["axis"])
+    first = VELOCITIES.index(match["first"])
+    force = "N" if row < 3 else "N m"
+    axis = f"{'force' if row < 3 else 'moment'} {match['axis']}"
+    b = match["first"]
+    if match["dot"]:
+        unit = ("kg", "kg m", "kg m2")[(row >= 3) + (first >= 3)]
+        meaning = f"added mass: {axis} per d{b}/dt"
+        return Coefficient(name, row, first, -1, -1, unit, meaning)
+    if match["abs"]:
+        second, c = VELOCITIES.index(match["abs"]), match["abs"]
+        if first == second:
+            square = f"{match['axis']}_{b}{b}"
+            if square in EVEN:
+                raise UserError(f"'{name}' is odd in {b}, but symmetry makes it {square} ({b}^2)")
+            raise UserError(f"'{name}' is written {square}")
+        left, right, formula = ABSOLUTE + second, PLAIN + first, f"{b} |{c}|"
+    elif match["second"]:
+        second, c = VELOCITIES.index(match["second"]), match["second"]
+        if first != second:
+            left, right, formula = PLAIN + first, PLAIN + second, f"{b} {c}"
+        elif name in EVEN:
+            left, right, formula = PLAIN + first, PLAIN + first, f"{b}^2"
+        else:
+            left, right, formula = ABSOLUTE + first, PLAIN + first, f"|{b}| {b}"
+    else:
+        second, left, right, formula = first, ONE, PLAIN + first, b
+    if match["neg"]:
+        if not first == second == row:
+            own = VELOCITIES[row]
+            raise UserError(
+                f"'{name}': only an axis's own damping may differ for negative velocity, "
+                f"{match['axis']}_{own}_neg or {match['axis']}_{own}{own}_neg"
+            )
+        right = NEGATIVE + first
+        formula = formula.removesuffix(b) + f"min({b}, 0)"
+    meaning = f"{'linear damping' if left == ONE else 'quadratic term'}: {axis} = {name} {formula}"
+    order = [first] if left == ONE else [first, second]
+    return Coefficient(name, row, first, left, right, _unit(force, order), meaning)
+
+
+@cache
+def parse_fin(name: str) -> FinCoefficient | None:
+    """The fin coefficient called ``name``; None for any other name."""
+    match = _FIN_GRAMMAR.fullmatch(name)
+    if match is None:
+        return None
+    axis, fin, power = match["axis"], match["fin"], len(match["speed"])
+    row, square = AXES.index(axis), match["square"] is not None
+    even = square and fin in _FIN_EVEN.get(axis, "")
+    speed = ("", "u ", "u^2 ")[power]
+    angle = f"d{fin}" if not square else f"d{fin}^2" if even else f"|d{fin}| d{fin}"
+    force = "N" if row < 3 else "N m"
+    radians = "rad2" if square else "rad"
+    unit = (f"{force}/{radians}", f"{force} s/(m {radians})", f"{force} s2/(m2 {radians})")[power]
+    side = "force" if row < 3 else "moment"
+    meaning = f"fin ({_FIN_NAMES[fin]}): {side} {axis} = {name} {speed}{angle}"
+    return FinCoefficient(name, row, power, fin, square, even, unit, meaning)
+
+
+def fin_catalogue() -> list[FinCoefficient]:
+    """Every fin coefficient of the grammar."""
+    names = [
+        f"{axis}_{speed}d{fin}{square}"
+        for speed in ("uu", "u", "")
+        for axis in AXES
+        for fin in FINS
+        for square in ("", f"d{fin}")
+    ]
+    return [c for name in names if (c := parse_fin(name))]
+
+
+def _unit(force: str, velocities: list[int]) -> str:
+    """``force`` over the product of the velocities, e.g. ``N s2/m2``, ``N m s2/(m rad)``."""
+    metres = sum(v < 3 for v in velocities)
+    radians = len(velocities) - metres
+    seconds = "s" if len(velocities) == 1 else f"s{len(velocities)}"
+    below = [
+        base if count == 1 else f"{base}{count}"
+        for base, count in (("m", metres), ("rad", radians))
+        if count
+    ]
+    return f"{force} {seconds}/" + (below[0] if len(below) == 1 else f"({' '.join(below)})")
+
+
+def catalogue() -> list[Coefficient]:
+    """Every coefficient of the grammar, one name a term, by axis within kind."""
+    names = [f"{a}_{b}dot" for a in AXES for b in VELOCITIES]
+    names += [f"{a}_{b}" for a in AXES for b in VELOCITIES]
+    names += [f"{a}_{b}{b}" for a in AXES for b in VELOCITIES]
+    pairs = [(b, c) for i, b in enumerate(VELOCITIES) for c in VELOCITIES[i + 1 :]]
+    names += [f"{a}_{b}{c}" for a in AXES for b, c in pairs]
+    names += [f"{a}_{b}_abs_{c}" for a in AXES for b in VELOCITIES for c in VELOCITIES if b != c]
+    own = list(zip(AXES, VELOCITIES, strict=True))
+    names += [f"{a}_{b}_neg" for a, b in own] + [f"{a}_{b}{b}_neg" for a, b in own]
+    unique: dict[tuple[int, ...], Coefficient] = {}
+    for name in names:
+        coefficient = parse(name)
+        unique.setdefault(coefficient.place, coefficient)
+    return list(unique.values())

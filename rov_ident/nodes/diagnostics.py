@@ -1,0 +1,219 @@
+"""What an estimator node says of itself in `/diagnostics`, and which of it goes to the log."""
+
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from numpy.typing import NDArray
+from rclpy.node import Node
+
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
+from rov_ident.core.states import Level, State
+from rov_ident.estimation.checkpoint import Keeper
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.io.topics import BATTERY, Reader
+from rov_ident.nodes.conversions import to_status
+from rov_ident.sampling.validation import describe
+
+_LOG_PERIOD = 10.0  # s; between two equal warnings in the log, so that others can be seen
+_LATE = 2.0  # s; a checkpoint that is older than two periods of /diagnostics is worth a warning
+_SLOW = {BATTERY: 10.0}  # s; battery monitors publish at 0.1 Hz and faster
+# The consequence of something that has a warning of its own.
+_NO_WARNING = {"sample: no odometry yet", "sample: no wrench"}
+# Counts in a second up to which there is no warning: a good message now and then looks like an
+# outlier, and takes its neighbour with it.
+_CHANCE = {"imu: outlier between its neighbours": 2, "wrench: outlier between its neighbours": 2}
+
+
+@dataclass
+class Inputs:
+    """The topics of a node by role, and what has come in on them."""
+
+    sources: Mapping[str, tuple[str, type]]
+    received: Counter[str] = field(default_factory=Counter)
+    silence: dict[str, float] = field(default_factory=dict)  # s since the last message
+    subscriptions: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.silence = dict.fromkeys(self.sources, 0.0)
+
+    def is_missing(self, role: str, timeout: float) -> bool:
+        return self.silence[role] > max(timeout, _SLOW.get(role, 0.0))
+
+    def have_stopped(self, timeout: float) -> bool:
+        """Whether one is silent without which there are no samples."""
+        return self.is_missing(ODOMETRY, timeout) or self.is_missing(WRENCH, timeout)
+
+
+class Diagnostics:
+    """Publishes `/diagnostics` of a node, a status each for inputs, estimation, model, checkpoint.
+
+    With ``lockstep`` silence is not taken for the end of the inputs.
+    """
+
+    def __init__(
+        self, node: Node, online: OnlineEstimator, reader: Reader, inputs: Inputs, lockstep: bool
+    ) -> None:
+        self._node, self._online, self._reader = node, online, reader
+        self._inputs, self._lockstep = inputs, lockstep
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.ratios: list[NDArray[np.float64]] = []  # (k, 6) since the last time
+        self._counts: Counter[str] = Counter()
+        self._received: Counter[str] = Counter()
+        self._published = time.monotonic()
+        self._logged, self._logged_at = "", 0.0
+
+    def publish(
+        self, stopped: str, waiting: int, interpreting: bool, keeper: Keeper | None
+    ) -> None:
+        """``stopped``: why there are no samples; ``waiting`` messages are not used yet."""
+        now = time.monotonic()
+        period, self._published = now - self._published, now
+        complaints = self._complaints()
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            self._input_status(complaints, period),
+            self._estimation_status(stopped, waiting, interpreting),
+            self._model_status(),
+        ]
+        if keeper is not None:
+            message.status.append(self._checkpoint_status(keeper))
+        self._publisher.publish(message)
+        # Without the numbers, which differ each time.
+        complaint = "; ".join(text.partition(" (")[0] for text in complaints)
+        if complaint and (complaint != self._logged or now - self._logged_at > _LOG_PERIOD):
+            self._node.get_logger().warning(complaint)
+            self._logged, self._logged_at = complaint, now
+
+    def _status(
+        self, kind: str, level: Level, words: str, values: dict[str, str]
+    ) -> DiagnosticStatus:
+        # By the full name: all vehicles share /diagnostics.
+        name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {kind}"
+        return to_status(name, self._online.config.name, level, words, values)
+
+    # ---------------------------------------------------------------- inputs
+
+    def _complaints(self) -> list[str]:
+        """What keeps the inputs from being used, in words."""
+        complaints = []
+        for role, (name, _) in self._inputs.sources.items():
+            if self._lockstep or not self._inputs.is_missing(role, self._online.config.timeout):
+                continue
+            topic = self._node.resolve_topic_name(name)
+            if self._inputs.received[role]:
+                complaints.append(f"no more messages on {topic}: its driver has stopped")
+            elif role == IMU:
+                continue  # it may well have none
+            elif self._node.count_publishers(topic):
+                complaints.append(
+                    f"no message received on {topic}, though it has a publisher: it is silent, "
+                    "or of another type, or its quality of service does not match qos.reliability"
+                )
+            else:
+                complaints.append(f"no message received on {topic}: remap it or start the driver")
+        counts = self._online.counts + self._reader.counts
+        refused = counts - self._counts
+        complaints += describe(
+            {k: n for k, n in refused.items() if k not in _NO_WARNING and n > _CHANCE.get(k, 0)}
+        )
+        self._counts = counts
+        return complaints
+
+    def _input_status(self, complaints: list[str], period: float) -> DiagnosticStatus:
+        values = {}
+        received = self._inputs.received
+        for role, subscription in self._inputs.subscriptions.items():
+            values[f"{role} rate"] = f"{(received[role] - self._received[role]) / period:.1f} Hz"
+            values[f"{role} publishers"] = str(subscription.get_publisher_count())
+        self._received = received.copy()
+        values.update({name: str(count) for name, count in sorted(self._counts.items())})
+        stopped = self._inputs.have_stopped(self._online.config.timeout)
+        level = Level.STALE if stopped else Level.WARN if complaints else Level.OK
+        words = "; ".join(complaints) or "all messages are used"
+        return self._status("inputs", level, words, values)
+
+    # ---------------------------------------------------------------- estimation
+
+    def _estimation_status(
+        self, stopped: str, waiting: int, interpreting: bool
+    ) -> DiagnosticStatus:
+        report = self._online.report()
+        states = list(zip(report.names, report.states, strict=True))
+        values = {
+            level.name: " ".join(name for name, state in states if state.level == level)
+            for level in (Level.OK, Level.WARN, Level.ERROR)
+        }
+        values["condition number"] = f"{report.condition:.3g}"
+        values |= {
+            state.value: " ".join(name for name, at in states if at is state)
+            for state in State
+            if state is not State.STALE
+        }
+        ratios = np.concatenate([np.zeros((0, 6)), *self.ratios])
+        self.ratios.clear()
+        for i, axis in enumerate("XYZKMN"):
+            finite = ratios[np.isfinite(ratios[:, i]), i]
+            if len(finite):
+                values[f"test ratio {axis}"] = f"{finite.mean():.3g}"
+        for part, ratio in self._online.sampler.kinematic_filter.test_ratios.items():
+            values[f"test ratio odom {part}"] = f"{ratio:.3g}"
+        converged = sum(state is State.CONVERGED for state in report.states)
+        words = f"{converged} of {len(states)} coefficients have converged"
+        wrong = [s for s in State if s.level == Level.ERROR and s in report.states]
+        if not self._online.enabled:
+            level, words = Level.WARN, f"disabled, {words}"
+        elif wrong:
+            level = Level.ERROR
+            words = ", ".join([words, *(f"{s.value}: {values[s.value]}" for s in wrong)])
+        elif stopped:
+            level, words = Level.STALE, f"stale: no samples, {words}"
+        else:
+            level = Level.OK
+        if waiting:
+            words = f"{words}; {waiting} messages wait"
+        if interpreting:
+            words = f"{words}; interpreted until compiled"
+        return self._status("estimation", level, words, values)
+
+    # ---------------------------------------------------------------- model and checkpoint
+
+    def _model_status(self) -> DiagnosticStatus:
+        """What the model seems to lack, in words and numbers."""
+        monitor = self._online.monitor
+        found = [] if monitor is None else monitor.suspicions
+        values = {}
+        for i, suspicion in enumerate(found):
+            number = f" {i + 1}" if i else ""
+            values[f"effect{number}"] = suspicion.effect
+            values[f"axis{number}"] = suspicion.axes
+            values[f"score{number}"] = f"{suspicion.score:.3g}"
+            values[f"penalty{number}"] = f"{suspicion.penalty:.3g}"
+            values[f"price{number}"] = values[f"penalty{number}"]  # an alias for one release
+            values[f"share{number}"] = f"{suspicion.share:.3g}"
+            values[f"alternatives{number}"] = " ".join(suspicion.rivals)
+            for name, value in suspicion.parameters.items():
+                values[f"{suspicion.effect}.{name}"] = f"{value:.4g} {suspicion.units[name]}"
+        level = Level.WARN if found else Level.OK
+        words = "; ".join(s.sentence for s in found) or (
+            "the monitor is being compiled" if monitor is None else "nothing is seen to be missing"
+        )
+        return self._status("model", level, words, values)
+
+    def _checkpoint_status(self, keeper: Keeper) -> DiagnosticStatus:
+        values = {"path": str(keeper.path), "write time": f"{keeper.took:.3g} s"}
+        level, words = Level.OK, "what is learnt is on disk"
+        if keeper.failure:
+            level = Level.ERROR
+            words = f"{keeper.failure}: what is learnt from now on would be lost in a crash"
+        elif keeper.late > _LATE:
+            level = Level.WARN
+            words = f"the disk is slow: the last checkpoint is {keeper.late:.1f} s old"
+        elif self._online.stamp == 0:
+            words = "nothing learnt yet"
+        return self._status("checkpoint", level, words, values)

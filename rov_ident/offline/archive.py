@@ -1,0 +1,214 @@
+"""Many bags as one fit: each is read once, and every pass maps a function over all of them.
+
+What a pass gives are sums over samples, so that the passes of single bags add up to that of the
+archive. They are added in the order of the bags, wherever they were computed: in this process, in
+several, or on a Dask cluster, and the result is the same.
+"""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import repeat
+from multiprocessing import get_context
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.threads import limit_process
+from rov_ident.sampling.records import Record, read_record
+from rov_ident.sampling.smoothing import smoothed
+
+Samples = NDArray[np.void]
+Mapper = Callable[..., list[Any]]
+"""``mapper(function, *arguments)``: [function(samples, *arguments)] of every bag, in order."""
+Sums = TypeVar("Sums", bound=tuple[Any, ...])
+Progress = Callable[[str, int, int], None]
+"""Called with the name of the bag just read, how many are done, and how many there are."""
+
+
+@dataclass(frozen=True)
+class Bag:
+    """What is kept of a bag beside its samples."""
+
+    path: Path
+    sha256: str
+    notes: tuple[str, ...]
+    samples: int
+    duration: float  # s
+
+
+class Archive:
+    """Bags whose samples stay where they were read; :meth:`each` maps a function over them.
+
+    ``bags`` in the order given; ``notes`` say what was refused, and which bags were left out.
+    """
+
+    def __init__(self, bags: Sequence[Bag], notes: Sequence[str], each: Mapper) -> None:
+        self.bags, self.notes, self.each = tuple(bags), tuple(notes), each
+
+    @property
+    def samples(self) -> int:
+        return sum(bag.samples for bag in self.bags)
+
+    @property
+    def duration(self) -> float:
+        return sum(bag.duration for bag in self.bags)
+
+
+def total(parts: Sequence[Sums]) -> Sums:
+    """The sums of all bags, field by field, from those of each."""
+    return type(parts[0])(*(sum(values) for values in zip(*parts, strict=True)))
+
+
+def of_records(records: Sequence[Record]) -> Archive:
+    """Records that have been read already, in this process."""
+    return _archive([_parts(record) for record in records], _here)
+
+
+@contextlib.contextmanager
+def opened(
+    paths: Sequence[Path],
+    config: Config,
+    jobs: int = 1,
+    dask: str = "",
+    progress: Progress | None = None,
+) -> Iterator[Archive]:
+    """Read bags, in ``jobs`` processes or on a Dask cluster at the address ``dask`` ("local").
+
+    Raises UserError if no bag can be read, or the cluster cannot be reached.
+    """
+
+    def told(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
+        for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True)):
+            yield outcome
+            if progress is not None:
+                progress(path.name, i + 1, len(paths))
+
+    if dask:
+        with _cluster(dask, jobs) as client:
+            yield _archive(told(_on_dask(client, paths, config)), partial(_by_dask, client))
+    elif jobs > 1 and len(paths) > 1:
+        # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
+        with (
+            tempfile.TemporaryDirectory(prefix="rov_ident-") as folder,
+            ProcessPoolExecutor(min(jobs, len(paths)), get_context("spawn"), limit_process) as pool,
+        ):
+            files = [Path(folder) / f"{i}.npy" for i in range(len(paths))]
+            outcomes = pool.map(_stored, paths, repeat(config), files)
+            yield _archive(told(outcomes), partial(_by_processes, pool))
+    else:
+        yield _archive(told(_tried(path, config) for path in paths), _here)
+
+
+def default_jobs() -> int:
+    """As many processes as this one may use processors."""
+    return len(os.sched_getaffinity(0))
+
+
+Outcome = tuple[Bag, Any] | str
+"""A bag and where its samples are (the array, a file, or a future), or why it was left out."""
+
+
+def _archive(outcomes: Iterable[Outcome], each: Callable[..., list[Any]]) -> Archive:
+    """``each(where the samples are, function, *arguments)``: the function's results in order."""
+    read, failures = [], []
+    for outcome in outcomes:
+        if isinstance(outcome, str):
+            failures.append(outcome)
+        else:
+            read.append(outcome)
+    if not read:
+        raise UserError("; ".join(failures) or "no bag was given")
+    bags = [bag for bag, _ in read]
+    notes = [*failures, *(note for bag in bags for note in bag.notes)]
+    return Archive(bags, notes, partial(each, [where for _, where in read]))
+
+
+def _parts(record: Record) -> tuple[Bag, Samples]:
+    samples = smoothed(record.samples)
+    return Bag(record.path, record.sha256, record.notes, len(samples), record.duration), samples
+
+
+def _tried(path: Path, config: Config) -> Outcome:
+    try:
+        return _parts(read_record(path, config))
+    except UserError as error:
+        text = str(error)
+        return f"left out: {text if path.name in text else f'{path.name}: {text}'}"
+
+
+def _here(samples: Sequence[Samples], function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    return [function(part, *arguments) for part in samples]
+
+
+# ------------------------------------------------------------------ processes
+
+
+def _stored(path: Path, config: Config, file: Path) -> Outcome:
+    outcome = _tried(path, config)
+    if isinstance(outcome, str):
+        return outcome
+    np.save(file, outcome[1])
+    return outcome[0], file
+
+
+def _of_file(file: Path, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    return function(np.load(file, allow_pickle=False), *arguments)
+
+
+def _by_processes(
+    pool: ProcessPoolExecutor, files: Sequence[Path], function: Callable[..., Any], *arguments: Any
+) -> list[Any]:
+    return list(pool.map(_of_file, files, repeat(function), repeat(arguments)))
+
+
+# ------------------------------------------------------------------ Dask
+
+
+@contextlib.contextmanager
+def _cluster(address: str, jobs: int) -> Iterator[Any]:
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise UserError("--dask needs Dask: pip install 'rov_ident[dask]'") from error
+    with contextlib.ExitStack() as stack:
+        if address == "local":
+            local = LocalCluster(
+                n_workers=max(jobs, 1), threads_per_worker=1, dashboard_address=None
+            )
+            yield stack.enter_context(Client(stack.enter_context(local)))
+            return
+        try:
+            client = Client(address, timeout=10)
+        except (OSError, ValueError) as error:
+            raise UserError(f"no Dask scheduler answers at {address}: {error}") from error
+        yield stack.enter_context(client)
+
+
+def _bag_alone(outcome: Outcome) -> Bag | str:
+    return outcome if isinstance(outcome, str) else outcome[0]
+
+
+def _on_dask(client: Any, paths: Sequence[Path], config: Config) -> Iterator[Outcome]:
+    """Every bag with the future of its samples, which stay on the cluster."""
+    read = client.map(_tried, list(paths), [config] * len(paths), pure=False)
+    for whole, alone in zip(read, client.map(_bag_alone, read, pure=False), strict=True):
+        bag = alone.result()
+        yield (
+            bag if isinstance(bag, str) else (bag, client.submit(itemgetter(1), whole, pure=False))
+        )
+
+
+def _by_dask(
+    client: Any, samples: Sequence[Any], function: Callable[..., Any], *arguments: Any
+) -> list[Any]:
+    return client.gather([client.submit(function, s, *arguments, pure=False) for s in samples])

@@ -1,0 +1,362 @@
+"""Offline fits of an archive: least squares, instrumental variables, maximum likelihood.
+
+All channels together, or channel by channel: then the other components of the motion are as
+measured, a channel whose open-loop simulation is good already is left alone, and one that the
+motion does not show is refused, with the reason (Zhao et al. 2018).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.config.prior import prior_of
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array
+from rov_ident.core.states import CONTRADICTED, State, of_fit
+from rov_ident.effects import Acting, compiled
+from rov_ident.estimation.physical import Estimate, physical
+from rov_ident.model.coefficients import MOTIONS, Coefficient
+from rov_ident.model.equations import Model
+from rov_ident.offline import least_squares, maximum_likelihood
+from rov_ident.offline.archive import Archive, Samples, total
+from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
+from rov_ident.reports.result import NORMAL, provenance
+from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers, over_ground, predicted
+
+KINDS = ("ls", "iv", "ml")
+CHANNELS: dict[str, tuple[str, ...]] = {
+    **{name: (name,) for name in MOTIONS},
+    "lateral": ("sway", "yaw"),
+    "longitudinal": ("heave", "pitch"),
+}
+"""What can be fitted by itself: single axes, and those that one pair of actuators moves."""
+
+_MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
+_GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
+_NOISY = 1.5  # or relative to the noise of what it is compared with
+_COLOURED = 2.0  # times the Cramer-Rao bound, from which intervals say that a cause is missing
+_NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
+_POINTS = 1500  # of a curve in a picture
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a fit is made.
+
+    ``stages``: channels, fitted one group after the other; none: all together. ``prior``: whether
+    what the configuration says of the coefficients counts as one more measurement. ``weighted``:
+    least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
+    errors of the wrench.
+    """
+
+    stages: tuple[tuple[str, ...], ...] = ()
+    prior: bool = True
+    weighted: bool = True
+    process: bool = True
+
+
+class _Stage(NamedTuple):
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    states: dict[str, State]
+    more: dict[str, Any]
+
+
+def fit_batch(
+    archive: Archive,
+    config: Config,
+    kind: str,
+    settings: Settings | None = None,
+    say: Say | None = None,
+) -> Fit:
+    """Fit an archive.
+
+    Raises UserError if there is no such estimator, a channel has no coefficient to estimate, or the
+    configured model cannot be simulated.
+    """
+    if kind not in KINDS:
+        raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
+    settings = settings or Settings()
+    tell = say or (lambda what: None)
+    tell("open loop, as configured")
+    before = open_loop_rmse(archive, config)
+    notes = list(archive.notes)
+    prior = prior_of(config)
+    values, covariance = prior.mean.copy(), np.diag(prior.std**2)
+    states = dict.fromkeys(prior.names, State.HELD)
+    now, parts = config, []
+    for stage in settings.stages or (MOTIONS,):
+        found = _stage(archive, now, kind, stage, settings, notes, tell)
+        if found is None:
+            continue
+        at = np.array([prior.names.index(name) for name in found.names])
+        values[at] = found.values
+        states.update(found.states)
+        covariance[np.ix_(at, at)] = found.covariance
+        now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
+        parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
+    tell("open loop, fitted")
+    after = open_loop_rmse(archive, now)
+    motion = archive.each(_range)
+    low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
+    more: dict[str, Any] = {
+        "open_loop_before": {"horizon_s": HORIZON, "rmse": numbers(before)},
+        "range": {n: [a, b] for n, a, b in zip(VELOCITIES, low.tolist(), high.tolist())},
+    }
+    more |= {"stages": parts} if settings.stages else parts[0]
+    return Fit(
+        estimator=kind,
+        names=prior.names,
+        units=prior.units,
+        values=values,
+        covariance=covariance,
+        states=tuple(states.values()),
+        given=config,
+        fitted=now,
+        samples=archive.samples,
+        duration=archive.duration,
+        rmse=after,
+        provenance=provenance(((b.path.name, b.sha256) for b in archive.bags), vehicle=config.name),
+        notes=tuple(notes),
+        more=more,
+    )
+
+
+def _stage(
+    archive: Archive,
+    config: Config,
+    kind: str,
+    channels: Sequence[str],
+    settings: Settings,
+    notes: list[str],
+    say: Say,
+) -> _Stage | None:
+    """Fit some channels; None, and a note, where there is nothing to do."""
+    free = np.array([axis in channels for axis in MOTIONS])
+    name = ", ".join(channels)
+    # an added mass belongs to both axes that it couples
+    names = tuple(
+        n
+        for n, c in _coefficients(config).items()
+        if free[c.row] and (not c.is_added_mass or free[c.column])
+    )
+    if not names:
+        raise UserError(f"no coefficient of {name} is among those to estimate (key `estimate`)")
+    config = replace(config, estimate=names)
+    if settings.stages:
+        if good := _is_good(archive, config, free):
+            notes.append(f"{name}: left alone, {good}")
+            return None
+        say(f"{name}: excitation")
+        known, reason = _excited(archive, config, free)
+        if not known:
+            notes.append(f"{name}: not fitted, {reason}")
+            return None
+        if held := [n for n in names if n not in known]:
+            notes.append(f"{name}: {', '.join(held)} held, {reason}")
+            names, config = known, replace(config, estimate=known)
+    prior = prior_of(config)
+    precision = 1.0 if settings.prior else _NO_PRIOR
+
+    def progress(what: str) -> None:
+        say(f"{name}: {what}" if settings.stages else what)
+
+    solution = least_squares.solve(
+        archive.each,
+        config,
+        free,
+        instrumental=kind == "iv",
+        weighted=settings.weighted,
+        precision=precision,
+        progress=progress,
+    )
+    base = least_squares.base_parameters(names, solution.information, prior.std)
+    more: dict[str, Any] = {
+        "base_parameters": {
+            "identifiable": [str(c) for c in base.combinations],
+            "unidentified": list(base.unidentified),
+            "not_excited": list(base.unexcited),
+            "condition": base.condition if np.isfinite(base.condition) else None,
+            "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
+        }
+    }
+    found, covariance = solution.values, solution.covariance
+    if kind == "ml":
+        start = config.dynamics.with_values(dict(zip(names, found.tolist(), strict=True)))
+        if np.linalg.eigvalsh(start.mass_matrix)[0] <= 0.0:
+            start = config.dynamics
+        likelihood = maximum_likelihood.maximise(
+            archive.each, config, start, free, precision / prior.std**2, settings.process, progress
+        )
+        found, covariance = likelihood.values, likelihood.covariance
+        bound = np.sqrt(np.diag(likelihood.bound))
+        more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
+        more["noise"] = _noise(likelihood, free)
+        more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
+        wider = float(np.median(np.sqrt(np.diag(covariance)) / bound))
+        if wider > _COLOURED:
+            notes.append(
+                f"{name + ': ' if settings.stages else ''}what remains is no white noise, so that "
+                f"intervals are {wider:.1f} times as wide as they could be: rov-ident explain "
+                "looks for what the model lacks"
+            )
+        if not likelihood.converged:
+            notes.append(f"{name}: the iteration did not settle: give a better configuration")
+    removed = 1.0 - np.diag(covariance) / prior.std**2
+    estimate = Estimate(names, found, covariance, 0.0)
+    values = physical(config.dynamics, prior, estimate)
+    states = {}
+    for i, n in enumerate(names):
+        at_bound = bool(abs(found[i] - values[i]) > CONTRADICTED * estimate.std[i])
+        if at_bound:
+            notes.append(
+                f"{n}: the data ask for {found[i]:.4g}, which no passive hull has; "
+                f"{values[i]:.4g} is kept"
+            )
+        states[n] = of_fit(
+            values[i], estimate.std[i], prior.std[i], bool(removed[i] > IDENTIFIABLE), at_bound
+        )
+    unknown = [n for n in base.unidentified if states[n] is State.HELD]
+    if unknown and not settings.stages:
+        notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
+    return _Stage(names, values, covariance, states, more)
+
+
+def _coefficients(config: Config) -> dict[str, Coefficient]:
+    """Those to estimate, by name."""
+    all_ = dict(zip(config.model.names, config.model.coefficients, strict=True))
+    return {name: all_[name] for name in config.estimate}
+
+
+def _is_good(archive: Archive, config: Config, free: NDArray[np.bool_]) -> str:
+    """Why a channel needs no fit, in words, or nothing."""
+    rmse = open_loop_rmse(archive, config, free)[free]
+    size, noise = _sizes(archive)
+    share = rmse / np.maximum(size[free], 1e-9)
+    if np.all((share < _GOOD) | (rmse < _NOISY * noise[free])):
+        worst = 100.0 * float(np.max(share))
+        return f"its open-loop error is at most {worst:.1f} % of the motion, or noise"
+    return ""
+
+
+def _excited(
+    archive: Archive, config: Config, free: NDArray[np.bool_]
+) -> tuple[tuple[str, ...], str]:
+    """Names of the coefficients that the motion shows, and why not the others."""
+    prior = prior_of(config)
+    information = predicted_information(archive, config, free)
+    covariance = maximum_likelihood.inverse_of(information + np.diag(prior.std**-2.0))
+    std = np.sqrt(np.diag(covariance))
+    size, noise = _sizes(archive)
+    # A wrong trim alone makes the prediction move where the vehicle does not: look at it, too.
+    moved_by = [c.column if c.is_added_mass else c.velocity for c in _coefficients(config).values()]
+    known = std**2 < (1.0 - IDENTIFIABLE) * prior.std**2
+    known &= (size > _MOVES * noise)[moved_by]
+    uncertain = ", ".join(
+        f"{n} ± {NORMAL * s:.2g} {u} (95 %)"
+        for n, s, u, k in zip(prior.names, std, prior.units, known, strict=True)
+        if not k
+    )
+    moved = ", ".join(
+        f"{axis} moves {size[i]:.2g} {'m/s' if i < 3 else 'rad/s'}"
+        for i, axis in enumerate(MOTIONS)
+        if free[i]
+    )
+    return tuple(np.array(prior.names)[known].tolist()), (
+        f"the motion does not show it: it would be known to {uncertain} ({moved} rms); drive it "
+        "harder, in both directions"
+    )
+
+
+def predicted_information(
+    archive: Archive, config: Config, free: NDArray[np.bool_] | None = None
+) -> Array:
+    """Information (n, n) about the coefficients to estimate that the bags' motion holds, at the
+    configured values and noise."""
+    estimated = prior_of(config).estimated
+    noise = maximum_likelihood.assumed(config, maximum_likelihood.LIKELY)
+    parts = archive.each(maximum_likelihood.one_pass, config.dynamics, estimated, noise, free)
+    return total(parts).information
+
+
+# ------------------------------------------------------------------ open loop
+
+
+def open_loop_rmse(
+    archive: Archive, config: Config, free: NDArray[np.bool_] | None = None
+) -> Array:
+    """RMSE (6,) of the open-loop simulation in windows of HORIZON seconds over all bags."""
+    parts = archive.each(_squares, config.dynamics, compiled(config.effects), free)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rmse: Array = np.sqrt(sum(p[0] for p in parts) / sum(p[1] for p in parts))
+    return rmse
+
+
+def _squares(
+    samples: Samples, model: Model, effects: Acting, free: NDArray[np.bool_] | None
+) -> tuple[Array, int]:
+    measured = samples["measured"]
+    with np.errstate(invalid="ignore"):
+        error = predicted(model, samples, HORIZON, free, effects) - over_ground(samples)
+    return np.sum(error[measured] ** 2, axis=0), int(measured.sum())
+
+
+def _range(samples: Samples) -> tuple[Array, Array]:
+    """Where the motion is for all but a thousandth of the time, either side."""
+    low, high = np.quantile(samples["nu"], [0.001, 0.999], axis=0)
+    return low, high
+
+
+def _sizes(archive: Archive) -> tuple[Array, Array]:
+    """Root mean square (6,) over the bags of what :func:`_size` gives."""
+    size, noise = (np.sqrt(np.mean(np.square(x), axis=0)) for x in zip(*archive.each(_size)))
+    return size, noise
+
+
+def _size(samples: Samples) -> tuple[Array, Array]:
+    """Root mean square (6,) of the motion, and of the noise of its measurement."""
+    noise = np.sqrt(np.mean(samples["odometry_variance"], axis=0))
+    if np.isfinite(samples["gyro"]).any():
+        noise[3:] = np.sqrt(np.mean(samples["gyro_variance"]))
+    return np.sqrt(np.mean(samples["nu"] ** 2, axis=0)), noise
+
+
+def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
+    """One for each bag: the open-loop simulation in windows of HORIZON, before and after."""
+    found = archive.each(_curves, before.dynamics, after.dynamics, compiled(before.effects))
+    return [Curves(bag.path.name, *of) for bag, of in zip(archive.bags, found, strict=True)]
+
+
+def _curves(samples: Samples, before: Model, after: Model, effects: Acting) -> tuple[Array, ...]:
+    keep = slice(None, None, max(1, len(samples) // _POINTS))
+    simulated = (predicted(m, samples, HORIZON, None, effects)[keep] for m in (before, after))
+    return samples["t"][keep], over_ground(samples)[keep], *simulated
+
+
+def validation(archive: Archive, before: Config, after: Config) -> dict[str, Any]:
+    """RMSE of the open-loop simulation on bags that no fit has seen, for the JSON of a fit."""
+    return {
+        "horizon_s": HORIZON,
+        "rmse_before": numbers(open_loop_rmse(archive, before)),
+        "rmse": numbers(open_loop_rmse(archive, after)),
+        "bags": [{"file": bag.path.name, "sha256": bag.sha256} for bag in archive.bags],
+    }
+
+
+def _noise(found: maximum_likelihood.Likelihood, free: NDArray[np.bool_]) -> dict[str, Any]:
+    n = found.noise
+    axes = [a for a, f in zip(VELOCITIES, free, strict=True) if f]
+    factor = np.sqrt(n.measurement[free])
+    floor = np.sqrt(n.floor[free] / n.correlation_time)
+    return {
+        "measurement_factor": dict(zip(axes, factor.tolist(), strict=True)),
+        "wrench_floor": dict(zip(axes, floor.tolist(), strict=True)),
+        "wrench_relative": n.relative,
+    }

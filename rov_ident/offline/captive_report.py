@@ -1,0 +1,40 @@
+"""The page of `forces`: what was fitted, how well, and why this structure."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rov_ident.core.messages import Array
+from rov_ident.offline.captive_tests import AxisFit
+from rov_ident.reports import html as report
+from rov_ident.reports import plots
+
+
+def page(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
+    """The page of a force table."""
+    sections = [report.bullets(notes)] if notes else []
+    for axis, f in fits.items():
+        unit = "N" if axis in "XYZ" else "N m"
+        tried = [[" ".join(c.terms), f"{c.cv_rmse:.4g}"] for c in f.candidates[:8]]
+        sizes: Array = np.array([len(c.terms) for c in f.candidates], dtype=np.float64)
+        errors: Array = np.array([c.cv_rmse for c in f.candidates], dtype=np.float64)
+        chosen = [set(c.terms) for c in f.candidates].index(set(f.names))
+        sections += [
+            report.heading(f"{axis}: R2 {f.r2:.4f}, residual {f.rmse:.3g} {unit}"),
+            report.panels(
+                [
+                    plots.to_svg(plots.parity(f.measured, f.fitted, axis, unit), f"fit-{axis}-"),
+                    plots.to_svg(
+                        plots.structures(sizes, errors, chosen, "structures tried", unit),
+                        f"tried-{axis}-",
+                    ),
+                ],
+                "Left: every row of the table. Right: the best structures that were tried.",
+            ),
+            report.numbers(f),
+            report.paragraph(f"Chosen because: {f.why}."),
+            report.table(["structure", f"cross-validated error [{unit}]"], tried),
+        ]
+    lead = ", ".join(f"{axis}: {' '.join(f.names)}" for axis, f in fits.items())
+    origin = report.origin(next(iter(fits.values())))
+    return report.page(f"Coefficients from {name}", lead, sections, origin)

@@ -1,0 +1,186 @@
+"""Thrust, drag and added mass of the surge channel, from step-up and coast-down (Zhao et al. 2018).
+
+    (m - X_udot) u_dot = k1 n + k2 |n| n + X_u u + X_uu |u| u
+
+Every term is a force: multiply ``m - X_udot``, k1, k2, X_u and X_uu by one number, and the motion
+is the same. Speeds alone tell the *ratios* to the inertia; one force or mass from elsewhere sets
+the scale: a bollard pull, or the added mass (a spheroid's, say).
+
+Fitted by output error: u is simulated from the shaft speed n, run by run, each from an estimated
+starting speed, and compared with the measured one.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rov_ident.core.errors import UserError
+from rov_ident.core.jit import kernel
+from rov_ident.core.linalg import scaled_inverse
+from rov_ident.io.csv_table import read_csv
+from rov_ident.model.equations import Array
+from rov_ident.reports.result import Result
+
+_UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: shaft speed n (N,) held from each ``t`` (N,) [s] on, measured surge speed u (N,)."""
+
+    t: Array
+    n: Array
+    u: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoastDown(Result):
+    """k1 and k2 are per shaft speed in 1/s or its unit; ``rmse`` [m/s] of the simulated speed."""
+
+    rmse: float
+
+    def to_json(self) -> str:
+        """The machine-readable result."""
+        result = {
+            "coefficients": self.entries(),
+            "speed_rmse_mps": self.rmse,
+            "provenance": self.provenance,
+        }
+        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+
+
+def read_run(path: Path, columns: Mapping[str, str]) -> tuple[Run, str]:
+    """A run from a CSV file with the columns `t_s`, `n` and `u`, or as ``columns`` calls them, and
+    the file's sha256.
+
+    Raises UserError if it is no such file.
+    """
+    if unknown := sorted(set(columns) - {"t_s", "n", "u"}):
+        raise UserError(f"`{unknown[0]}` cannot be mapped: use one of t_s n u")
+    table = read_csv(path)
+    headings = [columns.get(name, name) for name in ("t_s", "n", "u")]
+    for name, heading in zip(("t_s", "n", "u"), headings, strict=True):
+        if heading not in table.cells:
+            raise UserError(
+                f"{path} has no column `{heading}`: it has {', '.join(table.cells)}; name the "
+                f"right one with --map {name}=HEADING"
+            )
+    return Run(*map(table.numbers, headings)), table.sha256
+
+
+def fit_coast_downs(
+    runs: Sequence[Run],
+    mass: float,
+    *,
+    added_mass: float | None = None,
+    bollard: tuple[float, float] | None = None,
+) -> CoastDown:
+    """Fit step-up and coast-down runs.
+
+    ``added_mass``: X_udot [kg], not positive; or ``bollard``: a shaft speed and the thrust [N] at
+    rest there. One of the two.
+
+    Raises UserError if the scale is not given, or the runs lack thrust, coasting, or speed.
+    """
+    if (added_mass is None) == (bollard is None):
+        raise UserError(
+            "speeds do not tell forces: give either the added mass X_udot or one bollard pull"
+        )
+    if added_mass is not None and added_mass > 0.0:
+        raise UserError(f"added_mass is {added_mass:g}: X_udot is negative (SNAME signs)")
+    if not runs:
+        raise UserError("no run was given")
+    _check(runs)
+    speed = max(float(np.abs(r.u).max()) for r in runs)
+    shaft = max(float(np.abs(r.n).max()) for r in runs)
+    rise = max(1.0, max(float(r.t[-1] - r.t[0]) for r in runs) / 10.0)
+    size = np.array(
+        [speed / rise / shaft, speed / rise / shaft**2, 1.0 / rise, 1.0 / (rise * speed)]
+    )
+
+    def errors_of(x: Array) -> list[Array]:
+        return [r.u - _simulated(x[:4] * size, x[4 + k], r.t, r.n) for k, r in enumerate(runs)]
+
+    start = np.concatenate([[0.5, 0.5, -0.5, -0.5], [float(np.median(r.u[:5])) for r in runs]])
+    found = least_squares(lambda x: np.concatenate(errors_of(x)), start, x_scale="jac")
+    ratio = found.x[:4] * size
+    errors = errors_of(found.x)
+    left = np.concatenate(errors)
+    # residuals of one run are alike from point to point: allow for it by their own correlation
+    variance = float(left @ left) / max(len(left) - len(found.x), 1) * _inflation(errors)
+    covariance = scaled_inverse(found.jac.T @ found.jac)[:4, :4] * variance
+    covariance = covariance * np.outer(size, size)
+    if added_mass is not None:
+        inertia, slope = mass - added_mass, np.zeros(4)
+    else:
+        assert bollard is not None
+        n, thrust = bollard
+        terms = np.array([n, abs(n) * n, 0.0, 0.0])
+        if not float(terms @ ratio) * thrust > 0.0:
+            raise UserError("the bollard pull and the runs disagree about the sign of the thrust")
+        inertia = thrust / float(terms @ ratio)
+        slope = -inertia * terms / float(terms @ ratio)
+        if inertia <= mass:
+            raise UserError(
+                f"with {thrust:g} N at rest the runs make mass and added mass {inertia:.3g} kg, "
+                f"less than the mass of {mass:g} kg: check the bollard pull"
+            )
+    # of the four and of X_udot = mass - inertia, by the four ratios
+    jacobian = np.vstack([inertia * np.eye(4) + np.outer(ratio, slope), -slope])
+    return CoastDown(
+        estimator="output error",
+        names=tuple(_UNITS),
+        units=tuple(_UNITS.values()),
+        values=np.append(inertia * ratio, mass - inertia),
+        covariance=jacobian @ covariance @ jacobian.T,
+        rmse=float(np.sqrt(np.mean(left**2))),
+    )
+
+
+def _check(runs: Sequence[Run]) -> None:
+    for i, r in enumerate(runs):
+        if not (len(r.t) == len(r.n) == len(r.u)) or len(r.t) < 10:
+            raise UserError(f"run {i + 1}: t, n and u must have one length, 10 points at least")
+        if not np.isfinite([r.t, r.n, r.u]).all():
+            raise UserError(f"run {i + 1}: holds values that are not finite")
+        if np.any(np.diff(r.t) <= 0.0):
+            raise UserError(f"run {i + 1}: times must increase")
+    shaft = np.abs(np.concatenate([r.n for r in runs]))
+    speed = np.abs(np.concatenate([r.u for r in runs]))
+    if not shaft.any():
+        raise UserError("the shaft never turns: add a step-up run")
+    if not np.any((shaft == 0.0) & (speed > 0.3 * speed.max())):
+        raise UserError("no run coasts (n = 0 at speed): drag and thrust cannot be told apart")
+    if len(np.unique(np.round(shaft[shaft > 0.0] / shaft.max(), 1))) < 2:
+        raise UserError("the shaft turns at one speed only: k1 and k2 cannot be told apart")
+
+
+def _inflation(residuals: Sequence[Array]) -> float:
+    """By how much means of the residuals scatter more than white noise would let them."""
+    lagged = sum(float(e[1:] @ e[:-1]) for e in residuals)
+    power = sum(float(e @ e) for e in residuals)
+    rho = min(max(lagged / max(power, 1e-300), 0.0), 0.99)
+    return (1.0 + rho) / (1.0 - rho)
+
+
+@kernel
+def _simulated(ratio, start, t, n):
+    """u (N,) from its value ``start`` at t[0], steps of 20 ms at most."""
+    u = np.empty(len(t))
+    u[0] = start
+    for k in range(len(t) - 1):
+        x, span = u[k], t[k + 1] - t[k]
+        steps = max(1, int(np.ceil(span / 0.02)))
+        dt = span / steps
+        push = ratio[0] * n[k] + ratio[1] * abs(n[k]) * n[k]
+        for _ in range(steps):
+            a = push + ratio[2] * x + ratio[3] * abs(x) * x
+            y = x + 0.5 * dt * a
+            x += dt * (push + ratio[2] * y + ratio[3] * abs(y) * y)
+            x = min(max(x, -50.0), 50.0)
+        u[k + 1] = x
+    return u

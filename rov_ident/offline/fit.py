@@ -1,0 +1,218 @@
+"""Offline fits, all with one type of result."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rov_ident.config import Config, dump
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array
+from rov_ident.core.states import State, of_fit
+from rov_ident.effects import compiled
+from rov_ident.estimation.compilation import ensure_compiled
+from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.model.equations import Model
+from rov_ident.reports.result import Result, Shown, provenance
+from rov_ident.reports.table import Table, Tables
+from rov_ident.sampling.records import HORIZON, Record, numbers, score
+from rov_ident.sampling.sampler import Sampler
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
+
+
+TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
+          "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
+_SHOWN = 60.0  # s of motion in the picture of a fit
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Measured and simulated velocities (k, 6) of a bag, thinned for a picture."""
+
+    name: str
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Shown, Result):
+    """Coefficients identified from dives.
+
+    ``names``, ``units``, ``values``, ``std``, ``lower``, ``upper`` (n,) and ``covariance`` (n, n)
+    are in the order of ``names``; ``lower`` and ``upper`` are the 95 % interval.
+    ``states`` (n,) tell how well each is known: "held" where the prior and not the data made the
+    value. ``rmse`` (6,) [m/s, rad/s] is of open-loop windows of HORIZON seconds. ``given`` is the
+    configuration that the fit began with, ``fitted`` the same with the values found.
+    """
+
+    states: tuple[State, ...]
+    given: Config = field(repr=False)
+    fitted: Config = field(repr=False)
+    samples: int
+    duration: float
+    rmse: Array
+    more: dict[str, Any] = field(default_factory=dict)
+    """Further parts of the JSON that only some estimators have."""
+    curves: tuple[Curves, ...] = field(default=(), repr=False)
+    """Of every bag that was fitted: the open-loop simulation before and after."""
+    judged: tuple[Curves, ...] = field(default=(), repr=False)
+    """The same of the bag that was held back for validation."""
+
+    @property
+    def model(self) -> Model:
+        """The equations of motion with the values found."""
+        return self.fitted.model
+
+    @property
+    def sentence(self) -> str:
+        """What was fitted, by which method, to how much data."""
+        bags = len(self.provenance["bags"])
+        known = sum(self.identifiable)
+        return (
+            f"{TITLES[self.estimator].capitalize()} on {bags} bag{'s' * (bags != 1)}, "
+            f"{self.duration:.0f} s: the data determine {known} of {len(self.names)} coefficients."
+        )
+
+    def table(self) -> Table | Tables:
+        """Every coefficient with half of its 95 % interval, and the configured value."""
+        states = [state.value for state in self.states]
+        configured = [f"{self.given.value(name):.5g}" for name in self.names]
+        title = f"{self.estimator}: {self.samples} samples, {self.duration:.1f} s"
+        parts = [self.numbers(title, {"configured": configured, "state": states})]
+        if judged := self.more.get("validation"):
+            rows = [
+                [name, *("" if x is None else f"{x:.4f}" for x in (before, judged["rmse"][name]))]
+                for name, before in judged["rmse_before"].items()
+            ]
+            title = f"{judged['bags'][0]['file']}, simulated in open loop: RMSE"
+            parts.append(Table(title, ["", "before", "after"], rows))
+        if found := self.more.get("reference"):
+            title = f"after {found['duration_s']:.1f} s: our filter and filterpy's"
+            head = ["", "ours", "std", "filterpy's", "std", "apart, in std"]
+            rows = [
+                [name, *(f"{x:.5g}" for x in row.values())]
+                for name, row in found["coefficients"].items()
+            ]
+            parts.append(Table(title, head, rows))
+        return parts[0] if len(parts) == 1 else Tables(tuple(parts))
+
+    def plot(self) -> "Figure":
+        """The coefficients relative to the configured ones, and the motion simulated with both."""
+        from rov_ident.reports import plots
+
+        before = np.array([self.given.value(name) for name in self.names])
+        size = np.where(before == 0.0, np.maximum(np.abs(self.values), 1e-12), np.abs(before))
+        change = 100.0 * (self.values - before) / size
+        half = 100.0 * self.quantile * self.std / size
+        one = next(iter(self.judged or self.curves), None)
+        if one is None:
+            return plots.fitted(self.names, (change, half), None)
+        part = one.t < one.t[0] + _SHOWN
+        models = {"as configured": one.before[part], "retuned": one.after[part]}
+        return plots.fitted(self.names, (change, half), (one.t[part], one.measured[part], models))
+
+    def page(self) -> str:
+        """A self-contained HTML document: coefficients, and the simulation before and after."""
+        from rov_ident.offline.report import page
+
+        return page(self)
+
+    def save_config(self, path: str | Path) -> None:
+        """Write :attr:`fitted` as a parameter file, whatever its ending.
+
+        Raises
+        ------
+        UserError
+            If it cannot be written.
+        """
+        bags = ", ".join(bag["file"] for bag in self.provenance["bags"])
+        comment = f"Fitted by rov-ident fit --estimator {self.estimator} to {bags}."
+        dump(self.fitted, path, comment)
+
+    def _writers(self) -> dict[str, Callable[[Path], None]]:
+        return super()._writers() | {".yaml": self.save_config}
+
+    @property
+    def identifiable(self) -> tuple[bool, ...]:
+        """(n,) whether the data decide about a coefficient."""
+        return tuple(state not in (State.HELD, State.DIVERGED) for state in self.states)
+
+    def to_json(self) -> str:
+        """The machine-readable result; numbers that do not exist are null."""
+        coefficients = self.entries()
+        for entry, known, state in zip(coefficients.values(), self.identifiable, self.states):
+            entry |= {"identifiable": known, "state": state.value}
+        result = {
+            "estimator": self.estimator,
+            "coefficients": coefficients,
+            "samples": self.samples,
+            "duration_s": self.duration,
+            "open_loop": {"horizon_s": HORIZON, "rmse": numbers(self.rmse)},
+            "notes": list(self.notes),
+            **self.more,
+            "provenance": self.provenance,
+        }
+        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+
+
+def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
+    """Fold a recursive estimator over records, one after the other, as the node would.
+
+    Raises
+    ------
+    UserError
+        If the data are too few to say anything.
+    """
+    if kind not in ESTIMATORS:
+        raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")
+    ensure_compiled(config, kind)
+    estimator = OnlineEstimator(config, kind)
+    for record in records:
+        estimator.sampler = Sampler(config)
+        if config.estimate_effects:  # samples depend on what is known by then
+            bag = Bag(record.path)
+            for role, message in inputs.messages(bag, inputs.select(bag, config), config):
+                estimator.push(role, message)
+            estimator.flush()
+        else:
+            estimator.take(record.samples)
+    report = estimator.report()
+    states = [
+        of_fit(value, std, prior, 1.0 - (std / prior) ** 2 > IDENTIFIABLE, now is State.AT_BOUND)
+        if now is not State.DIVERGED
+        else now
+        for value, std, prior, now in zip(
+            report.values, report.std, estimator.prior.std, report.states, strict=True
+        )
+    ]
+    found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    samples = sum(len(record.samples) for record in records)
+    moves, effects = found.dynamics, compiled(found.effects)
+    scores = [score(moves, record.samples, effects=effects) for record in records]
+    squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
+    return Fit(
+        estimator=kind,
+        names=report.names,
+        units=report.units,
+        values=report.values,
+        covariance=report.covariance,
+        states=tuple(states),
+        given=config,
+        fitted=found,
+        samples=samples,
+        duration=sum(record.duration for record in records),
+        rmse=np.sqrt(np.sum(squares, axis=0) / samples),
+        provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
+        notes=tuple(note for record in records for note in record.notes),
+    )

@@ -1,0 +1,281 @@
+"""Batch least squares over the 6-DOF regressor, and instrumental variables.
+
+*From a record*: the rows ``y = Phi theta + noise`` are those of `filtered_regression`, every
+channel through one low-pass filter, so that nothing is differentiated. Least squares is the
+solution of ``sum w Phi' (y - Phi theta) = 0``. Its regressors hold the noise of the velocities, and
+the estimate is biased however long the record: noise in Phi meets itself in Phi', and the square of
+a noisy velocity is too large on average, by the noise's variance. *Instrumental variables* replace
+the left factor by what is not noisy::
+
+    sum w Z' (y - Phi theta) = 0,   Z: the same rows along the *simulated* motion
+
+simulated from the wrench with the present coefficients, and again with the new ones (refined
+instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias, which is the
+added masses'. It does not cure the second, that of the quadratic damping: an expected square is no
+matter of correlation. Maximum likelihood has neither.
+
+Sums over the samples of several bags are sums over bags: an archive is one fit.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+from rov_ident.config import Config
+from rov_ident.core.jit import inlined, kernel
+from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.effects import Acting, compiled
+from rov_ident.model.equations import Array, Model
+from rov_ident.model.scales import authority
+from rov_ident.offline.archive import Mapper, Samples, total
+from rov_ident.offline.filtered_regression import Regression, filtered_rows, regression
+from rov_ident.sampling.records import HORIZON, predicted
+
+PERIOD = 0.1  # s between rows
+_LAG = 2.0  # s; window over the correlation of the residuals
+_ROUNDS = 4  # of instruments, each simulated with the coefficients of the one before
+_KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
+# quarters of the prior variance are gone
+
+
+class Moments(NamedTuple):
+    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,).
+
+    In prior standard deviations about the prior's mean.
+    """
+
+    sums: Array
+    rows: Array
+
+
+class Batch(NamedTuple):
+    """What the passes over the bags need to know."""
+
+    task: Regression
+    effects: Acting  # of the simulation
+    instruments: Model | None = None  # the model along whose motion the instruments are taken
+
+
+@dataclass(frozen=True)
+class Solution:
+    """values and covariance of the estimated coefficients, in their units.
+
+    ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
+    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
+    """
+
+    values: Array
+    covariance: Array
+    information: Array
+    noise: Array
+    rows: int
+
+
+def solve(
+    each: Mapper,
+    config: Config,
+    free: NDArray[np.bool_] | None = None,
+    *,
+    instrumental: bool = False,
+    weighted: bool = True,
+    precision: float = 1.0,
+    progress: Callable[[str], None] | None = None,
+) -> Solution:
+    """Least squares over every bag, the estimated coefficients those of the configuration.
+
+    ``weighted``: by the residual of each axis, found in a first, ordinary round (in units of the
+    axis's own forces). ``precision`` multiplies the prior's: 1 takes the configuration as it is.
+    """
+    free = np.ones(6, dtype=bool) if free is None else free
+    say = progress or (lambda what: None)
+    task = regression(config)
+    batch = Batch(task, compiled(config.effects))
+    prior: Array = np.eye(len(task.scale)) * precision
+    repeats = 2.0 / (task.corner * PERIOD)
+    forces = authority(config.dynamics)
+
+    def solved(moments: Moments, weight: Array) -> tuple[Array, Array]:
+        sums = np.einsum("k,kij->ij", weight / repeats, moments.sums)
+        information = sums[:-1, :-1]
+        return information, np.array(np.linalg.solve(information + prior, sums[:-1, -1]))
+
+    def residual(moments: Moments, x: Array) -> Array:
+        tail = np.append(-x, 1.0)
+        squares = np.einsum("i,kij,j->k", tail, moments.sums, tail)
+        std: Array = np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
+        return std
+
+    say("least squares")
+    moments = total(each(moments_of, batch))
+    # ordinary: forces and moments in units of their own size, else a metre would decide
+    weight = np.where(free, 1.0 / (0.03 * forces) ** 2, 0.0)
+    information, x = solved(moments, weight)
+    for _ in range(3 if weighted else 0):
+        noise = np.maximum(residual(moments, x), 1e-6 * forces)
+        weight = np.where(free, 1.0 / noise**2, 0.0)
+        information, x = solved(moments, weight)
+    noise, normal = residual(moments, x), information
+    for round_ in range(_ROUNDS if instrumental else 0):
+        say(f"instruments, round {round_ + 1}")
+        theta = config.dynamics.theta.copy()
+        theta[task.estimated] += task.scale * x
+        model = config.dynamics.with_theta(theta)
+        if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0.0:
+            break
+        batch, old = batch._replace(instruments=model), x
+        moments = total(each(moments_of, batch))
+        normal, x = solved(moments, weight)
+        if np.abs(x - old).max() < 1e-4:
+            break
+    say("residuals")
+    scatter = sum(each(scatter_of, batch, x, weight / repeats)) + prior
+    inverse = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)
+    covariance = widened(sandwich(inverse, scatter), np.diag(scaled_inverse(information + prior)))
+    return Solution(
+        task.theta[task.estimated] + task.scale * x,
+        covariance * np.outer(task.scale, task.scale),
+        information,
+        noise,
+        int(moments.rows[free].sum()),
+    )
+
+
+# ------------------------------------------------------------------ of one bag
+
+
+def moments_of(samples: Samples, batch: Batch) -> Moments:
+    """The sums of one bag's samples (k,) of SAMPLE."""
+    phi, z = _both(samples, batch)
+    return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(len(phi))))
+
+
+def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
+    """Covariance (n, n) of one bag's accumulated ``sum w Z' e``, correlation in time included."""
+    phi, z = _both(samples, batch)
+    error = phi[:, :, -1] - phi[:, :, :-1] @ x
+    score = np.einsum("ka,kai->ki", error * weight, z[:, :, :-1])
+    total, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
+    _scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
+    return total
+
+
+def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+    z = phi = filtered_rows(batch.task, samples, PERIOD)
+    if batch.instruments is not None:  # along the motion that the model says, through the water
+        nu = predicted(batch.instruments, samples, np.inf, effects=batch.effects)
+        if not np.isfinite(nu).all():
+            nu = predicted(batch.instruments, samples, HORIZON, effects=batch.effects)
+        simulated = samples.copy()
+        simulated["nu"] = nu
+        simulated["nu"][:, :3] -= samples["water"]
+        z = filtered_rows(batch.task, simulated, PERIOD)
+        z[:, :, -1] = phi[:, :, -1]
+    good = np.isfinite(z).all(axis=(1, 2))
+    return phi[good], z[good]
+
+
+@kernel
+def _scatter(score, fade, total, lagged):
+    for k in range(len(score)):
+        add_scatter(score[k], fade, total, lagged)
+
+
+@inlined
+def add_scatter(score, fade, total, lagged):
+    """Add to total (n, n) the products of a score (n,) with itself and with those before it.
+
+    ``lagged`` (n,) is the sum of these, which fades by the factor ``fade`` from one to the next.
+    """
+    n = len(lagged)
+    for i in range(n):
+        lagged[i] *= fade
+    for i in range(n):
+        f, h = score[i], lagged[i]
+        for j in range(n):
+            total[i, j] += f * (score[j] + lagged[j]) + h * score[j]
+    for i in range(n):
+        lagged[i] += score[i]
+
+
+# ------------------------------------------------------------------ what a bag can tell
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A combination that the data determine: ``name + sum of factor * other``."""
+
+    name: str
+    others: tuple[tuple[str, float], ...]
+
+    def __str__(self) -> str:
+        parts = [f"{'+' if f > 0 else '-'} {abs(f):.3g} {name}" for name, f in self.others]
+        return " ".join([self.name, *parts])
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """Which coefficients, or combinations of them, the data identify.
+
+    ``combinations``: identifiable. ``unidentified``: coefficients of which only a combination with
+    others, or nothing at all (``unexcited``), is known. ``condition``: of the regressor, its
+    columns of unit length; ``collinear``: pairs of columns with the cosine between them.
+    """
+
+    combinations: tuple[Combination, ...]
+    unidentified: tuple[str, ...]
+    unexcited: tuple[str, ...]
+    condition: float
+    collinear: tuple[tuple[str, str, float], ...]
+
+
+def base_parameters(names: Sequence[str], information: Array, scale: Array) -> BaseParameters:
+    """From the information (n, n) in units of ``scale`` (n,), the prior's standard deviations.
+
+    A QR decomposition with pivoting puts the columns that add most first; those after the numerical
+    rank are combinations of these (Gautier 1991). The rank counts directions of which the data
+    remove three quarters of the prior variance.
+    """
+    eigenvalues, vectors = np.linalg.eigh(information)
+    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
+    length = np.sqrt(np.maximum(np.diag(information), 0.0))
+    seen = length**2 >= _KNOWN
+    unexcited = tuple(name for name, s in zip(names, seen, strict=True) if not s)
+    at = np.flatnonzero(seen)
+    if len(at) == 0:
+        return BaseParameters((), unexcited, unexcited, np.inf, ())
+    r, pivot = qr(root[:, at], mode="r", pivoting=True)
+    r = r[: len(at)]
+    rank = int(np.count_nonzero(np.diag(r) ** 2 >= _KNOWN))
+    base, rest = at[pivot[:rank]], at[pivot[rank:]]
+    mixed = np.linalg.solve(r[:rank, :rank], r[:rank, rank:])
+    unknown = {*unexcited, *(names[k] for k in rest)}
+    combinations = []
+    for i in np.argsort(base):
+        others = [
+            (names[k], float(mixed[i, j] * scale[base[i]] / scale[k]))
+            for j, k in enumerate(rest)
+            if abs(mixed[i, j]) > 0.02
+        ]
+        combinations.append(Combination(names[base[i]], tuple(others)))
+        unknown |= {names[base[i]]} if others else set()
+    unit = root[:, at] / length[at]
+    cosine = unit.T @ unit
+    singular = np.linalg.svd(unit, compute_uv=False)
+    pairs = [
+        (names[at[i]], names[at[j]], float(cosine[i, j]))
+        for i in range(len(at))
+        for j in range(i)
+        if abs(cosine[i, j]) > 0.95
+    ]
+    pairs.sort(key=lambda p: -abs(p[2]))
+    return BaseParameters(
+        tuple(combinations),
+        tuple(name for name in names if name in unknown),
+        unexcited,
+        float(singular[0] / singular[-1]) if singular[-1] > 0.0 else np.inf,
+        tuple(pairs),
+    )

@@ -1,0 +1,495 @@
+"""Maximum likelihood from a record: output error, and with the wrench's own noise, innovations.
+
+The motion is simulated from the thruster wrench; its error against the measured velocities has the
+cost (Zhao et al. 2018, sec. 2; Ljung 1999, sec. 7.4)::
+
+    J(theta) = sum over measurements of  e^2 / s + ln s
+
+minimised by Newton and Raphson with the Gauss-Newton Hessian. Where the wrench is taken as exact,
+``e`` is the output error and ``s = R`` follows from the residuals. A measured wrench has errors of
+its own, which the velocity integrates: then a Kalman filter over the velocity, driven by the same
+equations of motion, turns the output errors into independent innovations::
+
+    M nu_dot = tau + f - h(nu, theta) - g,     f white with density q = T (rel tau)^2 + floor
+    z = nu + noise of variance R
+
+The first is the second with q = 0. The sensitivities ``de/dtheta`` are those of the filter's mean,
+one recursion beside its covariance's; that the gain depends on theta, too, multiplies an earlier
+innovation, which no later one is correlated with, and is left out. R, floor and rel are themselves
+estimated by maximum likelihood (Fisher scoring).
+
+The inverse of the information ``J = sum (de/dtheta)'(de/dtheta) / s`` is the Cramer-Rao bound at
+these noise levels. Coefficients' covariances are not taken from it alone, as residuals may be
+coloured: the covariance of the accumulated score stands between two inverse informations.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.config.prior import prior_of
+from rov_ident.core.errors import UserError
+from rov_ident.core.jit import inlined, kernel, record
+from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.estimation.observer import (
+    LANES,
+    OBSERVER,
+    advance,
+    advance_covariance,
+    correct,
+    drive_of,
+    force_of,
+    linearised_step,
+)
+from rov_ident.estimation.shared import measure, steps_of
+from rov_ident.model.equations import Array, Model, Structure, momentum_columns
+from rov_ident.model.scales import authority
+from rov_ident.offline.archive import Mapper, Samples, total
+from rov_ident.offline.least_squares import add_scatter
+
+_LAG = 1.0  # s; window over the correlation of the score in time
+_GATE = 6.0  # standard deviations; an innovation further off is an outlier
+_NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
+_ITERATIONS = 25
+_SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
+LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the residuals are made of.
+
+    ``measurement`` (6,) multiplies the variances that the samples state; ``floor`` (6,) is the
+    density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
+    relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
+    """
+
+    measurement: Array
+    floor: Array
+    relative: float
+    correlation_time: float
+
+    def process(self, samples: Samples) -> Array:
+        """Density (k, 6) of the wrench's error."""
+        lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
+        variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
+        density: Array = self.floor + lasting * variance
+        return density
+
+
+def assumed(config: Config, least: float = _SMALLEST) -> Noise:
+    """The noise that a configuration states.
+
+    ``least``: that of the wrench where there is none, relative to the axis's authority.
+    """
+    w = config.wrench
+    smallest = least * authority(config.dynamics)
+    floor = np.maximum(np.array(w.floor_std), smallest) ** 2 * w.correlation_time
+    return Noise(np.ones(6), floor, w.relative_std, w.correlation_time)
+
+
+class _Equations(NamedTuple):
+    structure: Structure
+    mass: Array  # (6, 6)
+    inverse: Array  # (6, 6), among the free components
+    theta: Array  # (m, LANES)
+    one_theta: Array  # (m, 1)
+    restoring: Array  # (6, 3)
+    estimated: NDArray[np.int64]  # (n,)
+    free: NDArray[np.bool_]  # (6,)
+
+
+class Pass(NamedTuple):
+    """One pass of the filter over samples; sums over bags are sums of these.
+
+    information (n, n); score (n,) = minus half the cost's gradient; ``scatter`` (n, n) the
+    covariance of the accumulated score, correlation in time included; ``cost``; number
+    of innovations ``used`` and of ``outliers``.
+    """
+
+    information: Array
+    score: Array
+    scatter: Array
+    cost: float
+    used: int
+    outliers: int
+
+
+def one_pass(
+    samples: Samples,
+    model: Model,
+    estimated: NDArray[np.int64],
+    noise: Noise,
+    free: NDArray[np.bool_] | None = None,
+    gate: float = np.inf,
+) -> Pass:
+    """The likelihood of samples (k,) of SAMPLE at the model's values, with its derivatives.
+
+    ``estimated`` (n,) are indices into theta; components not ``free`` (6,) follow the measurement.
+    """
+    return _passed(samples, model, estimated, noise, free, gate, np.zeros((3, 0, 6)))
+
+
+class Innovations(NamedTuple):
+    """Innovations e (k, 6) and their variances s (k, 6), NaN where nothing was measured, and the
+    filtered velocity nu (k, 6)."""
+
+    e: Array
+    s: Array
+    nu: Array
+
+
+def innovations(
+    samples: Samples,
+    model: Model,
+    noise: Noise,
+    free: NDArray[np.bool_] | None = None,
+    gate: float = np.inf,
+) -> Innovations:
+    """What the filter finds in each sample."""
+    out = np.full((3, len(samples), 6), np.nan)
+    _passed(samples, model, np.zeros(0, dtype=np.int64), noise, free, gate, out)
+    return Innovations(*out)
+
+
+def _passed(
+    samples: Samples,
+    model: Model,
+    estimated: NDArray[np.int64],
+    noise: Noise,
+    free: NDArray[np.bool_] | None,
+    gate: float,
+    out: Array,
+) -> Pass:
+    free = np.ones(6, dtype=bool) if free is None else free
+    mass, theta = model.mass_matrix, model.theta[:, None]
+    inverse, at = np.zeros((6, 6)), np.ix_(free, free)
+    inverse[at] = np.linalg.inv(mass[at])
+    equations = _Equations(
+        model.structure, mass, inverse, np.repeat(theta, LANES, axis=1),
+        np.ascontiguousarray(theta), model.body.restoring, estimated, free,
+    )  # fmt: skip
+    n = len(estimated)
+    information, score, scatter, sums = np.zeros((n, n)), np.zeros(n), np.zeros((n, n)), np.zeros(3)
+    _filter(
+        equations, samples, noise.process(samples), noise.measurement, gate,
+        information, score, scatter, sums, out,
+    )  # fmt: skip
+    return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
+
+
+# ------------------------------------------------------------------ noise
+
+
+_STEP_NOISE = 0.02  # of the logarithm of a noise level, for its sensitivities
+_KNOWN = np.log(30.0)  # prior standard deviation of such a logarithm
+
+
+def _levels(noise: Noise) -> Array:
+    """(13,) logarithms: measurement, floor, relative (as a variance)."""
+    floor, relative = np.maximum(noise.floor, 1e-300), max(noise.relative, 1e-5) ** 2
+    return np.log(np.concatenate([noise.measurement, floor, [relative]]))
+
+
+def _at_levels(noise: Noise, levels: Array, process: bool) -> Noise:
+    values = np.exp(levels)
+    values[6:] *= process
+    return replace(
+        noise, measurement=values[:6], floor=values[6:12], relative=float(np.sqrt(values[12]))
+    )
+
+
+def noise_slope(
+    samples: Samples, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool
+) -> tuple[Array, Array]:
+    """Fisher information (13, 13) and half the likelihood's gradient (13,) about the logarithms.
+
+    Without ``process`` only the measurements' are looked at.
+    """
+    samples = samples[:_NOISE_SAMPLES]
+    levels = _levels(noise)
+    base = innovations(samples, model, noise, free, _GATE)
+    keep = np.isfinite(base.e)
+    e, s = base.e[keep], base.s[keep]
+    free_levels = np.concatenate([free, free & process, [process]])
+    slopes = np.zeros((13, 2, len(e)))
+    for i in np.flatnonzero(free_levels):
+        moved = levels.copy()
+        moved[i] += _STEP_NOISE
+        there = innovations(samples, model, _at_levels(noise, moved, process), free)
+        slopes[i, 0] = (there.e[keep] - e) / (_STEP_NOISE * np.sqrt(s))
+        slopes[i, 1] = np.log(there.s[keep] / s) / _STEP_NOISE
+    unit = e / np.sqrt(s)
+    gradient = 0.5 * slopes[:, 1] @ (unit**2 - 1.0) - slopes[:, 0] @ unit
+    information = slopes[:, 0] @ slopes[:, 0].T + 0.5 * slopes[:, 1] @ slopes[:, 1].T
+    return information, gradient
+
+
+# ------------------------------------------------------------------ the estimate
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
+
+    ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
+    """
+
+    values: Array
+    covariance: Array
+    bound: Array
+    noise: Noise
+    total: Pass
+    iterations: int
+    converged: bool
+
+
+def maximise(
+    each: Mapper,
+    config: Config,
+    model: Model,
+    free: NDArray[np.bool_] | None = None,
+    precision: Array | None = None,
+    process: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Likelihood:
+    """The coefficients of largest likelihood, from ``model``'s values on.
+
+    ``precision`` (n,) is that of the prior about the configured values; ``process``: whether the
+    wrench has errors, else pure output error.
+
+    Raises UserError if the model cannot be simulated.
+    """
+    free = np.ones(6, dtype=bool) if free is None else free
+    prior = prior_of(config)
+    estimated, mean = prior.estimated, prior.mean
+    precision = np.zeros(len(mean)) if precision is None else precision
+    noise = assumed(config)
+    if not process:
+        noise = replace(noise, floor=np.zeros(6), relative=0.0)
+    say = progress or (lambda what: None)
+
+    def at_values(theta: Array) -> Model:
+        moved = model.theta.copy()
+        moved[estimated] = theta
+        return model.with_theta(moved)
+
+    def look(theta: Array, gate: float) -> tuple[Pass, float]:
+        there = at_values(theta)
+        if np.linalg.eigvalsh(there.mass_matrix)[0] <= 0.0:
+            return nothing, np.inf
+        found = total(each(one_pass, there, estimated, noise, free, gate))
+        cost = float(found.cost + precision @ (theta - mean) ** 2)
+        # an outlier is worth its gate, so that refusing one gains nothing
+        if np.isfinite(gate):
+            cost += found.outliers * gate**2
+        return found, cost if np.isfinite(cost) else np.inf
+
+    nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
+    theta, count, converged = model.theta[estimated].copy(), 0, False
+    settled, at, enough = theta, nothing, 1e-6 * len(theta)
+    for stage, gate in enumerate((np.inf, _GATE, _GATE)):
+        far = theta - settled
+        if stage == 2 and far @ at.information @ far < 0.1 * len(theta):
+            break  # the noise levels would be the same
+        if stage:
+            settled = theta
+            say("noise levels")
+            noise = _noise_levels(each, at_values(theta), noise, free, process)
+        at, cost = look(theta, gate)
+        converged = True
+        for _ in range(_ITERATIONS):
+            say(f"step {count + 1}")
+            slope = at.score + precision * (mean - theta)
+            change = inverse_of(at.information + np.diag(precision)) @ slope
+            if slope @ change < enough:
+                break
+            factor = 1.0
+            while factor > 1e-3:
+                found, there = look(theta + factor * change, gate)
+                if there < cost:
+                    break
+                factor *= 0.5
+            else:
+                break
+            count += 1
+            theta, at, gained, cost = theta + factor * change, found, cost - there, there
+            if gained < enough:
+                break
+        else:
+            converged = False
+    bound = inverse_of(at.information + np.diag(precision))
+    # From few data the scatter is itself uncertain: never thinner than the bound.
+    covariance = widened(sandwich(bound, at.scatter + np.diag(precision)), np.diag(bound))
+    return Likelihood(theta, covariance, bound, noise, at, count, converged)
+
+
+def _noise_levels(
+    each: Mapper, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool
+) -> Noise:
+    levels = start = _levels(noise) if process else np.zeros(13)
+    least = np.full(13, -np.inf)
+    least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
+    least[12] = np.log(1e-10)
+    for _ in range(8):
+        parts = each(noise_slope, model, _at_levels(noise, levels, process), free, process)
+        information = sum(p[0] for p in parts) + np.eye(13) / _KNOWN**2
+        gradient = sum(p[1] for p in parts) - (levels - start) / _KNOWN**2
+        change = np.clip(np.linalg.solve(information, gradient), -1.5, 1.5)
+        moved = np.maximum(levels + change, least)
+        change, levels = moved - levels, moved
+        if np.abs(change).max() < 0.05:
+            break
+    return _at_levels(noise, levels, process)
+
+
+def inverse_of(information: Array) -> Array:
+    """Inverse of an information matrix, scaled to a unit diagonal meanwhile.
+
+    Raises UserError if it is not finite, as the model could not be simulated.
+    """
+    if not np.isfinite(information).all():
+        raise UserError(
+            "the simulation diverges along this motion: check the signs and sizes of the "
+            "coefficients and the axes of the bag"
+        )
+    # The rounding of sums over a hundred thousand samples leaves some 1e-14 of the largest.
+    return scaled_inverse(information, rcond=1e-13)
+
+
+# ------------------------------------------------------------------ kernels
+
+
+_SCRATCH = record(
+    [
+        *OBSERVER,
+        ("noise", "f8", (6, 6)),  # variance density of the acceleration
+        ("z", "f8", (6,)),  # nu as measured
+        ("r", "f8", (6,)),  # its variance
+        ("cross", "f8", (6,)),  # covariance of nu with one component of it
+    ]
+)
+
+
+class _Work(NamedTuple):
+    of_rate: Array  # (6, m)
+    momentum: Array  # (6, m)
+    of_motion: Array  # (6, m)
+    drive: Array  # (6, n)
+    spare: Array  # (6, n)
+    scratch: NDArray[np.void]  # (1,) of _SCRATCH
+
+
+@inlined
+def _predict(eq, sample, process, x, p, sensitivity, scale, work):
+    """Velocity x (6,), covariance p (6, 6), sensitivity (6, n) to the sample's time."""
+    s, n = work.scratch[0], len(eq.estimated)
+    force_of(sample, sample.wrench, eq.restoring, s.force, s.slope)
+    for i in range(6):
+        for j in range(6):
+            s.force[i] -= eq.mass[i, j] * s.guide[j]
+    steps = steps_of(sample.dt)
+    dt = sample.dt / steps
+    for step in range(steps):
+        late = step * dt - 0.5 * sample.dt
+        linearised_step(eq.structure, eq.theta, eq.one_theta, x, late, dt, s)
+        if n > 0:
+            momentum_columns(eq.structure, s.middle_nu_dot, work.of_rate)
+            drive_of(eq.structure, s.middle, eq.estimated, scale, 0, n, work, work.drive)
+            advance(s.transition, sensitivity, s.into, work.drive, work.spare)
+        for i in range(6):
+            x[i] = s.end[i]
+            for j in range(6):
+                total = 0.0
+                for a in range(6):
+                    total += s.into[i, a] * process[a] * s.into[j, a]
+                s.noise[i, j] = total / (dt * dt)
+        advance_covariance(s.transition, s.noise, dt, p, s.product)
+
+
+@kernel
+def _filter(
+    eq, samples, process, measurement, gate, information, score, scatter, sums, out
+):  # fmt: skip
+    """Add to information (n, n), score (n,), scatter (n, n), sums (3,): cost, innovations used,
+    outliers. ``out`` (3, k, 6), unless it is empty, is filled with :class:`Innovations`."""
+    all_e, all_s, all_nu = out[0], out[1], out[2]
+    n, m = len(eq.estimated), len(eq.theta)
+    work = _Work(
+        np.empty((6, m)), np.empty((6, m)), np.empty((6, m)), np.empty((6, n)), np.empty((6, n)),
+        np.empty(1, dtype=_SCRATCH),
+    )  # fmt: skip
+    x, old, p, sensitivity = np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((6, n))
+    now, lagged, row, scale = np.zeros(n), np.zeros(n), np.zeros(n), np.ones(n)
+    s = work.scratch[0]
+    for i in range(6):
+        for j in range(6):
+            s.inverse[i, j], s.one_mass[i, j, 0] = eq.inverse[i, j], eq.mass[i, j]
+            for k in range(LANES):
+                s.mass[i, j, k] = eq.mass[i, j]
+    started = False
+    for k in range(len(samples)):
+        sample = samples[k]
+        measure(sample, s.z, s.r)
+        if sample.restart or not started or not sample.dt > 0.0:
+            started = True
+            for i in range(6):
+                x[i] = sample.nu[i]
+                old[i] = sample.nu[i]
+                p[i, :] = 0.0
+                if eq.free[i]:
+                    known = sample.odometry_variance[i]
+                    if i >= 3 and sample.gyro_variance > 0.0:
+                        known = sample.gyro_variance
+                    p[i, i] = known * measurement[i]
+            sensitivity[:] = 0.0
+            lagged[:] = 0.0
+            if len(all_nu) > 0:
+                for i in range(6):
+                    all_nu[k, i] = x[i]
+            continue
+        for i in range(6):
+            s.guide[i] = 0.0
+            if not eq.free[i]:  # it goes from measurement to measurement
+                x[i] = old[i]
+                s.guide[i] = (sample.nu[i] - old[i]) / sample.dt
+            old[i] = sample.nu[i]
+        _predict(eq, sample, process[k], x, p, sensitivity, scale, work)
+        now[:] = 0.0
+        for i in range(6):
+            if not eq.free[i]:
+                x[i] = sample.nu[i]
+                continue
+            if np.isnan(s.z[i]):
+                continue
+            e, size = s.z[i] - x[i], p[i, i] + s.r[i] * measurement[i]
+            if len(all_e) > 0:
+                all_e[k, i] = e
+                all_s[k, i] = size
+            if e * e > gate * gate * size:
+                sums[2] += 1.0
+                if len(all_e) > 0:
+                    all_e[k, i] = np.nan
+                continue
+            sums[0] += e * e / size + np.log(size)
+            sums[1] += 1.0
+            for j in range(n):
+                row[j] = sensitivity[i, j]
+                now[j] += row[j] * (e / size)
+            for g in range(n):
+                f = row[g] / size
+                for j in range(n):
+                    information[g, j] += f * row[j]
+            for j in range(6):
+                s.cross[j] = p[j, i]
+            correct(x, p, sensitivity, row, s.cross, size, e)
+        if len(all_nu) > 0:
+            for i in range(6):
+                all_nu[k, i] = x[i]
+        for j in range(n):
+            score[j] += now[j]
+        add_scatter(now, np.exp(-sample.dt / _LAG), scatter, lagged)

@@ -1,0 +1,92 @@
+"""The page of a fit: coefficients, and the open-loop simulation before and after."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rov_ident.core.messages import Array
+from rov_ident.offline.fit import Curves, Fit
+from rov_ident.reports import plots
+from rov_ident.reports.html import bullets, heading, legend, origin, panels, paragraph
+from rov_ident.reports.html import page as document
+from rov_ident.reports.table import Tables
+from rov_ident.sampling.records import HORIZON, VELOCITIES
+
+_BEFORE, _AFTER = "as configured", "retuned"
+_MOST = 4  # bags that are drawn
+
+
+def page(fit: Fit) -> str:
+    """A self-contained HTML document."""
+    judged, drawn, shown = fit.judged, fit.curves, fit.table()
+    coefficients = shown.parts[0] if isinstance(shown, Tables) else shown
+    sections = [
+        heading(f"Open-loop simulation in windows of {HORIZON:g} s, before and after"),
+        legend({label: (plots.css(colour), ",".join(str(3 * d) for d in dashes), 1.0)
+                for label, (colour, dashes) in plots.MODELS.items()
+                if label in (_BEFORE, _AFTER)}),
+    ]  # fmt: skip
+    if judged:
+        sections += [heading("On what no fit has seen"), *_curves(judged, "judged")]
+    if drawn:
+        sections += [heading("On what was fitted"), *_curves(drawn, "fitted")]
+    sections += [heading("Coefficients"), coefficients.html()]
+    if fit.notes:
+        sections += [heading("Notes"), bullets(fit.notes)]
+    return document(f"Fit of {fit.given.name}", fit.sentence, sections, origin(fit))
+
+
+def _curves(drawn: Sequence[Curves], key: str) -> list[str]:
+    before = _rmse([c.before - c.measured for c in drawn])
+    after = _rmse([c.after - c.measured for c in drawn])
+    sections = [_bars(before, after, key)]
+    for k, curve in enumerate(drawn[:_MOST]):
+        name = curve.name
+        simulated = (curve.before, curve.after)
+        errors = [np.abs(x - curve.measured) for x in simulated]
+        sections += [
+            _motion(curve, simulated, "{name} [{unit}]", curve.measured,
+                    f"{name}: measured (grey) and simulated", f"{key}-m{k}"),
+            _motion(curve, errors, "|error| [{unit}]", None,
+                    f"{name}: error of the simulation", f"{key}-e{k}"),
+        ]  # fmt: skip
+    if len(drawn) > _MOST:
+        sections.append(paragraph(f"The first {_MOST} of {len(drawn)} bags are drawn."))
+    return sections
+
+
+def _rmse(errors: Sequence[Array]) -> Array:
+    joined = np.concatenate(errors)
+    joined = joined[np.isfinite(joined).all(axis=1)]
+    rmse: Array = np.sqrt(np.mean(joined**2, axis=0)) if len(joined) else np.full(6, np.nan)
+    return rmse
+
+
+def _unit(i: int) -> str:
+    return "m/s" if i < 3 else "rad/s"
+
+
+def _bars(before: Array, after: Array, key: str) -> str:
+    parts = []
+    for label, pick, unit in (
+        ("linear", slice(0, 3), "m/s"), ("angular", slice(3, 6), "rad/s")
+    ):  # fmt: skip
+        models = {_BEFORE: before[pick], _AFTER: after[pick]}
+        drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
+        parts.append(plots.to_svg(drawn, f"{key}-{label}"))
+    return panels(parts, "Root mean square error over all bags.")
+
+
+def _motion(
+    curve: Curves, pair: Sequence[Array], label: str, measured: Array | None, caption: str, key: str
+) -> str:
+    """Six panels of ``pair``, before and after (k, 6)."""
+    svgs = []
+    for i, name in enumerate(VELOCITIES):
+        drawn = plots.curves(
+            curve.t, {_BEFORE: pair[0][:, i], _AFTER: pair[1][:, i]}, name, "time [s]",
+            label.format(name=name, unit="m/s" if i < 3 else "rad/s"),
+            measured=None if measured is None else measured[:, i],
+        )  # fmt: skip
+        svgs.append(plots.to_svg(drawn, f"{key}{i}"))
+    return panels(svgs, caption, wide=True)

@@ -1,0 +1,172 @@
+"""The wrench that acts during a sample: held commands through the thrusters, and surroundings.
+
+A command holds from its stamp to the next one. A value taken at the sample's instant would look
+like a delay of half a period, so the sample carries the mean over its interval and the slope of the
+line with the same mean and first moment (docs/samples.md).
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.jit import kernel
+from rov_ident.core.messages import WRENCH, Array
+from rov_ident.core.quaternions import rotation
+from rov_ident.effects import act, add_wrenches, compiled, memory
+from rov_ident.sampling.despiking import Despiker
+from rov_ident.sampling.dropped_commands import SILENCE, CommandPeriod, estimated
+from rov_ident.sampling.effect_jacobians import EffectJacobians
+from rov_ident.sampling.queues import Waiting
+
+_ZERO = np.zeros(6)
+
+
+class MeanWrench(NamedTuple):
+    """Of an interval, each (6,)."""
+
+    mean: Array  # N, N m
+    slope: Array  # per s
+    doubt: Array  # N2, (N m)2: mean square of what may be wrong with the commands
+
+
+class _Command(NamedTuple):
+    t: float  # s
+    wrench: Array  # (6,)
+    doubt: Array  # (6,) N2, (N m)2: mean square of what may be wrong with it
+
+
+class ActingWrench:
+    """Takes commands from their queue and says what acts in each interval."""
+
+    def __init__(self, config: Config) -> None:
+        self.configure(config)
+        self.clear()
+
+    def configure(self, config: Config, jacobians: EffectJacobians | None = None) -> None:
+        """Take other settings and other values of effects; their memory stays."""
+        self._timeout = config.timeout
+        self._jacobians = jacobians
+        self._effects = compiled(config.effects)
+        self._has_inputs = bool(self._effects.inputs.any())
+        self._has_surroundings = bool(self._effects.wrenches.any())
+
+    def clear(self) -> None:
+        self._command: _Command | None = None  # the one that is held
+        self._memory = memory()
+        self._around = np.zeros(6)  # the surroundings' wrench at the last sample
+        self._period = CommandPeriod()
+        self._last_received = -np.inf  # s
+        self._estimated: deque[_Command] = deque()  # of those that were dropped
+
+    @property
+    def hold(self) -> float:
+        """How long [s] a command acts, of late; 0 if that is not known yet."""
+        return self._period.mean
+
+    def over(
+        self,
+        start: float,
+        end: float,
+        queue: deque[Waiting],
+        despiker: Despiker,
+        commands: list[tuple[float, Array]] | None,
+    ) -> MeanWrench | None:
+        """What acts from ``start`` to ``end`` [s] by the commands in the queue; None if none does.
+
+        Commands up to ``end`` are taken from the queue and appended to ``commands``.
+        """
+        pieces: list[tuple[float, float, Array, Array]] = []
+        now = start
+        while (command := self._next(end, queue, despiker)) is not None:
+            if self._command is None:
+                start = now = max(command.t, start)
+            elif command.t > now:
+                wrench = self._act(self._command, now, command.t)
+                pieces.append((now, command.t, wrench, self._command.doubt))
+                now = command.t
+            self._command = command
+            if commands is not None:
+                commands.append((command.t, command.wrench))
+        held = self._command
+        if held is None or end - held.t > min(self._timeout, SILENCE * self._period.longest):
+            self._command = None
+            self._memory = memory()
+            if self._jacobians is not None:
+                self._jacobians.forget()
+            return None
+        acting = self._act(held, now, end)
+        if not pieces:
+            return MeanWrench(acting, _ZERO, held.doubt)
+        pieces.append((now, end, acting, held.doubt))
+        length, middle = end - start, 0.5 * (start + end)
+        total = MeanWrench(np.zeros(6), np.zeros(6), np.zeros(6))
+        for begin, stop, wrench, doubt in pieces:
+            share = (stop - begin) / length
+            moment = 12.0 * share * (0.5 * (begin + stop) - middle) / length**2
+            _add_piece(share, moment, wrench, doubt, *total)
+        return total
+
+    def _next(self, end: float, queue: deque[Waiting], despiker: Despiker) -> _Command | None:
+        """The next command before ``end`` [s]; if it was dropped, an estimate of it."""
+        if not queue:
+            return None
+        at, held, last = queue[0].t, self._command, self._last_received
+        silent = at - last > self._period.threshold and not self._estimated
+        if silent and held is not None and held.t == last:
+            dropped = self._period.dropped(at - last)
+            commands = estimated(last, held.wrench, at, queue[0].values, dropped)
+            self._estimated.extend(map(_Command._make, commands))
+        if self._estimated and self._estimated[0].t < min(at, end):
+            return self._estimated.popleft()
+        # One that comes at the end does not act yet; its successors tell whether it is an outlier.
+        if at > end or (at == end and held is not None):
+            return None
+        wrench, _, doubt = despiker.judge(WRENCH, queue)
+        queue.popleft()
+        self._estimated.clear()
+        if last > -np.inf:
+            self._period.update(at - last)
+        self._last_received = at
+        return _Command(at, wrench, doubt)
+
+    def _act(self, command: _Command, begin: float, end: float) -> Array:
+        """The wrench (6,) that acts in the mean from ``begin`` to ``end`` by a held command."""
+        wrench, dt = command.wrench.copy(), end - begin
+        if self._has_inputs:
+            act(self._effects, self._memory, begin, dt, wrench)
+        if self._jacobians is not None:
+            self._jacobians.act(begin, dt, command.wrench)
+        return wrench
+
+    def surround(self, sample: NDArray[np.void]) -> None:
+        """Add the wrench effects along the measured motion to the sample (1,) of SAMPLE."""
+        if self._has_surroundings:
+            _surround(self._effects, sample, self._around)
+
+
+@kernel
+def _add_piece(share, moment, wrench, doubt, mean, slope, mean_doubt):
+    for i in range(6):
+        mean[i] += share * wrench[i]
+        slope[i] += moment * wrench[i]
+        mean_doubt[i] += share * doubt[i]
+
+
+@kernel
+def _surround(effects, sample, around):
+    """Add the wrench effects to the sample; around (6,): theirs at the last sample, then at this.
+
+    In a straight line in between, as the motion is.
+    """
+    out, now = sample[0], np.zeros(6)
+    add_wrenches(effects, out.t, out.nu, rotation(out.orientation), now)
+    for i in range(6):
+        before = now[i] if out.restart else around[i]
+        out.surroundings[i] = 0.5 * (before + now[i])
+        out.surroundings_slope[i] = (now[i] - before) / out.dt if out.dt > 0.0 else 0.0
+        out.wrench[i] += out.surroundings[i]
+        out.wrench_slope[i] += out.surroundings_slope[i]
+        around[i] = now[i]

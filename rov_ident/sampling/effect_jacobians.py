@@ -1,0 +1,199 @@
+"""How a sample changes with the parameters of the configured effects.
+
+An estimator treats such a parameter as a linear one, about the value p0 by which the sample was
+made; the sampler follows the estimate (`Sampler.recentre`), so that what is not linear in the
+parameter (a lag, the place of a tether) is right in the end. With ``d = p - p0`` the equations of
+motion and the measured velocity become::
+
+    M nu_dot + h(nu) - G down = wrench + J d,      measured = nu + V d + noise
+
+``J`` (6, k) is the change of the wrench: difference quotients of the input effects, run beside the
+configured ones, and of the wrench effects at the measured motion; of effects on the rigid body
+``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration of the configured model. ``V`` (6, k)
+is the change of the measured velocity: of moving water, and of effects on the velocity sensors.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.config.prior import theta_of
+from rov_ident.core.jit import inlined, kernel
+from rov_ident.core.messages import Array
+from rov_ident.core.quaternions import rotation
+from rov_ident.effects import (
+    EFFECTS,
+    Acting,
+    Values,
+    act,
+    add_wrenches,
+    compiled,
+    correct,
+    memory,
+    parameter,
+    rigid_body,
+    sense,
+)
+from rov_ident.effects.base import EffectParameter, Reading
+from rov_ident.model.coefficients import AXES
+from rov_ident.model.equations import coriolis, force_of_one
+
+_ZERO = np.zeros(3)
+
+
+class EffectJacobians:
+    """The Jacobians of the samples of one configuration, fed with what its sampler sees."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.size = k = len(config.estimate_effects)
+        self._forces: list[int] = []  # indices of parameters
+        self._bodies: list[int] = []
+        self._senses: list[tuple[int, Values, Values]] = []
+        self._water = np.zeros((3, k))  # world
+        self._about = theta_of(config)[len(config.model.theta) :]
+        self._mask = np.ones((6, k))  # 0 where a parameter belongs to another axis
+        self._width = np.ones(k)  # of the difference quotients
+        variants: list[Acting] = []  # of each force one with less and one with more
+        mass, restoring = [], []
+        for i, (name, own) in enumerate(config.estimate_effects):
+            effect = EFFECTS[name]
+            p = parameter(name, own)
+            low, high = self._displaced(name, p, effect.act is not None)
+            self._width[i] = high[name][own] - low[name][own]
+            if p.axis:
+                self._mask[:, i] = [axis == p.axis for axis in AXES]
+            if effect.act is not None or effect.wrench is not None:
+                self._forces.append(i)
+                variants += [compiled(low), compiled(high)]
+            elif effect.water is not None:
+                self._water[:, i] = compiled(high).water - compiled(low).water
+                self._water[:, i] /= self._width[i]
+            elif effect.body is not None:
+                self._bodies.append(i)
+                there = [rigid_body(config.model.body, values) for values in (high, low)]
+                width = self._width[i]
+                mass.append((there[0].mass_matrix - there[1].mass_matrix) / width)
+                restoring.append((there[0].restoring - there[1].restoring) / width)
+            else:
+                self._senses.append((i, low, high))
+        self._variants = (
+            Acting(*(np.array(part) for part in zip(*variants, strict=True))) if variants else None
+        )
+        self._mass, self._restoring = np.array(mass), np.array(restoring)
+        self._inverse = np.linalg.inv(config.dynamics.mass_matrix)
+        self.forget()
+        self._velocity = np.zeros((6, k))
+
+    def _displaced(self, name: str, p: EffectParameter, is_input: bool) -> tuple[Values, Values]:
+        """The configured effects with one parameter a step lower, and higher, inside its bounds."""
+        here = self.config.effects[name][p.name]
+        # an input effect may have kinks (a deadband) or whole steps (a delay) that a step must pass
+        step = (0.05 if is_input else 1e-3) * p.typical
+
+        def at(value: float) -> Values:
+            effects = self.config.effects
+            return {**effects, name: {**effects[name], p.name: value}}
+
+        return at(max(here - step, p.lower)), at(min(here + step, p.upper))
+
+    def forget(self) -> None:
+        """The command before the next one is not known."""
+        count = len(self._variants.inputs) if self._variants is not None else 0
+        self._memory = np.zeros((count, *memory().shape))
+        self._impulse = np.zeros((count, 6))
+        self._around = np.zeros((count, 6))
+        self._time = 0.0
+
+    def act(self, t: float, dt: float, command: Array) -> None:
+        """The command (6,) holds from t to t + dt."""
+        if self._variants is not None:
+            _act(self._variants, self._memory, t, dt, command, self._impulse)
+            self._time += dt
+
+    def about(self, config: Config) -> "EffectJacobians":
+        """The same of a configuration with other values of the parameters; what is known stays."""
+        new = EffectJacobians(config)
+        for name in ("_memory", "_around", "_impulse", "_time", "_velocity"):
+            setattr(new, name, getattr(self, name))
+        return new
+
+    def measure(self, v: Array, omega: Array, has_imu: bool) -> None:
+        """The velocity (3,) and rate (3,) over ground before the next sample.
+
+        Not the measured ones: their noise would be in column and innovation alike.
+        """
+        for i, low, high in self._senses:
+            given = sense(Reading(v, omega, omega, _ZERO), self.config.effects)
+            before, after = correct(given, low), correct(given, high)
+            rate = before.gyro - after.gyro if has_imu else before.angular - after.angular
+            change = np.concatenate([before.linear - after.linear, rate])
+            self._velocity[:, i] = change / self._width[i]
+
+    def extend(self, sample: NDArray[np.void], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+        """The sample (1,) of SAMPLE with J, V and p0 behind it; what has acted is used up.
+
+        ``dtype`` is the :func:`~rov_ident.sampling.sample.sample_type` of so many parameters.
+        """
+        k, row = self.size, sample[0]
+        to_world = rotation(row["orientation"])
+        by_wrench, by_velocity = np.zeros((6, k)), self._velocity.copy()
+        if self._variants is not None:
+            count = len(self._variants.inputs)
+            now = np.zeros((count, 6))
+            _surround(self._variants, row["t"], row["nu"], to_world, now)
+            before = now if row["restart"] else self._around
+            wrench = 0.5 * (before + now)
+            if self._time > 0.0:
+                wrench += self._impulse / self._time
+            by_wrench[:, self._forces] = (wrench[1::2] - wrench[::2]).T
+            self._around, self._time = now, 0.0
+            self._impulse[:] = 0.0
+        by_wrench *= self._mask / self._width
+        if self._bodies:
+            model = self.config.dynamics
+            columns = np.empty((len(self._bodies), 6))
+            nu, wrench, down = (row[name].copy() for name in ("nu", "wrench", "down"))
+            _change_body(
+                model.structure, model.mass_matrix, model.theta, self._inverse,
+                model.body.restoring, self._mass, self._restoring, nu, wrench, down, columns,
+            )  # fmt: skip
+            by_wrench[:, self._bodies] = columns.T
+        by_velocity[:3] += to_world.T @ self._water
+        parts = (sample, by_wrench, by_velocity, self._about)
+        return np.frombuffer(bytearray(b"".join(part.tobytes() for part in parts)), dtype)
+
+
+@inlined
+def _variant(variants, v):
+    """One of the variants, which are stacked."""
+    return Acting(
+        variants.inputs[v], variants.input_parameters[v], variants.wrenches[v],
+        variants.wrench_parameters[v], variants.water[v],
+    )  # fmt: skip
+
+
+@kernel
+def _act(variants, state, t, dt, command, impulse):
+    for v in range(len(variants.inputs)):
+        wrench = command.copy()
+        act(_variant(variants, v), state[v], t, dt, wrench)
+        for i in range(6):
+            impulse[v, i] += dt * wrench[i]
+
+
+@kernel
+def _surround(variants, t, nu, rotation, out):
+    for v in range(len(variants.inputs)):
+        add_wrenches(_variant(variants, v), t, nu, rotation, out[v])
+
+
+@kernel
+def _change_body(
+    structure, mass, theta, inverse, restoring, of_mass, of_restoring, nu, wrench, down, out
+):
+    """out (k, 6): ``dG down - dM nu_dot - C(dM nu) nu`` of each change of the rigid body."""
+    h = force_of_one(structure, mass, theta, nu)
+    nu_dot = inverse @ (wrench + restoring @ down - h)
+    for i in range(len(out)):
+        out[i] = of_restoring[i] @ down - of_mass[i] @ nu_dot - coriolis(of_mass[i] @ nu, nu)

@@ -1,0 +1,212 @@
+"""A bag as its raw messages in arrays: what the search for a discrepancy works on.
+
+The estimators see samples, in which odometry and IMU are already blended. Whether one sensor
+contradicts another shows only before that.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_multiply, to_core
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Message, Odometry
+from rov_ident.sampling.despiking import largest_usual, measured_values
+from rov_ident.sampling.dropped_commands import SILENCE, completed
+from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, Validation, describe
+
+_USUAL = 2.0  # times what 99 % of the messages keep to
+_PAUSE = 60.0  # s between two bags that are searched as one
+
+
+@dataclass(frozen=True)
+class Streams:
+    """The three topics in core axes (FRD, NED); times in seconds since the first message.
+
+    odometry: ``t`` (N,), position (N, 3), orientation (N, 4) w x y z, nu (N, 6) as measured.
+    IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
+    wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; dropped ones are estimated.
+    ``has_pose`` tells whether the positions mean anything; ``notes`` say what was left out.
+    """
+
+    t: Array
+    position: Array
+    orientation: Array
+    nu: Array
+    imu_t: Array
+    gyro: Array
+    specific_force: Array
+    demand_t: Array
+    demand: Array
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_pose(self) -> bool:
+        return bool(np.ptp(self.position, axis=0).max() > 0.0)
+
+    @property
+    def guided(self) -> NDArray[np.bool_]:
+        """Axes (6,) whose velocity a simulation can only take as measured.
+
+        Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
+        computed, without. What turns the vehicle is then unknown. A velocity that never changes was
+        not measured: a record in the plane holds zeros for the rest.
+        """
+        unknown: NDArray[np.bool_] = np.repeat([False, not self.demand[:, 3:].any()], 3)
+        return unknown | (np.nanmax(self.nu, axis=0) == np.nanmin(self.nu, axis=0))
+
+    @property
+    def duration(self) -> float:
+        return float(self.t[-1])
+
+
+def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
+    """Arrays from messages as they are on the wire; what cannot be used is left out.
+
+    Raises UserError if odometry or wrench are missing.
+    """
+    taken, counts = _taken(messages, config)
+    imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
+    odometry = _driven(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
+    for name, found in (("odometry", odometry), ("wrench", wrench)):
+        if len(found) < 2:
+            raise UserError(f"the bag holds no usable {name} messages")
+    measured = np.array([measured_values(m) for _, m in imu]).reshape(-1, 6)
+    return Streams(
+        np.array([t for t, _ in odometry]),
+        np.array([m.position for _, m in odometry]),
+        _continuous(np.array([m.orientation for _, m in odometry])),
+        np.array([np.concatenate([m.linear, m.angular]) for _, m in odometry]),
+        np.array([t for t, _ in imu]),
+        measured[:, :3].copy(),
+        measured[:, 3:].copy(),
+        *completed(
+            np.array([t for t, _ in wrench]), np.array([measured_values(m) for _, m in wrench])
+        ),
+        tuple(f"left out: {reason}" for reason in describe(counts)),
+    )
+
+
+def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
+    """Several bags as one, with gaps between them, and the time [s] at which each begins."""
+    begins, begin = [], 0.0
+    for bag in bags:
+        begins.append(begin)
+        begin += bag.duration + _PAUSE
+    if len(bags) == 1:
+        return bags[0], begins
+
+    both: dict[str, Any] = {"notes": tuple(note for bag in bags for note in bag.notes)}
+    for name in (f.name for f in fields(Streams) if f.name != "notes"):
+        shifts = begins if name in ("t", "imu_t", "demand_t") else [0.0] * len(bags)
+        both[name] = np.concatenate([getattr(b, name) + s for b, s in zip(bags, shifts)])
+    return Streams(**both), begins
+
+
+def _driven(
+    odometry: list[tuple[float, Any]], commanded: list[float], hold: float, counts: Counter[str]
+) -> list[tuple[float, Any]]:
+    """The messages at times when a command acts: one that has been held for longer than ``hold``
+    [s], or several times as long as is usual, says nothing of what the thrusters do."""
+    if len(commanded) > 1:
+        hold = min(hold, SILENCE * float(np.quantile(np.diff(commanded), 0.99)))
+    times = np.array([t for t, _ in odometry])
+    given = np.array([-np.inf, *commanded])
+    age = times - given[np.searchsorted(given, times, side="right") - 1]
+    silent = np.isfinite(age) & (age > hold)
+    counts["odom: no wrench at that time"] += int(silent.sum())
+    return [message for message, drop in zip(odometry, silent, strict=True) if not drop]
+
+
+def _taken(
+    messages: Iterable[tuple[str, Message]], config: Config
+) -> tuple[dict[str, list[tuple[float, Any]]], Counter[str]]:
+    """Time [s] and message in core axes of all that the estimators would take, and what is refused.
+
+    Velocities that have not been measured again are refused here.
+    """
+    validation, origin = Validation(), None
+    taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: []}
+    for role, message in messages:
+        reason = validation.judge(role, message)
+        if reason == NEW_CLOCK:
+            validation.forget_motion()
+        elif reason:
+            continue
+        origin = message.stamp if origin is None else origin
+        validation.counts[role] += 1
+        if isinstance(message, Odometry):
+            message = validation.marked(message)
+            if message.twist_variance[0] == REPEATED:
+                validation.counts["odom: velocity repeated, not measured anew"] += 1
+                continue
+        t = (message.stamp - origin) * 1e-9
+        taken[role].append((t, to_core(message, config.frames)))
+    return taken, validation.counts
+
+
+def _despiked(
+    role: str, taken: list[tuple[float, Any]], config: Config, counts: Counter[str]
+) -> list[tuple[float, Any]]:
+    """The messages without one or two in a row that hold what no others do.
+
+    Live, an outlier is what jumps there and back; here the whole bag tells what is usual, and a
+    controller that chatters keeps its commands.
+    """
+    if len(taken) < 2:
+        return taken
+    x = np.array([measured_values(m) for _, m in taken])
+    x = np.abs(x - np.median(x, axis=0))
+    usual = np.maximum(_USUAL * np.quantile(x, 0.99, axis=0), largest_usual(role, config))
+    edges = np.flatnonzero(np.diff((x > usual).any(axis=1), prepend=False, append=False))
+    lone = [range(*edge) for edge in edges.reshape(-1, 2).tolist() if edge[1] - edge[0] <= 2]
+    outliers = {i for indices in lone for i in indices}
+    counts[f"{role}: outlier"] += len(outliers)
+    return [taken[i] for i in range(len(taken)) if i not in outliers]
+
+
+def _continuous(q: Array) -> Array:
+    """Unit quaternions (N, 4), signs chosen so that neighbours are close."""
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    flips = np.sum(q[1:] * q[:-1], axis=1) < 0.0
+    sign = np.where(np.cumsum(np.concatenate([[0], flips])) % 2, -1.0, 1.0)
+    return q * sign[:, None]
+
+
+def orientation_at(streams: Streams, t: Array) -> Array:
+    """Attitude (k, 4) at the instants t (k,): a cubic through the measured attitudes and rates."""
+    i = np.clip(np.searchsorted(streams.t, t, side="right") - 1, 0, len(streams.t) - 2)
+    h = (streams.t[i + 1] - streams.t[i])[:, None]
+    s = (t - streams.t[i])[:, None] / h
+    q0, q1 = streams.orientation[i], streams.orientation[i + 1]
+    d0, d1 = _rate(q0, streams.nu[i, 3:]), _rate(q1, streams.nu[i + 1, 3:])
+    s = np.clip(s, 0.0, 1.0)
+    q = (
+        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q0
+        + s * (1.0 - s) ** 2 * h * d0
+        + s**2 * (3.0 - 2.0 * s) * q1
+        + s**2 * (s - 1.0) * h * d1
+    )
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def _rate(q: Array, omega: Array) -> Array:
+    """q_dot (k, 4) = q (0, omega) / 2."""
+    rates = np.insert(omega, 0, 0.0, axis=1)
+    return 0.5 * quaternion_multiply(q, rates)
+
+
+def interpolated(t: Array, y: Array, at: Array) -> Array:
+    """Columns y (N, n) at times t (N,), between which they are linear, at the times ``at``."""
+    return np.stack([np.interp(at, t, column) for column in y.T], axis=1)
+
+
+def integral(t: Array, y: Array) -> Array:
+    """The integral (N, n) of columns y (N, n) from the first of the times t (N,) (trapezoids)."""
+    steps = 0.5 * np.diff(t)[:, None] * (y[1:] + y[:-1])
+    return np.vstack([np.zeros(y.shape[1]), np.cumsum(steps, axis=0)])

@@ -1,0 +1,156 @@
+"""A bag as the estimators see it: its samples, and what had to be refused."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array
+from rov_ident.effects import Acting
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.model.equations import Model
+from rov_ident.sampling.sample import believed, joined, stretches
+from rov_ident.sampling.sampler import Sampler
+from rov_ident.sampling.validation import describe
+from rov_ident.simulation.open_loop import open_loop
+from rov_ident.simulation.virtual_sensors import Dive
+
+HORIZON = 10.0  # s; of the open-loop windows by which models are judged
+VELOCITIES = tuple("uvwpqr")
+
+Progress = Callable[[int, int], None]
+"""Called now and then with the messages read so far and in all."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """The samples (k,) of SAMPLE of one bag, in its own time.
+
+    ``notes`` say in words what was refused or lost; ``sha256`` is of the bag's bytes.
+    """
+
+    path: Path
+    samples: NDArray[np.void]
+    counts: Counter[str]
+    notes: tuple[str, ...]
+    sha256: str
+
+    @property
+    def duration(self) -> float:
+        """Seconds that the samples cover, gaps left out."""
+        return float(self.samples["dt"].sum())
+
+
+def read_record(path: str | Path, config: Config, progress: Progress | None = None) -> Record:
+    """Read a bag into samples.
+
+    Raises UserError if the bag cannot be read, lacks a topic, or yields no sample, naming what is
+    missing.
+    """
+    bag = Bag(Path(path))
+    topics = inputs.select(bag, config)
+    total = inputs.total(bag, topics)
+    sampler = Sampler(config.with_effects_held)
+    parts: list[NDArray[np.void]] = []
+    unusable: Counter[str] = Counter()
+    for done, (role, message) in enumerate(inputs.messages(bag, topics, config, unusable)):
+        part = sampler.push(role, message)
+        if len(part):
+            parts.append(part)
+        if progress is not None and done % 2000 == 0:
+            progress(done, total)
+    parts.append(sampler.flush())
+    if progress is not None:
+        progress(total, total)
+    samples = believed(joined(parts))
+    counts = sampler.counts + unusable
+    notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
+    notes += [bag.damage] if bag.damage else []
+    if len(samples) < 2:
+        raise UserError(
+            f"{path}: its messages make no samples"
+            + (f": {'; '.join(notes)}" if notes else ", it is too short")
+        )
+    return Record(Path(path), samples, counts, tuple(notes), bag.sha256)
+
+
+def predicted(
+    model: Model,
+    samples: NDArray[np.void],
+    horizon: float,
+    free: NDArray[np.bool_] | None = None,
+    effects: Acting | None = None,
+) -> Array:
+    """Velocities (k, 6) over ground, simulated open loop in windows of ``horizon`` seconds.
+
+    An infinite horizon is one run. Every window starts from the measured state at its first sample;
+    so does every stretch after a gap. Components not marked in ``free`` (6,) follow the
+    measurement. Infinite where the simulation diverges. ``effects`` on the wrench and the current
+    act along the simulated motion, in place of what the samples say they did along the measured
+    one.
+    """
+    out = np.empty((len(samples), 6))
+    for first, end in stretches(samples):
+        part = samples[first:end]
+        thrust = part["wrench"] - part["surroundings"]
+        slope = part["wrench_slope"] - part["surroundings_slope"]
+        # a sample's wrench belongs to the interval that ends there
+        thrust, slope = (np.vstack([values[1:], values[-1:]]) for values in (thrust, slope))
+        out[first:end] = open_loop(
+            model, part["t"], thrust, over_ground(part), part["orientation"], horizon, slope, free,
+            effects,
+        )  # fmt: skip
+    return out
+
+
+def over_ground(samples: NDArray[np.void]) -> Array:
+    """The measured velocities (k, 6) over ground, as the odometry has them."""
+    nu = samples["nu"].copy()
+    nu[:, :3] += samples["water"]
+    return nu
+
+
+@dataclass(frozen=True)
+class Score:
+    """Open-loop simulation against measurement: rmse and R2 (6,) per velocity component."""
+
+    rmse: Array
+    r2: Array
+
+
+def score(
+    model: Model,
+    samples: NDArray[np.void],
+    horizon: float = HORIZON,
+    free: NDArray[np.bool_] | None = None,
+    effects: Acting | None = None,
+) -> Score:
+    """Score the simulation of :func:`predicted` where the velocity was measured."""
+    measured = samples["measured"]
+    nu = over_ground(samples)[measured]
+    error = predicted(model, samples, horizon, free, effects)[measured] - nu
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rmse = np.sqrt(np.mean(error**2, axis=0))
+        r2 = 1.0 - np.sum(error**2, axis=0) / np.sum((nu - nu.mean(axis=0)) ** 2, axis=0)
+    return Score(rmse, r2)
+
+
+def numbers(values: Array) -> dict[str, float | None]:
+    """By velocity component; None where there is none, as JSON wants it."""
+    return {
+        n: v if np.isfinite(v) else None for n, v in zip(VELOCITIES, values.tolist(), strict=True)
+    }
+
+
+def samples_of(config: Config, run: Dive) -> Iterator[np.ndarray]:
+    """The samples (k,) of a dive as an estimator configured so would see them."""
+    sampler = Sampler(config)
+    for _, role, message in run.messages:
+        yield sampler.push(role, message)
+    yield sampler.flush()

@@ -1,0 +1,91 @@
+"""The record of one sample, and sequences of them."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.jit import record
+from rov_ident.core.messages import Array
+
+NO_SIDES = np.zeros((1, 13, 0))
+
+SAMPLE = record(
+    [
+        ("t", "f8"),  # s since the first message
+        ("dt", "f8"),  # s since the previous sample
+        ("restart", "?"),  # the interval before this sample is not known: filters begin anew
+        ("anew", "?"),  # the samples before were wrong, too: what they taught is given up
+        ("measured", "?"),  # an odometry message belongs to this sample
+        ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
+        ("nu", "f8", (6,)),  # m/s, rad/s: through the water
+        ("water", "f8", (3,)),  # m/s: velocity of the water in body axes; nu + water: over ground
+        ("orientation", "f8", (4,)),  # w x y z, body -> world
+        ("down", "f8", (3,)),  # unit, body axes
+        ("down_slope", "f8", (3,)),  # per s, over the interval
+        ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
+        ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
+        ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
+        ("hold", "f8"),  # s: how long a command acts, of late; 0: not known yet
+        ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
+        ("surroundings_slope", "f8", (6,)),
+        ("odometry", "f8", (6,)),  # as nu; NaN: not measured
+        ("odometry_variance", "f8", (6,)),
+        ("gyro", "f8", (3,)),  # rad/s, bias removed; NaN: not measured
+        ("gyro_variance", "f8"),
+        ("gyro_bias", "f8", (3,)),  # rad/s: what was taken off the gyro here
+        ("attitude", "f8", (4,)),  # as the odometry has it; NaN: not measured
+    ]
+)
+
+
+def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
+    """One array of the samples in all parts, as np.concatenate, which is slow with records."""
+    return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=parts[0].dtype)
+
+
+def believed(samples: NDArray[np.void]) -> NDArray[np.void]:
+    """Samples (k,) of SAMPLE without those from before the last one with which all begins anew."""
+    anew = np.flatnonzero(samples["anew"])
+    return samples[anew[-1] :] if len(anew) else samples
+
+
+def stretches(samples: NDArray[np.void]) -> Iterator[tuple[int, int]]:
+    """Where each stretch of samples (k,) without a gap begins and ends."""
+    edges = np.flatnonzero(samples["restart"]).tolist()
+    return pairwise(sorted({0, *edges, len(samples)}))
+
+
+def sample_type(size: int) -> np.dtype[np.void]:
+    """The dtype of samples that know how they change with ``size`` parameters of effects.
+
+    A SAMPLE, then ``by_wrench`` and ``by_velocity`` (6, size) and ``about`` (size,): the values of
+    the parameters by which the sample was made. See :mod:`rov_ident.sampling.effect_jacobians`.
+    """
+    if size == 0:
+        return SAMPLE
+    first, step = SAMPLE.itemsize, 48 * size
+    names = list(SAMPLE.names or ())
+    kinds = [SAMPLE.fields[name] for name in names] if SAMPLE.fields else []
+    return record(
+        {
+            "names": [*names, "by_wrench", "by_velocity", "about"],
+            "formats": [*(k[0] for k in kinds), *([("f8", (6, size))] * 2), ("f8", (size,))],
+            "offsets": [*(k[1] for k in kinds), first, first + step, first + 2 * step],
+        }
+    )
+
+
+def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
+    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size).
+
+    Six rows of the wrench, six of the measured velocity, and the values that they are about.
+    """
+    if samples.dtype == SAMPLE:
+        return samples, NO_SIDES
+    size = (samples.dtype.itemsize - SAMPLE.itemsize) // 104
+    rows = np.ascontiguousarray(samples).view(np.uint8).reshape(len(samples), -1)
+    plain = np.ascontiguousarray(rows[:, : SAMPLE.itemsize]).view(SAMPLE)[:, 0]
+    sides = np.ascontiguousarray(rows[:, SAMPLE.itemsize :]).view(np.float64)
+    return plain, sides.reshape(len(samples), 13, size)

@@ -1,0 +1,178 @@
+"""From messages to samples: one clock, one set of axes, one filter for every channel.
+
+Topics come at their own rates and phases. A :class:`Sampler` waits until every topic has reached an
+instant (or is ``grace`` seconds behind), then emits one sample for it. The instants are those of
+the IMU messages while there is an IMU, else those of the odometry. Everything is decided by the
+stamps, never by arrival, so that a bag gives the same samples live, replayed and offline.
+
+What a sample holds, and why (docs/samples.md has the measurements):
+
+* ``wrench`` is the *mean* over the interval that ends at the sample, ``wrench_slope`` its trend in
+  there, of all that acts besides the model: thrusters and configured wrench effects.
+* ``nu`` is the best estimate of the body velocity *through the water*. A steady current is a moving
+  frame, in which the equations of motion are those for still water, so it is subtracted here.
+* ``odometry`` and ``gyro`` are the same measurements one by one, their noise independent. With a
+  gyro the odometry's own angular rate only serves to find the gyro's bias.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.frames import to_core
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry
+from rov_ident.sampling.acting_wrench import ActingWrench
+from rov_ident.sampling.despiking import Despiker, measured_values
+from rov_ident.sampling.effect_jacobians import EffectJacobians
+from rov_ident.sampling.kinematic_filter import KinematicFilter
+from rov_ident.sampling.queues import Instant, Queues, Waiting
+from rov_ident.sampling.sample import SAMPLE, joined, sample_type
+from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, Validation
+
+_LONGEST_INTERVAL = 0.5  # s without a measurement: restart rather than bridge
+_NO_VALUES = np.zeros(6)
+_NO_WRENCH = (_NO_VALUES, _NO_VALUES, _NO_VALUES)
+
+
+class Sampler:
+    """Merges the three topics into samples; the only part of the estimation that waits.
+
+    ``counts`` holds how many messages of each kind were taken or, by reason, refused; bad data
+    never raises. ``origin`` is the stamp [ns] of t = 0. Who wants the single commands (t [s],
+    wrench (6,)) of the samples sets ``commands`` to a list, and empties it now and then.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._validation = Validation()
+        self.counts = self._validation.counts
+        self.origin: int | None = None
+        self._frames = config.frames
+        self._queues = Queues()
+        self._despiker = Despiker(config, self.counts)
+        self.kinematic_filter = KinematicFilter(config)
+        self._acting = ActingWrench(config)
+        self.commands: list[tuple[float, Array]] | None = None
+        self._previous = math.nan  # s; time of the last sample
+        self.configure(config)
+
+    def configure(self, config: Config) -> None:
+        """Take other settings; the buffered messages and the motion stay."""
+        effects = config.estimate_effects
+        self._jacobians = EffectJacobians(config) if effects else None
+        self._none = np.zeros(0, dtype=sample_type(len(effects)))
+        self._queues.grace = config.grace
+        self._despiker.configure(config)
+        self.kinematic_filter.configure(config)
+        self._acting.configure(config, self._jacobians)
+
+    def recentre(self, config: Config) -> None:
+        """Go on with other values of the effects' parameters; their memory stays."""
+        assert self._jacobians is not None
+        self._jacobians = self._jacobians.about(config)
+        self.kinematic_filter.take_effects(config)
+        self._acting.configure(config, self._jacobians)
+
+    def _clear(self) -> None:
+        """Forget the buffered messages and the motion, not the clock's origin."""
+        self._validation.forget_motion()
+        self._queues.clear()
+        self._despiker.clear()
+        self.kinematic_filter.clear()
+        self._acting.clear()
+        self._previous = math.nan
+        if self._jacobians is not None:
+            self._jacobians.forget()
+
+    def push(self, role: str, message: Message) -> NDArray[np.void]:
+        """Take a message as it is on the wire; the samples (k,) of SAMPLE that are now complete."""
+        reason = self._validation.judge(role, message)
+        if reason == NEW_CLOCK:
+            done = self.flush()
+            self._clear()
+            self._enqueue(role, message)
+            return done
+        if reason:
+            return self._none
+        if self.origin is None:
+            self.origin = message.stamp
+        t = (message.stamp - self.origin) * 1e-9
+        if t < self._previous:
+            self.counts[f"{role}: too late"] += 1
+            self._queues.wait_longer(t)
+            if role != WRENCH:
+                return self._none
+        self._enqueue(role, message)
+        return self._emit(final=False)
+
+    def flush(self) -> NDArray[np.void]:
+        """The samples (k,) still waiting for a topic that will not come: the input has ended."""
+        return self._emit(final=True)
+
+    def _enqueue(self, role: str, message: Message) -> None:
+        """Queue a message in core axes."""
+        assert self.origin is not None
+        self.counts[role] += 1
+        t = (message.stamp - self.origin) * 1e-9
+        if isinstance(message, Odometry):
+            message = self._validation.marked(message)
+        message = to_core(message, self._frames)
+        values = _NO_VALUES if isinstance(message, Odometry) else measured_values(message)
+        self._queues.add(role, Waiting(t, message, values))
+
+    def _emit(self, final: bool) -> NDArray[np.void]:
+        """The samples (k,) that wait for nothing more; ``final``: nothing more will come."""
+        samples, queues = [], self._queues
+        while (instant := queues.next_instant(final)) is not None:
+            if instant.has_imu and self._despiker.judge(IMU, queues[IMU])[1]:
+                # dropped: of an IMU the others tell enough, and a guess would not do
+                queues[IMU].popleft()
+                continue
+            sample = self._sample(instant)
+            if sample is not None:
+                samples.append(sample)
+        if not samples:
+            return self._none
+        return samples[0] if len(samples) == 1 else joined(samples)
+
+    def _sample(self, instant: Instant) -> NDArray[np.void] | None:
+        """The sample (1,) of an instant, of which the messages are taken; None if it has none."""
+        t, dt = instant.t, instant.t - self._previous
+        restart = not 0.0 < dt <= _LONGEST_INTERVAL
+        begin = t if restart else self._previous
+        self._previous = t
+        wrench = self._acting.over(begin, t, self._queues[WRENCH], self._despiker, self.commands)
+        sample = np.zeros(1, dtype=SAMPLE)
+        imu = self._queues[IMU].popleft().message if instant.has_imu else None
+        odometry, age = None, 0.0
+        if instant.has_odometry:
+            measured_at, odometry, _ = self._queues[ODOMETRY].popleft()
+            age = t - measured_at
+        assert imu is None or isinstance(imu, Imu)
+        assert odometry is None or isinstance(odometry, Odometry)
+        if self._jacobians is not None:
+            motion = self.kinematic_filter.state[0]
+            self._jacobians.measure(motion["v"], motion["rate"], has_imu=imu is not None)
+        if restart:
+            self.kinematic_filter.restart()
+        taken, known, anew, stopped = self.kinematic_filter.step(
+            sample, t, 0.0 if restart else dt, restart, self._acting.hold, wrench or _NO_WRENCH,
+            odometry, age, imu,
+        )  # fmt: skip
+        if stopped:
+            self.counts["imu: gap, odometry alone"] += 1
+        if odometry is not None and not taken:
+            repeated = odometry.twist_variance[0] == REPEATED
+            why = "velocity repeated" if repeated else "outlier, or marked as not measured"
+            self.counts[f"odom: {why}"] += 1
+        if anew:
+            self.counts["odom: contradicts the first, begun anew"] += 1
+        if wrench is None or not known:
+            self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
+            self._previous = math.nan
+            return None
+        self._acting.surround(sample)
+        return (
+            sample if self._jacobians is None else self._jacobians.extend(sample, self._none.dtype)
+        )

@@ -1,0 +1,127 @@
+"""Smoothing of samples for offline fits, which know what came later; a live estimator cannot.
+
+The gyro's bias is found from odometry and gyro as they come, so it is known worst in the first
+seconds; here each sample takes the bias known two minutes later. The attitude, too, is smoothed.
+Its error matters: gravity's direction times buoyancy is a moment, and an error that lasts for
+seconds cannot be told from one of the coefficients.
+
+Attitude: the integrated rates give Q, off by a random walk d that the measured attitudes see with
+white noise (a local-level model; Durbin and Koopman 2012, ch. 2)::
+
+    q = exp(d) Q,   d[k] = d[k - 1] + w,   log(q_measured Q^-1) = d + v
+
+v's variance is half that of the differences of successive measurements. w's is that of the rates'
+noise times the factor of highest likelihood, as integration has errors of its own.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.frames import quaternion_multiply
+from rov_ident.core.jit import kernel
+from rov_ident.core.quaternions import rotation, turned
+from rov_ident.model.equations import Array
+from rov_ident.sampling.sample import stretches
+
+_LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
+# odometry's rates have told it to a tenth of their own noise
+_FACTORS = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])
+_FEWEST = 10  # measured attitudes; fewer do not tell their noise
+_ROBUST = 0.6745  # median absolute deviation of a Gaussian over its standard deviation
+
+
+def smoothed(samples: NDArray[np.void]) -> NDArray[np.void]:
+    """Samples (k,) of SAMPLE with bias and attitude smoothed over each stretch without a gap."""
+    out = samples.copy()
+    for first, end in stretches(samples):
+        part = out[first:end]
+        later = np.searchsorted(part["t"], part["t"] + _LOOK_AHEAD, side="right") - 1
+        change = part["gyro_bias"] - part["gyro_bias"][later]
+        inertial = np.isfinite(part["gyro"][:, 0])
+        part["gyro"][inertial] += change[inertial]
+        part["nu"][inertial, 3:] += change[inertial]
+        _smooth(part)
+    return out
+
+
+def _smooth(part: NDArray[np.void]) -> None:
+    """Smooth orientation, down and its slope in place."""
+    seen = np.flatnonzero(np.isfinite(part["attitude"][:, 0]))
+    if len(seen) < _FEWEST:
+        return
+    inertial = np.isfinite(part["gyro"][:, 0])
+    rate_variance = np.where(inertial, part["gyro_variance"], part["odometry_variance"][:, 3])
+    ahead = np.empty((len(part), 4))
+    _integrate(part["attitude"][seen[0]], seen[0], part["nu"], part["dt"], ahead)
+    off = _rotation_vector(part["attitude"][seen], ahead[seen])
+    steps = np.diff(off, axis=0)
+    noise = 0.5 * float(np.median(np.abs(steps)) / _ROBUST) ** 2 + 1e-12
+    walk = np.add.reduceat(rate_variance * part["dt"] ** 2, seen)[:-1] + 1e-12
+    error, best = off, np.inf
+    for factor in _FACTORS:
+        level, cost = _local_level(off, noise, factor * walk)
+        if cost < best:
+            error, best = level, cost
+    t = part["t"]
+    error = np.stack([np.interp(t, t[seen], column) for column in error.T], axis=1)
+    down = np.empty((len(part), 3))
+    _turn(ahead, error, part["orientation"], down)
+    part["down"] = down
+    dt = np.maximum(part["dt"][1:], 1e-6)
+    part["down_slope"][1:] = (down[1:] - down[:-1]) / dt[:, None]
+
+
+def _rotation_vector(q: Array, reference: Array) -> Array:
+    """log(q reference^-1) (k, 3): the turn in world axes from the reference to q."""
+    product = quaternion_multiply(q, reference * [1.0, -1.0, -1.0, -1.0])
+    real, vector = product[:, 0], product[:, 1:]
+    vector = np.where(real[:, None] < 0.0, -vector, vector)
+    size = np.linalg.norm(vector, axis=1)
+    angle = 2.0 * np.arctan2(size, np.abs(real))
+    turn: Array = vector * (angle / np.maximum(size, 1e-12))[:, None]
+    return turn
+
+
+@kernel
+def _integrate(q, first, nu, dt, out):
+    """Attitudes (k, 4) by the rates nu (k, 6) from q at ``first``, in both directions."""
+    out[first] = q / np.sqrt(np.sum(q**2))
+    for k in range(first + 1, len(out)):
+        out[k] = turned(out[k - 1], 0.5 * (nu[k - 1, 3:] + nu[k, 3:]) * dt[k])
+    for k in range(first - 1, -1, -1):
+        out[k] = turned(out[k + 1], -0.5 * (nu[k + 1, 3:] + nu[k, 3:]) * dt[k + 1])
+
+
+@kernel
+def _local_level(z, noise, walk):
+    """Levels (n, 3) of z (n, 3) smoothed from both sides; minus twice the log-likelihood."""
+    n = len(z)
+    level, variance, ahead = z.copy(), np.empty(n), np.empty(n)
+    variance[0], cost = noise, 0.0
+    for k in range(1, n):
+        ahead[k] = variance[k - 1] + walk[k - 1]
+        total = ahead[k] + noise
+        gain = ahead[k] / total
+        variance[k] = (1.0 - gain) * ahead[k]
+        for i in range(3):
+            e = z[k, i] - level[k - 1, i]
+            level[k, i] = level[k - 1, i] + gain * e
+            cost += e * e / total + np.log(total)
+    for k in range(n - 2, -1, -1):
+        gain = variance[k] / ahead[k + 1]
+        for i in range(3):
+            level[k, i] += gain * (level[k + 1, i] - level[k, i])
+    return level, cost
+
+
+@kernel
+def _turn(q, error, orientation, down):
+    """orientation = exp(error) q, down the third row of its matrix."""
+    for k in range(len(q)):
+        r = rotation(q[k])
+        body = np.zeros(3)
+        for i in range(3):
+            for j in range(3):
+                body[i] += r[j, i] * error[k, j]
+        orientation[k] = turned(q[k], body)
+        down[k] = rotation(orientation[k])[2]

@@ -1,0 +1,141 @@
+"""Which messages are refused, and why: fields, frames and stamps; each refusal is counted by name.
+
+Bad data never raises. Whatever is refused leaves everything as it was.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+
+from rov_ident.core.messages import Imu, Message, Odometry
+
+NEW_CLOCK = "clock: jumps, buffers restarted"
+"""Counted where stamps begin anew: a bag that starts over, another computer."""
+REPEATED = 2e3
+"""The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""
+
+_LARGEST_JUMP = 10.0  # s; a stamp this far ahead, or _LARGEST_STEP_BACK behind, is another clock:
+_LARGEST_STEP_BACK = 1.0  # s; topics that are reordered or lost for a while stay well within both
+_AGREEMENT = 1.0  # s; two stamps out of line that are so close to one another are of one new clock
+_LAST_STAMP = (2**31 - 1) * 10**9  # ns; the end of ROS time, 32 bits of seconds
+_REASONS = 100  # so many names of refusals are kept, so that a log cannot be flooded with them
+_GRID = 1e-4  # m/s; drivers that round velocities round to no finer grid than this
+_OFF_GRID = 0.01  # of a grid step; single precision of 10 m/s is that near
+_FINE_MESSAGES = 20  # a velocity off the grid shows for so many messages that they are not rounded
+_WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_ned")
+
+
+class Validation:
+    """Judges messages as they are on the wire, one after another.
+
+    ``counts`` holds, by name, how many were refused; the sampler adds those that were taken.
+    """
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._frame_ids: dict[str, tuple[str, ...]] = {}  # by topic, those of its first message
+        self._last_stamp: dict[str, int] = {}  # ns
+        self._suspect: dict[str, int] = {}  # ns; a stamp out of line, by topic
+        self.forget_motion()
+
+    def forget_motion(self) -> None:
+        """Compare the next velocity with none before it."""
+        self._velocity = b""  # bytes of the last one
+        self._fine = 0  # messages for which velocities still count as not rounded to a grid
+
+    def judge(self, role: str, message: Message) -> str:
+        """Why a message is refused, after counting it; empty if it is taken.
+
+        :data:`NEW_CLOCK` if it is the first to be taken of another clock.
+        """
+        reason = self._fault(role, message) or self._stamp_fault(role, message.stamp)
+        if not reason:
+            self._last_stamp[role] = message.stamp
+            self._suspect.pop(role, None)
+        elif reason == NEW_CLOCK:
+            self.counts[reason] += 1
+            self._last_stamp = {role: message.stamp}
+        else:
+            name = f"{role}: {reason}"
+            if name not in self.counts and len(self.counts) >= _REASONS:
+                name = f"{role}: refused for yet another reason"
+            self.counts[name] += 1
+        return reason
+
+    def _fault(self, role: str, message: Message) -> str:
+        """What is wrong with the fields or the frame, or an empty string."""
+        if message.stamp <= 0:
+            return "zero stamp"
+        if message.stamp >= _LAST_STAMP:
+            return "stamp at the end of time"
+        frames: tuple[str, ...]
+        if isinstance(message, Odometry):
+            frames = (message.frame_id, message.child_frame_id)
+            p, q, v, w = message.position, message.orientation, message.linear, message.angular
+            if not 0.5 < q.dot(q) < 2.0:  # NaN too
+                return "orientation is not a unit quaternion"
+            size = v.dot(v) + w.dot(w) + 1e-12 * p.dot(p)
+        elif isinstance(message, Imu):
+            frames = (message.frame_id,)
+            w, f = message.angular_velocity, message.linear_acceleration
+            size = w.dot(w) + f.dot(f) / 400.0
+        else:
+            frames = (message.frame_id,)
+            f, w = message.force, message.torque
+            size = 2.5e-9 * (f.dot(f) + w.dot(w))
+        # One comparison refuses NaN, infinities and what no vehicle reaches: 50 m/s, 50 rad/s,
+        # 50,000 km, 100 g, 1 MN, 1 MN m.
+        if not size < 2500.0:
+            return "not finite or absurdly large"
+        if self._frame_ids.get(role) == frames:
+            return ""
+        if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
+            return f"frame {_shown(frames[-1:])} is a world frame, body axes are needed"
+        if self._frame_ids.setdefault(role, frames) != frames:
+            return f"frame changed from {_shown(self._frame_ids[role])} to {_shown(frames)}"
+        return ""
+
+    def _stamp_fault(self, role: str, stamp: int) -> str:
+        """What is wrong with the stamp [ns] after the last one of its topic, or an empty string."""
+        last = self._last_stamp.get(role)
+        if last is None:
+            return ""
+        step = (stamp - last) * 1e-9
+        if -_LARGEST_STEP_BACK <= step <= _LARGEST_JUMP:
+            if step > 0.0:
+                return ""
+            return "duplicate stamp" if step == 0.0 else "backward stamp"
+        # A single wild stamp is an error; two in a row that agree are another clock.
+        suspect = self._suspect.get(role)
+        self._suspect[role] = stamp
+        agrees = suspect is not None and abs(stamp - suspect) * 1e-9 < _AGREEMENT
+        return NEW_CLOCK if agrees else "stamp jumps"
+
+    def marked(self, message: Odometry) -> Odometry:
+        """The message, its velocity marked by its variance if it has not been measured again.
+
+        That is so if it repeats the last one to the last digit: its sensor has lost the ground, or
+        is slower than its messages. Where velocities are rounded to a grid it may be by chance.
+        """
+        velocity, before = message.linear.tobytes(), self._velocity
+        self._velocity = velocity
+        if velocity == before:
+            if self._fine:
+                variance = message.twist_variance.copy()
+                variance[:3] = REPEATED
+                return message._replace(twist_variance=variance)
+        else:
+            steps = [v / _GRID for v in message.linear.tolist()]
+            off = any(abs(step - round(step)) > _OFF_GRID for step in steps)
+            self._fine = _FINE_MESSAGES if off else max(self._fine - 1, 0)
+        return message
+
+
+def _shown(frames: tuple[str, ...]) -> str:
+    """Frame ids as they may stand in a log, whatever is in them."""
+    return ", ".join(repr(frame if len(frame) <= 40 else f"{frame[:37]}...") for frame in frames)
+
+
+def describe(counts: Mapping[str, int]) -> list[str]:
+    """The refusals among a sampler's counts, in words, most frequent first."""
+    refused = {name: n for name, n in counts.items() if ":" in name and n}
+    return [f"{name} ({n})" for name, n in sorted(refused.items(), key=lambda item: -item[1])]

@@ -1,0 +1,174 @@
+"""What the sensors of a simulated vehicle publish: rates, noise, delays, from one seed."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.core.frames import (
+    acceleration_of_arm,
+    quaternion_from_euler,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    velocity_of_arm,
+)
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
+from rov_ident.effects import acted, compiled, sense
+from rov_ident.effects.base import Reading
+from rov_ident.simulation.manoeuvres import manoeuvre
+from rov_ident.simulation.open_loop import Trajectory, simulate
+
+_FRAMES = ("odom_ned", "base_link_frd")
+_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+START = 1_000_000_000  # ns; stamp of the first instant: zero would read as "no stamp"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Rates in Hz (an ``imu_rate`` of zero: no IMU), noise as standard deviations of one sample.
+
+    ``wrench_std`` is relative to the wrench. ``delay`` (s) and ``jitter`` (s, standard deviation of
+    it) put off the arrival of a message, never its stamp; ``drop`` is the share of messages lost.
+    """
+
+    odometry_rate: float = 20.0
+    imu_rate: float = 100.0
+    wrench_rate: float = 50.0
+    linear_std: float = 0.008
+    angular_std: float = 0.004
+    position_std: float = 0.01
+    attitude_std: float = 0.002
+    accelerometer_std: float = 0.03
+    gyro_std: float = 0.003
+    accelerometer_bias_std: float = 0.0
+    gyro_bias_std: float = 0.0
+    wrench_std: float = 0.01
+    delay: float = 0.0
+    jitter: float = 0.0
+    drop: float = 0.0
+
+    def scaled(self, factor: float) -> "Suite":
+        """The same sensors with all noise multiplied."""
+        noise = {name: factor * v for name, v in vars(self).items() if name.endswith("_std")}
+        return dataclasses.replace(self, **noise)
+
+
+@dataclass(frozen=True)
+class Dive:
+    """A simulated dive: the true motion at all instants, and the messages in order of arrival.
+
+    ``messages`` holds (arrival [ns], role, message), in ROS axes.
+    """
+
+    truth: Trajectory
+    demand: Array  # (N, 6), held from each instant of the truth to the next
+    messages: list[tuple[int, str, Message]]
+
+
+def dive(
+    config: Config, name: str = "steps", duration: float = 180.0, suite: Suite | None = None,
+    seed: int = 0,
+) -> Dive:  # fmt: skip
+    """Drive the configured vehicle through a manoeuvre and measure it.
+
+    Raises UserError if there is no such manoeuvre, or the simulation diverges.
+    """
+    suite = suite or Suite()
+    rng = np.random.default_rng(seed)
+    demand_t = np.arange(0.0, duration, 1.0 / suite.wrench_rate)
+    demand = manoeuvre(name, config.dynamics, demand_t, rng)
+    return measure(config, demand_t, demand, duration, suite, rng)
+
+
+def measure(
+    config: Config, demand_t: Array, demand: Array, duration: float, suite: Suite,
+    rng: np.random.Generator,
+) -> Dive:  # fmt: skip
+    """Simulate under a wrench demanded from each of ``demand_t`` (K,) to the next, and measure."""
+    # Every topic starts at a phase of its own, as real drivers do.
+    odometry_t = _clock(suite.odometry_rate, duration, rng)
+    imu_t = _clock(suite.imu_rate, duration, rng)
+    t = np.unique(np.concatenate([demand_t, odometry_t, imu_t, np.arange(0.0, duration, 0.005)]))
+    held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
+    effects = compiled(config.effects)
+    truth = simulate(config.dynamics, t, acted(effects, t, held), effects=effects)
+    sensed = sense(_reading(truth, config), config.effects)
+
+    messages: list[tuple[int, str, Message]] = []
+    variance = np.repeat([suite.linear_std**2, suite.angular_std**2], 3)
+    for i in np.searchsorted(t, odometry_t):
+        noise = rng.standard_normal(12)
+        tilt = quaternion_from_rotation_vector(suite.attitude_std * noise[:3])
+        position = _coarse(truth.position[i] + suite.position_std * noise[3:6])
+        attitude = _coarse(quaternion_multiply(truth.orientation[i], tilt))
+        linear = _coarse(sensed.linear[i] + suite.linear_std * noise[6:9])
+        angular = _coarse(sensed.angular[i] + suite.angular_std * noise[9:])
+        odometry = Odometry(0, *_FRAMES, position, attitude, linear, angular, variance)
+        messages.append(_stamped(t[i], ODOMETRY, odometry))
+    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))  # IMU -> body
+    gyro_variance, variance = np.full(3, suite.gyro_std**2), np.full(3, suite.accelerometer_std**2)
+    accelerometer_bias = suite.accelerometer_bias_std * rng.standard_normal(3)
+    gyro_bias = suite.gyro_bias_std * rng.standard_normal(3)
+    for i in np.searchsorted(t, imu_t):
+        noise = rng.standard_normal(6)
+        gyro = _coarse(mounting.T @ sensed.gyro[i] + gyro_bias + suite.gyro_std * noise[:3])
+        force = mounting.T @ sensed.specific_force[i] + accelerometer_bias
+        force = _coarse(force + suite.accelerometer_std * noise[3:])
+        imu = Imu(0, "imu_link_frd", _LEVEL, gyro, force, gyro_variance, variance)
+        messages.append(_stamped(t[i], IMU, imu))
+    for at, wrench in zip(demand_t, demand, strict=True):
+        noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
+        messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
+
+    keep = rng.random(len(messages)) >= suite.drop
+    late = suite.delay + suite.jitter * np.abs(rng.standard_normal(len(messages)))
+    arrived = [
+        (stamp + round(1e9 * lag), role, message)
+        for (stamp, role, message), kept, lag in zip(messages, keep, late, strict=True)
+        if kept
+    ]
+    # A topic keeps its order, however late its messages are.
+    newest: dict[str, int] = {}
+    ordered = []
+    for arrival, role, message in sorted(arrived, key=lambda m: m[2].stamp):
+        newest[role] = max(arrival, newest.get(role, 0))
+        ordered.append((newest[role], role, message))
+    ordered.sort(key=lambda m: m[0])
+    return Dive(truth, held, ordered)
+
+
+def _reading(truth: Trajectory, config: Config) -> Reading:
+    """What perfect sensors measure where the configuration says that they are, in body axes."""
+    v, omega = truth.nu[:, :3], truth.nu[:, 3:]
+    v_dot, omega_dot = truth.nu_dot[:, :3], truth.nu_dot[:, 3:]
+    down = quaternion_to_matrix(truth.orientation)[:, 2, :]
+    acceleration = v_dot + np.cross(omega, v) - config.gravity * down
+    acceleration += acceleration_of_arm(omega, omega_dot, config.imu.position)
+    linear = v + velocity_of_arm(omega, config.odometry.position)
+    return Reading(linear, omega, omega, acceleration)
+
+
+def _clock(rate: float, duration: float, rng: np.random.Generator) -> Array:
+    """Instants of a topic, on whole microseconds."""
+    if rate <= 0.0:
+        return np.zeros(0)
+    return np.round(np.arange(rng.random() / rate, duration, 1.0 / rate), 6)
+
+
+def _coarse(values: Array) -> Array:
+    """As a sensor gives them, in single precision: another computer's last bit does not show."""
+    return values.astype(np.float32).astype(np.float64)
+
+
+def _stamped(t: float, role: str, message: Message) -> tuple[int, str, Message]:
+    stamp = START + round(1e9 * t)
+    return stamp, role, message._replace(stamp=stamp)
+
+
+def odometry_of(t: Array, nu: Array) -> list[tuple[int, str, Message]]:
+    """Velocities (N, 6) at t (N,) as odometry messages without a pose; (arrival, role, message)."""
+    none = np.zeros(6)
+    messages = (Odometry(0, *_FRAMES, none[:3], _LEVEL, v[:3], v[3:], none) for v in nu)
+    return [_stamped(at, ODOMETRY, message) for at, message in zip(t, messages, strict=True)]

@@ -1,0 +1,4 @@
+"""Vehicles that steer: zigzags, Nomoto's models, autopilots.
+
+Heading and rudder only, or simulated vehicles with fins.
+"""

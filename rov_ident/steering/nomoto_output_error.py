@@ -1,0 +1,190 @@
+"""Nomoto's model by output error: the simulated heading is fitted, every first state estimated."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rov_ident.core.errors import UserError
+from rov_ident.core.linalg import sandwich, scaled_inverse
+from rov_ident.core.messages import Array
+from rov_ident.steering.nomoto_model import (
+    Nomoto,
+    first_state,
+    jumps_of,
+    model_of,
+    names_of,
+    respond,
+    rmse,
+)
+from rov_ident.steering.zigzag import Zigzag
+
+_DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
+
+
+def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
+    """Output error from the best linear model of a grid, and for the second order also from the
+    fitted first-order one with a fast second time constant: the better of the two."""
+    start, firsts = _linear_start(runs, order)
+    best = _descend(runs, order, nonlinear, _with_cubic(start, nonlinear), firsts)
+    if order == 2:
+        simple = output_error(runs, 1, nonlinear)
+        x = dict(zip(names_of(1, nonlinear), simple.theta))
+        fast = 0.1 * abs(x["a0"]) ** -1.0
+        start = np.array([x["a0"] / fast, x["a0"] + 1.0 / fast, x["b0"] / fast, 0.0, x["delta_0"]])
+        start = _with_cubic(start, nonlinear, x.get("c", 0.0) / fast)
+        states, shares = zip(*(first_state(2, nonlinear, start, run) for run in runs))
+        other = _descend(runs, 2, nonlinear, start, states, shares)
+        best = min(best, other, key=lambda m: m.rmse)
+    if not math.isfinite(best.rmse):
+        raise UserError("the fit does not converge: try --order 1 without --nonlinear")
+    return best
+
+
+def _with_cubic(theta: Array, nonlinear: bool, c: float = 0.0) -> Array:
+    return np.insert(theta, len(theta) - 1, c) if nonlinear else theta
+
+
+def _descend(
+    runs: Sequence[Zigzag],
+    order: int,
+    nonlinear: bool,
+    start: Array,
+    firsts: Sequence[Array],
+    shares: Sequence[Array] = (),
+) -> Nomoto:
+    """Least squares on the simulated headings over theta, every run's first state, and the instants
+    of jumps that fall between two rows (:attr:`Zigzag.reversals`)."""
+    n, states = len(start), order + 1
+    known = [run.known for run in runs]
+    speed = max(float(np.std(np.gradient(r.heading[k], r.t[k]))) for r, k in zip(runs, known))
+    names = names_of(order, nonlinear)
+    # Scales: of the offset the rudder's spread, of the cubic term one that equals a0 at r_rms,
+    # of b1 what T3 of the geometric mean of T1 and T2 would make it.
+    scale = np.abs(start)
+    if order == 2:
+        scale[3] = scale[2] / np.sqrt(scale[0])
+    scale[names.index("delta_0")] = 0.1 * max(float(np.std(run.rudder)) for run in runs)
+    if nonlinear:
+        scale[names.index("c")] = abs(start[0]) / speed**2
+    scale = np.maximum(scale, 1e-9)
+    jumps = [jumps_of(run) for run in runs]
+    scales, x0 = [scale], [start / scale]
+    lower, upper = [np.full(n, -np.inf)], [np.full(n, np.inf)]
+    size = np.array([0.1, *[speed] * order])
+    for i, (first, count) in enumerate(zip(firsts, jumps)):
+        guess = np.clip(shares[i], 0.01, 0.99) if shares else np.full(count, 0.5)
+        scales += [size, np.ones(count)]
+        x0 += [first / size, guess]
+        lower += [np.full(states, -np.inf), np.zeros(count)]
+        upper += [np.full(states, np.inf), np.ones(count)]
+    sizes = np.concatenate(scales)
+
+    def residual(x: Array) -> Array:
+        x = x * sizes
+        parts, at = [], n
+        for run, seen, count in zip(runs, known, jumps):
+            first, shares = x[at : at + states], x[at + states : at + states + count]
+            at += states + count
+            parts.append((respond(order, nonlinear, x[:n], run, first, shares) - run.heading)[seen])
+        return np.concatenate(parts)
+
+    bounded = any(jumps)
+    result = least_squares(
+        residual,
+        np.concatenate(x0),
+        bounds=(np.concatenate(lower), np.concatenate(upper)),
+        method="trf" if bounded else "lm",
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-12,
+        max_nfev=100 if bounded else 200 * len(sizes),
+    )
+    if not result.cost < _DIVERGED:
+        zeros = np.zeros((n, n))
+        return model_of(order, nonlinear, "oe", start, zeros, runs[0].unit, math.inf)
+    free = result.active_mask == 0  # a jump's instant on its bound is no free parameter
+    lengths = [int(k.sum()) for k in known]
+    covariance = np.zeros((len(sizes), len(sizes)))
+    covariance[np.ix_(free, free)] = robust_covariance(result.jac[:, free], result.fun, lengths)
+    covariance *= np.outer(sizes, sizes)
+    return model_of(
+        order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], runs[0].unit,
+        rmse(result.fun),
+    )  # fmt: skip
+
+
+def _linear_start(runs: Sequence[Zigzag], order: int) -> tuple[Array, list[Array]]:
+    """Start of the search: over a grid of time constants all else of the linear model is linear."""
+    states = order + 1
+    total = sum(int(run.known.sum()) for run in runs)
+    longest = max(run.t[-1] - run.t[0] for run in runs)
+    shortest = min(float(np.median(np.diff(run.t))) for run in runs)
+    grid = np.geomspace(max(shortest, 1e-3 * longest), 3.0 * longest, 25)
+    pairs = (
+        [(1.0 / T, 0.0) for T in grid]
+        if order == 1
+        else [(1.0 / (T * S), (T + S) / (T * S)) for T in grid[::2] for S in grid[::2] if S < T]
+    )
+    target = np.concatenate([run.heading[run.known] for run in runs])
+    best, cost = None, np.inf
+    for a0, a1 in pairs:
+        columns = np.zeros((total, order + 1 + states * len(runs)))
+        row = 0
+        for i, run in enumerate(runs):
+            rows = slice(row, row + int(run.known.sum()))
+            row = rows.stop
+            ones = dataclasses.replace(run, rudder=np.ones(len(run.t)))
+            units = [(1.0, 0.0, run, 0), (1.0, 0.0, ones, order)]
+            units += [(0.0, 1.0, run, 1)] if order == 2 else []
+            for b0, b1, driven, column in units:
+                theta = np.array([a0, b0, 0.0] if order == 1 else [a0, a1, b0, b1, 0.0])
+                columns[rows, column] = respond(order, False, theta, driven, np.zeros(3))[run.known]
+            theta = np.array([a0, 0.0, 0.0] if order == 1 else [a0, a1, 0.0, 0.0, 0.0])
+            for column, first in enumerate(np.eye(states), order + 1 + states * i):
+                columns[rows, column] = respond(order, False, theta, run, first)[run.known]
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        solution = np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
+        error = float(np.sum((columns @ solution - target) ** 2))
+        if error < cost:
+            best, cost = (a0, a1, solution), error
+    if best is None or not abs(best[2][0]) > 0.0:
+        raise UserError(
+            f"the heading of {runs[0].name} does not follow the rudder: check the columns, and "
+            "that the run is a zigzag"
+        )
+    a0, a1, x = best
+    start = [a0, x[0], -x[1] / x[0]] if order == 1 else [a0, a1, x[0], x[1], -x[2] / x[0]]
+    return np.array(start), list(x[order + 1 :].reshape(len(runs), states))
+
+
+def robust_covariance(jac: Array, error: Array, lengths: Sequence[int]) -> Array:
+    """Covariance (n, n) of a least-squares solution whose residuals are coloured.
+
+    The sandwich ``(J'J)^-1 S (J'J)^-1`` with the long-run covariance S of the scores ``J e``, from
+    a Bartlett window over scores prewhitened by a first-order autoregression (Andrews and Monahan
+    1992), run by run: plain least squares takes a slow residual for many independent ones.
+    """
+    n = jac.shape[1]
+    scores = jac * error[:, None]
+    s = np.zeros((n, n))
+    ends = np.cumsum(lengths)[:-1]
+    for length, part, e in zip(lengths, np.split(scores, ends), np.split(error, ends)):
+        if length < 4:
+            s += part.T @ part
+            continue
+        own = float(np.clip(float(e[1:] @ e[:-1]) / (float(e @ e) + 1e-300), 0.0, 0.97))
+        white = part[1:] - own * part[:-1]
+        power = float(np.sum(white**2)) + 1e-300
+        rho = float(np.clip(float(np.sum(white[1:] * white[:-1])) / power, -0.9, 0.97))
+        # Andrews (1991), eq. 6.2: the bandwidth for an AR(1) of that correlation.
+        alpha = 4.0 * rho**2 / ((1.0 - rho) ** 2 * (1.0 + rho) ** 2)
+        lags = int(min(1.1447 * (alpha * length) ** (1.0 / 3.0), 0.25 * length))
+        long_run = white.T @ white
+        for lag in range(1, lags + 1):
+            gamma = white[lag:].T @ white[:-lag]
+            long_run += (1.0 - lag / (lags + 1.0)) * (gamma + gamma.T)
+        s += long_run / (1.0 - own) ** 2
+    return sandwich(scaled_inverse(jac.T @ jac), s) * len(error) / max(len(error) - n, 1)

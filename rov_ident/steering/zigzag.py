@@ -1,0 +1,215 @@
+"""Records of steering: heading and rudder over time, from a CSV file or a bag."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import FrameDefaults, quaternion_to_euler, to_core
+from rov_ident.core.messages import Array, Odometry, Wrench
+from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.csv_table import CsvTable, read_csv
+from rov_ident.io.topics import ODOMETRY, POSE, WRENCH, messages, select
+
+_RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
+_STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
+_TURNED = 2.5 * np.pi  # a heading beyond it counts turns, or is in degrees
+_FAINT = 1.0  # deg; a zigzag whose angles all stay below it is one in radians
+
+
+@dataclass(frozen=True)
+class Zigzag:
+    """A run: t (n,) [s] increasing, heading (n,) [rad] unwrapped, NaN where not known, rudder (n,)
+    [rad]; ``unit`` is that of the rudder (`rad`, or `N m` for a yaw moment in its stead).
+    ``held``: the rudder is known to stay as it is from one row to the next."""
+
+    name: str
+    t: Array
+    heading: Array
+    rudder: Array
+    unit: str = "rad"
+    held: bool = False
+    sha256: str = ""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which rows have a heading."""
+        return np.isfinite(self.heading)
+
+    @property
+    def step(self) -> float:
+        """Median time between two headings [s]."""
+        return float(np.median(np.diff(self.t[self.known])))
+
+    @property
+    def reversals(self) -> NDArray[np.intp]:
+        """Rows after which a rudder that otherwise stands still has jumped: the two steps beside
+        are level. When it jumped within the step is not in the record."""
+        level = np.abs(np.diff(self.rudder)) < 1e-3 * np.ptp(self.rudder)
+        jumps = np.flatnonzero(~level)
+        inside = jumps[(jumps > 0) & (jumps < len(level) - 1)]
+        return inside[level[inside - 1] & level[inside + 1]]
+
+    def cornered(self) -> "Zigzag":
+        """The run with rows added where the rudder begins and ends to move.
+
+        A servo goes from one level to another at its own rate. Straight lines between samples cut
+        the corners, as if the rudder turned earlier and less; at that rate, known from within the
+        longer movements, the lines through the first and last moving sample meet the levels at the
+        corners. Added rows have no heading; movements not at one rate are left as they are.
+        """
+        if self.held or len(self.t) < 4:
+            return self
+        slope = np.diff(self.rudder) / np.diff(self.t)
+        level = np.abs(np.diff(self.rudder)) < 1e-3 * np.ptp(self.rudder)
+        inner = ~level[1:-1] & ~level[:-2] & ~level[2:]
+        if not inner.any():
+            return self
+        usual = float(np.median(np.abs(slope[1:-1][inner])))
+        begin = np.flatnonzero(level[:-1] & ~level[1:]) + 1  # row where it still stands
+        added: list[tuple[float, float]] = []
+        for i in begin:
+            still = np.flatnonzero(level[i:])
+            if not len(still) or still[0] < 2:
+                continue
+            j = i + still[0]  # row where it stands again
+            own = np.abs(slope[i + 1 : j - 1])
+            rate = float(np.median(own)) if len(own) else usual
+            if len(own) and np.ptp(own) > 0.1 * rate:
+                continue  # no movement at one rate
+            first = self.t[i + 1] - abs(self.rudder[i + 1] - self.rudder[i]) / rate
+            last = self.t[j - 1] + abs(self.rudder[j] - self.rudder[j - 1]) / rate
+            if self.t[i] < first < self.t[i + 1]:
+                added.append((first, self.rudder[i]))
+            if self.t[j - 1] < last < self.t[j]:
+                added.append((last, self.rudder[j]))
+        if not added:
+            return self
+        t, rudder = np.array(added).T
+        apart = np.abs(t[:, None] - self.t).min(axis=1) > 1e-6 * np.diff(self.t).min()
+        t, rudder = t[apart], rudder[apart]
+        rows = np.searchsorted(self.t, t)
+        return replace(
+            self,
+            t=np.insert(self.t, rows, t),
+            heading=np.insert(self.heading, rows, np.nan),
+            rudder=np.insert(self.rudder, rows, rudder),
+        )
+
+
+def read(path: Path, config: Config | None = None) -> Zigzag:
+    """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
+
+    ``config`` says which types and axes a bag has that are not the usual ones.
+
+    Raises UserError if it cannot be read, lacks a column or topic, or is in other units than it
+    says.
+    """
+    is_bag = path.is_dir() or path.suffix == ".mcap"
+    return from_bag(path, config) if is_bag else from_csv(path)
+
+
+def from_csv(path: Path) -> Zigzag:
+    """Columns `t_s`, `heading_rad|deg` (empty where not measured) and `rudder_rad|deg`."""
+    table = read_csv(path)
+    if "t_s" not in table.cells:
+        raise UserError(
+            f"{path} has no column t_s, the time in seconds: it has {', '.join(table.cells)}"
+        )
+    t = table.numbers("t_s")
+    if (bad := np.flatnonzero(np.diff(t) <= 0.0)).size:
+        raise UserError(
+            f"{path}, line {table.lines[bad[0] + 1]}: t_s goes from {t[bad[0]]:g} to "
+            f"{t[bad[0] + 1]:g}, but time must increase: sort the rows"
+        )
+    rudder = _angle(table, "rudder", blank=False)
+    heading = _angle(table, "heading", blank=True)
+    known = np.isfinite(heading)
+    heading[known] = np.unwrap(heading[known])
+    return Zigzag(path.name, t, heading, rudder, sha256=table.sha256)
+
+
+def _angle(table: CsvTable, name: str, blank: bool) -> Array:
+    """The column `name_rad` or `name_deg` in radians, its unit held against its values."""
+    found = [f"{name}_{unit}" for unit in ("rad", "deg") if f"{name}_{unit}" in table.cells]
+    if not found:
+        hint = f"say its unit by renaming it {name}_rad or {name}_deg" if name in table.cells else (
+            f"it has {', '.join(table.cells)}"
+        )  # fmt: skip
+        raise UserError(f"{table.path} has no column {name}_rad or {name}_deg: {hint}")
+    values = table.numbers(found[0], blank)
+    moved = values[np.isfinite(values)]
+    if len(moved) == 0:
+        raise UserError(f"{table.path}: the column {found[0]} is empty: fill it in")
+    if len(found) == 2:
+        apart = np.nanmax(np.abs(np.radians(table.numbers(found[1], blank)) - values), initial=0.0)
+        if not apart < 0.01 + 1e-3 * np.nanmax(np.abs(values)):
+            raise UserError(f"{table.path}: {found[0]} and {found[1]} disagree: remove one of them")
+    if found[0].endswith("_rad"):
+        largest = float(np.abs(moved).max())
+        if largest > (_STEEPEST if name == "rudder" else _TURNED):
+            way_out = "" if name == "rudder" else ", else wrap it to +-pi"
+            raise UserError(
+                f"{table.path}: {found[0]} reaches {largest:g}, which looks like degrees: rename "
+                f"the column {name}_deg if it is{way_out}"
+            )
+        return values
+    if 0.0 < np.ptp(moved) < _FAINT:
+        raise UserError(
+            f"{table.path}: {found[0]} varies by {np.ptp(moved):.3g} only, which looks like "
+            f"radians: rename the column {name}_rad if it is"
+        )
+    return np.radians(values)
+
+
+def from_bag(path: Path, config: Config | None = None) -> Zigzag:
+    """Heading of the odometry; the rudder from a std_msgs/Float64 (or 32) topic [rad] whose name
+    ends in `rudder`, stamped as recorded, or without one the yaw moment of the thruster wrench."""
+    bag = Bag(path)
+    steered = [
+        name
+        for name, topic in bag.topics.items()
+        if topic.type_name in _RUDDER_TYPES and name.endswith("rudder") and topic.message_count
+    ]
+    if len(steered) > 1:
+        raise UserError(f"{path} has several rudders, {', '.join(steered)}: keep one")
+    roles = (ODOMETRY,) if steered else (ODOMETRY, WRENCH)
+    if config is None:
+        frames, stream = FrameDefaults(), read_messages(bag, select_topics(bag, roles=roles))
+    else:
+        frames = config.frames
+        stream = messages(bag, select(bag, config, (*roles, POSE)), config)
+    rows: dict[str, list[tuple[float, float]]] = {ODOMETRY: [], WRENCH: []}
+    for role, message in stream:
+        if not isinstance(message, Odometry | Wrench):
+            continue
+        core = to_core(message, frames)
+        if isinstance(core, Odometry):
+            value = float(quaternion_to_euler(core.orientation)[2])
+        else:
+            value = float(core.torque[2])
+        if np.isfinite(value):
+            rows[role].append((1e-9 * core.stamp, value))
+    if steered:
+        kind = _RUDDER_TYPES[bag.topics[steered[0]].type_name]
+        for m in bag.iter_raw(steered):
+            angle = np.frombuffer(m.data, ("<" if m.data[1] else ">") + kind, 1, 4)[0]
+            rows[WRENCH].append((1e-9 * m.log_time, float(angle)))
+    (t, heading), (at, steering) = (np.array(rows[k]).reshape(-1, 2).T for k in (ODOMETRY, WRENCH))
+    t, first = np.unique(t, return_index=True)
+    at, once = np.unique(at, return_index=True)
+    if len(t) < 2 or len(at) < 1:
+        raise UserError(f"{path} has too few messages of heading or rudder: record a longer run")
+    heading = np.unwrap(heading[first])
+    # Heading and input on the instants of either, so that a step of the input keeps its time.
+    both = np.unique(np.concatenate([t, at[(at > t[0]) & (at < t[-1])]]))
+    index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)
+    known = np.full(len(both), np.nan)
+    known[np.searchsorted(both, t)] = heading
+    return Zigzag(
+        path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m", True,
+        bag.sha256,
+    )  # fmt: skip

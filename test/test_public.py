@@ -1,0 +1,379 @@
+"""The public face: `import rov_ident as ri`, what it offers, and what it leaves alone."""
+
+import ast
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib
+import nbclient
+import nbformat
+import numpy as np
+import pytest
+from conftest import HEAVY
+from matplotlib.figure import Figure
+from threadpoolctl import threadpool_info
+
+import rov_ident as ri
+from rov_ident.cli.program import main
+
+ROOT = Path(__file__).parent.parent
+CONTRACT = (
+    "load read fit explain check simulate plan compare OnlineEstimator HydrodynamicModel Model "
+    "Config Record EFFECTS coefficients UserError __version__"
+).split()
+FUNCTIONS = sorted(name for name in ri.__all__ if inspect.isfunction(getattr(ri, name)))
+HEAVY_MODULES = {"numpy", "scipy", "numba", "matplotlib", "rclpy", "yaml", "rich", "threading"}
+
+
+# ------------------------------------------------------------------ the list of names
+
+
+def test_the_face_is_complete():
+    assert set(CONTRACT) <= set(ri.__all__)
+    assert set(ri.__all__) <= set(dir(ri))
+    assert all(getattr(ri, name) is not None for name in ri.__all__)
+    assert ri.__version__ == re.search(r'version="(.+)"', (ROOT / "setup.py").read_text())[1]
+    assert ri.config.load is not None and ri.consumer.HydrodynamicModel is ri.HydrodynamicModel
+    with pytest.raises(AttributeError, match="no attribute 'rubbish'"):
+        _ = ri.rubbish
+
+
+def test_type_checkers_see_the_same_names():
+    tree = ast.parse(Path(ri.__file__).read_text())
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {a.asname for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    assert seen == set(ri.__all__) - {"__version__"}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_argument_is_documented(name):
+    function = getattr(ri, name)
+    doc = inspect.getdoc(function)
+    parameters = inspect.signature(function).parameters
+    if parameters:
+        described, raised = doc.partition("Parameters\n---")[2].partition("Raises\n---")[::2]
+        assert "UserError" in raised
+    for parameter in parameters:
+        assert re.search(rf"^(\w+, )*{parameter}(, \w+)*$", described, re.M), parameter
+
+
+@pytest.mark.parametrize("name", [n for n in ri.__all__ if inspect.isclass(getattr(ri, n))])
+def test_every_class_is_documented(name):
+    kind = getattr(ri, name)
+    assert len(kind.__doc__) > 20
+    assert not kind.__doc__.startswith(f"{name}("), "written by dataclass"
+    if kind in (ri.OnlineEstimator, ri.HydrodynamicModel):
+        for parameter in list(inspect.signature(kind).parameters):
+            assert f"``{parameter}``" in kind.__doc__
+        assert "UserError" in kind.__doc__
+    for method, value in vars(kind).items():
+        if inspect.isfunction(value) and not method.startswith("_") and len(
+            inspect.signature(value).parameters
+        ) > 1 and kind in (ri.OnlineEstimator, ri.HydrodynamicModel):  # fmt: skip
+            assert value.__doc__, method
+
+
+# ------------------------------------------------------------------ what importing leaves alone
+
+STATE = """
+import gc, json, os, signal, sys, time, warnings
+def state():
+    return [dict(os.environ), [str(signal.getsignal(s)) for s in sorted(signal.valid_signals())],
+            list(warnings.filters), sys.path[:], list(sys.meta_path), sys.excepthook,
+            sys.getrecursionlimit(), os.listdir("/proc/self/task"), gc.isenabled()]
+before, modules, begin = state(), set(sys.modules), time.process_time()
+import rov_ident
+spent = time.process_time() - begin
+after = state()
+print(json.dumps([repr(before) == repr(after), sorted(set(sys.modules) - modules), spent]))
+"""
+
+
+def test_importing_changes_nothing_and_takes_no_time():
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    spent = []
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-c", STATE], env=environment, capture_output=True, text=True,
+            check=True, cwd=ROOT,
+        )  # fmt: skip
+        same, loaded, seconds = json.loads(done.stdout)
+        assert same
+        assert not {name.partition(".")[0] for name in loaded} & HEAVY_MODULES
+        spent.append(seconds)
+    assert min(spent) < 0.05  # s of CPU; a shell prompt is felt as late from 0.1 s
+
+
+USED = """
+import json, logging, os, signal, sys
+import numpy as np
+np.seterr(over="raise")
+import matplotlib
+matplotlib.rcParams["font.size"] = 13
+def state():
+    return [dict(os.environ), np.geterr(), dict(matplotlib.rcParams), logging.root.level,
+            [str(signal.getsignal(s)) for s in sorted(signal.valid_signals())]]
+before = state()
+import rov_ident as ri
+for name in ri.__all__:
+    getattr(ri, name)
+assert ri.coefficients()[0].unit
+from rov_ident.reports import plots
+plots.intervals(["a"], {"b": (np.ones(1), np.ones(1))}, "x").savefig(os.devnull, format="png")
+print(json.dumps([repr(a) == repr(b) for a, b in zip(before, state())]))
+print("rclpy" in sys.modules)
+"""
+
+
+def test_nor_does_loading_every_name():
+    done = subprocess.run(
+        [sys.executable, "-c", USED], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert done.stdout.split() == ["[true,", *["true,"] * 3, "true]", "False"]
+
+
+def blas_threads():
+    return [
+        library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+    ]
+
+
+def test_blas_is_limited_within_a_call_and_given_back():
+    from rov_ident.core.threads import one_blas_thread
+
+    before = blas_threads()
+    assert before
+    with one_blas_thread():
+        with one_blas_thread():
+            assert set(blas_threads()) == {1}
+        assert set(blas_threads()) == {1}
+    assert blas_threads() == before
+
+
+def test_the_program_has_one_blas_thread_before_numpy_is_loaded():
+    """Said later, threads are there already, and wait at full load."""
+    program = (
+        "import os, sys; from rov_ident.core.threads import limit_process; limit_process(); "
+        "print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "1"]
+    command = [sys.executable, "-c", "import sys, rov_ident.cli; print('numpy' in sys.modules)"]
+    assert subprocess.run(command, capture_output=True, text=True).stdout == "False\n"
+
+
+def test_python_m():
+    command = [sys.executable, "-m", "rov_ident", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ri.__version__
+
+
+# ------------------------------------------------------------------ results
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp("public") / "dive.mcap"
+    ri.simulate(HEAVY, manoeuvre="steps", duration=40.0, seed=3).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fit(bag):
+    return ri.fit(bag, HEAVY, "ls")
+
+
+@pytest.fixture(scope="module")
+def results(bag, fit):
+    return {
+        "fit": fit,
+        "check": ri.check(str(bag), HEAVY),
+        "beside": ri.simulate(HEAVY, bag=bag),
+        "manoeuvre": ri.simulate(HEAVY, manoeuvre="steps", duration=5.0),
+        "plan": ri.plan(HEAVY, duration=10.0),
+        "comparison": ri.compare(HEAVY, fit),
+    }
+
+
+@pytest.mark.parametrize("name", ["fit", "check", "beside", "manoeuvre", "plan", "comparison"])
+def test_a_result_shows_itself(results, name, tmp_path):
+    result = results[name]
+    assert isinstance(result.plot(), Figure)
+    assert str(result) == str(result.table())
+    assert "─" in str(result)
+    document = json.loads(result.to_json())
+    shown = result._repr_html_()
+    assert shown.count("<table>") >= 1 and "<svg" in shown and "<script" not in shown
+    result.save(tmp_path / "new" / "result.json")
+    assert json.loads((tmp_path / "new" / "result.json").read_text()) == document
+    for ending, magic in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".html", b"<!doctype")):
+        result.save(tmp_path / f"result{ending}")
+        assert (tmp_path / f"result{ending}").read_bytes().startswith(magic)
+    with pytest.raises(ri.UserError, match="is saved as"):
+        result.save(tmp_path / "result.docx")
+    with pytest.raises(ri.UserError, match="cannot be written"):
+        result.save(Path("/proc/none/result.png"))
+
+
+def test_a_figure_is_not_registered_and_a_notebook_shows_it(results):
+    figure = results["comparison"].plot()
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    if "matplotlib.pyplot" in sys.modules:
+        assert not sys.modules["matplotlib.pyplot"].get_fignums()
+    assert matplotlib.rcParams["axes.spines.top"] is True
+
+
+def test_the_command_gives_the_same_fit(bag, fit, tmp_path, capsys):
+    path = tmp_path / "fit.json"
+    arguments = ["fit", str(bag), "--config", str(HEAVY), "--estimator", "ls", "--json", str(path)]
+    assert main([*arguments, "--jobs", "1"]) == 0
+    assert path.read_text() == fit.to_json()
+    assert str(fit).splitlines()[1:] == capsys.readouterr().out.splitlines()[1:]
+    assert "± 95 %" in str(fit)
+
+
+def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
+    given = ri.load(HEAVY)
+    assert ri.load(given) is given
+    several = ri.fit([str(bag)], given, "ls", "surge")
+    assert np.isclose(several.value("X_uu"), fit.value("X_uu"), rtol=0.05)
+    assert several.value("Y_vv") == given.value("Y_vv")
+    fit.save(tmp_path / "fitted.yaml")
+    again = ri.load(tmp_path / "fitted.yaml")
+    assert [again.value(name) for name in fit.names] == fit.values.tolist()
+    assert ri.HydrodynamicModel(tmp_path / "fitted.yaml").M.shape == (6, 6)
+    record = ri.read(bag, given)
+    assert record.duration == pytest.approx(40.0, abs=0.2)
+    estimator = ri.OnlineEstimator(HEAVY, "rls")
+    estimator.take(record.samples)
+    assert estimator.report().names == fit.names
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda bag: ri.fit(bag, HEAVY, "ols"), "there is no estimator 'ols'"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", "warp"), "no channel 'warp'"),
+        (lambda bag: ri.fit(bag, HEAVY, "rls", "surge"), "channels .* no meaning"),
+        (lambda bag: ri.fit(bag, HEAVY, "ml", weighted=False), "weighted .* no meaning"),
+        (lambda bag: ri.fit("nowhere.mcap", HEAVY, "ls"), "nowhere.mcap"),
+        (lambda bag: ri.load("nowhere.yaml"), "nowhere.yaml"),
+        (lambda bag: ri.simulate(HEAVY), "either a bag or a manoeuvre"),
+        (lambda bag: ri.OnlineEstimator(HEAVY, "ols"), "there is no estimator 'ols'"),
+        (lambda bag: ri.compare(HEAVY, bag), "no JSON of a result"),
+        (lambda bag: ri.compare(HEAVY, "nowhere.json"), "nowhere.json cannot be read"),
+    ],
+)
+def test_what_the_caller_can_mend_is_a_user_error(bag, call, message):
+    with pytest.raises(ri.UserError, match=message):
+        call(bag)
+
+
+# ------------------------------------------------------------------ comparison
+
+
+def document(**entries):
+    return json.dumps(
+        {"coefficients": {n: {"value": v, "std": s, "unit": u} for n, (v, s, u) in entries.items()}}
+    )
+
+
+def test_a_comparison_is_in_standard_deviations_of_the_difference(tmp_path, capsys):
+    a, b, out = tmp_path / "a.json", tmp_path / "b.json", tmp_path / "c.json"
+    a.write_text(document(X_u=(-10.0, 0.3, "N s/m"), Y_v=(-5.0, 1.0, "N s/m"), Z_w=(1, 1, "N s/m")))
+    b.write_text(document(X_u=(-12.0, 0.4, "N s/m"), Y_v=(-5.5, 1.0, "N s/m"), K_p=(1, 1, "N m s")))
+    found = ri.compare(a, b)
+    assert found.names == ("X_u", "Y_v")
+    assert found.deviations == pytest.approx([-2.0 / 0.5, -0.5 / np.sqrt(2.0)])
+    assert found.changed == ("X_u",)
+    assert (found.only_a, found.only_b) == (("Z_w",), ("K_p",))
+    assert main(["compare", str(a), str(b), "--json", str(out)]) == 0
+    assert json.loads(out.read_text()) == json.loads(found.to_json())
+    assert "1 of 2 coefficients" in capsys.readouterr().out
+
+
+def test_every_kind_of_result_can_be_compared(tmp_path, fit, results):
+    same = ri.compare(fit, fit)
+    assert same.changed == () and "same data" in same.notes[0]
+    assert ri.compare(HEAVY, fit).deviations == pytest.approx(
+        (fit.values - [fit.given.value(n) for n in fit.names]) / fit.std
+    )
+    findings = {
+        "retuned": {"changed": {"X_u": {"from": -1.0, "to": -2.0, "std": 0.1, "unit": "N s/m"}}},
+        "effects": [
+            {
+                "effect": "thruster_lag",
+                "parameters": {"time_constant": {"value": 0.2, "std": 0.01, "unit": "s"}},
+            }
+        ],
+    }
+    path = tmp_path / "findings.json"
+    path.write_text(json.dumps(findings))
+    assert ri.compare(path, path).names == ("X_u", "thruster_lag.time_constant")
+    path.write_text(json.dumps({"order": 1, "K": {"value": 1.0, "std": 0.1, "unit": "1/s"}}))
+    assert ri.compare(path, path).names == ("K",)
+    path.write_text(json.dumps({"axes": {"X": {"terms": {"X_uu": findings["effects"][0]["parameters"]["time_constant"]}}}}))  # fmt: skip  # noqa: E501
+    assert ri.compare(path, path).names == ("X_uu",)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[]", "3", "{}", "{", '{"coefficients": 3}', '{"coefficients": {}}', "[" * 10_000,
+        '{"coefficients": {"X_u": {"value": "a", "std": 1, "unit": "s"}}}',
+        '{"coefficients": {"X_u": {"value": 1, "std": -1, "unit": "s"}}}',
+        '{"coefficients": {"X_u": {"value": NaN, "std": 1, "unit": "s"}}}',
+        '{"effects": 3, "retuned": {"changed": 3}}', '{"retuned": {"changed": {}}, "effects": [3]}',
+        '{"axes": {"X": 3}}', '{"provenance": {"bags": [3]}, "axes": 3}',
+        document(X_u=(1.0, 1.0, "kg")),
+    ],
+)  # fmt: skip
+def test_bad_files_are_refused_in_a_sentence(tmp_path, capsys, text):
+    good, bad = tmp_path / "good.json", tmp_path / "bad.json"
+    good.write_text(document(X_u=(-10.0, 0.3, "N s/m")))
+    bad.write_text(text)
+    assert main(["compare", str(good), str(bad)]) == 2
+    assert "bad.json" in capsys.readouterr().err.replace("\n", "")
+
+
+# ------------------------------------------------------------------ what is written of it
+
+
+@pytest.mark.slow
+def test_the_lines_in_the_readme_run(tmp_path, monkeypatch, capsys):
+    for folder in ("bags", "config"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "README.md").read_text()
+    code = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
+    assert len(code) == 1
+    exec(compile(code[0], "README.md", "exec"), {})
+    assert "± 95 %" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # the first use of anything compiles it
+def test_the_notebook_runs(tmp_path):
+    """In a kernel of its own, from top to bottom, as the reader runs it."""
+    (tmp_path / "examples").mkdir()
+    for folder in ("bags", "config"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    notebook = nbformat.read(ROOT / "examples" / "first_fit.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells), "shipped without output"
+    where = {"metadata": {"path": str(tmp_path / "examples")}}
+    client = nbclient.NotebookClient(notebook, timeout=800, resources=where)
+    client.execute()
+    outputs = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
+    assert not [o for o in outputs if o.output_type == "stream" and o.name == "stderr"]
+    kinds = [kind for o in outputs for kind in o.get("data", {})]
+    assert kinds.count("text/html") >= 2 and kinds.count("image/png") >= 2
+    text = "".join(o.text for o in outputs if o.output_type == "stream")
+    assert "the structure of the simulation is right" in text.lower()
+    assert (tmp_path / "examples" / "out" / "fitted.yaml").exists()
