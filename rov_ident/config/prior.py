@@ -51,17 +51,34 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
     chosen = [model.coefficients[i] for i in index]
     keys = config.estimate_effects if effects else ()
     more = [parameter(*key) for key in keys]
+    nuisance = config.nuisance_std
     k, none = len(more), np.full(len(chosen), np.inf)
     return Prior(
         (*config.estimate, *(".".join(key) for key in keys)),
         (*(c.unit for c in chosen), *(p.unit for p in more)),
         np.array([*index, *range(len(model.theta), len(model.theta) + k)], dtype=np.int64),
         np.concatenate([model.theta[index], [config.effects[name][own] for name, own in keys]]),
-        np.concatenate([std, [p.typical for p in more]]),
+        np.concatenate([std, [nuisance.get(key, p.typical) for key, p in zip(keys, more)]]),
         np.array([c.is_diagonal for c in chosen] + [False] * k, dtype=bool),
         np.concatenate([-none, [p.lower for p in more]]),
         np.concatenate([none, [p.upper for p in more]]),
     )
+
+
+def rigid_body_covariance(config: Config, names: tuple[str, ...]) -> Array:
+    """What an uncertain rigid body adds to the covariance (n, n) of the coefficients ``names``.
+
+    A motion shows the sum of rigid body and added mass alone: an error of the mass is one of
+    X_udot, Y_vdot and Z_wdot alike, one of a moment of inertia one of K_pdot, M_qdot or N_rdot.
+    """
+    known, body = config.vehicle_uncertainty, config.model.body
+    sources = np.zeros((4, len(names)))  # mass, and the three moments of inertia
+    sizes = [known.mass_std * body.mass] * 3 + (known.inertia_std * np.diag(body.inertia)).tolist()
+    for row, name in enumerate(("X_udot", "Y_vdot", "Z_wdot", "K_pdot", "M_qdot", "N_rdot")):
+        if name in names:
+            sources[max(row - 2, 0), names.index(name)] = sizes[row]
+    covariance: Array = sources.T @ sources
+    return covariance
 
 
 def theta_of(config: Config) -> Array:

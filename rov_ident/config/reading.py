@@ -24,6 +24,7 @@ from rov_ident.config.schema import (
     Thrusters,
     Vector,
     Vehicle,
+    VehicleUncertainty,
 )
 from rov_ident.config.words import expected, shown, suggestion
 from rov_ident.core.errors import UserError
@@ -102,6 +103,8 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
         prior = settings["prior"]
         std = {_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}
         settings["prior"] = dataclasses.replace(prior, std=std)
+    known = {f.name: getattr(vehicle, f.name) for f in dataclasses.fields(VehicleUncertainty)}
+    settings["vehicle_uncertainty"] = VehicleUncertainty(**known)
     config = Config(name=vehicle.name, model=model, **settings)
     if np.linalg.eigvalsh(config.dynamics.mass_matrix)[0] <= 0:
         raise UserError("effects.cog_offset makes the mass matrix indefinite: give a smaller one")
@@ -143,7 +146,7 @@ def _read_section(section: type, values: Any, prefix: str) -> dict[str, Any]:
         raise UserError(f"{prefix[:-1]} is {shown(values)}, but must be a section of keys")
     fields = {item.name: item for item in dataclasses.fields(section)}
     if section is Config:  # these are made from `vehicle` and `coefficients`
-        del fields["name"], fields["model"]
+        del fields["name"], fields["model"], fields["vehicle_uncertainty"]
     for name in values:
         if name not in fields:
             others = ["vehicle", "coefficients"] if section is Config else []

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FrameDefaults
-from rov_ident.effects import rigid_body
+from rov_ident.effects import EFFECTS, rigid_body
 from rov_ident.model import thruster_allocation as thrusters
 from rov_ident.model.equations import GRAVITY, Model
 
@@ -72,7 +72,21 @@ class Parameter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Vehicle:
+class VehicleUncertainty:
+    """`vehicle`: how well the rigid body is known; standard deviations, zero: exactly."""
+
+    mass_std: float = option(
+        0.01, "of the mass, relative; it widens X_udot Y_vdot Z_wdot", lower=0.0
+    )
+    inertia_std: float = option(
+        0.05, "of the moments of inertia, relative; it widens K_pdot M_qdot N_rdot", lower=0.0
+    )
+    buoyancy_std: float = option(0.02, "of the buoyancy, relative to the weight", lower=0.0)
+    cog_std: float = option(0.005, "of the centre of gravity, each component", "m", lower=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicle(VehicleUncertainty):
     """`vehicle`: the rigid body as the file states it."""
 
     name: str = option(None, "name of the vehicle")
@@ -230,6 +244,12 @@ class OdometrySensor:
         0.005, "noise of an angular rate, where the message gives none", "rad/s", lower=POSITIVE
     )
     attitude_std: float = option(0.005, "noise of an attitude angle", "rad", lower=POSITIVE)
+    latency_std: float = option(
+        0.1,
+        "how late linear velocities may be against their stamps; zero: not at all",
+        "s",
+        lower=0.0,
+    )
     gate: float = option(
         5.0, "a velocity further off the integrated IMU is refused", "sigma", lower=POSITIVE
     )
@@ -265,6 +285,12 @@ class ImuSensor:
 class WrenchNoise:
     """`wrench`: how well the thruster wrench is known."""
 
+    scale_std: float = option(
+        0.15, "of one factor on the whole wrench; zero: it is exact", lower=0.0
+    )
+    lag_std: float = option(
+        0.2, "time constant that the thrusters' lag may have; zero: none", "s", lower=0.0
+    )
     relative_std: float = option(0.01, "standard deviation relative to the wrench", lower=0.0)
     correlation_time: float = option(
         0.02,
@@ -380,6 +406,10 @@ class Config:
         1.0, "inputs silent for longer are reported as stopped", "s", lower=POSITIVE, live=True
     )
     grace: float = option(0.3, "how long a late topic is waited for, in stamp time", "s", lower=0.0)
+    current_std: float = option(
+        0.3, "of the velocity of the water north and east; zero: it is still", "m/s", lower=0.0
+    )
+    vehicle_uncertainty: VehicleUncertainty = field(default_factory=VehicleUncertainty)
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     estimate_effects: tuple[tuple[str, str], ...] = ()
 
@@ -394,6 +424,35 @@ class Config:
         if own:
             return self.effects[effect][own]
         return float(self.model.theta[self.model.names.index(name)])
+
+    @property
+    def nuisance_std(self) -> dict[tuple[str, str], float]:
+        """Prior standard deviations of what no vehicle's file knows, by (effect, parameter)."""
+        body, vehicle = self.model.body, self.vehicle_uncertainty
+        std = {
+            ("thrust_scale", "scale"): self.wrench.scale_std,
+            ("thruster_lag", "time_constant"): self.wrench.lag_std,
+            ("ocean_current", "north"): self.current_std,
+            ("ocean_current", "east"): self.current_std,
+            ("buoyancy", "delta"): vehicle.buoyancy_std * body.weight,
+            **{("cog_offset", name): vehicle.cog_std for name in ("dx", "dy", "dz")},
+            ("velocity_latency", "delay"): self.odometry.latency_std,
+        }
+        return {key: value for key, value in std.items() if value > 0.0}
+
+    @property
+    def with_nuisance(self) -> "Config":
+        """The same, with what no vehicle's file knows among the parameters to estimate.
+
+        An effect that the file gives is left to what it says of it under `estimate`.
+        """
+        added = [key for key in self.nuisance_std if key[0] not in self.effects]
+        effects = {name: {p.name: p.null for p in EFFECTS[name].parameters} for name, _ in added}
+        return dataclasses.replace(
+            self,
+            effects={**self.effects, **effects},
+            estimate_effects=(*self.estimate_effects, *added),
+        )
 
     @property
     def with_effects_held(self) -> "Config":

@@ -30,6 +30,7 @@ def to_parameters(config: Config) -> dict[str, Any]:
         "cog": body.cog.tolist(),
         "cob": body.cob.tolist(),
         "inertia": inertia.tolist(),
+        **_changed(config.vehicle_uncertainty),
     }
     coefficients = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
     coefficients |= config.model.fins

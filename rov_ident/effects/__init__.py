@@ -124,6 +124,11 @@ def correct(reading: Reading, effects: Values) -> Reading:
     return reading
 
 
+def latency(effects: Values) -> float:
+    """How late [s] the linear velocities are against their stamps."""
+    return effects.get("velocity_latency", {}).get("delay", 0.0)
+
+
 def affects_sensors(effects: Values) -> bool:
     """Whether :func:`correct` changes anything."""
     return any(effect.name in effects for effect in _SENSE)

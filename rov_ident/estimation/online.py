@@ -4,7 +4,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config, load
-from rov_ident.config.prior import prior_of
+from rov_ident.config.prior import prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
@@ -29,6 +29,9 @@ Kind = Literal["rls", "ukf"]
 CENTRING_TIME = 1.0
 """s; the sampler takes over the estimated parameters of effects this often. A choice: these take
 many seconds to be learnt, and each time costs a report, which is slower than a step."""
+_RECENTRE = 0.2
+"""Standard deviations by which a parameter of an effect must have moved for samples to follow: what
+a sample is then wrong by is of second order in this."""
 EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
@@ -117,12 +120,13 @@ class OnlineEstimator:
     """
 
     def __init__(self, config: str | os.PathLike[str] | Config, kind: Kind) -> None:
-        config = load(config)
+        config = load(config).with_nuisance
         if kind not in ESTIMATORS:
             raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")
         self.config = config
         self.kind = kind
         self.prior = prior_of(config, effects=True)
+        self._rigid_body = rigid_body_covariance(config, self.prior.names)
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
@@ -136,7 +140,7 @@ class OnlineEstimator:
         self._state = self._module.init(self._task)
         self._last_t = math.nan
         self._recalled = 0  # ns: the stamp before the first sample
-        self._centred = -math.inf
+        self._centred, self._about = -math.inf, self._configured
         # information over the prior's: in the window that is filling, and in the one before
         self._gained = np.zeros((2, len(self.prior.names)))
         self._window = np.zeros(1)  # s of the window that is filling
@@ -152,10 +156,10 @@ class OnlineEstimator:
 
     def configure(self, config: Config) -> None:
         """Take other settings of the same model and coefficients; what is learnt stays."""
-        self.config = config
+        self.config = config = config.with_nuisance
         self._task = self._module.problem(config)
         self.sampler.configure(config)
-        self._centred = -math.inf
+        self._centred, self._about = -math.inf, self._configured
 
     def attach(self, monitor: Monitor) -> None:
         """Let a monitor see from now on what the estimator sees."""
@@ -223,13 +227,29 @@ class OnlineEstimator:
                 self.monitor.look(window, self.report().by_name)
         return info
 
+    @property
+    def _configured(self) -> Array:
+        """(k,) the parameters of effects as configured."""
+        return self.prior.mean[len(self.config.estimate) :]
+
     def _recentre(self) -> None:
-        """Have the sampler take over the parameters of effects as they are estimated now."""
+        """Have the sampler take over the parameters of effects as they are estimated now.
+
+        But not for changes far below their uncertainty: samples are right to first order anyway.
+        """
+        raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
+        bounds = (x[len(self.config.estimate) :] for x in (self.prior.lower, self.prior.upper))
+        now = np.clip(raw.values[len(self.config.estimate) :], *bounds)
+        if not (np.abs(now - self._about) > _RECENTRE * raw.std[len(self.config.estimate) :]).any():
+            return
+        self._about = now
         # The rigid body is the estimator's own, and what acts on it all but linear.
         found = {
-            name: value
-            for name, value in self.report().effects.items()
-            if EFFECTS[name.partition(".")[0]].body is None
+            f"{effect}.{name}": value
+            for (effect, name), value in zip(
+                self.config.estimate_effects, now.tolist(), strict=True
+            )
+            if EFFECTS[effect].body is None
         }
         self.sampler.recentre(self.config.with_values(found))
 
@@ -288,6 +308,7 @@ class OnlineEstimator:
     def report(self) -> Report:
         """The present coefficients, made physical, with their state in words."""
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
+        raw = replace(raw, covariance=raw.covariance + self._rigid_body)
         values = physical(self.config.dynamics, self.prior, raw)
         diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
         if diverged:

@@ -68,6 +68,7 @@ from rov_ident.estimation.shared import (
     Problem,
     add_score,
     begin,
+    drive_sides,
     measure,
     problem_of,
     steps_of,
@@ -411,8 +412,7 @@ def _predict(task, state, work, sample, side):
             for i in range(6):
                 s.middle[i] *= work.moving[i]  # or products with mere noise would be learnt from
         drive_of(task.structure, s.middle, work.estimated, work.scale, 0, free, work, work.drive)
-        if side.shape[1] > 0:
-            _drive_sides(task, work, side)
+        drive_sides(len(task.theta) - side.shape[1], work.estimated, work.scale, side, work.drive)
         advance(s.transition, sensitivity, s.into, work.drive, work.rows)
         advance_covariance(s.transition, noise, dt, p, s.product)
         for i in range(6):
@@ -421,16 +421,6 @@ def _predict(task, state, work, sample, side):
     for i in range(6):
         fastest += nu[i] * nu[i]
     return fastest < FASTEST**2  # not so with NaN
-
-
-@inlined
-def _drive_sides(task, work, side):
-    """work.drive of the parameters of effects."""
-    first = len(task.theta) - side.shape[1]
-    for a in range(len(work.estimated)):
-        if work.estimated[a] >= first:
-            for i in range(6):
-                work.drive[i, a] = work.scale[a] * side[i, work.estimated[a] - first]
 
 
 @inlined

@@ -122,6 +122,16 @@ def wrench_of(theta, sample, side, wrench):
 
 
 @inlined
+def drive_sides(first, estimated, scale, side, drive):
+    """The columns of drive (6, n) of parameters of effects, which are theta from ``first`` on."""
+    if side.shape[1] > 0:
+        for a in range(len(estimated)):
+            if estimated[a] >= first:
+                for i in range(6):
+                    drive[i, a] = scale[a] * side[i, estimated[a] - first]
+
+
+@inlined
 def steps_of(dt):
     """Into how many steps an interval is divided."""
     return max(1, int(np.ceil(dt / MAX_STEP - 1e-9)))

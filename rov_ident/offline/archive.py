@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import repeat
+from itertools import count, repeat
 from multiprocessing import get_context
 from operator import itemgetter
 from pathlib import Path
@@ -50,10 +50,13 @@ class Archive:
     """Bags whose samples stay where they were read; :meth:`each` maps a function over them.
 
     ``bags`` in the order given; ``notes`` say what was refused, and which bags were left out.
+    ``reread(config, columns)`` is the archive of the same bags, read with another configuration.
     """
 
-    def __init__(self, bags: Sequence[Bag], notes: Sequence[str], each: Mapper) -> None:
-        self.bags, self.notes, self.each = tuple(bags), tuple(notes), each
+    def __init__(
+        self, bags: Sequence[Bag], notes: Sequence[str], each: Mapper, reread: "Reader"
+    ) -> None:
+        self.bags, self.notes, self.each, self.reread = tuple(bags), tuple(notes), each, reread
 
     @property
     def samples(self) -> int:
@@ -64,6 +67,9 @@ class Archive:
         return sum(bag.duration for bag in self.bags)
 
 
+Reader = Callable[[Config, bool], Archive]
+
+
 def total(parts: Sequence[Sums]) -> Sums:
     """The sums of all bags, field by field, from those of each."""
     return type(parts[0])(*(sum(values) for values in zip(*parts, strict=True)))
@@ -71,7 +77,12 @@ def total(parts: Sequence[Sums]) -> Sums:
 
 def of_records(records: Sequence[Record]) -> Archive:
     """Records that have been read already, in this process."""
-    return _archive([_parts(record) for record in records], _here)
+    paths = [record.path for record in records]
+
+    def reread(config: Config, columns: bool) -> Archive:
+        return _archive((_tried(path, config, columns) for path in paths), _here, reread)
+
+    return _archive([_parts(record) for record in records], _here, reread)
 
 
 @contextlib.contextmanager
@@ -95,18 +106,33 @@ def opened(
 
     if dask:
         with _cluster(dask, jobs) as client:
-            yield _archive(told(_on_dask(client, paths, config)), partial(_by_dask, client))
+
+            def on_dask(config: Config, columns: bool = False) -> Archive:
+                read = _on_dask(client, paths, config, columns)
+                return _archive(told(read), partial(_by_dask, client), on_dask)
+
+            yield on_dask(config)
     elif jobs > 1 and len(paths) > 1:
         # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
         with (
             tempfile.TemporaryDirectory(prefix="rov_ident-") as folder,
             ProcessPoolExecutor(min(jobs, len(paths)), get_context("spawn"), limit_process) as pool,
         ):
-            files = [Path(folder) / f"{i}.npy" for i in range(len(paths))]
-            outcomes = pool.map(_stored, paths, repeat(config), files)
-            yield _archive(told(outcomes), partial(_by_processes, pool))
+            readings = count()
+
+            def in_processes(config: Config, columns: bool = False) -> Archive:
+                k = next(readings)
+                files = [Path(folder) / f"{k}-{i}.npy" for i in range(len(paths))]
+                outcomes = pool.map(_stored, paths, repeat(config), repeat(columns), files)
+                return _archive(told(outcomes), partial(_by_processes, pool), in_processes)
+
+            yield in_processes(config)
     else:
-        yield _archive(told(_tried(path, config) for path in paths), _here)
+
+        def here(config: Config, columns: bool = False) -> Archive:
+            return _archive(told(_tried(path, config, columns) for path in paths), _here, here)
+
+        yield here(config)
 
 
 def default_jobs() -> int:
@@ -118,7 +144,9 @@ Outcome = tuple[Bag, Any] | str
 """A bag and where its samples are (the array, a file, or a future), or why it was left out."""
 
 
-def _archive(outcomes: Iterable[Outcome], each: Callable[..., list[Any]]) -> Archive:
+def _archive(
+    outcomes: Iterable[Outcome], each: Callable[..., list[Any]], reread: Reader
+) -> Archive:
     """``each(where the samples are, function, *arguments)``: the function's results in order."""
     read, failures = [], []
     for outcome in outcomes:
@@ -130,7 +158,7 @@ def _archive(outcomes: Iterable[Outcome], each: Callable[..., list[Any]]) -> Arc
         raise UserError("; ".join(failures) or "no bag was given")
     bags = [bag for bag, _ in read]
     notes = [*failures, *(note for bag in bags for note in bag.notes)]
-    return Archive(bags, notes, partial(each, [where for _, where in read]))
+    return Archive(bags, notes, partial(each, [where for _, where in read]), reread)
 
 
 def _parts(record: Record) -> tuple[Bag, Samples]:
@@ -138,9 +166,9 @@ def _parts(record: Record) -> tuple[Bag, Samples]:
     return Bag(record.path, record.sha256, record.notes, len(samples), record.duration), samples
 
 
-def _tried(path: Path, config: Config) -> Outcome:
+def _tried(path: Path, config: Config, columns: bool = False) -> Outcome:
     try:
-        return _parts(read_record(path, config))
+        return _parts(read_record(path, config, columns=columns))
     except UserError as error:
         text = str(error)
         return f"left out: {text if path.name in text else f'{path.name}: {text}'}"
@@ -153,8 +181,8 @@ def _here(samples: Sequence[Samples], function: Callable[..., Any], *arguments: 
 # ------------------------------------------------------------------ processes
 
 
-def _stored(path: Path, config: Config, file: Path) -> Outcome:
-    outcome = _tried(path, config)
+def _stored(path: Path, config: Config, columns: bool, file: Path) -> Outcome:
+    outcome = _tried(path, config, columns)
     if isinstance(outcome, str):
         return outcome
     np.save(file, outcome[1])
@@ -198,9 +226,12 @@ def _bag_alone(outcome: Outcome) -> Bag | str:
     return outcome if isinstance(outcome, str) else outcome[0]
 
 
-def _on_dask(client: Any, paths: Sequence[Path], config: Config) -> Iterator[Outcome]:
+def _on_dask(
+    client: Any, paths: Sequence[Path], config: Config, columns: bool
+) -> Iterator[Outcome]:
     """Every bag with the future of its samples, which stay on the cluster."""
-    read = client.map(_tried, list(paths), [config] * len(paths), pure=False)
+    n = len(paths)
+    read = client.map(_tried, list(paths), [config] * n, [columns] * n, pure=False)
     for whole, alone in zip(read, client.map(_bag_alone, read, pure=False), strict=True):
         bag = alone.result()
         yield (

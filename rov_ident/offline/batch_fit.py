@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import prior_of
+from rov_ident.config.prior import prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
-from rov_ident.effects import Acting, compiled
+from rov_ident.effects import EFFECTS, Acting, compiled
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.model.coefficients import MOTIONS, Coefficient
 from rov_ident.model.equations import Model
@@ -52,13 +52,14 @@ class Settings:
     ``stages``: channels, fitted one group after the other; none: all together. ``prior``: whether
     what the configuration says of the coefficients counts as one more measurement. ``weighted``:
     least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
-    errors of the wrench.
+    errors of the wrench. ``readings``: at most so often are bags read for the parameters of effects.
     """
 
     stages: tuple[tuple[str, ...], ...] = ()
     prior: bool = True
     weighted: bool = True
     process: bool = True
+    readings: int = 4
 
 
 class _Stage(NamedTuple):
@@ -88,12 +89,19 @@ def fit_batch(
     tell("open loop, as configured")
     before = open_loop_rmse(archive, config)
     notes = list(archive.notes)
-    prior = prior_of(config)
+    effects = kind == "ml" and not settings.stages
+    config = config.with_nuisance if effects else config
+    prior = prior_of(config, effects)
     values, covariance = prior.mean.copy(), np.diag(prior.std**2)
     states = dict.fromkeys(prior.names, State.HELD)
     now, parts = config, []
-    for stage in settings.stages or (MOTIONS,):
-        found = _stage(archive, now, kind, stage, settings, notes, tell)
+    if effects and config.estimate_effects:
+        archive, found = _relinearised(archive, config, kind, settings, notes, tell)
+        values, covariance, states = found.values, found.covariance, found.states
+        now = config.with_values(dict(zip(found.names, values.tolist(), strict=True)))
+        parts.append(found.more)
+    for stage in () if parts else settings.stages or (MOTIONS,):
+        found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
         if found is None:
             continue
         at = np.array([prior.names.index(name) for name in found.names])
@@ -103,7 +111,7 @@ def fit_batch(
         now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
-    after = open_loop_rmse(archive, now)
+    after = open_loop_rmse(_as_read_by(archive, config, now), now)
     motion = archive.each(_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
@@ -127,6 +135,36 @@ def fit_batch(
         notes=tuple(notes),
         more=more,
     )
+
+
+def _relinearised(
+    archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Say
+) -> tuple[Archive, _Stage]:
+    """A fit with parameters of effects, and the archive as they have it.
+
+    Samples are linear in these about the values with which they were made: the bags are read anew
+    until the estimate stays where they were.
+    """
+    about, first = config, len(config.estimate)
+    while True:
+        told: list[str] = []
+        samples = archive.reread(about, True)
+        found = _stage(samples, config, kind, MOTIONS, settings, told, say)
+        assert found is not None
+        before = np.array([about.value(name) for name in found.names[first:]])
+        settings = replace(settings, readings=settings.readings - 1)
+        std = np.sqrt(np.diag(found.covariance))[first:]
+        # what is left out is of second order in this
+        if settings.readings == 0 or (np.abs(found.values[first:] - before) < 0.3 * std).all():
+            notes += told
+            return samples, found
+        about = config.with_values(
+            {
+                name: value
+                for name, value in zip(found.names[first:], found.values[first:].tolist())
+                if EFFECTS[name.partition(".")[0]].body is None  # the equations' own, and linear
+            }
+        )
 
 
 def _stage(
@@ -162,7 +200,8 @@ def _stage(
         if held := [n for n in names if n not in known]:
             notes.append(f"{name}: {', '.join(held)} held, {reason}")
             names, config = known, replace(config, estimate=known)
-    prior = prior_of(config)
+    prior = prior_of(config, effects=True)
+    coefficients = prior_of(config)
     precision = 1.0 if settings.prior else _NO_PRIOR
 
     def progress(what: str) -> None:
@@ -177,7 +216,7 @@ def _stage(
         precision=precision,
         progress=progress,
     )
-    base = least_squares.base_parameters(names, solution.information, prior.std)
+    base = least_squares.base_parameters(names, solution.information, coefficients.std)
     more: dict[str, Any] = {
         "base_parameters": {
             "identifiable": [str(c) for c in base.combinations],
@@ -189,12 +228,16 @@ def _stage(
     }
     found, covariance = solution.values, solution.covariance
     if kind == "ml":
-        start = config.dynamics.with_values(dict(zip(names, found.tolist(), strict=True)))
-        if np.linalg.eigvalsh(start.mass_matrix)[0] <= 0.0:
-            start = config.dynamics
         likelihood = maximum_likelihood.maximise(
-            archive.each, config, start, free, precision / prior.std**2, settings.process, progress
+            archive.each,
+            config,
+            _start(archive, config, dict(zip(names, found.tolist(), strict=True)), free),
+            free,
+            precision / prior.std**2,
+            settings.process,
+            progress,
         )
+        names = prior.names
         found, covariance = likelihood.values, likelihood.covariance
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
@@ -209,6 +252,7 @@ def _stage(
             )
         if not likelihood.converged:
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
+    covariance = covariance + rigid_body_covariance(config, names)
     removed = 1.0 - np.diag(covariance) / prior.std**2
     estimate = Estimate(names, found, covariance, 0.0)
     values = physical(config.dynamics, prior, estimate)
@@ -227,6 +271,24 @@ def _stage(
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
     return _Stage(names, values, covariance, states, more)
+
+
+def _start(
+    archive: Archive, config: Config, values: dict[str, float], free: NDArray[np.bool_]
+) -> Model:
+    """Of the configured model and the one with these values that which explains the data better."""
+    given, found = config.dynamics, config.dynamics.with_values(values)
+    if np.linalg.eigvalsh(found.mass_matrix)[0] <= 0.0:
+        return given
+    noise, none = maximum_likelihood.assumed(config), np.zeros(0, dtype=np.int64)
+    effects = prior_of(config, effects=True).mean[len(config.estimate) :]
+    costs = [
+        total(
+            archive.each(maximum_likelihood.one_pass, model, none, noise, free, np.inf, effects)
+        ).cost
+        for model in (given, found)
+    ]
+    return given if costs[0] < costs[1] or not np.isfinite(costs[1]) else found
 
 
 def _coefficients(config: Config) -> dict[str, Coefficient]:
@@ -330,22 +392,39 @@ def _size(samples: Samples) -> tuple[Array, Array]:
 
 def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
     """One for each bag: the open-loop simulation in windows of HORIZON, before and after."""
-    found = archive.each(_curves, before.dynamics, after.dynamics, compiled(before.effects))
-    return [Curves(bag.path.name, *of) for bag, of in zip(archive.bags, found, strict=True)]
+    known = archive.each(_curves, before.dynamics, compiled(before.effects))
+    found = _as_read_by(archive, before, after).each(
+        _curves, after.dynamics, compiled(after.effects)
+    )
+    return [
+        Curves(
+            bag.path.name, t, measured, simulated,
+            np.stack([np.interp(t, later, column) for column in fitted.T], axis=1),
+        )
+        for bag, (t, measured, simulated), (later, _, fitted) in zip(
+            archive.bags, known, found, strict=True
+        )
+    ]  # fmt: skip
 
 
-def _curves(samples: Samples, before: Model, after: Model, effects: Acting) -> tuple[Array, ...]:
+def _curves(samples: Samples, model: Model, effects: Acting) -> tuple[Array, Array, Array]:
     keep = slice(None, None, max(1, len(samples) // _POINTS))
-    simulated = (predicted(m, samples, HORIZON, None, effects)[keep] for m in (before, after))
-    return samples["t"][keep], over_ground(samples)[keep], *simulated
+    simulated = predicted(model, samples, HORIZON, None, effects)[keep]
+    return samples["t"][keep], over_ground(samples)[keep], simulated
+
+
+def _as_read_by(archive: Archive, before: Config, after: Config) -> Archive:
+    """The archive, read by ``before``, as ``after`` reads it: with its effects on the input."""
+    return archive if after.effects == before.effects else archive.reread(after, False)
 
 
 def validation(archive: Archive, before: Config, after: Config) -> dict[str, Any]:
     """RMSE of the open-loop simulation on bags that no fit has seen, for the JSON of a fit."""
+    fitted = _as_read_by(archive, before, after)
     return {
         "horizon_s": HORIZON,
         "rmse_before": numbers(open_loop_rmse(archive, before)),
-        "rmse": numbers(open_loop_rmse(archive, after)),
+        "rmse": numbers(open_loop_rmse(fitted, after)),
         "bags": [{"file": bag.path.name, "sha256": bag.sha256} for bag in archive.bags],
     }
 

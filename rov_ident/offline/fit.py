@@ -20,7 +20,7 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
 from rov_ident.reports.result import Result, Shown, provenance
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON, Record, numbers, score
+from rov_ident.sampling.records import HORIZON, Record, numbers, read_record, score
 from rov_ident.sampling.sampler import Sampler
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     estimator = OnlineEstimator(config, kind)
     for record in records:
         estimator.sampler = Sampler(config)
-        if config.estimate_effects:  # samples depend on what is known by then
+        if estimator.config.estimate_effects:  # samples depend on what is known by then
             bag = Bag(record.path)
             for role, message in inputs.messages(bag, inputs.select(bag, config), config):
                 estimator.push(role, message)
@@ -196,7 +196,10 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
             report.values, report.std, estimator.prior.std, report.states, strict=True
         )
     ]
+    config = estimator.config
     found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    if found.effects != config.effects:  # what acts is no longer what was read
+        records = [read_record(record.path, found) for record in records]
     samples = sum(len(record.samples) for record in records)
     moves, effects = found.dynamics, compiled(found.effects)
     scores = [score(moves, record.samples, effects=effects) for record in records]

@@ -34,6 +34,7 @@ from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.filtered_regression import Regression, filtered_rows, regression
 from rov_ident.sampling.records import HORIZON, predicted
+from rov_ident.sampling.sample import parts
 
 PERIOD = 0.1  # s between rows
 _LAG = 2.0  # s; window over the correlation of the residuals
@@ -164,6 +165,7 @@ def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array
 
 
 def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+    samples, _ = parts(samples)
     z = phi = filtered_rows(batch.task, samples, PERIOD)
     if batch.instruments is not None:  # along the motion that the model says, through the water
         nu = predicted(batch.instruments, samples, np.inf, effects=batch.effects)

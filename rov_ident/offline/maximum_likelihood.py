@@ -45,17 +45,19 @@ from rov_ident.estimation.observer import (
     force_of,
     linearised_step,
 )
-from rov_ident.estimation.shared import measure, steps_of
+from rov_ident.estimation.shared import drive_sides, measure, steps_of, wrench_of
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.least_squares import add_scatter
+from rov_ident.sampling.sample import parts
 
 _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; an innovation further off is an outlier
 _NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
 _ITERATIONS = 25
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
+_NONE = np.zeros(0)
 LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
 
 
@@ -126,12 +128,15 @@ def one_pass(
     noise: Noise,
     free: NDArray[np.bool_] | None = None,
     gate: float = np.inf,
+    effects: Array = _NONE,
 ) -> Pass:
     """The likelihood of samples (k,) of SAMPLE at the model's values, with its derivatives.
 
-    ``estimated`` (n,) are indices into theta; components not ``free`` (6,) follow the measurement.
+    ``estimated`` (n,) are indices into theta, behind which come the values (p,) of parameters of
+    ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
+    measurement.
     """
-    return _passed(samples, model, estimated, noise, free, gate, np.zeros((3, 0, 6)))
+    return _passed(samples, model, estimated, noise, free, gate, effects, np.zeros((3, 0, 6)))
 
 
 class Innovations(NamedTuple):
@@ -149,10 +154,11 @@ def innovations(
     noise: Noise,
     free: NDArray[np.bool_] | None = None,
     gate: float = np.inf,
+    effects: Array = _NONE,
 ) -> Innovations:
     """What the filter finds in each sample."""
     out = np.full((3, len(samples), 6), np.nan)
-    _passed(samples, model, np.zeros(0, dtype=np.int64), noise, free, gate, out)
+    _passed(samples, model, np.zeros(0, dtype=np.int64), noise, free, gate, effects, out)
     return Innovations(*out)
 
 
@@ -163,10 +169,12 @@ def _passed(
     noise: Noise,
     free: NDArray[np.bool_] | None,
     gate: float,
+    effects: Array,
     out: Array,
 ) -> Pass:
     free = np.ones(6, dtype=bool) if free is None else free
-    mass, theta = model.mass_matrix, model.theta[:, None]
+    samples, sides = parts(samples)
+    mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
     inverse, at = np.zeros((6, 6)), np.ix_(free, free)
     inverse[at] = np.linalg.inv(mass[at])
     equations = _Equations(
@@ -176,7 +184,7 @@ def _passed(
     n = len(estimated)
     information, score, scatter, sums = np.zeros((n, n)), np.zeros(n), np.zeros((n, n)), np.zeros(3)
     _filter(
-        equations, samples, noise.process(samples), noise.measurement, gate,
+        equations, samples, sides, noise.process(samples), noise.measurement, gate,
         information, score, scatter, sums, out,
     )  # fmt: skip
     return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
@@ -204,7 +212,12 @@ def _at_levels(noise: Noise, levels: Array, process: bool) -> Noise:
 
 
 def noise_slope(
-    samples: Samples, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool
+    samples: Samples,
+    model: Model,
+    noise: Noise,
+    free: NDArray[np.bool_],
+    process: bool,
+    effects: Array = _NONE,
 ) -> tuple[Array, Array]:
     """Fisher information (13, 13) and half the likelihood's gradient (13,) about the logarithms.
 
@@ -212,7 +225,7 @@ def noise_slope(
     """
     samples = samples[:_NOISE_SAMPLES]
     levels = _levels(noise)
-    base = innovations(samples, model, noise, free, _GATE)
+    base = innovations(samples, model, noise, free, _GATE, effects)
     keep = np.isfinite(base.e)
     e, s = base.e[keep], base.s[keep]
     free_levels = np.concatenate([free, free & process, [process]])
@@ -220,7 +233,9 @@ def noise_slope(
     for i in np.flatnonzero(free_levels):
         moved = levels.copy()
         moved[i] += _STEP_NOISE
-        there = innovations(samples, model, _at_levels(noise, moved, process), free)
+        there = innovations(
+            samples, model, _at_levels(noise, moved, process), free, effects=effects
+        )
         slopes[i, 0] = (there.e[keep] - e) / (_STEP_NOISE * np.sqrt(s))
         slopes[i, 1] = np.log(there.s[keep] / s) / _STEP_NOISE
     unit = e / np.sqrt(s)
@@ -259,14 +274,16 @@ def maximise(
 ) -> Likelihood:
     """The coefficients of largest likelihood, from ``model``'s values on.
 
-    ``precision`` (n,) is that of the prior about the configured values; ``process``: whether the
-    wrench has errors, else pure output error.
+    ``precision`` (n,) is that of the prior about the configured values, of coefficients and then of
+    the parameters of effects in the samples' columns; ``process``: whether the wrench has errors,
+    else pure output error.
 
     Raises UserError if the model cannot be simulated.
     """
     free = np.ones(6, dtype=bool) if free is None else free
-    prior = prior_of(config)
+    prior = prior_of(config, effects=True)
     estimated, mean = prior.estimated, prior.mean
+    own, effects = estimated < len(model.theta), mean[len(config.estimate) :]
     precision = np.zeros(len(mean)) if precision is None else precision
     noise = assumed(config)
     if not process:
@@ -275,14 +292,14 @@ def maximise(
 
     def at_values(theta: Array) -> Model:
         moved = model.theta.copy()
-        moved[estimated] = theta
+        moved[estimated[own]] = theta[own]
         return model.with_theta(moved)
 
     def look(theta: Array, gate: float) -> tuple[Pass, float]:
         there = at_values(theta)
         if np.linalg.eigvalsh(there.mass_matrix)[0] <= 0.0:
             return nothing, np.inf
-        found = total(each(one_pass, there, estimated, noise, free, gate))
+        found = total(each(one_pass, there, estimated, noise, free, gate, theta[~own]))
         cost = float(found.cost + precision @ (theta - mean) ** 2)
         # an outlier is worth its gate, so that refusing one gains nothing
         if np.isfinite(gate):
@@ -290,7 +307,7 @@ def maximise(
         return found, cost if np.isfinite(cost) else np.inf
 
     nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
-    theta, count, converged = model.theta[estimated].copy(), 0, False
+    theta, count, converged = np.append(model.theta[estimated[own]], effects), 0, False
     settled, at, enough = theta, nothing, 1e-6 * len(theta)
     for stage, gate in enumerate((np.inf, _GATE, _GATE)):
         far = theta - settled
@@ -299,25 +316,34 @@ def maximise(
         if stage:
             settled = theta
             say("noise levels")
-            noise = _noise_levels(each, at_values(theta), noise, free, process)
+            noise = _noise_levels(each, at_values(theta), noise, free, process, theta[~own])
         at, cost = look(theta, gate)
         converged = True
         for _ in range(_ITERATIONS):
             say(f"step {count + 1}")
             slope = at.score + precision * (mean - theta)
-            change = inverse_of(at.information + np.diag(precision)) @ slope
+            # a parameter at its bound that the data would have beyond it stays there
+            held = ((theta <= prior.lower) & (slope < 0.0)) | (
+                (theta >= prior.upper) & (slope > 0.0)
+            )
+            slope[held] = 0.0
+            information = at.information + np.diag(precision)
+            information[held] = information[:, held] = 0.0
+            information[held, held] = 1.0
+            change = inverse_of(information) @ slope
             if slope @ change < enough:
                 break
             factor = 1.0
             while factor > 1e-3:
-                found, there = look(theta + factor * change, gate)
+                moved = np.clip(theta + factor * change, prior.lower, prior.upper)
+                found, there = look(moved, gate)
                 if there < cost:
                     break
                 factor *= 0.5
             else:
                 break
             count += 1
-            theta, at, gained, cost = theta + factor * change, found, cost - there, there
+            theta, at, gained, cost = moved, found, cost - there, there
             if gained < enough:
                 break
         else:
@@ -329,16 +355,18 @@ def maximise(
 
 
 def _noise_levels(
-    each: Mapper, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool
+    each: Mapper, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool, effects: Array
 ) -> Noise:
     levels = start = _levels(noise) if process else np.zeros(13)
     least = np.full(13, -np.inf)
     least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
     least[12] = np.log(1e-10)
     for _ in range(8):
-        parts = each(noise_slope, model, _at_levels(noise, levels, process), free, process)
-        information = sum(p[0] for p in parts) + np.eye(13) / _KNOWN**2
-        gradient = sum(p[1] for p in parts) - (levels - start) / _KNOWN**2
+        slopes = each(
+            noise_slope, model, _at_levels(noise, levels, process), free, process, effects
+        )
+        information = sum(s[0] for s in slopes) + np.eye(13) / _KNOWN**2
+        gradient = sum(s[1] for s in slopes) - (levels - start) / _KNOWN**2
         change = np.clip(np.linalg.solve(information, gradient), -1.5, 1.5)
         moved = np.maximum(levels + change, least)
         change, levels = moved - levels, moved
@@ -368,6 +396,7 @@ _SCRATCH = record(
     [
         *OBSERVER,
         ("noise", "f8", (6, 6)),  # variance density of the acceleration
+        ("wrench", "f8", (6,)),  # that acts
         ("z", "f8", (6,)),  # nu as measured
         ("r", "f8", (6,)),  # its variance
         ("cross", "f8", (6,)),  # covariance of nu with one component of it
@@ -385,10 +414,11 @@ class _Work(NamedTuple):
 
 
 @inlined
-def _predict(eq, sample, process, x, p, sensitivity, scale, work):
+def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
     """Velocity x (6,), covariance p (6, 6), sensitivity (6, n) to the sample's time."""
     s, n = work.scratch[0], len(eq.estimated)
-    force_of(sample, sample.wrench, eq.restoring, s.force, s.slope)
+    wrench_of(eq.one_theta, sample, side, s.wrench)
+    force_of(sample, s.wrench, eq.restoring, s.force, s.slope)
     for i in range(6):
         for j in range(6):
             s.force[i] -= eq.mass[i, j] * s.guide[j]
@@ -400,6 +430,7 @@ def _predict(eq, sample, process, x, p, sensitivity, scale, work):
         if n > 0:
             momentum_columns(eq.structure, s.middle_nu_dot, work.of_rate)
             drive_of(eq.structure, s.middle, eq.estimated, scale, 0, n, work, work.drive)
+            drive_sides(len(eq.theta) - side.shape[1], eq.estimated, scale, side, work.drive)
             advance(s.transition, sensitivity, s.into, work.drive, work.spare)
         for i in range(6):
             x[i] = s.end[i]
@@ -413,7 +444,7 @@ def _predict(eq, sample, process, x, p, sensitivity, scale, work):
 
 @kernel
 def _filter(
-    eq, samples, process, measurement, gate, information, score, scatter, sums, out
+    eq, samples, sides, process, measurement, gate, information, score, scatter, sums, out
 ):  # fmt: skip
     """Add to information (n, n), score (n,), scatter (n, n), sums (3,): cost, innovations used,
     outliers. ``out`` (3, k, 6), unless it is empty, is filled with :class:`Innovations`."""
@@ -433,8 +464,12 @@ def _filter(
                 s.mass[i, j, k] = eq.mass[i, j]
     started = False
     for k in range(len(samples)):
-        sample = samples[k]
+        sample, side = samples[k], sides[k if sides.shape[2] > 0 else 0]
+        first = len(eq.theta) - side.shape[1]
         measure(sample, s.z, s.r)
+        for i in range(6):  # less what the parameters of effects, as they are, add to it
+            for j in range(side.shape[1]):
+                s.z[i] -= side[6 + i, j] * (eq.one_theta[first + j, 0] - side[12, j])
         if sample.restart or not started or not sample.dt > 0.0:
             started = True
             for i in range(6):
@@ -458,7 +493,7 @@ def _filter(
                 x[i] = old[i]
                 s.guide[i] = (sample.nu[i] - old[i]) / sample.dt
             old[i] = sample.nu[i]
-        _predict(eq, sample, process[k], x, p, sensitivity, scale, work)
+        _predict(eq, sample, side, process[k], x, p, sensitivity, scale, work)
         now[:] = 0.0
         for i in range(6):
             if not eq.free[i]:
@@ -479,6 +514,8 @@ def _filter(
             sums[1] += 1.0
             for j in range(n):
                 row[j] = sensitivity[i, j]
+                if eq.estimated[j] >= first:
+                    row[j] += side[6 + i, eq.estimated[j] - first]
                 now[j] += row[j] * (e / size)
             for g in range(n):
                 f = row[g] / size

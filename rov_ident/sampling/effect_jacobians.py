@@ -13,6 +13,8 @@ configured ones, and of the wrench effects at the measured motion; of effects on
 is the change of the measured velocity: of moving water, and of effects on the velocity sensors.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,7 +38,7 @@ from rov_ident.effects import (
 )
 from rov_ident.effects.base import EffectParameter, Reading
 from rov_ident.model.coefficients import AXES
-from rov_ident.model.equations import coriolis, force_of_one
+from rov_ident.model.equations import Structure, coriolis, force_of_one
 
 _ZERO = np.zeros(3)
 
@@ -51,6 +53,7 @@ class EffectJacobians:
         self._bodies: list[int] = []
         self._senses: list[tuple[int, Values, Values]] = []
         self._water = np.zeros((3, k))  # world
+        self._latency = -1  # index of the velocities' delay; none
         self._about = theta_of(config)[len(config.model.theta) :]
         self._mask = np.ones((6, k))  # 0 where a parameter belongs to another axis
         self._width = np.ones(k)  # of the difference quotients
@@ -63,7 +66,9 @@ class EffectJacobians:
             self._width[i] = high[name][own] - low[name][own]
             if p.axis:
                 self._mask[:, i] = [axis == p.axis for axis in AXES]
-            if effect.act is not None or effect.wrench is not None:
+            if name == "velocity_latency":
+                self._latency = i
+            elif effect.act is not None or effect.wrench is not None:
                 self._forces.append(i)
                 variants += [compiled(low), compiled(high)]
             elif effect.water is not None:
@@ -80,8 +85,22 @@ class EffectJacobians:
         self._variants = (
             Acting(*(np.array(part) for part in zip(*variants, strict=True))) if variants else None
         )
-        self._mass, self._restoring = np.array(mass), np.array(restoring)
-        self._inverse = np.linalg.inv(config.dynamics.mass_matrix)
+        model = config.dynamics
+        self._motion = _Motion(
+            model.structure,
+            model.mass_matrix,
+            model.theta,
+            np.linalg.inv(model.mass_matrix),
+            model.body.restoring,
+            np.array(self._bodies, dtype=np.int64),
+            np.array(mass).reshape(-1, 6, 6),
+            np.array(restoring).reshape(-1, 6, 3),
+            self._water,
+            self._latency,
+        )
+        self._scale = self._mask / self._width
+        self._acts = np.array(self._forces, dtype=np.int64)
+        self._surrounded = self._variants is not None and bool(self._variants.wrenches.any())
         self.forget()
         self._velocity = np.zeros((6, k))
 
@@ -130,38 +149,40 @@ class EffectJacobians:
             change = np.concatenate([before.linear - after.linear, rate])
             self._velocity[:, i] = change / self._width[i]
 
-    def extend(self, sample: NDArray[np.void], dtype: np.dtype[np.void]) -> NDArray[np.void]:
-        """The sample (1,) of SAMPLE with J, V and p0 behind it; what has acted is used up.
+    def extend(self, sample: NDArray[np.void], sides: Array) -> None:
+        """Fill sides (13, k) of the sample (1,) of SAMPLE with J, V and p0; what acted is used up."""
+        if self._surrounded:
+            self._surround(sample[0])
+        _fill(
+            self._motion, sample, self._acts, self._impulse, self._time, self._scale,
+            self._velocity, self._about, sides,
+        )  # fmt: skip
+        self._impulse[:] = 0.0
+        self._time = 0.0
 
-        ``dtype`` is the :func:`~rov_ident.sampling.sample.sample_type` of so many parameters.
-        """
-        k, row = self.size, sample[0]
-        to_world = rotation(row["orientation"])
-        by_wrench, by_velocity = np.zeros((6, k)), self._velocity.copy()
-        if self._variants is not None:
-            count = len(self._variants.inputs)
-            now = np.zeros((count, 6))
-            _surround(self._variants, row["t"], row["nu"], to_world, now)
-            before = now if row["restart"] else self._around
-            wrench = 0.5 * (before + now)
-            if self._time > 0.0:
-                wrench += self._impulse / self._time
-            by_wrench[:, self._forces] = (wrench[1::2] - wrench[::2]).T
-            self._around, self._time = now, 0.0
-            self._impulse[:] = 0.0
-        by_wrench *= self._mask / self._width
-        if self._bodies:
-            model = self.config.dynamics
-            columns = np.empty((len(self._bodies), 6))
-            nu, wrench, down = (row[name].copy() for name in ("nu", "wrench", "down"))
-            _change_body(
-                model.structure, model.mass_matrix, model.theta, self._inverse,
-                model.body.restoring, self._mass, self._restoring, nu, wrench, down, columns,
-            )  # fmt: skip
-            by_wrench[:, self._bodies] = columns.T
-        by_velocity[:3] += to_world.T @ self._water
-        parts = (sample, by_wrench, by_velocity, self._about)
-        return np.frombuffer(bytearray(b"".join(part.tobytes() for part in parts)), dtype)
+    def _surround(self, row: np.void) -> None:
+        """Add the impulse of the variants' wrench effects along the motion."""
+        now = np.zeros_like(self._around)
+        _surround(self._variants, row["t"], row["nu"], rotation(row["orientation"]), now)
+        before = now if row["restart"] else self._around
+        self._time = self._time or 1.0
+        self._impulse += 0.5 * self._time * (before + now)
+        self._around = now
+
+
+class _Motion(NamedTuple):
+    """What the columns of water, rigid body and latency are made of."""
+
+    structure: Structure
+    mass: Array  # (6, 6)
+    theta: Array  # (m,)
+    inverse: Array  # (6, 6)
+    restoring: Array  # (6, 3)
+    bodies: NDArray[np.int64]  # (b,): indices of parameters of the rigid body
+    of_mass: Array  # (b, 6, 6): change of the mass matrix
+    of_restoring: Array  # (b, 6, 3)
+    water: Array  # (3, k): change of the water's velocity in the world
+    latency: int
 
 
 @inlined
@@ -189,11 +210,37 @@ def _surround(variants, t, nu, rotation, out):
 
 
 @kernel
-def _change_body(
-    structure, mass, theta, inverse, restoring, of_mass, of_restoring, nu, wrench, down, out
-):
-    """out (k, 6): ``dG down - dM nu_dot - C(dM nu) nu`` of each change of the rigid body."""
-    h = force_of_one(structure, mass, theta, nu)
-    nu_dot = inverse @ (wrench + restoring @ down - h)
-    for i in range(len(out)):
-        out[i] = of_restoring[i] @ down - of_mass[i] @ nu_dot - coriolis(of_mass[i] @ nu, nu)
+def _fill(motion, samples, acts, impulse, time, scale, velocity, about, sides):
+    """sides (13, k): rows of the wrench, of the measured velocity, and the values they are about.
+
+    Of a change of the rigid body ``dG down - dM nu_dot - C(dM nu) nu``; of a later velocity
+    ``-nu_dot``, with the acceleration of the configured model: that of the sensors is noisy, and
+    the noise would be in column and innovation alike.
+    """
+    sample = samples[0]
+    for j in range(len(about)):
+        for i in range(6):
+            sides[i, j] = 0.0
+            sides[6 + i, j] = velocity[i, j]
+        sides[12, j] = about[j]
+    if time > 0.0:
+        for a in range(len(acts)):
+            for i in range(6):
+                change = (impulse[2 * a + 1, i] - impulse[2 * a, i]) / time
+                sides[i, acts[a]] = change * scale[i, acts[a]]
+    to_world = rotation(sample.orientation)
+    for j in range(len(about)):
+        for i in range(3):
+            for a in range(3):
+                sides[6 + i, j] += to_world[a, i] * motion.water[a, j]
+    if len(motion.bodies) > 0 or motion.latency >= 0:
+        h = force_of_one(motion.structure, motion.mass, motion.theta, sample.nu)
+        nu_dot = motion.inverse @ (sample.wrench + motion.restoring @ sample.down - h)
+        for b in range(len(motion.bodies)):
+            change = motion.of_restoring[b] @ sample.down - motion.of_mass[b] @ nu_dot
+            change -= coriolis(motion.of_mass[b] @ sample.nu, sample.nu)
+            for i in range(6):
+                sides[i, motion.bodies[b]] = change[i]
+        if motion.latency >= 0:
+            for i in range(3):
+                sides[6 + i, motion.latency] = -nu_dot[i]

@@ -47,8 +47,11 @@ class Record:
         return float(self.samples["dt"].sum())
 
 
-def read_record(path: str | Path, config: Config, progress: Progress | None = None) -> Record:
-    """Read a bag into samples.
+def read_record(
+    path: str | Path, config: Config, progress: Progress | None = None, columns: bool = False
+) -> Record:
+    """Read a bag into samples; with ``columns`` they say how they change with the estimated
+    parameters of effects (:func:`~rov_ident.sampling.sample.sample_type`).
 
     Raises UserError if the bag cannot be read, lacks a topic, or yields no sample, naming what is
     missing.
@@ -56,7 +59,7 @@ def read_record(path: str | Path, config: Config, progress: Progress | None = No
     bag = Bag(Path(path))
     topics = inputs.select(bag, config)
     total = inputs.total(bag, topics)
-    sampler = Sampler(config.with_effects_held)
+    sampler = Sampler(config if columns else config.with_effects_held)
     parts: list[NDArray[np.void]] = []
     unusable: Counter[str] = Counter()
     for done, (role, message) in enumerate(inputs.messages(bag, topics, config, unusable)):

@@ -1,6 +1,7 @@
 """The record of one sample, and sequences of them."""
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -57,6 +58,7 @@ def stretches(samples: NDArray[np.void]) -> Iterator[tuple[int, int]]:
     return pairwise(sorted({0, *edges, len(samples)}))
 
 
+@cache
 def sample_type(size: int) -> np.dtype[np.void]:
     """The dtype of samples that know how they change with ``size`` parameters of effects.
 
@@ -75,6 +77,13 @@ def sample_type(size: int) -> np.dtype[np.void]:
             "offsets": [*(k[1] for k in kinds), first, first + step, first + 2 * step],
         }
     )
+
+
+def one_sample(size: int) -> tuple[NDArray[np.void], NDArray[np.void], Array]:
+    """A sample (1,) of :func:`sample_type`, all zeros; and as views its SAMPLE and sides (13, size)."""
+    whole = np.zeros(SAMPLE.itemsize + 104 * size, dtype=np.uint8)
+    sides = whole[SAMPLE.itemsize :].view(np.float64).reshape(13, size)
+    return whole.view(sample_type(size)), whole[: SAMPLE.itemsize].view(SAMPLE), sides
 
 
 def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
