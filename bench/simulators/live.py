@@ -9,6 +9,8 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
+
 from bench import HEAVY
 
 
@@ -22,6 +24,20 @@ def compile_all():
         fcntl.flock(lock, fcntl.LOCK_EX)
         for job in (compiler("rls"), compiler("ukf"), monitor.compiler()):
             assert job.ensure()
+
+
+ROUNDING = 1e-8  # standard deviations, for same_to_rounding
+
+
+def same_to_rounding(values, std, expected):
+    """What one process has estimated, values and std (n,), is another's Report ``expected``.
+
+    To rounding: sums are added in the order that suits the machine code of a process, which is not
+    the same after compiling as after reading the cache (core/jit.py). A message
+    that is used by one of them alone makes a difference a hundred thousand times as large.
+    """
+    np.testing.assert_array_less(np.abs(values - expected.values), ROUNDING * expected.std)
+    np.testing.assert_array_less(np.abs(std - expected.std), ROUNDING * expected.std)
 
 
 _CHUNK = 50  # messages
