@@ -37,10 +37,11 @@ check: .venv/test.stamp
 docs: .venv/docs.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-## accuracy over seeds, the tables of docs/accuracy.md (some two hours; it may be stopped and goes on
-## where it was)
+## accuracy over seeds, the tables of docs/accuracy.md, and on data as vehicles give it (hours; it may
+## be stopped and goes on where it was)
 accuracy: .venv/demo.stamp
 	$(BIN)/python -m bench.studies.accuracy
+	$(BIN)/python -m bench.studies.at_sea
 
 ## speed against peers, the table of docs/speed.md (ten minutes; let nothing else run)
 bench: .venv/bench.stamp

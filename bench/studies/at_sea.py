@@ -1,0 +1,481 @@
+"""Accuracy on data as vehicles give it: right, or said to be wrong.
+
+    python -m bench.studies.at_sea [--cases TEXT,...] [--driving KIND,...] [--estimators KIND,...]
+                                   [--dives N] [--seconds T] [--jobs N] [--minutes T] [--folder DIR]
+
+Each case is something that a vehicle does and its configuration file does not say, with a strength
+drawn by seed; the file's coefficients are off by up to 25 % besides. The simulator (sea.py) shares
+no code with the package. A dive is fitted as a user would do it: a bag, a file, `ri.fit`.
+
+Bars (exit status 1 where one is missed), of each case, driving and estimator:
+
+* the median error of the coefficients is at most 5 %, in a current 3 %, driven by a pilot 10 %, and
+  0.1 % where the file is right and says so ("known");
+* 95 % intervals hold the truth in 90 to 98 % of cases, or 95 % of the dives are said not to agree
+  with the model;
+* of a clean dive at most 2 % are;
+* RLS and UKF have at most 1.5 times the median error of ML.
+
+Of sensors that lie: in 95 % of dives everything called converged is within three standard
+deviations, or the dive is said not to agree with the model. A fit that is refused says so, too.
+
+Each fit leaves one line in a file of FOLDER, so that a run can be broken off and taken up again;
+with --minutes no fit is begun after so many, and what is missing counts as a bar missed.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import yaml
+
+import rov_ident as ri
+from bench.harness import Bars, Line, announce, digest, lines_of, table
+from bench.simulators import sea
+from bench.simulators.sea import DRIVING, Sea, Vehicle
+from rov_ident.config.schema import BY_KEY
+from rov_ident.io.write_messages import write_messages
+
+ESTIMATORS = ("rls", "ukf", "ml")
+
+Draw = Callable[[np.random.Generator, Vehicle], dict[str, Any]]
+
+
+# ------------------------------------------------------------------ cases: the fields of Sea
+
+
+def _clean(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {}
+
+
+def _thrust_scale(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"thrust_scale": rng.uniform(0.8, 1.1)}
+
+
+def _lag(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"lag": rng.uniform(0.1, 0.4)}
+
+
+def _current(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """It swings by up to a third of its speed, in five to fifteen minutes."""
+    speed, course = rng.uniform(0.1, 0.3), rng.uniform(-np.pi, np.pi)
+    swing = speed / 3.0 * rng.uniform(-1.0, 1.0, 2)
+    return {
+        "current": (speed * np.cos(course), speed * np.sin(course)),
+        "current_swing": tuple(swing.tolist()),
+        "current_period": rng.uniform(300.0, 900.0),
+    }
+
+
+def _trim(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    lift = 0.02 * sea.GRAVITY * vehicle.mass * rng.uniform(-1.0, 1.0)
+    return {"lift": lift, "cog": tuple(rng.uniform(-0.005, 0.005, 3).tolist())}
+
+
+def _late(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"velocity_delay": rng.uniform(0.05, 0.15)}
+
+
+def _mass(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    signs = rng.choice([-1.0, 1.0], 4)
+    inertia = 1.0 + signs[1:] * rng.uniform(0.05, 0.1, 3)
+    return {
+        "mass_factor": 1.0 + signs[0] * rng.uniform(0.01, 0.02),
+        "inertia_factor": tuple(inertia.tolist()),
+    }
+
+
+def _smoothed(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"smoothing": rng.uniform(0.05, 0.15)}
+
+
+def _sag(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """A battery's inner resistance and its cables, half its charge, and a propeller's pitch."""
+    return {
+        "resistance": rng.uniform(0.01, 0.03),
+        "discharge": rng.uniform(0.3, 1.0),
+        "advance": rng.uniform(0.1, 0.3),
+    }
+
+
+def _wrench_noise(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"wrench_floor": (0.5,) * 3 + (rng.uniform(0.04, 0.08),) * 3}
+
+
+def _biases(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """Of a gyro that is calibrated at rest; half of the vehicles copy it into the odometry."""
+    return {
+        "gyro_bias": tuple((0.01 * rng.standard_normal(3)).tolist()),
+        "accelerometer_bias": tuple((0.05 * rng.standard_normal(3)).tolist()),
+        "gyro_is_shared": bool(rng.random() < 0.5),
+    }
+
+
+def _clocks(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"odometry_rate": 10.0, "imu_clock": 0.02 * rng.choice([-1.0, 1.0])}
+
+
+ALONE: dict[str, Draw] = {
+    "thrust scale": _thrust_scale,
+    "thruster lag": _lag,
+    "current": _current,
+    "trim": _trim,
+    "late velocities": _late,
+    "mass and inertia": _mass,
+    "smoothed odometry": _smoothed,
+    "sag and advance": _sag,
+    "wrench noise": _wrench_noise,
+    "biases": _biases,
+    "clocks": _clocks,
+}
+
+
+def _everything(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    changes: dict[str, Any] = {}
+    for draw in ALONE.values():
+        changes |= draw(rng, vehicle)
+    return changes
+
+
+def _frozen(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"frozen_from": 60.0}
+
+
+def _turned(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"imu_turned": True}
+
+
+def _reversed(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"reversed_axis": int(rng.integers(6))}
+
+
+def _gyro(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    bias = np.zeros(3)
+    bias[rng.integers(3)] = 0.05 * rng.choice([-1.0, 1.0])
+    return {"gyro_bias": tuple(bias.tolist()), "gyro_is_shared": bool(rng.random() < 0.5)}
+
+
+def _stamps(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {"odometry_clock": 0.2}
+
+
+CASES: dict[str, Draw] = {"known": _clean, "clean": _clean, **ALONE, "all together": _everything}
+LIES: dict[str, Draw] = {
+    "velocity frozen": _frozen,
+    "IMU turned": _turned,
+    "wrench axis reversed": _reversed,
+    "gyro bias 0.05 rad/s": _gyro,
+    "stamps 0.2 s late": _stamps,
+}
+
+KNOWN: dict[str, Any] = {
+    "vehicle.mass_std": 0.0, "vehicle.inertia_std": 0.0, "wrench.scale_std": 0.0,
+    "wrench.lag_std": 0.0, "ocean_current.std": 0.0, "odometry.delay_std": 0.0,
+    "vehicle.buoyancy_std": 0.0, "vehicle.cog_std": 0.0,
+}  # fmt: skip
+"""What the file of the case "known" says besides; keys that do not exist are left out."""
+
+
+# ------------------------------------------------------------------ one fit
+
+
+@dataclass(frozen=True)
+class Trial:
+    case: str
+    driving: str
+    seed: int
+    seconds: float
+    estimator: str
+
+
+@dataclass(frozen=True)
+class Dive:
+    vehicle: Vehicle
+    sea: Sea
+    bag: bytes
+    parameters: dict[str, Any]
+
+
+def _stream(seed: int, purpose: str) -> np.random.Generator:
+    """Random numbers for one purpose: vehicle and driving are the same in all cases of a seed."""
+    return np.random.default_rng([seed, crc32(purpose.encode())])
+
+
+@lru_cache(maxsize=1)  # the fits of one dive follow each other
+def dive_of(case: str, driving: str, seed: int, seconds: float) -> Dive:
+    """Draw the vehicle and the strength of the case, dive, and write the bag."""
+    vehicle = sea.draw_vehicle(_stream(seed, "vehicle"))
+    draw = CASES.get(case) or LIES[case]
+    unknown = replace(Sea(), **draw(_stream(seed, case), vehicle))
+    truth = sea.dive(vehicle, unknown, driving, seconds, _stream(seed, driving))
+    messages = sea.measured(truth, unknown, _stream(seed, "sensors"))
+    parameters = sea.told(vehicle, unknown, _stream(seed, "file"))
+    for key, value in KNOWN.items() if case == "known" else ():
+        if key in BY_KEY:
+            section, _, name = key.rpartition(".")
+            parameters.setdefault(section, {})[name] = value
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "dive.mcap"
+        write_messages(path, messages)
+        return Dive(vehicle, unknown, path.read_bytes(), parameters)
+
+
+def measure(trial: Trial) -> Line:
+    """The line of one fit."""
+    dive = dive_of(trial.case, trial.driving, trial.seed, trial.seconds)
+    line: Line = {
+        "drawn": {f.name: v for f in fields(Sea) if (v := getattr(dive.sea, f.name)) != f.default}
+    }
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        bag, file = Path(folder) / "dive.mcap", Path(folder) / "vehicle.yaml"
+        bag.write_bytes(dive.bag)
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dive.parameters}}))
+        try:
+            fit = json.loads(ri.fit(bag, file, trial.estimator).to_json())
+        except ri.UserError as error:
+            return line | {"refused": str(error)}
+        except Exception as error:  # the study goes on; a crash is a bar missed
+            return line | {"crashed": f"{type(error).__name__}: {error}"}
+    entries = {name: fit["coefficients"][name] for name in dive.vehicle.theta}
+    lower = [e.get("lower", e["value"] - Z * e["std"]) for e in entries.values()]
+    upper = [e.get("upper", e["value"] + Z * e["std"]) for e in entries.values()]
+    verdict = fit.get("consistency", {})
+    return line | {
+        "seconds": time.monotonic() - begin,
+        "names": list(entries),
+        "true": list(dive.vehicle.theta.values()),
+        "value": [e["value"] for e in entries.values()],
+        "std": [e["std"] for e in entries.values()],
+        "lower": lower,
+        "upper": upper,
+        "state": [e["state"] for e in entries.values()],
+        "others": {k: e for k, e in fit["coefficients"].items() if k not in entries},
+        "consistent": verdict.get("consistent", True),
+        "sentence": verdict.get("sentence", ""),
+    }
+
+
+Z = 1.959963984540054  # of the normal distribution, 97.5 %
+
+
+# ------------------------------------------------------------------ tables
+
+
+@dataclass(frozen=True)
+class Group:
+    """The lines of one case, driving and estimator; arrays (dives, coefficients)."""
+
+    lines: list[Line]
+
+    @property
+    def fitted(self) -> list[Line]:
+        return [line for line in self.lines if "value" in line]
+
+    def _all(self, key: str) -> np.ndarray:
+        return np.array([line[key] for line in self.fitted])
+
+    @property
+    def error(self) -> np.ndarray:
+        return self._all("value") - self._all("true")
+
+    @property
+    def median(self) -> float:
+        """Of the error relative to the truth."""
+        if not self.fitted:
+            return np.inf
+        return float(np.median(np.abs(self.error / self._all("true"))))
+
+    @property
+    def covered(self) -> float:
+        true = self._all("true")
+        return float(np.mean((self._all("lower") <= true) & (true <= self._all("upper"))))
+
+    @property
+    def sigmas(self) -> np.ndarray:
+        return np.abs(self.error) / self._all("std")
+
+    @property
+    def converged(self) -> np.ndarray:
+        return self._all("state") == "converged"
+
+    @property
+    def disagrees(self) -> float:
+        """Share of the dives that are said not to fit the model; refused ones are among them."""
+        said = [not line.get("consistent", True) or "refused" in line for line in self.lines]
+        return float(np.mean(said))
+
+    @property
+    def honest(self) -> float:
+        """Share of the dives in which all that is called converged is within three sigma."""
+        good = iter(((self.sigmas <= 3.0) | ~self.converged).all(axis=1)) if self.fitted else None
+        held = [
+            "refused" in line or ("value" in line and (next(good) or not line["consistent"]))
+            for line in self.lines
+        ]
+        return float(np.mean(held))
+
+
+Groups = dict[tuple[str, str, str], Group]
+
+
+def grouped(lines: Sequence[Line]) -> Groups:
+    """By case, driving and estimator, in the order of the lines."""
+    found: dict[tuple[str, str, str], list[Line]] = defaultdict(list)
+    for line in lines:
+        t = line["trial"]
+        found[t["case"], t["driving"], t["estimator"]].append(line)
+    return {key: Group(group) for key, group in found.items()}
+
+
+def _limit(case: str, driving: str) -> float:
+    """The bar of the median error."""
+    if driving == "pilot":
+        return 0.1
+    return {"known": 0.001, "current": 0.03}.get(case, 0.05)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.3g} %"
+
+
+def _failed(group: Group, what: str, bars: Bars) -> str:
+    """Fits without a result: refused, and crashed."""
+    refused = sum("refused" in line for line in group.lines)
+    crashed = sum("crashed" in line for line in group.lines)
+    return bars.check(not crashed, f"{refused}, {crashed}", f"{what}: refused, crashed")
+
+
+def accuracy(groups: Groups, bars: Bars) -> None:
+    """Errors, intervals and verdicts of the cases."""
+    rows = []
+    for (case, driving, estimator), group in groups.items():
+        what = f"{case}, {driving}, {estimator}"
+        row = [case, driving, estimator, str(len(group.lines)), _failed(group, what, bars)]
+        if not group.fitted:
+            rows.append([*row, *["-"] * 6])
+            continue
+        said, covered = group.disagrees, group.covered
+        text = _percent(group.median)
+        row.append(bars.check(group.median <= _limit(case, driving), text, f"{what}: error"))
+        ml = groups.get((case, driving, "ml"))
+        if estimator == "ml" or ml is None or not ml.fitted:
+            row.append("")
+        else:
+            ratio = group.median / ml.median
+            row.append(bars.check(ratio <= 1.5, f"{ratio:.2f}", f"{what}: error over ML's"))
+        right = 0.9 <= covered <= 0.98 or said >= 0.95
+        row.append(bars.check(right, _percent(covered), f"{what}: coverage"))
+        if case in ("known", "clean"):
+            row.append(bars.check(said <= 0.02, _percent(said), f"{what}: false alarms"))
+        else:
+            row.append(_percent(said))
+        row += [_percent(group.converged.mean()), f"{np.median(group.sigmas):.2f}"]
+        rows.append(row)
+    table(
+        "case | driving | | dives | refused, crashed | median error | over ML's | 95 % cover"
+        " | said to disagree | converged | median error / std",
+        rows,
+    )
+
+
+def lies(groups: Groups, bars: Bars) -> None:
+    """Sensors that lie: right, or said to be wrong."""
+    rows = []
+    for (case, driving, estimator), group in groups.items():
+        what = f"{case}, {driving}, {estimator}"
+        row = [case, driving, estimator, str(len(group.lines)), _failed(group, what, bars)]
+        honest = bars.check(group.honest >= 0.95, _percent(group.honest), f"{what}: honest")
+        row += [honest, _percent(group.disagrees)]
+        if group.fitted:
+            worst = np.where(group.converged, group.sigmas, 0.0).max(axis=1)
+            row += [_percent(group.median), _percent(group.converged.mean()),
+                    f"{np.median(worst):.1f}, {worst.max():.1f}"]  # fmt: skip
+        else:
+            row += ["-"] * 3
+        rows.append(row)
+    table(
+        "fault | driving | | dives | refused, crashed | right, or said to be wrong"
+        " | said to disagree | median error | converged"
+        " | worst error / std of what is converged: median dive, worst dive",
+        rows,
+    )
+
+
+# ------------------------------------------------------------------ the study
+
+
+def trials(
+    cases: Sequence[str], driving: Sequence[str], estimators: Sequence[str], dives: int,
+    seconds: float,
+) -> list[Trial]:  # fmt: skip
+    """Seed by seed, so that a run that is broken off is a smaller sample of all rows."""
+    return [
+        Trial(case, how, seed, seconds, estimator)
+        for seed in range(dives)
+        for case in cases
+        for how in driving
+        for estimator in estimators
+    ]
+
+
+def source() -> str:
+    """The digest of what makes a line: the tables do not."""
+    here = Path(__file__).read_text().split("- tables\n")[0]
+    return digest(Path(sea.__file__).read_bytes(), here.encode())
+
+
+def _chosen(text: str, known: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
+    asked = [word.strip() for word in text.split(",")] if text else list(known)
+    if wrong := set(asked) - set(known):
+        parser.error(f"there is no {', '.join(sorted(wrong))}: use {', '.join(known)}")
+    return asked
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", default="", help=f"of {', '.join((*CASES, *LIES))}")
+    parser.add_argument("--driving", default="", help=f"of {', '.join(DRIVING)}")
+    parser.add_argument("--estimators", default="", help=f"of {', '.join(ESTIMATORS)}")
+    parser.add_argument("--dives", type=int, default=20, help="vehicles in each row")
+    parser.add_argument("--seconds", type=float, default=180.0, help="length of a dive")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument(
+        "--minutes", type=float, default=np.inf, help="of measuring: no fit is begun after"
+    )
+    parser.add_argument("--folder", type=Path, default=Path("build/at_sea"))
+    options = parser.parse_args()
+    cases = _chosen(options.cases, (*CASES, *LIES), parser)
+    driving = _chosen(options.driving, tuple(DRIVING), parser)
+    estimators = _chosen(options.estimators, ESTIMATORS, parser)
+    asked = trials(cases, driving, estimators, options.dives, options.seconds)
+    bars, path = Bars(), options.folder / "fits.jsonl"
+    announce()
+    if "known" in cases and (absent := [name for name in KNOWN if name not in BY_KEY]):
+        print(f"\nThe file of the case known cannot say (no such keys): {', '.join(absent)}.")
+    lines = lines_of(
+        asked, measure, lambda _: path, source(), jobs=options.jobs, minutes=options.minutes
+    )
+    order = {key: i for i, key in enumerate((*CASES, *LIES))}
+    groups = grouped(sorted(lines, key=lambda line: order[line["trial"]["case"]]))
+    if ours := {key: group for key, group in groups.items() if key[0] in CASES}:
+        accuracy(ours, bars)
+    if faults := {key: group for key, group in groups.items() if key[0] in LIES}:
+        lies(faults, bars)
+    if len(lines) < len(asked):
+        bars.missed.append(f"only {len(lines)} of {len(asked)} fits")
+    return bars.status()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
