@@ -3,11 +3,11 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bench import HEAVY, ROOT
 from rov_ident import config as configuration
 from rov_ident.core.messages import Odometry
 from rov_ident.io.bag_reader import Bag
@@ -16,9 +16,6 @@ from rov_ident.io.cdr import decode_odometry, encode
 from rov_ident.io.write_messages import write_messages
 
 pytestmark = pytest.mark.usefixtures("compiled")
-
-ROOT = Path(__file__).resolve().parents[1]
-HEAVY = ROOT / "config" / "bluerov2_heavy.yaml"
 
 
 def run(*arguments, cwd=None):

@@ -20,7 +20,7 @@ import pytest
 from browser import CHROMIUM, chromium
 from geometry_msgs.msg import WrenchStamped
 
-from bench import HEAVY
+from bench import HEAVY, ROOT
 from bench.simulators.live import in_pace, same_to_rounding
 from rov_ident import config
 from rov_ident.core.states import State
@@ -29,7 +29,7 @@ from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
 from rov_ident.simulation import virtual_sensors as sensors
 
-CONFIGS = HEAVY.parent
+CONFIGS = ROOT / "config"
 
 # ------------------------------------------------------------------ what it keeps
 
@@ -418,14 +418,14 @@ def command(domain):
 
 
 ROLES = ("odom", "imu", "wrench")
-VEHICLES = {"rov1": ("bluerov2_heavy.yaml", 1), "rov2": ("remus100.yaml", 2)}
+VEHICLES = {"rov1": (HEAVY, 1), "rov2": (CONFIGS / "remus100.yaml", 2)}
 NODES = {f"/{vehicle}/{kind}_node": (vehicle, kind) for vehicle in VEHICLES for kind in ESTIMATORS}
 
 
 def test_two_vehicles(command):
     """Four nodes in two namespaces, each with its own vehicle's numbers; and the
     page, the table and its JSON show all of them."""
-    configs = {vehicle: CONFIGS / name for vehicle, (name, _) in VEHICLES.items()}
+    configs = {vehicle: path for vehicle, (path, _) in VEHICLES.items()}
     dives = {
         vehicle: sensors.dive(config.load(configs[vehicle]), duration=8.0, seed=seed).messages
         for vehicle, (_, seed) in VEHICLES.items()

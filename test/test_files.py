@@ -17,7 +17,7 @@ from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.csv_log import parse_columns
 
 ROOT = Path(__file__).parent.parent
-DEMO, HEAVY = ROOT / "bags/demo.mcap", ROOT / "config/bluerov2_heavy.yaml"
+DEMO, HEAVY = ROOT / "bags/demo.mcap", ROOT / "bench/bluerov2_heavy_known.yaml"
 
 
 # ------------------------------------------------------------------ writing

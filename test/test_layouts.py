@@ -11,14 +11,14 @@ import foxglove.layouts as sdk
 import pytest
 from geometry_msgs.msg import WrenchStamped
 
-from bench import HEAVY
+from bench import HEAVY, ROOT
 from rov_ident import config
 from rov_ident.cli.program import main
 from rov_ident.dashboard import layouts
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.nodes.conversions import to_diagnostics
 
-FOLDER = HEAVY.parent
+FOLDER = ROOT / "config"
 
 
 @pytest.fixture(params=["", "rov1"])

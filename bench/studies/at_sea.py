@@ -180,7 +180,7 @@ LIES: dict[str, Draw] = {
 
 KNOWN: dict[str, Any] = {
     "vehicle.mass_std": 0.0, "vehicle.inertia_std": 0.0, "wrench.scale_std": 0.0,
-    "wrench.lag_std": 0.0, "ocean_current.std": 0.0, "odometry.delay_std": 0.0,
+    "wrench.lag_std": 0.0, "current_std": 0.0, "odometry.latency_std": 0.0,
     "vehicle.buoyancy_std": 0.0, "vehicle.cog_std": 0.0,
 }  # fmt: skip
 """What the file of the case "known" says besides; keys that do not exist are left out."""
@@ -223,7 +223,7 @@ def dive_of(case: str, driving: str, seed: int, seconds: float) -> Dive:
     for key, value in KNOWN.items() if case == "known" else ():
         if key in BY_KEY:
             section, _, name = key.rpartition(".")
-            parameters.setdefault(section, {})[name] = value
+            (parameters.setdefault(section, {}) if section else parameters)[name] = value
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dive.mcap"
         write_messages(path, messages)

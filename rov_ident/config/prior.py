@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.effects import parameter
+from rov_ident.effects import EFFECTS, parameter
 from rov_ident.model.equations import Array, Model
 from rov_ident.model.scales import WORKING_SPEED, authority
 
@@ -52,17 +52,40 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
     keys = config.estimate_effects if effects else ()
     more = [parameter(*key) for key in keys]
     nuisance = config.nuisance_std
+    spread = np.array([nuisance.get(key, p.typical) for key, p in zip(keys, more)])
+    mean = np.array([config.effects[name][own] for name, own in keys])
+    # three standard deviations for what is only supposed: beyond, the supposition is wrong
+    reach = np.array([_REACH * nuisance.get(key, np.inf) for key in keys])
     k, none = len(more), np.full(len(chosen), np.inf)
     return Prior(
         (*config.estimate, *(".".join(key) for key in keys)),
         (*(c.unit for c in chosen), *(p.unit for p in more)),
         np.array([*index, *range(len(model.theta), len(model.theta) + k)], dtype=np.int64),
-        np.concatenate([model.theta[index], [config.effects[name][own] for name, own in keys]]),
-        np.concatenate([std, [nuisance.get(key, p.typical) for key, p in zip(keys, more)]]),
+        np.concatenate([model.theta[index], mean]),
+        np.concatenate([std, spread]),
         np.array([c.is_diagonal for c in chosen] + [False] * k, dtype=bool),
-        np.concatenate([-none, [p.lower for p in more]]),
-        np.concatenate([none, [p.upper for p in more]]),
+        np.concatenate([-none, np.maximum([p.lower for p in more], mean - reach)]),
+        np.concatenate([none, np.minimum([p.upper for p in more], mean + reach)]),
     )
+
+
+_REACH = 3.0  # of 1000 normally distributed supposals, three are further off
+_HALF_NORMAL = np.sqrt(2.0 / np.pi)  # mean of a half-normal variable over its standard deviation
+
+
+def first_centre(config: Config) -> dict[str, float]:
+    """The values of effects' parameters, by name, about which samples are linear at first.
+
+    Those configured; but a lag that may be there is taken as long as its prior has it in the mean:
+    of one that is shorter than the interval between commands nothing shows.
+    """
+    prior = prior_of(config, effects=True)
+    centre = {}
+    for name, mean, std, lower in zip(prior.names, prior.mean, prior.std, prior.lower, strict=True):
+        if "." in name:
+            is_input = EFFECTS[name.partition(".")[0]].act is not None
+            centre[name] = float(mean + _HALF_NORMAL * std if is_input and mean == lower else mean)
+    return centre
 
 
 def rigid_body_covariance(config: Config, names: tuple[str, ...]) -> Array:

@@ -426,6 +426,11 @@ class Config:
         return float(self.model.theta[self.model.names.index(name)])
 
     @property
+    def effect_names(self) -> Names:
+        """Of the estimated parameters of effects, such as thruster_lag.time_constant."""
+        return tuple(".".join(key) for key in self.estimate_effects)
+
+    @property
     def nuisance_std(self) -> dict[tuple[str, str], float]:
         """Prior standard deviations of what no vehicle's file knows, by (effect, parameter)."""
         body, vehicle = self.model.body, self.vehicle_uncertainty

@@ -8,7 +8,8 @@ standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mea
   as a coefficient. It starts high and comes down: what an estimator learns with too little process
   noise weighs too much for ever. Innovations are added up over a second: what they have in common
   is process noise, while each alone is nearly all the sensor's.
-* *A change of the vehicle* is a NIS that stays large in the average over two seconds.
+* *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
+  average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
   it was the wrench: the velocity is lost, and begun anew from the measurement.
 """
@@ -25,6 +26,7 @@ _FASTEST = 0.1  # the most by which one innovation moves an average: ten are nee
 STEADY = 4.0  # a squared sum counts for at most this: 2 sigma, beyond which 5 % of normal ones are
 LARGEST = 3.0  # sigma that one innovation counts for at most: 0.3 % of normal ones are larger
 NIS_TIME = 2.0  # s; over which the NIS is averaged ("Forgetting")
+LEVEL_TIME = 60.0  # s; over which the usual NIS is averaged: several manoeuvres of ten seconds
 _LOST = 2  # outliers in a row: by chance as rare as the square of the share of outliers
 
 MONITOR = record(
@@ -36,6 +38,7 @@ MONITOR = record(
         ("since", "f8"),  # s since this velocity was measured: counted by the estimator
         ("seen", "f8"),  # s of innovations so far
         ("nis", "f8"),  # averaged: 1 is expected
+        ("usual", "f8"),  # averaged for longer
         ("outliers", "i8"),  # in a row: of linear and of angular velocity, with their first axes
     ]
 )
@@ -46,7 +49,7 @@ def first_monitor(process: NDArray[np.void]) -> NDArray[np.void]:
     """(6,) of MONITOR, before any innovation; ``process`` (1,) of PROCESS."""
     out = np.zeros(6, dtype=MONITOR)
     out["density"] = np.maximum(process["first"][0], process["floor"][0])
-    out["nis"] = 1.0
+    out["nis"] = out["usual"] = 1.0
     return out
 
 
@@ -71,6 +74,8 @@ def watch(m, process, i, room, moving, gate, innovation):
     # a single kick counts for no more than LARGEST: what has changed shows again and again
     counted = min(nis if moving else 1.0, LARGEST**2)
     m.nis += min(m.since / NIS_TIME, 1.0) * (counted - m.nis)
+    blend = min(m.since / min(m.seen + NIS_TIME, LEVEL_TIME), 1.0)
+    m.usual += blend * (counted - m.usual)
     if moving:
         keep = np.exp(-m.since / SUM_TIME)
         m.seen += m.since
@@ -84,6 +89,12 @@ def watch(m, process, i, room, moving, gate, innovation):
     else:
         interrupt(m)
     return nis > gate * gate
+
+
+@inlined
+def has_changed(m, threshold):
+    """Whether the NIS of an axis is ``threshold`` times what is usual."""
+    return m.nis > threshold * max(m.usual, 1.0)
 
 
 @inlined

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config, load
-from rov_ident.config.prior import prior_of, rigid_body_covariance
+from rov_ident.config.prior import first_centre, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
@@ -131,6 +131,8 @@ class OnlineEstimator:
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
         self.monitor: Monitor | None = None
+        self._about: Array  # (k,): values of the parameters of effects that samples are made with
+        self._centred: float  # s: since when
         self._enabled = True
         self._paused = False
         self.reset()
@@ -140,7 +142,6 @@ class OnlineEstimator:
         self._state = self._module.init(self._task)
         self._last_t = math.nan
         self._recalled = 0  # ns: the stamp before the first sample
-        self._centred, self._about = -math.inf, self._configured
         # information over the prior's: in the window that is filling, and in the one before
         self._gained = np.zeros((2, len(self.prior.names)))
         self._window = np.zeros(1)  # s of the window that is filling
@@ -148,8 +149,7 @@ class OnlineEstimator:
         self._variance = estimate.std**2
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
-        if self.config.estimate_effects:
-            self.sampler.recentre(self.config)
+        self._centre(first_centre(self.config))
         if self.monitor is not None:
             self.monitor.reset()
         self._origin = self.memory()
@@ -159,7 +159,7 @@ class OnlineEstimator:
         self.config = config = config.with_nuisance
         self._task = self._module.problem(config)
         self.sampler.configure(config)
-        self._centred, self._about = -math.inf, self._configured
+        self._centre(first_centre(config))
 
     def attach(self, monitor: Monitor) -> None:
         """Let a monitor see from now on what the estimator sees."""
@@ -218,7 +218,7 @@ class OnlineEstimator:
             if count := int(np.count_nonzero(info["reason"] == reason)):
                 self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
         self._follow_excitation(float(samples["dt"].sum()))
-        if self.config.estimate_effects and abs(self._last_t - self._centred) >= CENTRING_TIME:
+        if len(self._about) and not abs(self._last_t - self._centred) < CENTRING_TIME:
             self._centred = self._last_t
             self._recentre()
         if self.monitor is not None and self.sampler.commands is not None:
@@ -227,10 +227,10 @@ class OnlineEstimator:
                 self.monitor.look(window, self.report().by_name)
         return info
 
-    @property
-    def _configured(self) -> Array:
-        """(k,) the parameters of effects as configured."""
-        return self.prior.mean[len(self.config.estimate) :]
+    def next_record(self) -> None:
+        """Another record follows: inputs begin anew, what is learnt stays."""
+        self.sampler = Sampler(self.config)
+        self._centre(dict(zip(self.config.effect_names, self._about.tolist(), strict=True)))
 
     def _recentre(self) -> None:
         """Have the sampler take over the parameters of effects as they are estimated now.
@@ -238,20 +238,18 @@ class OnlineEstimator:
         But not for changes far below their uncertainty: samples are right to first order anyway.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
-        bounds = (x[len(self.config.estimate) :] for x in (self.prior.lower, self.prior.upper))
-        now = np.clip(raw.values[len(self.config.estimate) :], *bounds)
-        if not (np.abs(now - self._about) > _RECENTRE * raw.std[len(self.config.estimate) :]).any():
-            return
-        self._about = now
-        # The rigid body is the estimator's own, and what acts on it all but linear.
-        found = {
-            f"{effect}.{name}": value
-            for (effect, name), value in zip(
-                self.config.estimate_effects, now.tolist(), strict=True
-            )
-            if EFFECTS[effect].body is None
-        }
-        self.sampler.recentre(self.config.with_values(found))
+        own = slice(len(self.config.estimate), None)
+        now = np.clip(raw.values[own], self.prior.lower[own], self.prior.upper[own])
+        if (np.abs(now - self._about) > _RECENTRE * raw.std[own]).any():
+            self._centre(dict(zip(self.config.effect_names, now.tolist(), strict=True)))
+
+    def _centre(self, values: Mapping[str, float]) -> None:
+        """Have samples made with these values of the parameters of effects, all of them."""
+        self._centred, self._about = self._last_t, np.array(list(values.values()))
+        if values:
+            # The rigid body is the estimator's own, and what acts on it all but linear.
+            acting = {n: v for n, v in values.items() if EFFECTS[n.partition(".")[0]].body is None}
+            self.sampler.recentre(self.config.with_values(acting))
 
     def memory(self) -> Memory:
         """What is learnt so far, for `checkpoint`. The arrays are not to be changed.
@@ -289,7 +287,7 @@ class OnlineEstimator:
 
     def _begin_with(self, memory: Memory) -> None:
         """Know what is in the memory and nothing else."""
-        self._state, self._centred = memory.state, -math.inf
+        self._state, self._centred = memory.state, math.nan
         self._gained, self._window = memory.gained.copy(), memory.window.copy()
         self._variance, self._safe = memory.variance, memory.safe
 

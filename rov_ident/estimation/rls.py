@@ -46,7 +46,13 @@ from rov_ident.config import Config
 from rov_ident.config.prior import Prior
 from rov_ident.core.jit import copy, floats, inlined, inner, kernel, record, reordered
 from rov_ident.core.messages import Array
-from rov_ident.estimation.innovation_monitor import first_monitor, interrupt, lost, watch
+from rov_ident.estimation.innovation_monitor import (
+    first_monitor,
+    has_changed,
+    interrupt,
+    lost,
+    watch,
+)
 from rov_ident.estimation.mass_inverse import invert_mass
 from rov_ident.estimation.observer import (
     LANES,
@@ -619,7 +625,7 @@ def _suspect(state, work):
     for a in range(len(state.order)):
         work.moves[a] = False
         for i in range(6):
-            if a < c.free and state.monitor[i].nis > _CHANGED:
+            if a < c.free and has_changed(state.monitor[i], _CHANGED):
                 shown = work.sensitivity[i, a] ** 2
                 work.moves[a] |= shown > state.p[i, i] + work.scratch[0].r[i]
         any_of_them |= work.moves[a]

@@ -37,7 +37,13 @@ from rov_ident.config.prior import Prior, prior_of
 from rov_ident.core.jit import copy, floats, inlined, inner, kernel, record, reordered
 from rov_ident.core.messages import Array
 from rov_ident.core.runge_kutta import NODES, runge_kutta
-from rov_ident.estimation.innovation_monitor import first_monitor, interrupt, lost, watch
+from rov_ident.estimation.innovation_monitor import (
+    first_monitor,
+    has_changed,
+    interrupt,
+    lost,
+    watch,
+)
 from rov_ident.estimation.mass_inverse import invert_mass
 from rov_ident.estimation.observer import force_of
 from rov_ident.estimation.physical import Estimate, calibrated
@@ -533,7 +539,7 @@ def _look_back(task, state, work, dt):
     _sum_up(state, work, c.since)
     changed = False
     for i in range(6):
-        changed |= state.monitor[i].nis > task.settings[0].changed
+        changed |= has_changed(state.monitor[i], task.settings[0].changed)
     _walk(task, state, work, changed, c.since)
     c.since = 0.0
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import prior_of, rigid_body_covariance
+from rov_ident.config.prior import Prior, first_centre, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
@@ -52,7 +52,7 @@ class Settings:
     ``stages``: channels, fitted one group after the other; none: all together. ``prior``: whether
     what the configuration says of the coefficients counts as one more measurement. ``weighted``:
     least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
-    errors of the wrench. ``readings``: at most so often are bags read for the parameters of effects.
+    errors of the wrench. ``readings``: at most so often bags are read for parameters of effects.
     """
 
     stages: tuple[tuple[str, ...], ...] = ()
@@ -96,10 +96,10 @@ def fit_batch(
     states = dict.fromkeys(prior.names, State.HELD)
     now, parts = config, []
     if effects and config.estimate_effects:
-        archive, found = _relinearised(archive, config, kind, settings, notes, tell)
-        values, covariance, states = found.values, found.covariance, found.states
-        now = config.with_values(dict(zip(found.names, values.tolist(), strict=True)))
-        parts.append(found.more)
+        archive, whole = _relinearised(archive, config, kind, settings, notes, tell)
+        values, covariance, states = whole.values, whole.covariance, whole.states
+        now = config.with_values(dict(zip(whole.names, values.tolist(), strict=True)))
+        parts.append(whole.more)
     for stage in () if parts else settings.stages or (MOTIONS,):
         found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
         if found is None:
@@ -145,26 +145,23 @@ def _relinearised(
     Samples are linear in these about the values with which they were made: the bags are read anew
     until the estimate stays where they were.
     """
-    about, first = config, len(config.estimate)
+    first, start = len(config.estimate), None
+    centre = first_centre(config)
     while True:
         told: list[str] = []
-        samples = archive.reread(about, True)
-        found = _stage(samples, config, kind, MOTIONS, settings, told, say)
+        acting = {n: v for n, v in centre.items() if EFFECTS[n.partition(".")[0]].body is None}
+        samples = archive.reread(config.with_values(acting), True)
+        found = _stage(samples, config, kind, MOTIONS, settings, told, say, start)
         assert found is not None
-        before = np.array([about.value(name) for name in found.names[first:]])
+        start = found.values
+        before = np.array(list(centre.values()))
         settings = replace(settings, readings=settings.readings - 1)
         std = np.sqrt(np.diag(found.covariance))[first:]
         # what is left out is of second order in this
         if settings.readings == 0 or (np.abs(found.values[first:] - before) < 0.3 * std).all():
             notes += told
             return samples, found
-        about = config.with_values(
-            {
-                name: value
-                for name, value in zip(found.names[first:], found.values[first:].tolist())
-                if EFFECTS[name.partition(".")[0]].body is None  # the equations' own, and linear
-            }
-        )
+        centre = dict(zip(centre, found.values[first:].tolist(), strict=True))
 
 
 def _stage(
@@ -175,8 +172,12 @@ def _stage(
     settings: Settings,
     notes: list[str],
     say: Say,
+    start: Array | None = None,
 ) -> _Stage | None:
-    """Fit some channels; None, and a note, where there is nothing to do."""
+    """Fit some channels; None, and a note, where there is nothing to do.
+
+    ``start`` (n,) are the values to begin with, of maximum likelihood.
+    """
     free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
     # an added mass belongs to both axes that it couples
@@ -228,20 +229,25 @@ def _stage(
     }
     found, covariance = solution.values, solution.covariance
     if kind == "ml":
+        if start is None:
+            least = Estimate(names, found, covariance, 0.0)
+            start = _start(archive, config, coefficients, least, free)
         likelihood = maximum_likelihood.maximise(
             archive.each,
             config,
-            _start(archive, config, dict(zip(names, found.tolist(), strict=True)), free),
+            config.dynamics.with_values(dict(zip(names, start.tolist(), strict=False))),
             free,
             precision / prior.std**2,
             settings.process,
             progress,
+            start[len(names) :],
         )
         names = prior.names
         found, covariance = likelihood.values, likelihood.covariance
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
+        more["cost"] = likelihood.total.cost
         more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
         wider = float(np.median(np.sqrt(np.diag(covariance)) / bound))
         if wider > _COLOURED:
@@ -274,21 +280,22 @@ def _stage(
 
 
 def _start(
-    archive: Archive, config: Config, values: dict[str, float], free: NDArray[np.bool_]
-) -> Model:
-    """Of the configured model and the one with these values that which explains the data better."""
-    given, found = config.dynamics, config.dynamics.with_values(values)
-    if np.linalg.eigvalsh(found.mass_matrix)[0] <= 0.0:
-        return given
+    archive: Archive, config: Config, prior: Prior, found: Estimate, free: NDArray[np.bool_]
+) -> Array:
+    """The values to begin with: as configured, or as found by least squares if that does better."""
     noise, none = maximum_likelihood.assumed(config), np.zeros(0, dtype=np.int64)
     effects = prior_of(config, effects=True).mean[len(config.estimate) :]
+    values = (prior.mean, physical(config.dynamics, prior, found))
     costs = [
         total(
             archive.each(maximum_likelihood.one_pass, model, none, noise, free, np.inf, effects)
         ).cost
-        for model in (given, found)
+        for model in (
+            config.dynamics.with_values(dict(zip(prior.names, v.tolist(), strict=True)))
+            for v in values
+        )
     ]
-    return given if costs[0] < costs[1] or not np.isfinite(costs[1]) else found
+    return np.append(values[int(costs[1] < costs[0])], effects)
 
 
 def _coefficients(config: Config) -> dict[str, Coefficient]:

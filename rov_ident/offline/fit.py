@@ -21,7 +21,6 @@ from rov_ident.model.equations import Model
 from rov_ident.reports.result import Result, Shown, provenance
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, Record, numbers, read_record, score
-from rov_ident.sampling.sampler import Sampler
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -179,7 +178,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     ensure_compiled(config, kind)
     estimator = OnlineEstimator(config, kind)
     for record in records:
-        estimator.sampler = Sampler(config)
+        estimator.next_record()
         if estimator.config.estimate_effects:  # samples depend on what is known by then
             bag = Bag(record.path)
             for role, message in inputs.messages(bag, inputs.select(bag, config), config):

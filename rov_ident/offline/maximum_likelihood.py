@@ -56,6 +56,9 @@ _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; an innovation further off is an outlier
 _NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
 _ITERATIONS = 25
+_DOUBTFUL = 0.03  # of the axis's authority, lasting a second: what may be unexplained at first
+_NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first level to the least
+_SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better than a hundredth
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
 _NONE = np.zeros(0)
 LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
@@ -271,8 +274,10 @@ def maximise(
     precision: Array | None = None,
     process: bool = True,
     progress: Callable[[str], None] | None = None,
+    effects: Array | None = None,
 ) -> Likelihood:
-    """The coefficients of largest likelihood, from ``model``'s values on.
+    """The coefficients of largest likelihood, from ``model``'s values on, and those of the
+    parameters of ``effects`` (p,); None: as configured.
 
     ``precision`` (n,) is that of the prior about the configured values, of coefficients and then of
     the parameters of effects in the samples' columns; ``process``: whether the wrench has errors,
@@ -283,10 +288,16 @@ def maximise(
     free = np.ones(6, dtype=bool) if free is None else free
     prior = prior_of(config, effects=True)
     estimated, mean = prior.estimated, prior.mean
-    own, effects = estimated < len(model.theta), mean[len(config.estimate) :]
+    own = estimated < len(model.theta)
+    effects = mean[~own] if effects is None else effects
     precision = np.zeros(len(mean)) if precision is None else precision
     noise = assumed(config)
-    if not process:
+    if process:
+        # From above: where there is next to no process noise, its level hardly shows, and a search
+        # would stay there.
+        doubtful = (_DOUBTFUL * authority(config.dynamics)) ** 2
+        noise = replace(noise, floor=np.maximum(noise.floor, doubtful))
+    else:
         noise = replace(noise, floor=np.zeros(6), relative=0.0)
     say = progress or (lambda what: None)
 
@@ -313,10 +324,11 @@ def maximise(
         far = theta - settled
         if stage == 2 and far @ at.information @ far < 0.1 * len(theta):
             break  # the noise levels would be the same
-        if stage:
-            settled = theta
-            say("noise levels")
-            noise = _noise_levels(each, at_values(theta), noise, free, process, theta[~own])
+        # Before the first step, too: with less noise than there is, the likelihood of a model that
+        # is not right yet has valleys far from it.
+        settled = theta
+        say("noise levels")
+        noise = _noise_levels(each, at_values(theta), noise, free, process, theta[~own])
         at, cost = look(theta, gate)
         converged = True
         for _ in range(_ITERATIONS):
@@ -358,10 +370,10 @@ def _noise_levels(
     each: Mapper, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool, effects: Array
 ) -> Noise:
     levels = start = _levels(noise) if process else np.zeros(13)
-    least = np.full(13, -np.inf)
+    least = np.full(13, np.log(_SUREST))
     least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
     least[12] = np.log(1e-10)
-    for _ in range(8):
+    for _ in range(_NOISE_ITERATIONS):
         slopes = each(
             noise_slope, model, _at_levels(noise, levels, process), free, process, effects
         )

@@ -90,7 +90,7 @@ class EffectJacobians:
             model.structure,
             model.mass_matrix,
             model.theta,
-            np.linalg.inv(model.mass_matrix),
+            np.asarray(np.linalg.inv(model.mass_matrix), dtype=np.float64),
             model.body.restoring,
             np.array(self._bodies, dtype=np.int64),
             np.array(mass).reshape(-1, 6, 6),
@@ -150,7 +150,7 @@ class EffectJacobians:
             self._velocity[:, i] = change / self._width[i]
 
     def extend(self, sample: NDArray[np.void], sides: Array) -> None:
-        """Fill sides (13, k) of the sample (1,) of SAMPLE with J, V and p0; what acted is used up."""
+        """Fill sides (13, k) of the sample (1,) with J, V and p0; what has acted is used up."""
         if self._surrounded:
             self._surround(sample[0])
         _fill(
@@ -241,6 +241,7 @@ def _fill(motion, samples, acts, impulse, time, scale, velocity, about, sides):
             change -= coriolis(motion.of_mass[b] @ sample.nu, sample.nu)
             for i in range(6):
                 sides[i, motion.bodies[b]] = change[i]
-        if motion.latency >= 0:
+        # without an IMU a late velocity looks like thrust that comes early, whatever delays it
+        if motion.latency >= 0 and np.isfinite(sample.gyro[0]):
             for i in range(3):
                 sides[6 + i, motion.latency] = -nu_dot[i]

@@ -80,7 +80,7 @@ def sample_type(size: int) -> np.dtype[np.void]:
 
 
 def one_sample(size: int) -> tuple[NDArray[np.void], NDArray[np.void], Array]:
-    """A sample (1,) of :func:`sample_type`, all zeros; and as views its SAMPLE and sides (13, size)."""
+    """A sample (1,) of :func:`sample_type`, zeros; and views: its SAMPLE, its sides (13, size)."""
     whole = np.zeros(SAMPLE.itemsize + 104 * size, dtype=np.uint8)
     sides = whole[SAMPLE.itemsize :].view(np.float64).reshape(13, size)
     return whole.view(sample_type(size)), whole[: SAMPLE.itemsize].view(SAMPLE), sides
