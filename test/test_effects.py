@@ -33,6 +33,7 @@ CONTRACT = {
     "payload": "mass_wet x y z onset", "ocean_current": "north east down",
     "wave": "fx fy fz frequency phase", "tether_drag": "k x y z", "constant_force": "fx fy fz",
     "thruster_gain": "gain_X gain_Y gain_Z gain_K gain_M gain_N",
+    "thrust_scale": "scale",
     "thruster_asymmetry": "gain_X gain_Y gain_Z gain_K gain_M gain_N",
     "thruster_deadband": "width_X width_Y width_Z width_K width_M width_N",
     "thruster_lag": "time_constant", "actuation_delay": "delay",
@@ -310,8 +311,8 @@ def test_an_instant_without_length_changes_nothing_later(effect):
 def test_input_effects_act_one_after_the_other(heavy):
     """Delayed, dead below the width, weaker astern, amplified, in part lost, sagging, lagged."""
     order = (
-        "actuation_delay thruster_deadband thruster_asymmetry thruster_gain thruster_failure "
-        "battery_sag thruster_lag"
+        "actuation_delay thruster_deadband thruster_asymmetry thrust_scale thruster_gain "
+        "thruster_failure battery_sag thruster_lag"
     )
     assert [e.name for e in sorted(INPUT, key=lambda e: e.order)] == order.split()
     t = np.linspace(0.0, 1.5, 301)
@@ -373,6 +374,7 @@ INPUT_FORMS = {
     "thruster_failure": failed,
     "battery_sag": sagging,
     "thruster_gain": lambda t, d, **gains: d * of_axes(gains),
+    "thrust_scale": lambda t, d, scale: d * scale,
     "thruster_asymmetry": lambda t, d, **gains: np.where(d < 0.0, d * of_axes(gains), d),
     "thruster_deadband": lambda t, d, **widths: (
         np.sign(d) * np.maximum(np.abs(d) - of_axes(widths), 0.0)
