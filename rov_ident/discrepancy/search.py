@@ -243,6 +243,7 @@ class Search:
             if c.name != name and (EFFECTS[c.name].beyond == name or not lacking(c.name, h))
         ]
         fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
+        fits.pop(name, None)  # two families share some coefficients
         return fits | self.patterns.fits(rest)
 
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
@@ -319,15 +320,20 @@ class Search:
 
     def named(self, fitted: Fitted) -> list[str]:
         """The effects (and patterns) that a model has beyond the given one."""
-        own = set(self.given.keys)
-        return list(dict.fromkeys(effect_of(k) for k in fitted.hypothesis.keys if k not in own))
+        added = self._added(fitted)
+        return list(dict.fromkeys(effect_of(k, added) for k in added))
 
     def keys_of(self, fitted: Fitted, name: str) -> list[Key]:
+        added = self._added(fitted)
+        return [k for k in added if effect_of(k, added) == name]
+
+    def _added(self, fitted: Fitted) -> list[Key]:
         own = set(self.given.keys)
-        return [k for k in fitted.hypothesis.keys if k not in own and effect_of(k) == name]
+        return [k for k in fitted.hypothesis.keys if k not in own]
 
 
 def added_effect(rest: Fitted, larger: Fitted) -> str:
     """The effect (or pattern) that a larger model has more."""
     old = set(rest.hypothesis.keys)
-    return next(effect_of(k) for k in larger.hypothesis.keys if k not in old)
+    added = [k for k in larger.hypothesis.keys if k not in old]
+    return effect_of(added[0], added)

@@ -22,7 +22,12 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from rov_ident.config import Config
-from rov_ident.core.frames import acceleration_of_arm, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.frames import (
+    acceleration_of_arm,
+    quaternion_from_euler,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.core.quaternions import turned
@@ -30,7 +35,7 @@ from rov_ident.discrepancy.hypothesis import Key
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams, integral, interpolated, orientation_at
@@ -73,7 +78,7 @@ is not offset: together they would pass for a velocity scale of up to two percen
 
 def sensor_parameters() -> list[Key]:
     """Keys of all parameters of the effects of the velocity sensor and the IMU."""
-    return [(e.name, p.name) for e in EFFECTS.values() if e.sense for p in e.parameters]
+    return [(e.name, p.name) for e in EFFECTS.values() if e.of_sensors for p in e.parameters]
 
 
 def comparisons(
@@ -81,6 +86,7 @@ def comparisons(
 ) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
     keys = sensor_parameters()
+    streams = _in_place(streams, effects)
     here, there, rate = _corrected_readings(streams, config, effects)
     r = quaternion_to_matrix(streams.orientation)
     inertial = _DeadReckoning(streams, config, there, rate) if _has_imu(streams) else None
@@ -92,7 +98,7 @@ def comparisons(
     velocity = None if inertial is None else inertial.velocity
     moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
     reading = Reading(moving, turning, gyrating, here.specific_force)
-    moved = [_unit_change(reading, key) for key in keys]
+    moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
     made: list[tuple[str, Array, Array, list[Array]]] = []
     if streams.has_pose:
         way, *ways = (
@@ -101,7 +107,8 @@ def comparisons(
         y, columns = streams.position - way, [-w for w in ways]
         made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
     if inertial is not None:
-        shift = [_unit_change(there, key) for key in keys]
+        down = inertial.rotation[:, 2]
+        shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
         inside = (streams.t >= streams.imu_t[0]) & (streams.t <= streams.imu_t[-1])
         t = streams.t[inside]
         y = (np.einsum("kij,kj->ki", r, here.linear) - inertial.velocity)[inside]
@@ -150,9 +157,27 @@ def _undone(reading: Reading, effects: Mapping[str, Mapping[str, float]]) -> Rea
     return reading
 
 
-def _unit_change(reading: Reading, key: Key) -> Reading:
-    """What one unit of a parameter adds to a reading."""
-    effect = EFFECTS[key[0]]
+def _in_place(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
+    """The odometry with velocities of the time of its stamp (the last ones are held) and an
+    attitude against the world."""
+    delay, yaw = velocity_delay(effects), heading_error(effects)
+    nu, orientation = streams.nu.copy(), streams.orientation
+    if delay:
+        nu[:, :3] = interpolated(streams.t, streams.nu[:, :3], streams.t + delay)
+    if yaw:
+        orientation = quaternion_multiply(quaternion_from_euler(0.0, 0.0, -yaw), orientation)
+    return dataclasses.replace(streams, nu=nu, orientation=orientation)
+
+
+def _unit_change(reading: Reading, key: Key, t: Array, down: Array) -> Reading:
+    """What one unit of a parameter adds to a reading at the times t (N,), where ``down`` (N, 3) is
+    world down in body axes; of a heading, what turns a velocity in the world as much."""
+    effect, none = EFFECTS[key[0]], np.zeros_like(down)
+    if effect.late is not None:
+        return Reading(-np.gradient(reading.linear, t, axis=0), none, none, none)
+    if effect.heading is not None:
+        turned_force = np.cross(down, reading.specific_force)
+        return Reading(np.cross(down, reading.linear), none, none, turned_force)
     nulls = {p.name: p.null for p in effect.parameters}
     step = next(1e-4 * p.typical for p in effect.parameters if p.name == key[1])
     assert effect.sense is not None
@@ -167,7 +192,7 @@ class _DeadReckoning:
     def __init__(self, streams: Streams, config: Config, imu: Reading, rate: Array) -> None:
         self._t, self._at = streams.imu_t, streams.t
         q = orientation_at(streams, streams.imu_t)
-        self._rotation = quaternion_to_matrix(_attitude(q, streams.imu_t, imu.gyro, rate))
+        self.rotation = quaternion_to_matrix(_attitude(q, streams.imu_t, imu.gyro, rate))
         lever, force = np.array(config.imu.position), imu.specific_force
         if lever.any():
             turn = np.gradient(imu.gyro, streams.imu_t, axis=0)
@@ -177,7 +202,7 @@ class _DeadReckoning:
 
     def integrated(self, force: Array) -> Array:
         """The integral (N, 3) of specific forces (M, 3) turned into the world."""
-        total = integral(self._t, np.einsum("kij,kj->ki", self._rotation, force))
+        total = integral(self._t, np.einsum("kij,kj->ki", self.rotation, force))
         return interpolated(self._t, total, self._at)
 
 
@@ -287,6 +312,7 @@ def _linear_problem(
 
 def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
     """The streams as good sensors would have given them."""
+    streams = _in_place(streams, effects)
     nothing = np.zeros_like(streams.nu[:, :3])
     here = _undone(Reading(streams.nu[:, :3], streams.nu[:, 3:], nothing, nothing), effects)
     return dataclasses.replace(streams, nu=np.hstack([here.linear, here.angular]))
@@ -300,7 +326,7 @@ def search(
 ) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
     """The sensor effects that the data in the spans (from and to [s]) support, and the standard
     deviations of their parameters; with ``allowed`` just these are fitted, whatever they score."""
-    library = [e.name for e in EFFECTS.values() if e.sense]
+    library = [e.name for e in EFFECTS.values() if e.of_sensors]
     library = library if allowed is None else [n for n in library if n in set(allowed)]
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}

@@ -196,13 +196,14 @@ class WindowedProblem:
     ) -> Array:
         """Wrench effects and current (K, 6) along a motion; remembered for the last one."""
         acting = compiled(effects)
-        key = (acting.wrench_parameters.tobytes(), acting.water.tobytes())
+        acted = self.thrust(effects)[0]
+        key = tuple(part.tobytes() for part in acting)
         mine = self._remembered
         if getattr(mine, "along", None) is not motion.middle:
             mine.along, mine.wrenches = motion.middle, {}
         known: dict[object, Array] = mine.wrenches
         if key not in known:
-            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, motion)
+            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, acted, motion)
         return known[key]
 
     def _difference(

@@ -141,7 +141,8 @@ class EffectJacobians:
         if self._variants is not None:
             count = len(self._variants.inputs)
             now = np.zeros((count, 6))
-            _surround(self._variants, row["t"], row["nu"], to_world, now)
+            thrust = row["wrench"] - row["surroundings"]
+            _surround(self._variants, row["t"], row["nu"], to_world, thrust, now)
             before = now if row["restart"] else self._around
             wrench = 0.5 * (before + now)
             if self._time > 0.0:
@@ -183,9 +184,9 @@ def _act(variants, state, t, dt, command, impulse):
 
 
 @kernel
-def _surround(variants, t, nu, rotation, out):
+def _surround(variants, t, nu, rotation, thrust, out):
     for v in range(len(variants.inputs)):
-        add_wrenches(_variant(variants, v), t, nu, rotation, out[v])
+        add_wrenches(_variant(variants, v), t, nu, rotation, thrust, out[v])
 
 
 @kernel

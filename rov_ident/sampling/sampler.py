@@ -23,10 +23,12 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.frames import to_core
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry
+from rov_ident.effects import velocity_delay
 from rov_ident.sampling.acting_wrench import ActingWrench
 from rov_ident.sampling.despiking import Despiker, measured_values
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.kinematic_filter import KinematicFilter
+from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.queues import Instant, Queues, Waiting
 from rov_ident.sampling.sample import SAMPLE, joined, sample_type
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, Validation
@@ -50,6 +52,7 @@ class Sampler:
         self.origin: int | None = None
         self._frames = config.frames
         self._queues = Queues()
+        self._late = LateVelocities(0.0)
         self._despiker = Despiker(config, self.counts)
         self.kinematic_filter = KinematicFilter(config)
         self._acting = ActingWrench(config)
@@ -62,7 +65,8 @@ class Sampler:
         effects = config.estimate_effects
         self._jacobians = EffectJacobians(config) if effects else None
         self._none = np.zeros(0, dtype=sample_type(len(effects)))
-        self._queues.grace = config.grace
+        self._late.delay = velocity_delay(config.effects)
+        self._queues.grace = config.grace + self._late.delay
         self._despiker.configure(config)
         self.kinematic_filter.configure(config)
         self._acting.configure(config, self._jacobians)
@@ -78,6 +82,7 @@ class Sampler:
         """Forget the buffered messages and the motion, not the clock's origin."""
         self._validation.forget_motion()
         self._queues.clear()
+        self._late.clear()
         self._despiker.clear()
         self.kinematic_filter.clear()
         self._acting.clear()
@@ -118,8 +123,14 @@ class Sampler:
         if isinstance(message, Odometry):
             message = self._validation.marked(message)
         message = to_core(message, self._frames)
-        values = _NO_VALUES if isinstance(message, Odometry) else measured_values(message)
-        self._queues.add(role, Waiting(t, message, values))
+        if isinstance(message, Odometry):
+            timed = self._late.push(t, message) if self._late.delay else (t, message)
+            if timed is None:
+                self.counts["odom: velocities of a time without a pose"] += 1
+            else:
+                self._queues.add(role, Waiting(*timed, _NO_VALUES))
+        else:
+            self._queues.add(role, Waiting(t, message, measured_values(message)))
 
     def _emit(self, final: bool) -> NDArray[np.void]:
         """The samples (k,) that wait for nothing more; ``final``: nothing more will come."""

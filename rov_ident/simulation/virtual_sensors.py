@@ -15,7 +15,7 @@ from rov_ident.core.frames import (
     velocity_of_arm,
 )
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
-from rov_ident.effects import acted, compiled, sense
+from rov_ident.effects import acted, compiled, heading_error, sense, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.open_loop import Trajectory, simulate
@@ -95,6 +95,9 @@ def measure(
     effects = compiled(config.effects)
     truth = simulate(config.dynamics, t, acted(effects, t, held), effects=effects)
     sensed = sense(_reading(truth, config), config.effects)
+    late = t - velocity_delay(config.effects)
+    delayed = np.stack([np.interp(late, t, column) for column in sensed.linear.T], axis=1)
+    offset = quaternion_from_euler(0.0, 0.0, heading_error(config.effects))
 
     messages: list[tuple[int, str, Message]] = []
     variance = np.repeat([suite.linear_std**2, suite.angular_std**2], 3)
@@ -102,8 +105,10 @@ def measure(
         noise = rng.standard_normal(12)
         tilt = quaternion_from_rotation_vector(suite.attitude_std * noise[:3])
         position = _coarse(truth.position[i] + suite.position_std * noise[3:6])
-        attitude = _coarse(quaternion_multiply(truth.orientation[i], tilt))
-        linear = _coarse(sensed.linear[i] + suite.linear_std * noise[6:9])
+        attitude = _coarse(
+            quaternion_multiply(quaternion_multiply(offset, truth.orientation[i]), tilt)
+        )
+        linear = _coarse(delayed[i] + suite.linear_std * noise[6:9])
         angular = _coarse(sensed.angular[i] + suite.angular_std * noise[9:])
         odometry = Odometry(0, *_FRAMES, position, attitude, linear, angular, variance)
         messages.append(_stamped(t[i], ODOMETRY, odometry))
