@@ -41,6 +41,7 @@ CONTRACT = {
     "battery_sag": "end_loss", "sensor_lever_arm": "x y z",
     "sensor_misalignment": "roll pitch yaw", "velocity_scale": "scale",
     "imu_bias": "ax ay az gx gy gz", "velocity_latency": "delay", "heading_offset": "yaw",
+    "wrench_noise": "std_X std_Y std_Z std_K std_M std_N",
     "thrust_advance": "k", "coriolis": "", "crossflow": "",
     "thruster_saturation": "limit_X limit_Y limit_Z limit_K limit_M limit_N",
 }  # fmt: skip
@@ -53,6 +54,7 @@ SENSOR = [e for e in EFFECTS.values() if e.sense]
 
 every_effect = pytest.mark.parametrize("effect", EFFECTS.values(), ids=EFFECTS)
 every_parametric = pytest.mark.parametrize("effect", WITH_PARAMETERS, ids=lambda e: e.name)
+EXACT = [e for e in WITH_PARAMETERS if not e.noise]  # noise is lost
 every_input = pytest.mark.parametrize("effect", INPUT, ids=lambda e: e.name)
 every_wrench = pytest.mark.parametrize("effect", WRENCH, ids=lambda e: e.name)
 every_sensor = pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.name)
@@ -200,7 +202,7 @@ def test_close_to_null_little_changes(effect, mounted, without):
     assert 0.0 < difference.max() < 1e-2
 
 
-@every_parametric
+@pytest.mark.parametrize("effect", EXACT, ids=lambda e: e.name)
 def test_with_the_effect_samples_show_the_truth_and_without_they_do_not(effect, mounted):
     """Out of the simulator, into the sampler: open-loop simulation of the samples agrees."""
     values = {effect.name: typical(effect, np.random.default_rng(1))}
@@ -249,7 +251,7 @@ def test_coefficients_are_found_whatever_acts_besides(effect, estimator, mounted
 
 def test_all_effects_at_once(mounted):
     """They do not get into one another's way."""
-    values = {e.name: typical(e, np.random.default_rng(3)) for e in WITH_PARAMETERS}
+    values = {e.name: typical(e, np.random.default_rng(3)) for e in EXACT}
     config = dataclasses.replace(mounted, effects=values)
     dive = simulated(mounted, values)
     result = score(config.dynamics, samples_of(config, dive), 5.0, effects=compiled(values))
@@ -318,8 +320,8 @@ def test_an_instant_without_length_changes_nothing_later(effect):
 def test_input_effects_act_one_after_the_other(heavy):
     """Delayed, dead below the width, weaker astern, amplified, in part lost, sagging, lagged."""
     order = (
-        "actuation_delay thruster_deadband thruster_asymmetry thrust_scale thruster_gain "
-        "thruster_failure battery_sag thruster_saturation thruster_lag"
+        "wrench_noise actuation_delay thruster_deadband thruster_asymmetry thrust_scale "
+        "thruster_gain thruster_failure battery_sag thruster_saturation thruster_lag"
     )
     assert [e.name for e in sorted(INPUT, key=lambda e: e.order)] == order.split()
     t = np.linspace(0.0, 1.5, 301)
@@ -381,6 +383,7 @@ INPUT_FORMS = {
     "thruster_failure": failed,
     "battery_sag": sagging,
     "thruster_gain": lambda t, d, **gains: d * of_axes(gains),
+    "wrench_noise": lambda t, d, **std: np.where(np.abs(d) <= 3.0 * of_axes(std), 0.0, d),
     "thruster_saturation": lambda t, d, **limits: (
         np.sign(d) * np.minimum(np.abs(d), of_axes(limits))
     ),
@@ -422,6 +425,27 @@ def test_with_more_changes_than_fit_the_delay_gets_shorter_and_nothing_else():
     found = run(EFFECTS["actuation_delay"], t, demands, delay=0.5)
     room = (effects.base.MEMORY - 1) // 7
     np.testing.assert_allclose(found[1000:], demands[1001 - room : -room + 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_a_reading_moves_nothing_and_is_taken_back_at_rest(mounted, seed):
+    std = typical(EFFECTS["wrench_noise"], np.random.default_rng(seed))
+    config = dataclasses.replace(mounted, effects={"wrench_noise": std})
+    t = np.arange(0.0, 20.0, 0.02)
+    demand = np.where((t < 10.0)[:, None], 0.0, 20.0 * of_axes(std))
+    args = (t, demand, 20.0, sensors.Suite().scaled(0.0))
+    read, quiet = (
+        sensors.measure(c, *args, np.random.default_rng(seed)) for c in (config, mounted)
+    )
+    np.testing.assert_array_equal(read.truth.nu, quiet.truth.nu)
+    wrench = np.array([np.hstack(m[2:]) for _, role, m in read.messages if role == "wrench"])
+    np.testing.assert_allclose((wrench - demand).std(axis=0), of_axes(std), rtol=0.1)
+    acting = samples_of(config, read)
+    resting = np.abs(acting["wrench"][acting["t"] < 9.9])
+    assert np.mean(resting == 0.0) > 0.98
+    np.testing.assert_allclose(
+        acting["wrench"][acting["t"] > 10.1].mean(axis=0), 20.0 * of_axes(std), rtol=0.02
+    )
 
 
 def test_lag_reaches_63_percent_after_its_time_constant():

@@ -13,7 +13,7 @@ effects are linear to first order, and the fit is repeated about its own result.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ from rov_ident.core.frames import (
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.core.quaternions import turned
-from rov_ident.discrepancy.hypothesis import Key
+from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
@@ -68,6 +68,8 @@ class Comparison:
     scale: float  # standard deviation of the noise, in the unit of the comparison
 
 
+_LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
+
 THRUST_TIMING = tuple(("thrust held", axis) for axis in "XYZ")
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
@@ -78,7 +80,7 @@ is not offset: together they would pass for a velocity scale of up to two percen
 
 def sensor_parameters() -> list[Key]:
     """Keys of all parameters of the effects of the velocity sensor and the IMU."""
-    return [(e.name, p.name) for e in EFFECTS.values() if e.of_sensors for p in e.parameters]
+    return [(e.name, p.name) for e in _LIBRARY for p in e.parameters]
 
 
 def comparisons(
@@ -310,6 +312,34 @@ def _linear_problem(
     return LinearProblem(keys, normal, gradient[filled], rss[filled], count)
 
 
+def common_squares(
+    found: Sequence[Sequence[Comparison]], spans: Sequence[tuple[float, float]]
+) -> list[Array]:
+    """Squared innovations of several corrections, in units of the first one's noise, at the
+    instants in the spans where all count, summed over clusters of time: (C, comparisons) each."""
+    out: list[list[Array]] = [[] for _ in found]
+    last = int(max(c.t[-1] for of in found for c in of) / _CLUSTER) + 1
+    for same in zip(*found, strict=True):
+        times = [np.round(c.t, 6) for c in same]
+        common = times[0][within(spans, times[0])]
+        for t in times[1:]:
+            common = np.intersect1d(common, t)
+        for sums, c, t in zip(out, same, times, strict=True):
+            use = np.isin(t, common)
+            squares = (c.r[use] * (c.scale / same[0].scale)) ** 2
+            total: Array = np.zeros(last)
+            np.add.at(total, (t[use] / _CLUSTER).astype(int), squares)
+            sums.append(total)
+    stacked = [np.stack(sums, axis=1) for sums in out]
+    there = stacked[0].any(axis=1)
+    return [s[there] for s in stacked]
+
+
+def a_reading() -> Reading:
+    """A reading in which nothing is zero or like another."""
+    return Reading(*np.arange(1.0, 13.0).reshape(4, 3))
+
+
 def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
     """The streams as good sensors would have given them."""
     streams = _in_place(streams, effects)
@@ -323,20 +353,23 @@ def search(
     config: Config,
     spans: Sequence[tuple[float, float]],
     allowed: Iterable[str] | None = None,
+    fixed: Container[Key] = (),
 ) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
     """The sensor effects that the data in the spans (from and to [s]) support, and the standard
-    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score."""
-    library = [e.name for e in EFFECTS.values() if e.of_sensors]
+    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score;
+    the parameters ``fixed`` stay at their null."""
+    library = [e.name for e in _LIBRARY]
     library = library if allowed is None else [n for n in library if n in set(allowed)]
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     for _ in range(_ROUNDS):
         linear = _linear_problem(comparisons(streams, config, found), spans)
-        chosen = [key for key in linear.keys if key[0] in found]
-        units = [[k for k in linear.keys if k[0] == n] for n in library if n not in found]
+        free = [key for key in linear.keys if key not in fixed]
+        chosen = [key for key in free if key[0] in found]
+        units = [[k for k in free if k[0] == n] for n in library if n not in found]
         added = [k for unit in units for k in unit]
         if allowed is None:
-            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units)
+            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
         both = [*chosen, *added]
         if not both:
@@ -344,7 +377,8 @@ def search(
         change, _ = Scores(linear, THRUST_TIMING).solve(both)
         for (name, parameter), delta in zip(both, change.tolist(), strict=True):
             nulls = {p.name: p.null for p in EFFECTS[name].parameters}
-            found.setdefault(name, nulls)[parameter] += delta
+            value = found.setdefault(name, nulls)[parameter] + delta
+            found[name][parameter] = float(np.clip(value, *bounds((name, parameter))[1:]))
         at = linear.index([*both, *THRUST_TIMING])
         covariance = scaled_inverse(linear.normal[np.ix_(at, at)])
         variance = np.maximum(np.diag(covariance), 0.0) * variance_inflation(linear, at)

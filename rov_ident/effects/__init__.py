@@ -135,6 +135,19 @@ def heading_error(effects: Values) -> float:
     return sum(heading(**values) for heading, values in turns if heading is not None)
 
 
+def reading_noise(effects: Values) -> Array:
+    """Standard deviations (6,) of what is read of the wrench beside the command [N, N m]."""
+    parts = ((EFFECTS[name].noise, values) for name, values in effects.items())
+    squares = [noise(**values) ** 2 for noise, values in parts if noise is not None]
+    std: Array = np.sqrt(np.sum([np.zeros(6), *squares], axis=0))
+    return std
+
+
+def of_the_vehicle(effects: Values) -> Values:
+    """Without those that only change what is read of the wrench."""
+    return {name: values for name, values in effects.items() if EFFECTS[name].noise is None}
+
+
 def affects_sensors(effects: Values) -> bool:
     """Whether :func:`correct` changes anything."""
     return any(effect.name in effects for effect in _SENSE)
@@ -151,10 +164,11 @@ def estimable(name: str) -> dict[str, float | None]:
     With each of them the value at which it is better left alone unless asked for: the null of a
     parameter of one axis, of which an effect has several; None for others. An onset, a frequency
     and a phase are not among them, nor what shows in no velocity (the sampler finds the biases of
-    an IMU itself), nor the age of velocities, which are sorted by it before there is a sample.
+    an IMU itself), nor the age of velocities, which are sorted by it before there is a sample, nor
+    the noise of a reading.
     """
     effect = EFFECTS[name]
-    if effect.late is not None or effect.heading is not None:
+    if effect.late or effect.heading or effect.noise:
         return {}
     if effect.sense is not None and effect.correct is not None:
         given = Reading(*np.arange(1.0, 13.0).reshape(4, 3))

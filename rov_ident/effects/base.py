@@ -19,7 +19,9 @@ An effect says what it does by exactly one of these, each in the file of the eff
 ``act``
     A kernel ``act(p, state, t, dt, wrench)``: on entry ``wrench`` (6,) is commanded from ``t`` to
     ``t + dt``, on return it holds the mean of what acts meanwhile. ``state`` (:data:`MEMORY`,) is
-    the effect's own, all zeros before the first call. Effects act in the order of ``order``.
+    the effect's own, all zeros before the first call. Effects act in the order of ``order``. With
+    ``noise(**parameters) -> (6,)``, the standard deviation of what is read beside the command,
+    ``act`` takes back what it can of that, and nothing of it acts on a true command.
 ``sense``
     ``sense(reading, **parameters) -> reading`` and its inverse ``correct``: what the sensors give
     for true velocities, and back. A reading is a :class:`Reading` of one instant or of rows. The
@@ -126,7 +128,8 @@ class Effect:
     ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
     effect that does nearly the same and that every vehicle has: this one is looked for only in a
     model that has some of that. ``lasting`` are the effects that one with an onset cannot be told
-    from if it has been there from the start.
+    from if it has been there from the start. ``within`` names the effect of which this one is a
+    special case.
     """
 
     place: Literal["input", "motion", "wrench"]
@@ -138,6 +141,7 @@ class Effect:
     coefficients: tuple[str, ...] = ()
     beyond: str = ""
     lasting: tuple[str, ...] = ()
+    within: str = ""
     body: Callable[..., Any] | None = None
     wrench: Callable[..., None] | None = None
     water: Callable[..., Array] | None = None
@@ -145,10 +149,11 @@ class Effect:
     order: int = 0
     sense: Callable[..., Reading] | None = None
     correct: Callable[..., Reading] | None = None
+    noise: Callable[..., Array] | None = None
     late: Callable[..., float] | None = None
     heading: Callable[..., float] | None = None
 
     @property
     def of_sensors(self) -> bool:
         """Whether it changes what is measured, and no motion."""
-        return bool(self.sense or self.late or self.heading)
+        return bool(self.sense or self.late or self.heading or self.noise)

@@ -15,7 +15,15 @@ from rov_ident.core.frames import (
     velocity_of_arm,
 )
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
-from rov_ident.effects import acted, compiled, heading_error, sense, velocity_delay
+from rov_ident.effects import (
+    acted,
+    compiled,
+    heading_error,
+    of_the_vehicle,
+    reading_noise,
+    sense,
+    velocity_delay,
+)
 from rov_ident.effects.base import Reading
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.open_loop import Trajectory, simulate
@@ -92,7 +100,7 @@ def measure(
     imu_t = _clock(suite.imu_rate, duration, rng)
     t = np.unique(np.concatenate([demand_t, odometry_t, imu_t, np.arange(0.0, duration, 0.005)]))
     held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
-    effects = compiled(config.effects)
+    effects = compiled(of_the_vehicle(config.effects))
     truth = simulate(config.dynamics, t, acted(effects, t, held), effects=effects)
     sensed = sense(_reading(truth, config), config.effects)
     late = t - velocity_delay(config.effects)
@@ -123,7 +131,9 @@ def measure(
         force = _coarse(force + suite.accelerometer_std * noise[3:])
         imu = Imu(0, "imu_link_frd", _LEVEL, gyro, force, gyro_variance, variance)
         messages.append(_stamped(t[i], IMU, imu))
-    for at, wrench in zip(demand_t, demand, strict=True):
+    # of a generator of its own: without it everything else is as it would be anyway
+    read = demand + reading_noise(config.effects) * rng.spawn(1)[0].standard_normal(demand.shape)
+    for at, wrench in zip(demand_t, read, strict=True):
         noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
         messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
 
