@@ -26,22 +26,27 @@ from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.open_loop import simulate
 
 AXES = "XYZKMN"
-HOOKS = ("coefficients", "body", "wrench", "water", "act", "sense")
+HOOKS = ("coefficients", "body", "wrench", "water", "act", "sense", "late", "heading")
 CONTRACT = {
     "quadratic_damping": "", "linear_damping": "", "asymmetric_damping": "", "coupled_damping": "",
     "lift": "", "added_mass_coupling": "", "buoyancy": "delta", "cog_offset": "dx dy dz",
     "payload": "mass_wet x y z onset", "ocean_current": "north east down",
     "wave": "fx fy fz frequency phase", "tether_drag": "k x y z", "constant_force": "fx fy fz",
     "thruster_gain": "gain_X gain_Y gain_Z gain_K gain_M gain_N",
+    "thrust_scale": "scale",
     "thruster_asymmetry": "gain_X gain_Y gain_Z gain_K gain_M gain_N",
     "thruster_deadband": "width_X width_Y width_Z width_K width_M width_N",
     "thruster_lag": "time_constant", "actuation_delay": "delay",
     "thruster_failure": "gain_X gain_Y gain_Z gain_K gain_M gain_N onset",
     "battery_sag": "end_loss", "sensor_lever_arm": "x y z",
     "sensor_misalignment": "roll pitch yaw", "velocity_scale": "scale",
-    "imu_bias": "ax ay az gx gy gz",
+    "imu_bias": "ax ay az gx gy gz", "velocity_latency": "delay", "heading_offset": "yaw",
+    "wrench_noise": "std_X std_Y std_Z std_K std_M std_N",
+    "thrust_advance": "k", "coriolis": "", "crossflow": "",
+    "thruster_saturation": "limit_X limit_Y limit_Z limit_K limit_M limit_N",
 }  # fmt: skip
 
+CURRENT_ALONG = {"ocean_current": {"north": 0.3, "east": 0.0, "down": 0.0}}
 WITH_PARAMETERS = [e for e in EFFECTS.values() if not e.coefficients]
 INPUT = [e for e in EFFECTS.values() if e.act]
 WRENCH = [e for e in EFFECTS.values() if e.wrench]
@@ -49,6 +54,7 @@ SENSOR = [e for e in EFFECTS.values() if e.sense]
 
 every_effect = pytest.mark.parametrize("effect", EFFECTS.values(), ids=EFFECTS)
 every_parametric = pytest.mark.parametrize("effect", WITH_PARAMETERS, ids=lambda e: e.name)
+EXACT = [e for e in WITH_PARAMETERS if not e.noise]  # noise is lost
 every_input = pytest.mark.parametrize("effect", INPUT, ids=lambda e: e.name)
 every_wrench = pytest.mark.parametrize("effect", WRENCH, ids=lambda e: e.name)
 every_sensor = pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.name)
@@ -67,6 +73,7 @@ def typical(effect: Effect, rng: np.random.Generator | None = None) -> dict[str,
             "onset": 4.0 * share,
             "frequency": p.typical * share,
             "fixed": 15.0 * share,
+            "limit": p.typical * share,
         }.get(p.role, p.null + share * p.typical)
     return values
 
@@ -109,7 +116,7 @@ def test_the_name_is_that_of_the_file_and_everything_is_said(effect):
 def test_it_enters_by_exactly_one_hook_of_its_place(effect):
     used = [hook for hook in HOOKS if getattr(effect, hook)]
     assert len(used) == 1
-    places = {"act": "input", "sense": "motion", "water": "motion"}
+    places = dict.fromkeys(("sense", "water", "late", "heading"), "motion") | {"act": "input"}
     assert effect.place == places.get(used[0], "wrench")
     assert (effect.sense is None) == (effect.correct is None)
 
@@ -129,7 +136,7 @@ def test_bounds_are_finite_and_contain_null_and_typical(effect):
         assert p.typical > 0.0
         assert p.null + p.typical <= p.upper or p.null - p.typical >= p.lower
         assert p.axis == (p.name[-1] if p.name[-2:-1] == "_" else "")
-    assert any(p.role == "amplitude" for p in effect.parameters)
+    assert any(p.role in ("amplitude", "limit") for p in effect.parameters)
 
 
 # ------------------------------------------------------------------ in simulation and samples
@@ -189,17 +196,20 @@ def test_close_to_null_little_changes(effect, mounted, without):
     for p in effect.parameters:
         if p.role == "amplitude":
             near[p.name] += 1e-6 * p.typical * (1 if p.null < p.upper else -1)
+        elif p.role == "limit":  # it has its null wherever no command reaches it
+            near[p.name] = (1.0 - 1e-6) * np.abs(without.demand[:, AXES.index(p.axis)]).max()
     difference = np.abs(content(simulated(mounted, {effect.name: near})) - content(without))
     assert 0.0 < difference.max() < 1e-2
 
 
-@every_parametric
+@pytest.mark.parametrize("effect", EXACT, ids=lambda e: e.name)
 def test_with_the_effect_samples_show_the_truth_and_without_they_do_not(effect, mounted):
     """Out of the simulator, into the sampler: open-loop simulation of the samples agrees."""
     values = {effect.name: typical(effect, np.random.default_rng(1))}
-    dive = simulated(mounted, values)
+    known = CURRENT_ALONG if effect.heading else {}  # else no motion depends on the heading
+    dive = simulated(mounted, values | known)
     errors = []
-    for told in (values, {}):
+    for told in (values | known, known):
         config = dataclasses.replace(mounted, effects=told)
         rows = samples_of(config, dive)
         result = score(config.dynamics, rows, 5.0, effects=compiled(told))
@@ -241,7 +251,7 @@ def test_coefficients_are_found_whatever_acts_besides(effect, estimator, mounted
 
 def test_all_effects_at_once(mounted):
     """They do not get into one another's way."""
-    values = {e.name: typical(e, np.random.default_rng(3)) for e in WITH_PARAMETERS}
+    values = {e.name: typical(e, np.random.default_rng(3)) for e in EXACT}
     config = dataclasses.replace(mounted, effects=values)
     dive = simulated(mounted, values)
     result = score(config.dynamics, samples_of(config, dive), 5.0, effects=compiled(values))
@@ -310,8 +320,8 @@ def test_an_instant_without_length_changes_nothing_later(effect):
 def test_input_effects_act_one_after_the_other(heavy):
     """Delayed, dead below the width, weaker astern, amplified, in part lost, sagging, lagged."""
     order = (
-        "actuation_delay thruster_deadband thruster_asymmetry thruster_gain thruster_failure "
-        "battery_sag thruster_lag"
+        "wrench_noise actuation_delay thruster_deadband thruster_asymmetry thrust_scale "
+        "thruster_gain thruster_failure battery_sag thruster_saturation thruster_lag"
     )
     assert [e.name for e in sorted(INPUT, key=lambda e: e.order)] == order.split()
     t = np.linspace(0.0, 1.5, 301)
@@ -373,6 +383,11 @@ INPUT_FORMS = {
     "thruster_failure": failed,
     "battery_sag": sagging,
     "thruster_gain": lambda t, d, **gains: d * of_axes(gains),
+    "wrench_noise": lambda t, d, **std: np.where(np.abs(d) <= 3.0 * of_axes(std), 0.0, d),
+    "thruster_saturation": lambda t, d, **limits: (
+        np.sign(d) * np.minimum(np.abs(d), of_axes(limits))
+    ),
+    "thrust_scale": lambda t, d, scale: d * scale,
     "thruster_asymmetry": lambda t, d, **gains: np.where(d < 0.0, d * of_axes(gains), d),
     "thruster_deadband": lambda t, d, **widths: (
         np.sign(d) * np.maximum(np.abs(d) - of_axes(widths), 0.0)
@@ -412,6 +427,27 @@ def test_with_more_changes_than_fit_the_delay_gets_shorter_and_nothing_else():
     np.testing.assert_allclose(found[1000:], demands[1001 - room : -room + 1], atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_a_reading_moves_nothing_and_is_taken_back_at_rest(mounted, seed):
+    std = typical(EFFECTS["wrench_noise"], np.random.default_rng(seed))
+    config = dataclasses.replace(mounted, effects={"wrench_noise": std})
+    t = np.arange(0.0, 20.0, 0.02)
+    demand = np.where((t < 10.0)[:, None], 0.0, 20.0 * of_axes(std))
+    args = (t, demand, 20.0, sensors.Suite().scaled(0.0))
+    read, quiet = (
+        sensors.measure(c, *args, np.random.default_rng(seed)) for c in (config, mounted)
+    )
+    np.testing.assert_array_equal(read.truth.nu, quiet.truth.nu)
+    wrench = np.array([np.hstack(m[2:]) for _, role, m in read.messages if role == "wrench"])
+    np.testing.assert_allclose((wrench - demand).std(axis=0), of_axes(std), rtol=0.1)
+    acting = samples_of(config, read)
+    resting = np.abs(acting["wrench"][acting["t"] < 9.9])
+    assert np.mean(resting == 0.0) > 0.98
+    np.testing.assert_allclose(
+        acting["wrench"][acting["t"] > 10.1].mean(axis=0), 20.0 * of_axes(std), rtol=0.02
+    )
+
+
 def test_lag_reaches_63_percent_after_its_time_constant():
     t = np.array([0.0, 1.0, 1.24, 1.2400001])
     demands = np.array([np.zeros(6), np.full(6, 100.0), np.full(6, 100.0)])
@@ -421,6 +457,12 @@ def test_lag_reaches_63_percent_after_its_time_constant():
 
 def at_a_point(force: Array, place: Array) -> Array:
     return np.concatenate([force, np.cross(place, force)])
+
+
+def advancing(t, nu, rotation, k):
+    """By the form of the contract, axis by axis."""
+    factor = 1.0 - k * nu[:3] * np.sign(THRUST[:3])
+    return np.concatenate([(factor - 1.0) * THRUST[:3], np.zeros(3)])
 
 
 def payload(t, nu, rotation, mass_wet, x, y, z, onset):
@@ -440,6 +482,7 @@ def tether(t, nu, rotation, k, x, y, z):
 
 
 WRENCH_FORMS = {
+    "thrust_advance": advancing,
     "payload": payload,
     "wave": wave,
     "tether_drag": tether,
@@ -449,9 +492,12 @@ WRENCH_FORMS = {
 }
 
 
+THRUST = np.array([40.0, -25.0, 30.0, 2.0, -1.0, 3.0])
+
+
 def wrench_of(effect, t, nu, rotation, parameters):
     out = np.zeros(6)
-    effects.add_wrenches(compiled({effect.name: parameters}), t, nu, rotation, out)
+    effects.add_wrenches(compiled({effect.name: parameters}), t, nu, rotation, THRUST, out)
     return out
 
 
@@ -593,7 +639,9 @@ def test_the_tether_feels_the_water_not_the_ground(heavy):
     out, mass, theta = np.zeros(6), model.added_mass[:, :, None], model.theta[:, None]
     around = effects.surroundings(acting)
     nu, work = np.zeros(6), np.zeros(1, CURRENT)[0]
-    effects.add_surroundings(*around, model.structure, mass, theta, 0.0, nu, np.eye(3), work, out)
+    effects.add_surroundings(
+        *around, model.structure, mass, theta, 0.0, nu, np.eye(3), nu, work, out
+    )
     hull = 13.7 * 0.5 + 141.0 * 0.25
     np.testing.assert_allclose(out, [hull + 10.0 * 0.25, 0, 0, 0, 0, 0], atol=1e-12)
 

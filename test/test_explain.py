@@ -26,7 +26,7 @@ from bench.studies.explain import (
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import screening, sensor_consistency
 from rov_ident.discrepancy import search as discrepancy
-from rov_ident.discrepancy.explain import CUT_SHORT, _Model, _with_all_data, explain
+from rov_ident.discrepancy.explain import CUT_SHORT, _Model, _with_all_data, _with_reading, explain
 from rov_ident.discrepancy.findings import possibly_earlier, without_most_favourable
 from rov_ident.discrepancy.held_out import gain_of, split, thinned, windows
 from rov_ident.discrepancy.hypothesis import at_bound
@@ -133,8 +133,8 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
     whole = explain([there.streams], there.case.config).findings
     assert whole.effects[0].separable and CUT_SHORT not in whole.notes
 
-    search = Search(there.streams, there.case.config, split(there.streams.duration)[0])
-    fit(search.problem, search.given)
+    spans = split(there.streams.duration)[0]
+    search, _ = _with_reading(Search(there.streams, there.case.config, spans), spans)
     first_step = search.problem.steps_simulated
     monkeypatch.setattr(discrepancy, "BUDGET", first_step)
     findings = explain([there.streams], there.case.config).findings

@@ -129,11 +129,18 @@ def test_every_effect_in_every_tier(tier):
         assert case.unknown == name and case.axis in kind.axes and case.depends_on
 
 
+NOT_DRAWN = {
+    "thrust_scale", "thrust_advance", "thruster_saturation", "velocity_latency", "heading_offset",
+    "wrench_noise", "coriolis", "crossflow",
+}  # fmt: skip
+"""Hidden by the package's own simulator in test_explain_causes.py."""
+
+
 def test_names_of_the_tables():
     for pair in hidden.NESTED:
         assert pair < set(EFFECTS)
     assert set(hidden.UNOBSERVABLE) < set(TIERS)
-    assert set(EFFECTS) == set(library.EFFECTS)
+    assert set(EFFECTS) | NOT_DRAWN == set(library.EFFECTS) and not set(EFFECTS) & NOT_DRAWN
 
 
 # ------------------------------------------------------------------ the equations

@@ -17,6 +17,9 @@ EXACT = Suite().scaled(0.0)
 
 GIVEN = {
     "thruster_gain": {"gain_X": 0.9, "gain_N": 1.2},
+    "thrust_scale": {"scale": 0.9},
+    "thrust_advance": {"k": 0.2},
+    "thruster_saturation": {"limit_X": 20.0, "limit_Z": 40.0},
     "thruster_asymmetry": {"gain_X": 0.8},
     "thruster_deadband": {"width_Y": 2.0},
     "thruster_lag": {"time_constant": 0.1},
@@ -108,6 +111,9 @@ def test_without_estimated_effects_samples_are_what_they_were(heavy):
 
 TRUTH = {
     "thruster_gain": {"gain_X": 1.15, "gain_N": 0.9},
+    "thrust_scale": {"scale": 0.8},
+    "thrust_advance": {"k": 0.3},
+    "thruster_saturation": {"limit_X": 25.0, "limit_Z": 50.0},
     "thruster_lag": {"time_constant": 0.13},
     "actuation_delay": {"delay": 0.13},
     "ocean_current": {"north": 0.14, "east": -0.07, "down": 0.02},

@@ -40,7 +40,8 @@ class Conditions:
     every standard deviation; ``off`` is the largest relative error of a configured coefficient.
 
     ``excitation`` is one of :data:`EXCITATIONS`, or ``any`` well-excited kind; ``family`` one of
-    :data:`FAMILIES`, or ``other`` for any but the first.
+    :data:`FAMILIES`, or ``other`` for any but the first. ``reading`` is constant noise of the
+    wrench's reading, of forces [N] and moments [N m], beside that in proportion to the wrench.
     """
 
     duration: float = 180.0
@@ -51,6 +52,7 @@ class Conditions:
     off: float = 0.08
     excitation: str = "any"
     family: str = "heavy"
+    reading: tuple[float, float] = (0.0, 0.0)
 
 
 TIERS: dict[str, Conditions] = {
@@ -1012,6 +1014,8 @@ def _messages(
 
     rng = _stream(seed, "wrench")
     wrench = truth.command * (1.0 + noise * WRENCH_STD * rng.standard_normal(truth.command.shape))
+    std = np.repeat(conditions.reading, 3)
+    wrench = wrench + std * _stream(seed, "reading").standard_normal(wrench.shape)
     messages += [
         (n, "wrench", Wrench(n, "base_link_frd", a, b))
         for n, a, b in zip(stamps(truth.command_t), wrench[:, :3], wrench[:, 3:])

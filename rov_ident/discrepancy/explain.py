@@ -9,19 +9,23 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.discrepancy import sensor_consistency
+from rov_ident.discrepancy import extension, sensor_choice, sensor_consistency
 from rov_ident.discrepancy.findings import (
     changes,
     finding,
     is_certain,
+    noise_finding,
     residuals,
     sensor_findings,
     with_parameters,
 )
 from rov_ident.discrepancy.held_out import (
+    MOTIONS,
     PRACTICAL,
     Judge,
     blocks,
@@ -36,7 +40,9 @@ from rov_ident.discrepancy.results import Finding, Findings, Residual, Verdict
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import Search, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
+from rov_ident.discrepancy.sensor_choice import NOISE
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Shown
 from rov_ident.reports.table import Tables
@@ -45,6 +51,8 @@ from rov_ident.sampling.raw_streams import Streams, joined
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
+_NEAR_NOISE = 3.0  # times what fitted windows leave: a prediction of twice the time drifts further
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
@@ -137,18 +145,29 @@ def explain(
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
 
     say("comparing the sensors", 0.05)
-    sensors, std = sensor_consistency.search(streams, config, to_fit)
-    of_sensors = sensor_findings(streams, judged, config, sensors, std, to_fit, to_judge)
-    sensors = {f.effect: sensors[f.effect] for f in of_sensors if is_practical(f.gain)}
+    choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config)
+    of_sensors = sensor_findings(
+        streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
+        choice.alternatives, choice.fixed,
+    )  # fmt: skip
+    sensors = {f.effect: choice.sensors[f.effect] for f in of_sensors if is_practical(f.gain)}
+    recorded = judged, streams
     streams = sensor_consistency.corrected(streams, sensors)
     judged = sensor_consistency.corrected(judged, sensors)
 
     say("refitting the coefficients", 0.1)
-    search = Search(streams, config, thinned(to_fit))
-    retuned, model, residual = _searched(search, say)
+    search, start = _with_reading(Search(streams, config, thinned(to_fit)), to_fit)
+    retuned, model, residual = _searched(search, start, say)
     say("judging on held-out data", 0.9)
-    judge = Judge(WindowedProblem(judged, to_judge))
+    judge = Judge(WindowedProblem(judged, to_judge), sensors)
     _judge_effects(search, judge, retuned, model)
+    if search.config is not config:
+        std = sensor_choice.noise_std(streams, search.config.effects[NOISE])
+        of_sensors.append(noise_finding(search, judge, model.final, config, std))
+    given = Hypothesis(config, {})
+    as_recorded = Judge(WindowedProblem(recorded[0], to_judge))
+    baseline = as_recorded.summed(given)
+    written = extension.kept(judge, baseline, model.final.hypothesis)
     last, notes = _with_all_data(search, streams, model)
     found = [f for f in of_sensors if is_practical(f.gain)]
     found += [with_parameters(search, last, f) for f in model.found]
@@ -156,13 +175,25 @@ def explain(
     verdict: Verdict = "unexplained" if residual else "explained" if found else "agrees"
     if verdict == "agrees" and is_practical(judge.gain(search.given, retuned.hypothesis)):
         verdict = "retuned"
-    best = model.final.hypothesis
-    compared = {"as configured": search.given, "retuned": retuned.hypothesis, "extended": best}
+    best = given if written.model is None else written.model
+    compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
+    judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
+    rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
+    far = _far_off(judged, rmse[2], model.final.noise)
+    if far and verdict != "unexplained":
+        verdict = "unexplained"
+    extended = config
+    if written.model is not None:
+        values = extension.without_rows(last.hypothesis, written.axes)
+        reads = any(f.effect == NOISE and is_practical(f.gain) for f in of_sensors)
+        if not reads:
+            values = sensor_choice.with_noise(values, config.effects.get(NOISE, {}))
+        extended = _extended(values, sensors)
     everything = WindowedProblem(streams, blocks(streams))
+    notes = [*choice.notes, *notes, *filter(None, [written.note, far])]
     notes += [_NO_TORQUE] if streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
-    rmse = [judge.rmse(h) for h in compared.values()]
     findings = Findings(
         rmse[0],
         rmse[1],
@@ -177,7 +208,7 @@ def explain(
     return Explanation(
         findings,
         config,
-        _extended(config, last.hypothesis, sensors),
+        extended,
         everything.times,
         everything.measured,
         {label: everything.measured - everything.errors(h) for label, h in compared.items()},
@@ -201,10 +232,39 @@ def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams
     return streams, *of_all
 
 
-def _searched(search: Search, say: Progress) -> tuple[Fitted, _Model, list[Residual]]:
+def _with_reading(search: Search, spans: Spans) -> tuple[Search, Fitted | None]:
+    """The search with the noise of the wrench's reading in its configuration, where that is
+    believed, and the fit from which it starts."""
+    start = search.start()
+    noise = {} if start is None else sensor_choice.noise_of_wrench(search, start)
+    if not noise:
+        return search, start
+    config = sensor_choice.with_noise(search.given, noise).config
+    there = Search(search.problem.streams, config, thinned(spans))
+    return there, there.start()
+
+
+def _far_off(streams: Streams, rmse: Mapping[str, float], noise: Array) -> str:
+    """In words, which velocities the extended model leaves far off: by more than half of the
+    motion, and by more than the windows that were fitted leave in the mean."""
+    motion = np.nanstd(streams.nu, axis=0)
+    off = {
+        MOTIONS[c]: rmse[c] / m
+        for c, m, own in zip(VELOCITIES, motion, noise, strict=True)
+        if m > 0.0 and rmse[c] > max(_FAR_OFF * m, _NEAR_NOISE * own)
+    }
+    if not off:
+        return ""
+    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in off.items())
+    return f"much is left that no model explains, of the motion on held-out data: {shares}"
+
+
+def _searched(
+    search: Search, start: Fitted | None, say: Progress
+) -> tuple[Fitted, _Model, list[Residual]]:
     """The retuned model, the extended one, and what is left that has no name. UserError if the
     configured model cannot be simulated."""
-    path = search.run(lambda what: say("searching: " + what, 0.3))
+    path = search.run(lambda what: say("searching: " + what, 0.3), start)
     if not path:
         raise UserError(
             "the configured model diverges within seconds of simulation: check the signs and sizes "
@@ -225,7 +285,10 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
     together: the slightest leaves, and the rest is judged anew."""
     while True:
         known = {n: t for n, t in model.trials.items() if not n.startswith(UNKNOWN)}
-        found = [finding(search, judge, model.final, name, trial) for name, trial in known.items()]
+        found = [
+            finding(search, judge, retuned, model.final, name, trial)
+            for name, trial in known.items()
+        ]
         slight = [f for f in found if not is_practical(f.gain)]
         slight = [f for f in slight if not _supports_another(search, judge, model, f.effect)]
         if len(slight) < 2:
@@ -279,8 +342,9 @@ def _with_all_data(search: Search, streams: Streams, model: _Model) -> tuple[Fit
     return last, notes
 
 
-def _extended(config: Config, h: Hypothesis, sensors: Sensors) -> Config:
-    """The configuration with what was found."""
+def _extended(h: Hypothesis, sensors: Sensors) -> Config:
+    """The configuration of a hypothesis with what was found."""
+    config = h.config
     document = configuration.to_parameters(config)
     document["coefficients"] = {**document["coefficients"], **h.coefficients}
     if effects := h.effects | {name: dict(values) for name, values in sensors.items()}:

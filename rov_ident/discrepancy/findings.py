@@ -1,7 +1,7 @@
 """Findings: effects with their parameters, gains and rivals, in numbers and in sentences."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
@@ -17,11 +17,12 @@ from rov_ident.discrepancy.hypothesis import (
     role_of,
     unit_of,
 )
-from rov_ident.discrepancy.output_error import Fitted, onset_std
+from rov_ident.discrepancy.output_error import Fitted, onset_std, refit
 from rov_ident.discrepancy.results import Alternative, Change, Finding, Gain, Residual, Value
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
+from rov_ident.discrepancy.sensor_choice import NOISE, with_noise
 from rov_ident.discrepancy.windowed_problem import Spans, within
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -38,16 +39,22 @@ _EQUAL = "fits this bag as well"
 _EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
 
 
-def finding(search: Search, judge: Judge, final: Fitted, name: str, trial: Trial) -> Finding:
-    """An effect of the final model, judged against the model without it and against its rivals."""
+def finding(
+    search: Search, judge: Judge, retuned: Fitted, final: Fitted, name: str, trial: Trial
+) -> Finding:
+    """An effect of the final model, judged against the best model without it, be it the retuned
+    one, and against its rivals."""
     keys = search.keys_of(final, name)
     parameters = parameters_of(final, keys)
     onset, except_for = parameters.get("onset"), None
     if onset is not None:  # where it begins, between two windows, nothing can be predicted
         except_for = onset.value - 2.0 * onset.std, onset.value + 2.0 * onset.std
     axes = _axes(search, final, keys)
-    gain = judge.gain(trial.rest.hypothesis, final.hypothesis, except_for, axes)
-    alternatives, separable = _alternatives(search, judge, final, trial, except_for)
+    without = trial.rest.hypothesis
+    if judge.better(retuned.hypothesis, without, except_for):  # the best model without it
+        without = retuned.hypothesis
+    gain = judge.gain(without, final.hypothesis, except_for, axes)
+    alternatives, separable = _alternatives(search, judge, final, name, trial, except_for)
     stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
     values = final.hypothesis.values
     separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)
@@ -62,21 +69,24 @@ def _alternatives(
     search: Search,
     judge: Judge,
     final: Fitted,
+    name: str,
     trial: Trial,
     except_for: tuple[float, float] | None,
 ) -> tuple[tuple[Alternative, ...], bool]:
     """The rivals, the closest first, and whether the effect can be told from all of them; where it
     cannot, only those that it cannot be told from."""
     best = search.cost(final, final)
-    explained = trial.rest.rss - final.rss
+    explained = trial.rest.squares - final.squares
     found, separable = [], trial.rivals is not None
     for rival, fitted in (trial.rivals or {}).items():
         if rival.startswith(UNKNOWN):
             separable = separable and search.cost(fitted, final) > best - VERY_STRONG
             continue
-        share = (trial.rest.rss - fitted.rss) / max(explained, 1e-9)
+        share = (trial.rest.squares - fitted.squares) / max(explained, 1e-9)
         close = search.cost(fitted, final) - best < VERY_STRONG
-        if close or judge.better(fitted.hypothesis, final.hypothesis, except_for):
+        # a rival with parameters beyond this effect's own predicts better by chance alone
+        larger = EFFECTS[name].within == rival if name in EFFECTS else False
+        if close or (not larger and judge.better(fitted.hypothesis, final.hypothesis, except_for)):
             separable = False
             why = _EQUAL
         else:
@@ -195,6 +205,25 @@ def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
     return changed
 
 
+def noise_finding(
+    search: Search, judge: Judge, final: Fitted, given: Config, std: Mapping[str, float]
+) -> Finding:
+    """The noise of the wrench's reading, which the configuration of the model ``final`` has: judged
+    against the same model with the readings as they are in the configuration ``given``."""
+    name, h = NOISE, final.hypothesis
+    parameters = {
+        p.name: Value(h.config.effects[name][p.name], std[p.name], p.unit)
+        for p in EFFECTS[name].parameters
+        if h.config.effects[name][p.name] > 0.0
+    }
+    axes = tuple(p.axis for p in EFFECTS[name].parameters if p.name in parameters)
+    without = with_noise(h, given.effects.get(name, {}))
+    rest = refit(without, final.linearisation)
+    gain = judge.gain(without if rest is None else rest.hypothesis, h, None, axes)
+    words = sentence(name, parameters, gain)
+    return Finding(name, axes, parameters, None, gain, True, None, (), words)
+
+
 def sensor_findings(
     streams: Streams,
     judged: Streams,
@@ -203,13 +232,17 @@ def sensor_findings(
     std: Mapping[Key, float],
     fit: Spans,
     held: Spans,
+    alternatives: Mapping[str, Sequence[str]] | None = None,
+    fixed: Container[Key] = (),
 ) -> list[Finding]:
     """Findings of the sensor effects ``found`` in the spans ``fit`` of the streams, by how much
-    better the sensors agree in the spans ``held`` of the streams ``judged``."""
+    better the sensors agree in the spans ``held`` of the streams ``judged``. Each cannot be told
+    from its ``alternatives``; the parameters ``fixed`` are at their null."""
     findings = []
     after = sensor_consistency.comparisons(judged, config, found)
     for name in found:
-        rest, _ = sensor_consistency.search(streams, config, fit, [n for n in found if n != name])
+        others = [n for n in found if n != name]
+        rest, _ = sensor_consistency.search(streams, config, fit, others, fixed)
         before = sensor_consistency.comparisons(judged, config, rest)
         sums = [_common(*pair, held) for pair in zip(before, after, strict=True)]
         last = max(map(len, sums))
@@ -219,9 +252,12 @@ def sensor_findings(
         parameters = {
             p.name: Value(found[name][p.name], std[name, p.name], p.unit)
             for p in EFFECTS[name].parameters
+            if (name, p.name) in std
         }
         words = sentence(name, parameters, gain)
-        findings.append(Finding(name, (), parameters, None, gain, True, None, (), words))
+        rivals = tuple(Alternative(n, _EQUAL) for n in (alternatives or {}).get(name, ()))
+        run = EFFECTS[name].manoeuvre if rivals else None
+        findings.append(Finding(name, (), parameters, None, gain, not rivals, run, rivals, words))
     return findings
 
 

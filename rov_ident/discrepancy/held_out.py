@@ -2,7 +2,7 @@
 with it and without."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.results import Gain
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.effects import sense
+from rov_ident.effects.base import Reading
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
@@ -78,18 +80,32 @@ def thinned(spans: Spans) -> Spans:
 class Judge:
     """Open-loop simulation on data that no fit has seen."""
 
-    def __init__(self, problem: WindowedProblem) -> None:
-        self._problem = problem
-        self._guided = problem.guided
+    def __init__(
+        self, problem: WindowedProblem, sensors: Mapping[str, Mapping[str, float]] | None = None
+    ) -> None:
+        """``sensors``: the effects that were taken off the data, which are judged as recorded."""
+        self._problem, self._sensors = problem, sensors or {}
+        self._guided, self.free = problem.guided, ~problem.guided  # axes (6,)
         self._limit = _FAILED * problem.measured.std(axis=0) + 1e-9
         chunk = (problem.times / CHUNK).astype(int)
         self._number, self._chunk = np.unique(chunk, return_inverse=True)
 
     def squares(self, h: Hypothesis) -> Array:
         """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
-        error = np.abs(self._problem.errors(h))
+        error = np.abs(self._as_recorded(self._problem.errors(h)))
         capped: Array = np.where(error < self._limit, error, self._limit) ** 2
         return capped
+
+    def _as_recorded(self, error: Array) -> Array:
+        """Errors (N, 6) of the corrected velocities as those of the recorded ones."""
+        if not self._sensors:
+            return error
+        measured, none = self._problem.measured, np.zeros_like(error[:, :3])
+        measured, simulated = (
+            sense(Reading(x[:, :3], x[:, 3:], none, none), self._sensors)
+            for x in (measured, measured - error)
+        )
+        return np.hstack([measured.linear - simulated.linear, error[:, 3:]])
 
     def rmse(self, h: Hypothesis) -> dict[str, float]:
         error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
@@ -172,6 +188,14 @@ def gain_of(components: Sequence[str], before: Array, after: Array, count: float
     rmse = (np.sqrt(x.sum(axis=0) / count) for x in (before, after))
     best = int(np.argmax(np.where(low > 0.0, percent, -np.inf if (low > 0.0).any() else percent)))
     return Gain(components[best], *(float(x[best]) for x in (*rmse, percent, low, high)))
+
+
+def surely_less(a: Array, b: Array) -> bool:
+    """Whether squared errors a are less than b, both summed over chunks of time (C, K), all
+    components taken together: in 97.5 % of resampled chunks, one end of a 95 % interval."""
+    chunks = len(a)
+    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    return bool(np.quantile(_log_ratio(draws @ a, draws @ b).sum(axis=1), 0.975) < 0.0)
 
 
 def _log_ratio(a: Array, b: Array) -> Array:

@@ -182,14 +182,19 @@ def at_bound(key: Key, value: float, std: float) -> bool:
     return any(b != 0.0 and abs(value - b) < margin for b in bounds(key)[1:])
 
 
-def effect_of(key: Key) -> str:
-    """The effect that a parameter belongs to; of a pattern its axis and dependence."""
+def effect_of(key: Key, beside: Iterable[Key] = ()) -> str:
+    """The effect that a parameter belongs to; of a pattern its axis and dependence. A coefficient
+    that two families have (lift and Coriolis terms) belongs to that of which more is ``beside``.
+    """
     section, name = key
     if section == UNKNOWN:
         return f"{UNKNOWN} " + name.rpartition("|")[0]
     if section != COEFFICIENTS:
         return section
-    return next((e.name for e in EFFECTS.values() if name in e.coefficients), "coupled_damping")
+    families = [e for e in reversed(EFFECTS.values()) if name in e.coefficients]
+    there = {n for s, n in beside if s == COEFFICIENTS} if len(families) > 1 else set()
+    families.sort(key=lambda e: -len(there & set(e.coefficients)))
+    return families[0].name if families else "coupled_damping"
 
 
 def axis_of(key: Key) -> str:

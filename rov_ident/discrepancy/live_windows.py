@@ -83,8 +83,8 @@ class State(NamedTuple):
 
 def is_watched(effect: Effect) -> bool:
     """Whether an effect can be scored as it stands: it acts on the wrench, and at once."""
-    searched = {"frequency", "fixed"}
-    return effect.sense is None and not any(p.role in searched for p in effect.parameters)
+    searched = {"frequency", "fixed", "limit"}
+    return not effect.of_sensors and not any(p.role in searched for p in effect.parameters)
 
 
 def task_of(config: Config) -> Task:

@@ -144,12 +144,12 @@ def regressors(eq: Equations, motion: Motion) -> Array:
     return out
 
 
-def wrenches(eq: Equations, steps: Steps, motion: Motion) -> Array:
-    """Wrench effects and current (K, 6) along a motion."""
+def wrenches(eq: Equations, steps: Steps, thrust: Array, motion: Motion) -> Array:
+    """Wrench effects and current (K, 6) along a motion; ``thrust`` (K, 6) is of the thrusters."""
     out, (around, current) = np.zeros((len(motion.middle), 6)), surroundings(eq.acting)
     if around is not None:
         _wrenches(
-            around, current, eq.structure, eq.added, eq.theta, steps, motion.middle,
+            around, current, eq.structure, eq.added, eq.theta, steps, thrust, motion.middle,
             np.zeros(1, CURRENT), out,
         )  # fmt: skip
     return out
@@ -162,11 +162,13 @@ def _thrust(acting, state, t, wrench):
 
 
 @released
-def _wrenches(around, current, structure, added, theta, steps, nu, scratch, out):
+def _wrenches(around, current, structure, added, theta, steps, thrust, nu, scratch, out):
     t, middle, s = steps.t, steps.middle, scratch[0]
     for k in range(len(nu)):
         now = 0.5 * (t[k] + t[k + 1])
-        add_surroundings(around, current, structure, added, theta, now, nu[k], middle[k], s, out[k])
+        add_surroundings(
+            around, current, structure, added, theta, now, nu[k], middle[k], thrust[k], s, out[k]
+        )
 
 
 _LANES = 8  # six axes, none, and one more to fill the vectors
@@ -174,7 +176,8 @@ _LANES = 8  # six axes, none, and one more to fill the vectors
 _SCRATCH = record(
     [
         ("nu", "f8", (6, 1)),
-        ("push", "f8", (6,)),  # wrench of thrusters, weight and effects
+        ("thrust", "f8", (6,)),  # wrench of the thrusters
+        ("push", "f8", (6,)),  # and of weight and effects
         ("slope", "f8", (4, 6)),  # of Runge and Kutta's stages
         ("h", "f8", (6, 1)),
         ("extended", "f8", (EXTENDED_SIZE, 1)),
@@ -199,13 +202,14 @@ _SCRATCH = record(
 def _acceleration(around, current, structure, added, theta, restoring, t, rotation, given, s, out):
     """nu_dot (6,) at s.nu into out, ``given`` on guided axes; s.push (6,) is the thrusters'."""
     for i in range(6):
-        s.velocity[i] = s.nu[i, 0]
+        s.velocity[i], s.thrust[i] = s.nu[i, 0], s.push[i]
         for j in range(3):
             s.push[i] += restoring[i, j] * rotation[2, j]
     if around is not None:  # numba leaves this out where it is None
         add_surroundings(
-            around, current, structure, added, theta, t, s.velocity, rotation, s.current, s.push
-        )
+            around, current, structure, added, theta, t, s.velocity, rotation, s.thrust, s.current,
+            s.push,
+        )  # fmt: skip
     h = s.h
     generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
     for i in range(6):
@@ -223,7 +227,8 @@ def _acceleration(around, current, structure, added, theta, restoring, t, rotati
 @inner
 def _differentiate(around, current, structure, added, theta, wide, t, rotation, s):
     """s.by_velocity (6, 6): the derivative of the wrench on the vehicle by its velocity s.nu. Lane
-    j is a little faster along axis j, the last along none; ``wide`` (n, _LANES) is theta in each.
+    j is a little faster along axis j, the last along none; ``wide`` (n, _LANES) is theta in each,
+    s.thrust (6,) what the thrusters give.
     """
     nearby, h, last = s.nearby, s.nearby_h, _LANES - 1
     for i in range(6):
@@ -236,8 +241,8 @@ def _differentiate(around, current, structure, added, theta, wide, t, rotation, 
             for i in range(6):
                 s.velocity[i], s.push[i] = nearby[i, k], 0.0
             add_surroundings(
-                around, current, structure, added, theta, t, s.velocity, rotation, s.current,
-                s.push,
+                around, current, structure, added, theta, t, s.velocity, rotation, s.thrust,
+                s.current, s.push,
             )  # fmt: skip
             for i in range(6):
                 h[i, k] -= s.push[i]

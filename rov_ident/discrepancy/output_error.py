@@ -24,6 +24,7 @@ from rov_ident.discrepancy.hypothesis import (
     role_of,
 )
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
+from rov_ident.discrepancy.reading_noise import DRAWS
 from rov_ident.discrepancy.selection import variance_inflation
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
 from rov_ident.model.equations import Array, Indices
@@ -68,6 +69,20 @@ class Fitted:
     @property
     def rss(self) -> float:
         return self.linearisation.rss
+
+    @cached_property
+    def noise_squares(self) -> Array:
+        """Squared residuals (draws,) that noise of the wrench's reading makes."""
+        problem = self.linearisation.problem
+        if not problem.reading_std.any():
+            return np.zeros(DRAWS)
+        force = problem.noisy_thrust(self.hypothesis.effects)
+        return np.sum(self.linearisation.sensitivity_to(force) ** 2, axis=0)
+
+    @property
+    def squares(self) -> float:
+        """The squared residuals less those that noise of the reading is expected to make."""
+        return self.rss - float(self.noise_squares.mean())
 
     @cached_property
     def inflation(self) -> float:

@@ -76,8 +76,8 @@ def verdict(findings: Findings) -> str:
 def _named(effects: Sequence[Finding]) -> str:
     if not effects:
         return ""
-    sensors = [brief(f) for f in effects if EFFECTS[f.effect].sense is not None]
-    others = [brief(f) for f in effects if EFFECTS[f.effect].sense is None]
+    sensors = [brief(f) for f in effects if EFFECTS[f.effect].of_sensors]
+    others = [brief(f) for f in effects if not EFFECTS[f.effect].of_sensors]
     parts = [f"The simulation lacks {listed(others)}"] if others else []
     parts += [f"{'the' if others else 'The'} sensors show {listed(sensors)}"] if sensors else []
     if len(effects) == 1:

@@ -41,6 +41,7 @@ FARTHEST = 3.0  # typical sizes from null at which a fit of an input effect begi
 _ONSETS = 24  # scanned evenly over the bag: every 7 s of three minutes, about a window apart
 _FINE_ONSETS = 17  # scanned around the best of them, to an eighth of that distance
 _ONSET_RANGE = 0.04  # of the bag to either side: the distance of the even ones
+_LIMITS = (0.9, 0.75, 0.6, 0.45, 0.3)  # of the largest command; below that a limit is no longer one
 _PEAKS = 3  # of the spectrum that are tried as the frequency of a wave; effort
 
 
@@ -113,7 +114,7 @@ class Screening:
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
         """Parameters of an effect that h lacks, on axes that are simulated, in the groups in which
         they may join."""
-        groups = [] if effect.sense is not None else units(effect, h, ("amplitude",))
+        groups = [] if effect.of_sensors else units(effect, h, ("amplitude",))
         return [unit for unit in groups if all(map(self._is_simulated, unit))]
 
     def lacks_plainer(self, name: str, h: Hypothesis) -> bool:
@@ -147,7 +148,43 @@ class Screening:
                 {p.name: s * p.typical for p, s in zip(places, of, strict=True)} for of in signs
             ]
             return self._best_shape(now, effect, grid)
+        if "limit" in roles:
+            return self._limited(now, effect)
         return self._oscillating(now, effect) if "frequency" in roles else None
+
+    def _limited(self, now: Fitted, effect: Effect) -> Candidate | None:
+        """Limits of the thrust on single axes, at shares of the largest command: beyond it a limit
+        does nothing, so that no derivative at the null shows it."""
+        problem, h = self._problem, now.hypothesis
+        largest = np.abs(problem.steps.demand).max(axis=0)
+        limits = {p.axis: (effect.name, p.name) for p in effect.parameters if p.role == "limit"}
+        driven = [a for a in limits if largest[AXES.index(a)] > 0.0]
+        driven = [a for a in driven if self._is_simulated(limits[a])]
+        before, columns, labels = problem.thrust(h.effects)[0], [], []
+        for share in _LIMITS:
+            values = {limits[a]: share * float(largest[AXES.index(a)]) for a in driven}
+            change = problem.thrust(h.having(values).effects)[0] - before
+            for a in driven:
+                column = np.zeros_like(change)
+                column[:, AXES.index(a)] = change[:, AXES.index(a)]
+                columns.append(column)
+                labels.append((a, share))
+        if not labels:
+            return None
+        keys = [(a, str(share)) for a, share in labels]
+        sensitivity = now.linearisation.sensitivity_to(np.stack(columns, axis=2))
+        scores = scores_of(now.linearisation, keys, sensitivity)
+        gains = {k: scores.solve([k])[1] for k in keys if scores.solve([k])[0][0] > 0.0}
+        best = [
+            max(mine, key=lambda k: gains[k])
+            for a in driven
+            if (mine := [k for k in gains if k[0] == a])
+        ]
+        selected, score, white = scores.select([(k,) for k in best])
+        start = {
+            limits[a]: float(share) * float(largest[AXES.index(a)]) for a, share in selected.keys
+        }
+        return Candidate(effect.name, start, score, white) if start else None
 
     def _best_shape(
         self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]

@@ -8,12 +8,15 @@
    of no known cause (`pattern_search`). An effect that does not earn its place leaves.
 """
 
+import contextlib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.core.errors import UserError
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
@@ -30,7 +33,7 @@ from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_ons
 from rov_ident.discrepancy.patterns import PatternSearch, choice_penalty
 from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening, Workers
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
-from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import parse
 from rov_ident.sampling.raw_streams import Streams
@@ -45,6 +48,7 @@ LATE_THRUST = ("thruster_lag", "actuation_delay")
 HULL_DAMPING_ASKED = 0.0  # penalised score; of other effects VERY_STRONG is asked
 _MORE_THAN_DAMPING = 0.5  # of what hull damping explains: a rival of it must explain as much more
 _MORE_THAN_NAMED = 0.05  # of what a named effect explains: a pattern must explain as much more
+_NOISE_STD = 2.0  # standard deviations of the squares that noise of the reading makes, of one draw
 _OWN_DRAG = 0.5  # of the hull's drag that must remain beside an effect that imitates it
 
 # Effort: the times and rates in docs/explain-bench.md were measured with these.
@@ -54,6 +58,8 @@ _LEAST_SHARE = 0.3  # of the best score: a candidate with less is not fitted
 _MOST_EFFECTS = 6
 _MOST_PATTERNS = 3
 _ROUNDS = 3  # in which effects may give way to rivals
+_SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
+_FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
 BUDGET = 24_000  # steps simulated for each second of data (docs/explain.md, the card of an effect)
 
 
@@ -76,6 +82,7 @@ class Search:
         self, streams: Streams, config: Config, spans: Sequence[tuple[float, float]]
     ) -> None:
         self.config, self.problem = config, WindowedProblem(streams, spans)
+        self._spans = spans
         base = {
             (COEFFICIENTS, name): float(value)
             for name, value in zip(config.model.names, config.model.theta, strict=True)
@@ -95,9 +102,22 @@ class Search:
         self.cut_short = self.problem.steps_simulated > BUDGET
         return self.cut_short
 
-    def run(self, progress: Progress | None = None) -> list[Fitted]:
+    def start(self) -> Fitted | None:
+        """The fit of the model as it is: the likeliest of those that begin from the coefficients as
+        configured and from those that fit windows of a second, which is nearly least squares and
+        has hardly a second minimum. None where neither can be simulated."""
+        begins, spans = [self.given], shortened(self.problem.streams, self._spans)
+        with contextlib.suppress(UserError):  # too little odometry in any
+            short = fit(WindowedProblem(self.problem.streams, spans), self.given)
+            begins += [] if short is None else [short.hypothesis]
+        fits = self._workers.map(lambda h: fit(self.problem, h), begins)
+        free = ~self.problem.guided
+        there = [f for f in fits if f is not None]
+        return min(there, key=lambda f: float(np.log(f.noise[free]).sum()), default=None)
+
+    def run(self, progress: Progress | None = None, start: Fitted | None = None) -> list[Fitted]:
         """The fit of the model as it is, then that of each larger one."""
-        start = fit(self.problem, self.given)
+        start = start or self.start()
         if start is None:
             return []
         path = [start]
@@ -113,7 +133,7 @@ class Search:
         candidates = self._candidates(now, now.hypothesis)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.score:.0f}" for c in candidates[:5]))
-        fits = self.fit_best(now, candidates)
+        fits = self.fit_best(now, candidates) + self._with_late_thrust(now)
         best = self._best(now, fits) or self._damping_and_another(now, candidates)
         if best is None:
             damping = [f for f in fits if added_effect(now, f) in HULL_DAMPING]
@@ -131,7 +151,7 @@ class Search:
         """The fit with the best penalised score, if it is as good as asked; hull damping first."""
         if not fits:
             return None
-        closest = min(fits, key=lambda f: f.rss)
+        closest = min(fits, key=lambda f: f.squares)
         good = [f for f in fits if self.improvement(now, f, closest) >= asked]
         good = [f for f in good if self.is_determined(now, f)]
         damping = [f for f in good if added_effect(now, f) in HULL_DAMPING]
@@ -150,18 +170,27 @@ class Search:
             if damped is None:
                 continue
             fits = self.fit_best(damped, self._candidates(damped, now.hypothesis))
-            for name in LATE_THRUST:
-                if name not in now.hypothesis.effects:
-                    (p,) = EFFECTS[name].parameters
-                    late = {(name, p.name): p.null + FARTHEST * p.typical}
-                    there = refit(damped.hypothesis.having(late), damped.linearisation)
-                    fits += [there] if there is not None else []
+            fits += self._with_late_thrust(damped)
             pruned = [self._pruned(f, now) for f in fits]
             both = [f for f in pruned if f and set(zeros) & set(f.hypothesis.keys)]
             best = self._best(now, both)
             if best is not None:
                 return best
         return None
+
+    def _with_late_thrust(self, now: Fitted) -> list[Fitted]:
+        """Full fits of late thrust, begun well away from none: a model that lacks it has taken so
+        much added mass in its stead that its linearisation does not show it."""
+        lacking = [n for n in LATE_THRUST if n not in now.hypothesis.effects]
+        starts = [
+            {(name, p.name): p.null + FARTHEST * p.typical}
+            for name in lacking
+            for p in EFFECTS[name].parameters
+        ]
+        fits = self._workers.map(
+            lambda s: refit(now.hypothesis.having(s), now.linearisation), starts
+        )
+        return [f for f in fits if f is not None]
 
     def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
         """Full fits of the best candidates, and of hull damping, whatever its score: a model that
@@ -243,6 +272,7 @@ class Search:
             if c.name != name and (EFFECTS[c.name].beyond == name or not lacking(c.name, h))
         ]
         fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
+        fits.pop(name, None)  # two families share some coefficients
         return fits | self.patterns.fits(rest)
 
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
@@ -251,7 +281,7 @@ class Search:
         explain clearly more, unless it is in the model anyway."""
         now = self.cost(final, final)
         there = self.named(final)
-        explained = max(trial.rest.rss - final.rss, 1e-9)
+        explained = max(trial.rest.squares - final.squares, 1e-9)
         choices = [trial.rest]
         for rival, fitted in (trial.rivals or {}).items():
             margin = 0.0
@@ -262,7 +292,7 @@ class Search:
             elif name in HULL_DAMPING and rival not in HULL_DAMPING:
                 margin = _MORE_THAN_DAMPING
             clear = now - self.cost(fitted, final) > 3.0 * VERY_STRONG
-            clear = clear and final.rss - fitted.rss > margin * explained
+            clear = clear and final.squares - fitted.squares > margin * explained
             if (margin == 0.0 or clear) and self.is_determined(trial.rest, fitted):
                 choices.append(fitted)
         best = min(choices, key=lambda f: self.cost(f, final))
@@ -284,17 +314,20 @@ class Search:
     def improvement(self, now: Fitted, larger: Fitted, best: Fitted) -> float:
         """The penalised score of what a larger model has more, in the units of ``best``; also by
         the variance inflation of that alone (but for onsets, known from one window), whichever is
-        less."""
+        less. What noise of the reading can make by chance is taken off."""
         gain = self.cost(now, best) - self.cost(larger, best)
         new = [k for k in larger.hypothesis.keys if k not in now.hypothesis.values]
         dates = onsets(larger.hypothesis)
         own = variance_inflation_of(larger.linearisation, [k for k in new if k not in dates])
-        return min(gain, (now.rss - larger.rss) / max(own, 1e-9) - PENALTY * len(new))
+        by_chance = _NOISE_STD * (now.noise_squares - larger.noise_squares).std(ddof=1)
+        gain -= by_chance / best.inflation
+        alone = (now.squares - larger.squares - by_chance) / max(own, 1e-9) - PENALTY * len(new)
+        return float(min(gain, alone))
 
     def is_determined(self, now: Fitted, larger: Fitted) -> bool:
         """Whether the data, not the bounds, determine the parameters that a larger model has more:
-        no effect took over most of the drag of the hull, and no failure at a time was there from
-        the start."""
+        no effect took over most of the drag of the hull, no failure at a time was there from the
+        start, and no Coriolis term is larger than the mass that it would come from."""
         h, variance = larger.hypothesis, np.diag(larger.covariance)
         std = dict(zip(larger.linear.keys, np.sqrt(np.maximum(variance, 0.0)), strict=True))
         new = [k for k in h.keys if k not in now.hypothesis.values]
@@ -305,29 +338,45 @@ class Search:
         begun = [k for k in onsets(h) if k in new and len(EFFECTS[k[0]].lasting) == 1]
         is_drag = any(abs(after) < _OWN_DRAG * abs(before) for after, before in left)
         is_gain = any(h.values[k] <= 0.0 for k in begun)
-        return not (is_drag or is_gain or any(at_bound(k, h.values[k], std[k]) for k in new))
+        mass = np.diag(h.model.mass_matrix)[:3].max()  # no product of velocities has more
+        is_absurd = any(abs(h.values[k]) > mass for k in new if effect_of(k, new) == "coriolis")
+        return not (
+            is_drag or is_gain or is_absurd or any(at_bound(k, h.values[k], std[k]) for k in new)
+        )
 
     def cost(self, fitted: Fitted, best: Fitted) -> float:
         """Squared residuals in the units of ``best``, and the penalty of the added parameters."""
-        extra, rss = len(fitted.hypothesis.keys) - len(self.given.keys), fitted.rss
+        extra, squares = len(fitted.hypothesis.keys) - len(self.given.keys), fitted.squares
         if not np.allclose((fitted.noise / best.noise) ** 2, 1.0):
             starts = fitted.linearisation.starts
             there = linearise(self.problem, fitted.hypothesis, starts, best.noise)
             assert there is not None
-            rss = there.rss
-        return rss / best.inflation + PENALTY * extra
+            squares = Fitted(fitted.hypothesis, there, fitted.converged).squares
+        return squares / best.inflation + PENALTY * extra
 
     def named(self, fitted: Fitted) -> list[str]:
         """The effects (and patterns) that a model has beyond the given one."""
-        own = set(self.given.keys)
-        return list(dict.fromkeys(effect_of(k) for k in fitted.hypothesis.keys if k not in own))
+        added = self._added(fitted)
+        return list(dict.fromkeys(effect_of(k, added) for k in added))
 
     def keys_of(self, fitted: Fitted, name: str) -> list[Key]:
+        added = self._added(fitted)
+        return [k for k in added if effect_of(k, added) == name]
+
+    def _added(self, fitted: Fitted) -> list[Key]:
         own = set(self.given.keys)
-        return [k for k in fitted.hypothesis.keys if k not in own and effect_of(k) == name]
+        return [k for k in fitted.hypothesis.keys if k not in own]
+
+
+def shortened(streams: Streams, spans: Sequence[tuple[float, float]]) -> Spans:
+    """The spans cut into windows of about a second."""
+    length = max(_SHORT, _FEWEST_SHORT * float(np.median(np.diff(streams.t))))
+    edges = (np.linspace(a, b, max(1, int((b - a) / length)) + 1) for a, b in spans)
+    return [pair for of in edges for pair in itertools.pairwise(of.tolist())]
 
 
 def added_effect(rest: Fitted, larger: Fitted) -> str:
     """The effect (or pattern) that a larger model has more."""
     old = set(rest.hypothesis.keys)
-    return next(effect_of(k) for k in larger.hypothesis.keys if k not in old)
+    added = [k for k in larger.hypothesis.keys if k not in old]
+    return effect_of(added[0], added)

@@ -13,7 +13,7 @@ effects are linear to first order, and the fit is repeated about its own result.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,15 +22,20 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from rov_ident.config import Config
-from rov_ident.core.frames import acceleration_of_arm, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.frames import (
+    acceleration_of_arm,
+    quaternion_from_euler,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.core.quaternions import turned
-from rov_ident.discrepancy.hypothesis import Key
+from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams, integral, interpolated, orientation_at
@@ -63,6 +68,8 @@ class Comparison:
     scale: float  # standard deviation of the noise, in the unit of the comparison
 
 
+_LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
+
 THRUST_TIMING = tuple(("thrust held", axis) for axis in "XYZ")
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
@@ -73,7 +80,7 @@ is not offset: together they would pass for a velocity scale of up to two percen
 
 def sensor_parameters() -> list[Key]:
     """Keys of all parameters of the effects of the velocity sensor and the IMU."""
-    return [(e.name, p.name) for e in EFFECTS.values() if e.sense for p in e.parameters]
+    return [(e.name, p.name) for e in _LIBRARY for p in e.parameters]
 
 
 def comparisons(
@@ -81,6 +88,7 @@ def comparisons(
 ) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
     keys = sensor_parameters()
+    streams = _in_place(streams, effects)
     here, there, rate = _corrected_readings(streams, config, effects)
     r = quaternion_to_matrix(streams.orientation)
     inertial = _DeadReckoning(streams, config, there, rate) if _has_imu(streams) else None
@@ -92,7 +100,7 @@ def comparisons(
     velocity = None if inertial is None else inertial.velocity
     moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
     reading = Reading(moving, turning, gyrating, here.specific_force)
-    moved = [_unit_change(reading, key) for key in keys]
+    moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
     made: list[tuple[str, Array, Array, list[Array]]] = []
     if streams.has_pose:
         way, *ways = (
@@ -101,7 +109,8 @@ def comparisons(
         y, columns = streams.position - way, [-w for w in ways]
         made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
     if inertial is not None:
-        shift = [_unit_change(there, key) for key in keys]
+        down = inertial.rotation[:, 2]
+        shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
         inside = (streams.t >= streams.imu_t[0]) & (streams.t <= streams.imu_t[-1])
         t = streams.t[inside]
         y = (np.einsum("kij,kj->ki", r, here.linear) - inertial.velocity)[inside]
@@ -150,9 +159,27 @@ def _undone(reading: Reading, effects: Mapping[str, Mapping[str, float]]) -> Rea
     return reading
 
 
-def _unit_change(reading: Reading, key: Key) -> Reading:
-    """What one unit of a parameter adds to a reading."""
-    effect = EFFECTS[key[0]]
+def _in_place(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
+    """The odometry with velocities of the time of its stamp (the last ones are held) and an
+    attitude against the world."""
+    delay, yaw = velocity_delay(effects), heading_error(effects)
+    nu, orientation = streams.nu.copy(), streams.orientation
+    if delay:
+        nu[:, :3] = interpolated(streams.t, streams.nu[:, :3], streams.t + delay)
+    if yaw:
+        orientation = quaternion_multiply(quaternion_from_euler(0.0, 0.0, -yaw), orientation)
+    return dataclasses.replace(streams, nu=nu, orientation=orientation)
+
+
+def _unit_change(reading: Reading, key: Key, t: Array, down: Array) -> Reading:
+    """What one unit of a parameter adds to a reading at the times t (N,), where ``down`` (N, 3) is
+    world down in body axes; of a heading, what turns a velocity in the world as much."""
+    effect, none = EFFECTS[key[0]], np.zeros_like(down)
+    if effect.late is not None:
+        return Reading(-np.gradient(reading.linear, t, axis=0), none, none, none)
+    if effect.heading is not None:
+        turned_force = np.cross(down, reading.specific_force)
+        return Reading(np.cross(down, reading.linear), none, none, turned_force)
     nulls = {p.name: p.null for p in effect.parameters}
     step = next(1e-4 * p.typical for p in effect.parameters if p.name == key[1])
     assert effect.sense is not None
@@ -167,7 +194,7 @@ class _DeadReckoning:
     def __init__(self, streams: Streams, config: Config, imu: Reading, rate: Array) -> None:
         self._t, self._at = streams.imu_t, streams.t
         q = orientation_at(streams, streams.imu_t)
-        self._rotation = quaternion_to_matrix(_attitude(q, streams.imu_t, imu.gyro, rate))
+        self.rotation = quaternion_to_matrix(_attitude(q, streams.imu_t, imu.gyro, rate))
         lever, force = np.array(config.imu.position), imu.specific_force
         if lever.any():
             turn = np.gradient(imu.gyro, streams.imu_t, axis=0)
@@ -177,7 +204,7 @@ class _DeadReckoning:
 
     def integrated(self, force: Array) -> Array:
         """The integral (N, 3) of specific forces (M, 3) turned into the world."""
-        total = integral(self._t, np.einsum("kij,kj->ki", self._rotation, force))
+        total = integral(self._t, np.einsum("kij,kj->ki", self.rotation, force))
         return interpolated(self._t, total, self._at)
 
 
@@ -285,8 +312,37 @@ def _linear_problem(
     return LinearProblem(keys, normal, gradient[filled], rss[filled], count)
 
 
+def common_squares(
+    found: Sequence[Sequence[Comparison]], spans: Sequence[tuple[float, float]]
+) -> list[Array]:
+    """Squared innovations of several corrections, in units of the first one's noise, at the
+    instants in the spans where all count, summed over clusters of time: (C, comparisons) each."""
+    out: list[list[Array]] = [[] for _ in found]
+    last = int(max(c.t[-1] for of in found for c in of) / _CLUSTER) + 1
+    for same in zip(*found, strict=True):
+        times = [np.round(c.t, 6) for c in same]
+        common = times[0][within(spans, times[0])]
+        for t in times[1:]:
+            common = np.intersect1d(common, t)
+        for sums, c, t in zip(out, same, times, strict=True):
+            use = np.isin(t, common)
+            squares = (c.r[use] * (c.scale / same[0].scale)) ** 2
+            total: Array = np.zeros(last)
+            np.add.at(total, (t[use] / _CLUSTER).astype(int), squares)
+            sums.append(total)
+    stacked = [np.stack(sums, axis=1) for sums in out]
+    there = stacked[0].any(axis=1)
+    return [s[there] for s in stacked]
+
+
+def a_reading() -> Reading:
+    """A reading in which nothing is zero or like another."""
+    return Reading(*np.arange(1.0, 13.0).reshape(4, 3))
+
+
 def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
     """The streams as good sensors would have given them."""
+    streams = _in_place(streams, effects)
     nothing = np.zeros_like(streams.nu[:, :3])
     here = _undone(Reading(streams.nu[:, :3], streams.nu[:, 3:], nothing, nothing), effects)
     return dataclasses.replace(streams, nu=np.hstack([here.linear, here.angular]))
@@ -297,20 +353,23 @@ def search(
     config: Config,
     spans: Sequence[tuple[float, float]],
     allowed: Iterable[str] | None = None,
+    fixed: Container[Key] = (),
 ) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
     """The sensor effects that the data in the spans (from and to [s]) support, and the standard
-    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score."""
-    library = [e.name for e in EFFECTS.values() if e.sense]
+    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score;
+    the parameters ``fixed`` stay at their null."""
+    library = [e.name for e in _LIBRARY]
     library = library if allowed is None else [n for n in library if n in set(allowed)]
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     for _ in range(_ROUNDS):
         linear = _linear_problem(comparisons(streams, config, found), spans)
-        chosen = [key for key in linear.keys if key[0] in found]
-        units = [[k for k in linear.keys if k[0] == n] for n in library if n not in found]
+        free = [key for key in linear.keys if key not in fixed]
+        chosen = [key for key in free if key[0] in found]
+        units = [[k for k in free if k[0] == n] for n in library if n not in found]
         added = [k for unit in units for k in unit]
         if allowed is None:
-            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units)
+            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
         both = [*chosen, *added]
         if not both:
@@ -318,7 +377,8 @@ def search(
         change, _ = Scores(linear, THRUST_TIMING).solve(both)
         for (name, parameter), delta in zip(both, change.tolist(), strict=True):
             nulls = {p.name: p.null for p in EFFECTS[name].parameters}
-            found.setdefault(name, nulls)[parameter] += delta
+            value = found.setdefault(name, nulls)[parameter] + delta
+            found[name][parameter] = float(np.clip(value, *bounds((name, parameter))[1:]))
         at = linear.index([*both, *THRUST_TIMING])
         covariance = scaled_inverse(linear.normal[np.ix_(at, at)])
         variance = np.maximum(np.diag(covariance), 0.0) * variance_inflation(linear, at)

@@ -26,6 +26,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     thrust,
     wrenches,
 )
+from rov_ident.discrepancy.reading_noise import SMALL, draws, resting_noise
 from rov_ident.effects import EFFECTS, compiled
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, parse
@@ -40,6 +41,7 @@ ONSET_STEP = 0.2  # s; of the difference quotient: several messages, as thrust a
 _AMPLITUDE_STEP = 0.05  # typical sizes; the same for an input effect, whose thrust has kinks
 _SMALL_STEP = 1e-3  # typical sizes; the same where the wrench is smooth
 _COUNTED_RATE = 50.0  # Hz; the search allows more time for data that are denser (docs/explain.md)
+_REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
 
@@ -53,7 +55,8 @@ class WindowedProblem:
     ``measured`` (N, 6) are the velocities at ``times`` (N,), which are the ``nodes`` (N,) of the
     time axis ``steps``; ``window`` (N,) says in which window each lies, ``first`` and ``last``
     (W,) are the nodes where windows begin and end. ``guided`` (6,): axes that follow the
-    measurement. ``patterns``: wrenches (K, 6) of no known cause, by key.
+    measurement. ``patterns``: wrenches (K, 6) of no known cause, by key. ``reading_std`` (6,):
+    noise of the wrench's reading.
     """
 
     def __init__(self, streams: Streams, spans: Sequence[tuple[float, float]]) -> None:
@@ -66,7 +69,8 @@ class WindowedProblem:
         nodes = _subdivided(t)
         pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
         pieces = pieces[(pieces >= nodes[0]) & (pieces <= nodes[-1])]
-        held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
+        held = self._held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
+        self.reading_std = resting_noise(streams.demand)
         self.orientation, self.guided = orientation_at(streams, nodes), streams.guided
         given = np.empty((0, 6))  # accelerations of the guided axes, from each node to the next
         if self.guided.any():
@@ -105,6 +109,7 @@ class WindowedProblem:
         self._simulations = 0  # of all windows, so far
         self._stopped = False
         self._thrusts: dict[object, Array] = {}
+        self._noisy: dict[object, Array] = {}
         self._remembered = threading.local()  # wrenches along a motion
         self._counting = threading.Lock()
 
@@ -126,13 +131,26 @@ class WindowedProblem:
 
     def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
-        inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
-        key = tuple(sorted(inputs.items()))
+        key = _inputs(effects)
         known = self._thrusts.get(key)
         if known is None:
             if len(self._thrusts) > _REMEMBERED_THRUSTS:
                 self._thrusts = {}
             known = self._thrusts[key] = thrust(self.steps, compiled(effects))
+        return known
+
+    def noisy_thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+        """What noise of the reading adds to the mean thrust in each step, (K, 6, draws)."""
+        key = _inputs(effects)
+        known = self._noisy.get(key)
+        if known is None:
+            if len(self._noisy) > _REMEMBERED_NOISE:
+                self._noisy = {}
+            base, acting = self.thrust(effects)[0], compiled(effects)
+            of = draws(SMALL * self.reading_std, len(self.streams.demand))
+            demands = (self.steps.demand + noise[self._held] for noise in of)
+            moved = [thrust(self.steps._replace(demand=d), acting)[0] for d in demands]
+            known = self._noisy[key] = np.stack([(m - base) / SMALL for m in moved], axis=2)
         return known
 
     def motion(self, h: Hypothesis, starts: Array) -> Motion | None:
@@ -196,13 +214,14 @@ class WindowedProblem:
     ) -> Array:
         """Wrench effects and current (K, 6) along a motion; remembered for the last one."""
         acting = compiled(effects)
-        key = (acting.wrench_parameters.tobytes(), acting.water.tobytes())
+        acted = self.thrust(effects)[0]
+        key = tuple(part.tobytes() for part in acting)
         mine = self._remembered
         if getattr(mine, "along", None) is not motion.middle:
             mine.along, mine.wrenches = motion.middle, {}
         known: dict[object, Array] = mine.wrenches
         if key not in known:
-            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, motion)
+            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, acted, motion)
         return known[key]
 
     def _difference(
@@ -253,6 +272,12 @@ class WindowedProblem:
         """The measured velocity (W, 6) at the beginning of each window."""
         at = np.flatnonzero(np.diff(self.window, prepend=-1))
         return self.measured[at].copy()
+
+
+def _inputs(effects: Mapping[str, Mapping[str, float]]) -> tuple[object, ...]:
+    """What the thrust depends on."""
+    inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
+    return tuple(sorted(inputs.items()))
 
 
 def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:

@@ -51,13 +51,13 @@ def _acts(effects: list[Effect]) -> Any:
 def _wrenches(effects: list[Effect]) -> Any:
     """The same of all wrench effects."""
     if not effects:
-        return inlined(lambda i, there, parameters, t, nu, rotation, out: None)
+        return inlined(lambda i, there, parameters, t, nu, rotation, thrust, out: None)
     first, others = cast(Any, effects[0].wrench), _wrenches(effects[1:])
 
-    def calls(i, there, parameters, t, nu, rotation, out):  # type: ignore[no-untyped-def]
+    def calls(i, there, parameters, t, nu, rotation, thrust, out):  # type: ignore[no-untyped-def]
         if there[i]:
-            first(parameters[i], t, nu, rotation, out)
-        others(i + 1, there, parameters, t, nu, rotation, out)
+            first(parameters[i], t, nu, rotation, thrust, out)
+        others(i + 1, there, parameters, t, nu, rotation, thrust, out)
 
     return inlined(calls)
 
@@ -124,9 +124,28 @@ def correct(reading: Reading, effects: Values) -> Reading:
     return reading
 
 
-def latency(effects: Values) -> float:
-    """How late [s] the linear velocities are against their stamps."""
-    return effects.get("velocity_latency", {}).get("delay", 0.0)
+def velocity_delay(effects: Values) -> float:
+    """By how many seconds the linear velocities of the odometry are older than its stamp."""
+    return sum(late(**v) for n, v in effects.items() if (late := EFFECTS[n].late) is not None)
+
+
+def heading_error(effects: Values) -> float:
+    """What the heading of the odometry's attitude reads too much [rad]."""
+    turns = ((EFFECTS[name].heading, values) for name, values in effects.items())
+    return sum(heading(**values) for heading, values in turns if heading is not None)
+
+
+def reading_noise(effects: Values) -> Array:
+    """Standard deviations (6,) of what is read of the wrench beside the command [N, N m]."""
+    parts = ((EFFECTS[name].noise, values) for name, values in effects.items())
+    squares = [noise(**values) ** 2 for noise, values in parts if noise is not None]
+    std: Array = np.sqrt(np.sum([np.zeros(6), *squares], axis=0))
+    return std
+
+
+def of_the_vehicle(effects: Values) -> Values:
+    """Without those that only change what is read of the wrench."""
+    return {name: values for name, values in effects.items() if EFFECTS[name].noise is None}
 
 
 def affects_sensors(effects: Values) -> bool:
@@ -145,9 +164,12 @@ def estimable(name: str) -> dict[str, float | None]:
     With each of them the value at which it is better left alone unless asked for: the null of a
     parameter of one axis, of which an effect has several; None for others. An onset, a frequency
     and a phase are not among them, nor what shows in no velocity (the sampler finds the biases of
-    an IMU itself).
+    an IMU itself), nor the age of velocities, which are sorted by it before there is a sample, nor
+    the noise of a reading.
     """
     effect = EFFECTS[name]
+    if effect.late or effect.heading or effect.noise:
+        return {}
     if effect.sense is not None and effect.correct is not None:
         given = Reading(*np.arange(1.0, 13.0).reshape(4, 3))
         nulls = {p.name: p.null for p in effect.parameters}
@@ -161,7 +183,7 @@ def estimable(name: str) -> dict[str, float | None]:
     return {
         p.name: p.null if p.axis else None
         for p in effect.parameters
-        if p.role in ("amplitude", "place")
+        if p.role in ("amplitude", "limit", "place")
     }
 
 
@@ -193,21 +215,25 @@ def surroundings(acting: Acting) -> tuple[Acting | None, tuple[float, ...] | Non
 
 
 @inlined
-def add_wrenches(acting, t, nu, rotation, out):
-    """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water."""
-    _ALL_WRENCHES(0, acting.wrenches, acting.wrench_parameters, t, nu, rotation, out)
+def add_wrenches(acting, t, nu, rotation, thrust, out):
+    """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water, while
+    the thrusters give ``thrust`` (6,)."""
+    _ALL_WRENCHES(0, acting.wrenches, acting.wrench_parameters, t, nu, rotation, thrust, out)
 
 
 @inlined
-def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotation, s, out):
-    """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground.
+def add_surroundings(
+    around, current, structure, added_mass, theta, t, nu, rotation, thrust, s, out
+):
+    """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground,
+    while the thrusters give ``thrust`` (6,).
 
     ``around`` and ``current`` are of :func:`surroundings`; ``structure``, ``added_mass`` (6, 6, 1)
     and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world;
     s is a record of :data:`rov_ident.model.equations.CURRENT`, work space.
     """
     if current is None:  # numba leaves out what is not so
-        add_wrenches(around, t, nu, rotation, out)
+        add_wrenches(around, t, nu, rotation, thrust, out)
     else:
         north, east, down = current
         water = (
@@ -216,4 +242,4 @@ def add_surroundings(around, current, structure, added_mass, theta, t, nu, rotat
             rotation[0, 2] * north + rotation[1, 2] * east + rotation[2, 2] * down,
         )
         add_current(structure, added_mass, theta, nu, water, s, out)
-        add_wrenches(around, t, s.relative, rotation, out)
+        add_wrenches(around, t, s.relative, rotation, thrust, out)

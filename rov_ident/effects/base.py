@@ -9,20 +9,29 @@ An effect says what it does by exactly one of these, each in the file of the eff
     ``body(rigid_body, **parameters) -> rigid_body``: another rigid body (centre of gravity,
     buoyancy).
 ``wrench``
-    A kernel ``wrench(p, t, nu, rotation, out)`` that adds to the wrench ``out`` (6,) on the body:
-    ``p`` the parameters in their order (padded to :data:`SIZE`; an array or a tuple, to be read
-    one by one), ``t`` [s] since the first message,
-    ``nu`` (6,) body velocities relative to the water, ``rotation`` (3, 3) body -> world (NED).
+    A kernel ``wrench(p, t, nu, rotation, thrust, out)`` that adds to the wrench ``out`` (6,) on the
+    body: ``p`` the parameters in their order (padded to :data:`SIZE`; an array or a tuple, to be
+    read one by one), ``t`` [s] since the first message, ``nu`` (6,) body velocities relative to the
+    water, ``rotation`` (3, 3) body -> world (NED), ``thrust`` (6,) what the thrusters give after
+    the effects on the input.
 ``water``
     ``water(**parameters) -> (3,)``: the velocity of the water in the world [m/s].
 ``act``
     A kernel ``act(p, state, t, dt, wrench)``: on entry ``wrench`` (6,) is commanded from ``t`` to
     ``t + dt``, on return it holds the mean of what acts meanwhile. ``state`` (:data:`MEMORY`,) is
-    the effect's own, all zeros before the first call. Effects act in the order of ``order``.
+    the effect's own, all zeros before the first call. Effects act in the order of ``order``. With
+    ``noise(**parameters) -> (6,)``, the standard deviation of what is read beside the command,
+    ``act`` takes back what it can of that, and nothing of it acts on a true command.
 ``sense``
     ``sense(reading, **parameters) -> reading`` and its inverse ``correct``: what the sensors give
     for true velocities, and back. A reading is a :class:`Reading` of one instant or of rows. The
     sensors apply them in the order of ``order``, the way back is the opposite one.
+``late``
+    ``late(**parameters) -> float``: by how many seconds the linear velocities of the odometry are
+    older than its stamp, its pose and its angular velocities.
+``heading``
+    ``heading(**parameters) -> float``: what the heading of the odometry's attitude reads too much
+    [rad], about world down; its position is in the world.
 """
 
 from collections.abc import Callable
@@ -37,7 +46,7 @@ Array = NDArray[np.float64]
 SIZE = 8
 """The most parameters that a kernel takes."""
 
-Role = Literal["amplitude", "place", "onset", "frequency", "phase", "fixed"]
+Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed"]
 Axes = tuple[str, str, str]
 
 MEMORY = 1024
@@ -59,8 +68,9 @@ class EffectParameter:
 
     ``typical`` is a size at which the effect matters on a small ROV: the step from which a search
     starts and the width of the prior of an estimator. An ``amplitude`` makes the effect vanish at
-    its null; the other roles (where it attaches, when it begins, its frequency and phase) do
-    nothing while the amplitudes are at their nulls; ``fixed`` is never estimated.
+    its null; so does a ``limit``, which shows only once it is below what the thrusters are asked
+    for. The other roles (where it attaches, when it begins, its frequency and phase) do nothing
+    while the amplitudes are at their nulls; ``fixed`` is never estimated.
     """
 
     name: str
@@ -76,7 +86,7 @@ class EffectParameter:
 
 def per_axis(
     prefix: str, meaning: str, null: float, lower: float, upper: float, typical: float,
-    units: tuple[str, str] = ("1", "1"), moment: float = 1.0,
+    units: tuple[str, str] = ("1", "1"), moment: float = 1.0, role: Role = "amplitude",
 ) -> tuple[EffectParameter, ...]:  # fmt: skip
     """One parameter for each axis (``gain_X`` ... ``gain_N``), ``units`` of forces and moments.
 
@@ -86,7 +96,7 @@ def per_axis(
     sizes += [(axis, units[1], typical * moment) for axis in "KMN"]
     return tuple(
         EffectParameter(
-            f"{prefix}_{axis}", unit, f"{meaning} of {axis}", null, lower, upper, size, axis
+            f"{prefix}_{axis}", unit, f"{meaning} of {axis}", null, lower, upper, size, axis, role
         )
         for axis, unit, size in sizes
     )
@@ -118,7 +128,8 @@ class Effect:
     ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
     effect that does nearly the same and that every vehicle has: this one is looked for only in a
     model that has some of that. ``lasting`` are the effects that one with an onset cannot be told
-    from if it has been there from the start.
+    from if it has been there from the start. ``within`` names the effect of which this one is a
+    special case.
     """
 
     place: Literal["input", "motion", "wrench"]
@@ -130,6 +141,7 @@ class Effect:
     coefficients: tuple[str, ...] = ()
     beyond: str = ""
     lasting: tuple[str, ...] = ()
+    within: str = ""
     body: Callable[..., Any] | None = None
     wrench: Callable[..., None] | None = None
     water: Callable[..., Array] | None = None
@@ -137,3 +149,11 @@ class Effect:
     order: int = 0
     sense: Callable[..., Reading] | None = None
     correct: Callable[..., Reading] | None = None
+    noise: Callable[..., Array] | None = None
+    late: Callable[..., float] | None = None
+    heading: Callable[..., float] | None = None
+
+    @property
+    def of_sensors(self) -> bool:
+        """Whether it changes what is measured, and no motion."""
+        return bool(self.sense or self.late or self.heading or self.noise)

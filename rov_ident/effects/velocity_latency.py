@@ -1,15 +1,22 @@
-"""The linear velocities are older than their stamps say, against attitude, rates and thrust.
+"""Linear velocities are older than their stamp: a filter or a link between sensor and odometry.
 
-No function of one instant: the sampler and the simulated sensors move the velocities in time.
+``linear(stamp) = v(stamp - delay)``, in the body axes of that time. Pose and angular velocities are
+those of the stamp.
 """
 
 from rov_ident.effects.base import Effect, EffectParameter
 
+
+def late(delay: float) -> float:
+    return delay
+
+
 EFFECT = Effect(
     place="motion",
-    summary="The linear velocities come late against the other sensors.",
-    manoeuvre="steps of thrust and quick turns, with an IMU",
-    source="Kinsey, Whitcomb (2007), In situ alignment calibration of attitude and Doppler sensors "
-    "for precision underwater vehicle navigation, IEEE J. Oceanic Eng. 32(2)",
-    parameters=(EffectParameter("delay", "s", "of linear velocities", 0.0, 0.0, 1.0, 0.05),),
+    summary="The linear velocities are late against pose, angular velocities and thrust.",
+    manoeuvre="quick reversals of thrust along each axis, with a position fix or an IMU",
+    source="Kelly, Sukhatme (2014), A general framework for temporal calibration of multiple "
+    "proprioceptive and exteroceptive sensors, Experimental Robotics (Springer)",
+    parameters=(EffectParameter("delay", "s", "age at the stamp", 0.0, 0.0, 1.0, 0.05),),
+    late=late,
 )

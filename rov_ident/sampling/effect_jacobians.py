@@ -66,7 +66,7 @@ class EffectJacobians:
             self._width[i] = high[name][own] - low[name][own]
             if p.axis:
                 self._mask[:, i] = [axis == p.axis for axis in AXES]
-            if name == "velocity_latency":
+            if effect.late is not None:
                 self._latency = i
             elif effect.act is not None or effect.wrench is not None:
                 self._forces.append(i)
@@ -163,7 +163,9 @@ class EffectJacobians:
     def _surround(self, row: np.void) -> None:
         """Add the impulse of the variants' wrench effects along the motion."""
         now = np.zeros_like(self._around)
-        _surround(self._variants, row["t"], row["nu"], rotation(row["orientation"]), now)
+        thrust = row["wrench"] - row["surroundings"]
+        to_world = rotation(row["orientation"])
+        _surround(self._variants, row["t"], row["nu"], to_world, thrust, now)
         before = now if row["restart"] else self._around
         self._time = self._time or 1.0
         self._impulse += 0.5 * self._time * (before + now)
@@ -204,9 +206,9 @@ def _act(variants, state, t, dt, command, impulse):
 
 
 @kernel
-def _surround(variants, t, nu, rotation, out):
+def _surround(variants, t, nu, rotation, thrust, out):
     for v in range(len(variants.inputs)):
-        add_wrenches(_variant(variants, v), t, nu, rotation, out[v])
+        add_wrenches(_variant(variants, v), t, nu, rotation, thrust, out[v])
 
 
 @kernel

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.core.frames import quaternion_from_euler
+from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.messages import Array, Imu, Odometry
 from rov_ident.core.quaternions import rotation, turned
-from rov_ident.effects import affects_sensors, compiled, correct
+from rov_ident.effects import affects_sensors, compiled, correct, heading_error
 from rov_ident.effects.base import Reading
 from rov_ident.sampling.queues import MERGE
 
@@ -127,6 +127,8 @@ class KinematicFilter:
         """Take other values of the effects' parameters."""
         self._effects = config.effects
         self._corrects = affects_sensors(config.effects)
+        yaw = -heading_error(config.effects)
+        self._to_north = quaternion_from_euler(0.0, 0.0, yaw) if yaw else None
         self._settings["water"] = compiled(config.effects).water
 
     def clear(self) -> None:
@@ -195,7 +197,10 @@ class KinematicFilter:
         linear, angular = message.linear, message.angular
         if self._corrects:
             linear, angular, *_ = correct(Reading(linear, angular, _ZERO, _ZERO), self._effects)
-        into["orientation"][0] = message.orientation
+        orientation = message.orientation
+        if self._to_north is not None:
+            orientation = quaternion_multiply(self._to_north, orientation)
+        into["orientation"][0] = orientation
         into["linear"][0] = linear
         into["angular"][0] = angular
         into["variance"][0] = message.twist_variance

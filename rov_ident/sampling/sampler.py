@@ -16,19 +16,19 @@ What a sample holds, and why (docs/samples.md has the measurements):
 """
 
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.core.frames import quaternion_between, to_core
+from rov_ident.core.frames import to_core
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry
-from rov_ident.effects import latency
+from rov_ident.effects import velocity_delay
 from rov_ident.sampling.acting_wrench import ActingWrench
 from rov_ident.sampling.despiking import Despiker, measured_values
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.kinematic_filter import KinematicFilter
+from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.queues import Instant, Queues, Waiting
 from rov_ident.sampling.sample import joined, one_sample, sample_type
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, Validation
@@ -52,12 +52,12 @@ class Sampler:
         self.origin: int | None = None
         self._frames = config.frames
         self._queues = Queues()
+        self._late = LateVelocities(0.0)
         self._despiker = Despiker(config, self.counts)
         self.kinematic_filter = KinematicFilter(config)
         self._acting = ActingWrench(config)
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
-        self._history: deque[tuple[float, Odometry]] = deque()  # as long as velocities are late
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -66,28 +66,28 @@ class Sampler:
         self._jacobians = EffectJacobians(config) if effects else None
         self._size = len(effects)
         self._none = np.zeros(0, dtype=sample_type(self._size))
-        self._take_latency(config)
+        self._take_delay(config)
         self._despiker.configure(config)
         self.kinematic_filter.configure(config)
         self._acting.configure(config, self._jacobians)
 
-    def _take_latency(self, config: Config) -> None:
-        self._latency = latency(config.effects)
-        self._queues.grace = config.grace + self._latency
+    def _take_delay(self, config: Config) -> None:
+        self._late.delay = velocity_delay(config.effects)
+        self._queues.grace = config.grace + self._late.delay
 
     def recentre(self, config: Config) -> None:
         """Go on with other values of the effects' parameters; their memory stays."""
         assert self._jacobians is not None
         self._jacobians = self._jacobians.about(config)
-        self._take_latency(config)
+        self._take_delay(config)
         self.kinematic_filter.take_effects(config)
         self._acting.configure(config, self._jacobians)
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
         self._validation.forget_motion()
-        self._history.clear()
         self._queues.clear()
+        self._late.clear()
         self._despiker.clear()
         self.kinematic_filter.clear()
         self._acting.clear()
@@ -128,33 +128,17 @@ class Sampler:
         if isinstance(message, Odometry):
             message = self._validation.marked(message)
         message = to_core(message, self._frames)
-        if isinstance(message, Odometry) and self._latency > 0.0:
-            t -= self._latency
-            rest = self._earlier(t, message)
-            if rest is None:
+        if isinstance(message, Odometry):
+            timed, waiting = self._late.push(t, message), self._queues.odometry
+            if timed is None:
+                self.counts["odom: velocities of a time without a pose"] += 1
                 return
-            message = rest
-        values = _NO_VALUES if isinstance(message, Odometry) else measured_values(message)
-        self._queues.add(role, Waiting(t, message, values))
-
-    def _earlier(self, t: float, message: Odometry) -> Odometry | None:
-        """The message with attitude and rates of t [s], to which its late velocities belong.
-
-        None if they are not known: as long after the beginning as the velocities are late.
-        """
-        history = self._history
-        history.append((t + self._latency, message))
-        while len(history) > 1 and history[1][0] <= t:
-            history.popleft()
-        (start, before), (end, after) = history[0], history[min(1, len(history) - 1)]
-        waiting = self._queues.odometry
-        if start > t or t < self._previous or (waiting and t <= waiting[-1].t):
-            return None
-        share = (t - start) / (end - start) if end > start else 0.0
-        return message._replace(
-            orientation=quaternion_between(before.orientation, after.orientation, share),
-            angular=before.angular + share * (after.angular - before.angular),
-        )
+            # a delay that is found to be longer turns back the clock of the velocities for a moment
+            last = max(self._previous, waiting[-1].t) if waiting else self._previous
+            if not (self._late.delay and timed[0] <= last):
+                self._queues.add(role, Waiting(*timed, _NO_VALUES))
+        else:
+            self._queues.add(role, Waiting(t, message, measured_values(message)))
 
     def _emit(self, final: bool) -> NDArray[np.void]:
         """The samples (k,) that wait for nothing more; ``final``: nothing more will come."""

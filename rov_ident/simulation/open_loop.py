@@ -141,7 +141,8 @@ _SCRATCH = record(
         ("stage", "f8", (13,)),
         ("slope", "f8", (13,)),
         ("end", "f8", (13,)),  # of a step
-        ("push", "f8", (6,)),  # wrench of thrusters and effects
+        ("thrust", "f8", (6,)),  # wrench of the thrusters
+        ("push", "f8", (6,)),  # and of effects
         ("pace", "f8", (6,)),  # of the components that are not free, whatever it takes
         ("nu", "f8", (6, 1)),
         ("h", "f8", (6, 1)),
@@ -231,11 +232,11 @@ def _simulate(
                         s.push[j] += (now - 0.5 * span) * wrench_slope[i, j]
                 if around is not None:  # numba leaves this out where it is None
                     for j in range(6):
-                        s.velocity[j] = stage[7 + j]
+                        s.velocity[j], s.thrust[j] = stage[7 + j], s.push[j]
                     rotate(stage[3:7], s.rotation)
                     add_surroundings(
                         around, current, structure, added_mass, theta, t[i] + now, s.velocity,
-                        s.rotation, s.current, s.push,
+                        s.rotation, s.thrust, s.current, s.push,
                     )  # fmt: skip
                 _derivative(structure, theta, restoring, guided, s, slope)
                 if n == 0 and k == 0:

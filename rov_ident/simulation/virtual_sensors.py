@@ -15,7 +15,15 @@ from rov_ident.core.frames import (
     velocity_of_arm,
 )
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
-from rov_ident.effects import acted, compiled, sense
+from rov_ident.effects import (
+    acted,
+    compiled,
+    heading_error,
+    of_the_vehicle,
+    reading_noise,
+    sense,
+    velocity_delay,
+)
 from rov_ident.effects.base import Reading
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.open_loop import Trajectory, simulate
@@ -92,9 +100,12 @@ def measure(
     imu_t = _clock(suite.imu_rate, duration, rng)
     t = np.unique(np.concatenate([demand_t, odometry_t, imu_t, np.arange(0.0, duration, 0.005)]))
     held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
-    effects = compiled(config.effects)
+    effects = compiled(of_the_vehicle(config.effects))
     truth = simulate(config.dynamics, t, acted(effects, t, held), effects=effects)
     sensed = sense(_reading(truth, config), config.effects)
+    late = t - velocity_delay(config.effects)
+    delayed = np.stack([np.interp(late, t, column) for column in sensed.linear.T], axis=1)
+    offset = quaternion_from_euler(0.0, 0.0, heading_error(config.effects))
 
     messages: list[tuple[int, str, Message]] = []
     variance = np.repeat([suite.linear_std**2, suite.angular_std**2], 3)
@@ -102,8 +113,10 @@ def measure(
         noise = rng.standard_normal(12)
         tilt = quaternion_from_rotation_vector(suite.attitude_std * noise[:3])
         position = _coarse(truth.position[i] + suite.position_std * noise[3:6])
-        attitude = _coarse(quaternion_multiply(truth.orientation[i], tilt))
-        linear = _coarse(sensed.linear[i] + suite.linear_std * noise[6:9])
+        attitude = _coarse(
+            quaternion_multiply(quaternion_multiply(offset, truth.orientation[i]), tilt)
+        )
+        linear = _coarse(delayed[i] + suite.linear_std * noise[6:9])
         angular = _coarse(sensed.angular[i] + suite.angular_std * noise[9:])
         odometry = Odometry(0, *_FRAMES, position, attitude, linear, angular, variance)
         messages.append(_stamped(t[i], ODOMETRY, odometry))
@@ -118,7 +131,9 @@ def measure(
         force = _coarse(force + suite.accelerometer_std * noise[3:])
         imu = Imu(0, "imu_link_frd", _LEVEL, gyro, force, gyro_variance, variance)
         messages.append(_stamped(t[i], IMU, imu))
-    for at, wrench in zip(demand_t, demand, strict=True):
+    # of a generator of its own: without it everything else is as it would be anyway
+    read = demand + reading_noise(config.effects) * rng.spawn(1)[0].standard_normal(demand.shape)
+    for at, wrench in zip(demand_t, read, strict=True):
         noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
         messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
 

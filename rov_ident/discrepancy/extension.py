@@ -1,0 +1,77 @@
+"""The configuration that is written is never worse than the one given.
+
+On held-out data each velocity must be predicted better than by the configuration as given; else the
+coefficients of its axis stay as they were. As the axes are coupled, all choices of axes are tried.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from rov_ident.discrepancy.held_out import Judge, surely_less
+from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
+from rov_ident.model.coefficients import AXES, parse
+from rov_ident.model.equations import Array
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The axes of XYZKMN whose coefficients stay as they were, and the model with those; None where
+    no choice of axes will do: then nothing of what was found may be written."""
+
+    axes: tuple[str, ...]
+    model: Hypothesis | None
+
+    @property
+    def note(self) -> str:
+        """What stays as it was, in words; empty where nothing does."""
+        if self.model is None:
+            return (
+                "the extended configuration is the one given: on held-out data no part of what was "
+                "found predicts every velocity as well"
+            )
+        if not self.axes:
+            return ""
+        return (
+            f"the extended configuration keeps the coefficients of {', '.join(self.axes)} as they "
+            "were: on held-out data those found do not predict every velocity as well"
+        )
+
+
+def kept(judge: Judge, given: Array, h: Hypothesis) -> Kept:
+    """What of a hypothesis may be written; ``given`` (C, 6) are the squared errors of the
+    configuration as given on held-out data, summed over chunks of time.
+
+    Of the choices that are nowhere worse (on axes whose coefficients stay: beyond chance) that
+    which predicts best. Without any coefficient or effect it is the configuration given.
+    """
+    rows = [a for a in AXES if any(row_of(h, k) == a for k in h.keys)]
+    best: tuple[float, Kept] | None = None
+    for count in range(len(rows) + 1):
+        for axes in combinations(rows, count):
+            there = without_rows(h, axes)
+            after = judge.summed(there)
+            growth = np.log(np.maximum(after.sum(axis=0), 1e-300) / given.sum(axis=0))
+            own = np.array([a in rows and a not in axes for a in AXES])
+            worse = own & (growth > 0.0)
+            for i in np.flatnonzero(~own & judge.free):
+                worse[i] = surely_less(given[:, [i]], after[:, [i]])
+            total = float(growth[judge.free].sum())
+            if not worse[judge.free].any() and (best is None or total < best[0]):
+                best = total, Kept(axes, there)
+        if best is not None and count == 0:
+            break  # nothing has to stay
+    return Kept((), None) if best is None else best[1]
+
+
+def row_of(h: Hypothesis, key: tuple[str, str]) -> str:
+    """The axis of a fitted coefficient that the configuration has; of all else nothing."""
+    is_own = key[0] == COEFFICIENTS and key[1] in h.config.model.names
+    return AXES[parse(key[1]).row] if is_own else ""
+
+
+def without_rows(h: Hypothesis, axes: Collection[str]) -> Hypothesis:
+    """With the coefficients of some axes as configured."""
+    return h.without([k for k in h.keys if row_of(h, k) in axes]) if axes else h

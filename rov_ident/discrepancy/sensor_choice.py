@@ -1,0 +1,214 @@
+"""Which effects on the sensors are believed: how the sensors agree proposes, the dynamics decide.
+
+A correction of the velocities that makes the sensors agree, but the motion disagree with the
+thrust, is none: the pose may be what is wrong. So a correction is dropped where held-out data, as
+they were recorded, are surely predicted better without it; and whether the heading of the pose is
+off or the velocity sensor is turned, which a level vehicle cannot tell from its odometry, is
+decided by the thrust.
+
+The noise of the wrench's reading shows where commands rest. It is believed if the dynamics fit
+better without it.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.discrepancy import sensor_consistency
+from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
+from rov_ident.discrepancy.hypothesis import Hypothesis, Key
+from rov_ident.discrepancy.output_error import Fitted, fit
+from rov_ident.discrepancy.reading_noise import RESTING
+from rov_ident.discrepancy.search import Search
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.effects import EFFECTS
+from rov_ident.model.coefficients import AXES
+from rov_ident.model.equations import Array
+from rov_ident.sampling.raw_streams import Streams
+
+HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
+_YAW = (MOUNTING, "yaw")
+
+
+Sensors = dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The sensor effects that are believed, the standard deviations of their parameters, those that
+    the data cannot tell from the choice, by effect, and what was not believed, in words; ``fixed``
+    are parameters that were held at their null."""
+
+    sensors: Sensors
+    std: Mapping[Key, float]
+    alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    fixed: frozenset[Key] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What is fitted, and what is judged on, as recorded."""
+
+    streams: Streams
+    spans: Spans
+    judged: Streams
+    held: Spans
+    config: Config
+
+    def fitted(self, names: Sequence[str], fixed: frozenset[Key]) -> Choice:
+        found, std = sensor_consistency.search(self.streams, self.config, self.spans, names, fixed)
+        return Choice(found, std, fixed=fixed)
+
+    def dynamics(self, sensors: Sensors) -> Array | None:
+        """Squared errors (C, free axes) of held-out data as recorded, summed over chunks, of the
+        model fitted to corrected data; None where it cannot be simulated."""
+        streams, judged = (
+            sensor_consistency.corrected(s, sensors) for s in (self.streams, self.judged)
+        )
+        fitted = Search(streams, self.config, thinned(self.spans)).start()
+        if fitted is None:
+            return None
+        judge = Judge(WindowedProblem(judged, self.held), sensors)
+        return judge.summed(fitted.hypothesis)[:, ~streams.guided]
+
+    def agreement(self, of: Sequence[Sensors]) -> list[Array]:
+        """Squared innovations (C, comparisons) of corrections, in the units of the first."""
+        all_found = [sensor_consistency.comparisons(self.judged, self.config, s) for s in of]
+        return sensor_consistency.common_squares(all_found, self.held)
+
+
+def chosen(streams: Streams, spans: Spans, judged: Streams, held: Spans, config: Config) -> Choice:
+    """The effects that the streams support in the ``spans``, by what they do in the spans ``held``
+    of the streams ``judged``."""
+    data = _Data(streams, spans, judged, held, config)
+    found, std = sensor_consistency.search(streams, config, spans)
+    choice = Choice(found, std)
+    if {HEADING, MOUNTING} & found.keys():
+        choice = _heading_or_mounting(data, choice)
+    return _without_refuted(data, choice)
+
+
+def _heading_or_mounting(data: _Data, found: Choice) -> Choice:
+    """The heading of the pose, the mounting of the velocity sensor, or its tilt and the heading:
+    those that the sensors refute are dropped, then those that the dynamics refute, and of the rest
+    that is taken which changes the velocities least."""
+    others = [n for n in found.sensors if n not in (HEADING, MOUNTING)]
+    none: frozenset[Key] = frozenset()
+    variants = [
+        data.fitted([*others, HEADING], none),
+        data.fitted([*others, MOUNTING], none),
+        data.fitted([*others, HEADING, MOUNTING], frozenset({_YAW})),
+    ]
+    sums = data.agreement([v.sensors for v in variants])
+    order = sorted(range(len(variants)), key=lambda i: float(np.log(sums[i].sum(axis=0)).sum()))
+    best = order[0]
+    left = [i for i in order if not surely_less(sums[best], sums[i])]
+    if len(left) > 1:
+        squares = {i: s for i in left if (s := data.dynamics(variants[i].sensors)) is not None}
+        if squares:
+            least = min(squares, key=lambda i: float(np.log(squares[i].sum(axis=0)).sum()))
+            left = [i for i in left if i in squares and not surely_less(squares[least], squares[i])]
+    mine = min(left, key=(0, 2, 1).index)
+    rivals = {
+        name: tuple(
+            dict.fromkeys(
+                n for i in left for n in variants[i].sensors if n not in variants[mine].sensors
+            )
+        )
+        for name in variants[mine].sensors
+        if name in (HEADING, MOUNTING)
+    }
+    return dataclasses.replace(variants[mine], alternatives=rivals)
+
+
+def _without_refuted(data: _Data, choice: Choice) -> Choice:
+    """Without the corrections of velocities that make the prediction of the data surely worse."""
+    corrects = [n for n in choice.sensors if EFFECTS[n].sense or EFFECTS[n].late]
+    corrects = [n for n in corrects if _moves_velocity(n, choice.sensors[n])]
+    squares = data.dynamics(choice.sensors) if corrects else None
+    for name in corrects:
+        rest = data.fitted([n for n in choice.sensors if n != name], choice.fixed)
+        without = data.dynamics(rest.sensors)
+        if squares is None or (without is not None and surely_less(without, squares)):
+            words = (
+                f"{name}: the sensors would agree better with it, but the motion would not follow "
+            )
+            notes = (*choice.notes, words + "the thrust: it is not applied")
+            choice = dataclasses.replace(rest, alternatives=choice.alternatives, notes=notes)
+            squares = without
+    return choice
+
+
+def _moves_velocity(name: str, values: Mapping[str, float]) -> bool:
+    """Whether an effect changes the velocities of the odometry, and not only the IMU's readings."""
+    effect = EFFECTS[name]
+    if effect.sense is None:
+        return True
+    reading = sensor_consistency.a_reading()
+    return not np.array_equal(effect.sense(reading, **values).linear, reading.linear)
+
+
+# ------------------------------------------------------------------ the wrench
+
+
+def noise_of_wrench(search: Search, start: Fitted) -> dict[str, float]:
+    """The parameters of the noise of the reading, on the axes where the fit ``start`` is likelier
+    without it; empty where it is on none. It has no parameter that is fitted, so no more is asked.
+    """
+    config, problem = search.config, search.problem
+    if NOISE in config.effects or not problem.reading_std.any():
+        return {}
+    names = {p.axis: p.name for p in EFFECTS[NOISE].parameters}
+    values = {names[a]: float(s) for a, s in zip(AXES, problem.reading_std, strict=True)}
+    there = fit(problem, with_noise(start.hypothesis, values))
+    # What is read on an axis may act after all: tried with what the noise is taken off there.
+    acting = {} if there is None else _better_as_read(there)
+    if there is not None and acting:
+        values = {name: 0.0 if name in acting else value for name, value in values.items()}
+        there = fit(problem, with_noise(start.hypothesis, values)) if any(values.values()) else None
+    if there is None:
+        return {}
+    free = ~problem.guided
+    likelier = np.log(there.noise[free]).sum() < np.log(start.noise[free]).sum()
+    return values if likelier else {}
+
+
+def _better_as_read(fitted: Fitted) -> set[str]:
+    """The parameters of the noise without which a fit that has them all would be better."""
+    problem, linearisation, h = (
+        fitted.linearisation.problem,
+        fitted.linearisation,
+        fitted.hypothesis,
+    )
+    change = problem.thrust(with_noise(h, {}).effects)[0] - problem.thrust(h.effects)[0]
+    use = [i for i in np.flatnonzero(~problem.guided) if change[:, i].any()]
+    if not use:
+        return set()
+    columns = np.zeros((*change.shape, len(use)))
+    for k, i in enumerate(use):
+        columns[:, i, k] = change[:, i]
+    keys = [(NOISE, AXES[i]) for i in use]
+    linear = linearisation.having(keys, linearisation.sensitivity_to(columns))
+    slope, normal = linear.gradient.sum(axis=0), np.diag(linear.normal)
+    at = linear.index(keys)
+    better = 2.0 * slope[at] > normal[at]
+    names = {p.axis: p.name for p in EFFECTS[NOISE].parameters}
+    return {names[AXES[i]] for i, yes in zip(use, better, strict=True) if yes}
+
+
+def with_noise(h: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
+    """The hypothesis with noise of the reading in its configuration; without, where empty."""
+    effects = {n: v for n, v in h.config.effects.items() if n != NOISE}
+    if values:
+        effects = {**effects, NOISE: dict(values)}
+    return dataclasses.replace(h, config=dataclasses.replace(h.config, effects=effects))
+
+
+def noise_std(streams: Streams, values: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations of the parameters: of as many second differences as they are from."""
+    count = RESTING * len(streams.demand)
+    return {name: value / max(count, 1.0) ** 0.5 for name, value in values.items()}

@@ -1,0 +1,211 @@
+"""What explain names, and what it does not: thrust, late velocities, headings, noisy readings."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bench.simulators.hidden import LINEAR_STD, Conditions, draw
+from bench.studies.explain import streams_of
+from rov_ident.config import from_parameters, to_parameters
+from rov_ident.discrepancy import extension
+from rov_ident.discrepancy.explain import explain
+from rov_ident.discrepancy.held_out import Judge, split
+from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
+from rov_ident.discrepancy.reading_noise import resting_noise
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.sampling.raw_streams import gather
+from rov_ident.simulation.virtual_sensors import Suite, dive
+
+MINUTE = Conditions(duration=60.0)
+NOISY = Conditions(duration=120.0, excitation="pilot", reading=(0.5, 0.06))
+
+
+def hidden(name, rng):
+    """Values of an effect, and of coefficients, at random."""
+    u = rng.uniform
+    return {
+        "thrust_scale": ({"scale": 1.0 - u(0.1, 0.3)}, {}),
+        "thrust_advance": ({"k": u(0.2, 0.5)}, {}),
+        "thruster_saturation": ({"limit_X": u(18.0, 28.0), "limit_Z": u(35.0, 50.0)}, {}),
+        "velocity_latency": ({"delay": u(0.06, 0.2)}, {}),
+        "heading_offset": ({"yaw": u(0.1, 0.6)}, {}),
+        "coriolis": ({}, {"X_vr": u(15.0, 25.0), "Y_ur": -u(10.0, 20.0), "X_wq": -u(10.0, 20.0)}),
+        "crossflow": ({}, {"Y_v_abs_r": -u(50.0, 90.0), "N_v_abs_r": -u(10.0, 15.0)}),
+    }[name]
+
+
+def world_and_belief(heavy, name, values, coefficients, rng):
+    """A configuration with what is hidden, and one that knows nothing of it, off by up to 8 %."""
+    given = to_parameters(heavy)
+    theta = given["coefficients"]
+    believed = {n: v * (1.0 + rng.uniform(-0.08, 0.08)) for n, v in theta.items()}
+    effects = {name: values} if values else {}
+    world = {**given, "coefficients": {**theta, **coefficients}, "effects": effects}
+    return from_parameters(world), from_parameters({**given, "coefficients": believed})
+
+
+def findings_of(world, config, suite=None, seed=0, name="steps"):
+    run = dive(world, name, 60.0, suite or Suite(), seed)
+    return explain([gather(((r, m) for _, r, m in run.messages), config)], config).findings
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "thrust_scale",
+        "thrust_advance",
+        "thruster_saturation",
+        "velocity_latency",
+        "heading_offset",
+        "coriolis",
+        "crossflow",
+    ],
+)
+def test_each_cause_is_named_alone_and_with_its_size(heavy, name, seed):
+    rng = np.random.default_rng([seed, 3])
+    values, coefficients = hidden(name, rng)
+    world, config = world_and_belief(heavy, name, values, coefficients, rng)
+    findings = findings_of(world, config, seed=seed)
+    (found,) = findings.effects
+    assert found.effect == name and findings.verdict == "explained"
+    for parameter, true in (values | coefficients).items():
+        value = found.parameters[parameter]
+        assert abs(value.value - true) < max(4.0 * value.std, 0.04 * abs(true)), parameter
+
+
+# ------------------------------------------------------------------ by the other hand
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_weaker_thrust_is_one_factor(seed):
+    """15 % less on every axis than read: no payload, no six gains."""
+    case = draw(seed, conditions=MINUTE)
+    streams = streams_of(case)
+    read = dataclasses.replace(streams, demand=streams.demand / 0.85)
+    (found,) = explain([read], case.config).findings.effects
+    assert found.effect == "thrust_scale"
+    value = found.parameters["scale"]
+    assert abs(value.value - 0.85) < max(4.0 * value.std, 0.01)
+    assert "thruster_gain" not in [a.effect for a in found.alternatives if "as well" in a.why_not]
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_late_velocities_are_said_to_be_late(seed):
+    case = draw(seed, conditions=MINUTE)
+    streams, t = streams_of(case), case.truth.t
+    first = 1e-9 * (min(m.stamp for _, _, m in case.messages)) - 1.0  # of t = 0 in the truth
+    nu = streams.nu.copy()
+    late = streams.t + first - 0.12
+    nu[:, :3] = np.stack([np.interp(late, t, v) for v in case.truth.nu[:, :3].T], axis=1)
+    nu[:, :3] += LINEAR_STD * np.random.default_rng(seed).standard_normal(nu[:, :3].shape)
+    findings = explain([dataclasses.replace(streams, nu=nu)], case.config).findings
+    (found,) = findings.effects
+    assert found.effect == "velocity_latency"
+    assert found.parameters["delay"].value == pytest.approx(0.12, abs=0.006)
+
+
+# ------------------------------------------------------------------ sensors
+
+
+NO_IMU = dataclasses.replace(Suite(), imu_rate=0.0)
+
+
+@pytest.mark.parametrize("yaw", [0.3, -0.6])
+def test_a_heading_set_to_zero_is_no_mounting(heavy, yaw):
+    """Without an IMU only the thrust can tell, on a vehicle that is level."""
+    rng = np.random.default_rng(7)
+    world, config = world_and_belief(heavy, "heading_offset", {"yaw": yaw}, {}, rng)
+    findings = findings_of(world, config, NO_IMU, 3)
+    assert [f.effect for f in findings.effects] == ["heading_offset"]
+    assert findings.effects[0].parameters["yaw"].value == pytest.approx(yaw, abs=0.02)
+
+
+@pytest.mark.parametrize("yaw", [0.3, -0.15])
+def test_a_mounting_is_no_heading(heavy, yaw):
+    rng = np.random.default_rng(8)
+    mounting = {"roll": 0.03, "pitch": -0.04, "yaw": yaw}
+    world, config = world_and_belief(heavy, "sensor_misalignment", mounting, {}, rng)
+    findings = findings_of(world, config, NO_IMU, 3)
+    assert [f.effect for f in findings.effects] == ["sensor_misalignment"]
+    assert findings.effects[0].parameters["yaw"].value == pytest.approx(yaw, abs=0.02)
+
+
+def test_a_correction_that_the_thrust_refutes_is_not_applied(heavy):
+    """Positions too large by a tenth: the sensors would agree with a scale of the velocities."""
+    run = dive(heavy, "steps", 60.0, NO_IMU, 4)
+    messages = [
+        (r, m._replace(position=1.1 * m.position) if r == "odom" else m) for _, r, m in run.messages
+    ]
+    given = to_parameters(heavy)
+    known = from_parameters({**given, "estimate": ["X_uu"]})  # the rest of the model is known
+    findings = explain([gather(messages, known)], known).findings
+    assert findings.effects == ()
+    assert any("velocity_scale" in note and "not applied" in note for note in findings.notes)
+
+
+# ------------------------------------------------------------------ noise of the reading
+
+
+@pytest.mark.parametrize("seed", [4, 8, 9, 11])
+def test_noise_of_the_reading_is_not_taken_for_a_fault(seed):
+    """Bags of which a dead band, a gain or a centre of gravity was named before."""
+    case = draw(seed, conditions=NOISY)
+    findings = explain([streams_of(case)], case.config).findings
+    assert [f.effect for f in findings.effects if f.effect != "wrench_noise"] == []
+
+
+def test_noise_of_the_reading_is_named_with_its_size():
+    case = draw(2, conditions=NOISY)
+    explanation = explain([streams_of(case)], case.config)
+    (found,) = [f for f in explanation.findings.effects if f.effect == "wrench_noise"]
+    for name, value in found.parameters.items():
+        assert value.value == pytest.approx(0.06 if name[-1] in "KMN" else 0.5, rel=0.2)
+    assert "wrench_noise" in explanation.extended.effects
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_dead_band_is_found_beside_noise_of_the_reading(seed):
+    conditions = dataclasses.replace(NOISY, excitation="steps")
+    case = draw(seed, ("thruster_deadband",), 1.0, conditions=conditions)
+    findings = explain([streams_of(case)], case.config).findings
+    assert findings.effects[0].effect == "thruster_deadband"
+    for name, width in case.effects["thruster_deadband"].items():
+        assert findings.effects[0].parameters[name].value == pytest.approx(width, rel=0.2)
+
+
+def test_noise_is_measured_where_commands_rest():
+    rng = np.random.default_rng(0)
+    t = np.arange(0.0, 120.0, 0.02)
+    steps = np.where((t / 3.0).astype(int)[:, None] % 2 == 0, 0.0, np.full((len(t), 6), 20.0))
+    assert not resting_noise(steps).any()
+    std = np.array([0.5, 1.0, 0.2, 0.05, 0.1, 0.02])
+    noise = std * rng.standard_normal(steps.shape)
+    np.testing.assert_allclose(resting_noise(steps + noise), std, rtol=0.2)
+    assert not resting_noise(steps[:20]).any()
+
+
+# ------------------------------------------------------------------ what is written
+
+
+def test_an_axis_on_which_what_was_found_loses_stays_as_it_was(heavy):
+    """Surge found rightly, sway wrongly: sway keeps the coefficients of the file."""
+    run = dive(heavy, "steps", 60.0, Suite(), 6)
+    theta = dict(zip(heavy.model.names, heavy.model.theta.tolist()))
+    off = theta | {"X_uu": 0.6 * theta["X_uu"], "Y_vv": 0.9 * theta["Y_vv"]}
+    config = from_parameters({**to_parameters(heavy), "coefficients": off})
+    streams = gather(((r, m) for _, r, m in run.messages), config)
+    judge = Judge(WindowedProblem(streams, split(streams.duration)[1]))
+    right, wrong = (COEFFICIENTS, "X_uu"), (COEFFICIENTS, "Y_vv")
+    given = Hypothesis(config, {})
+    before = judge.summed(given)
+    found = Hypothesis(config, {right: theta["X_uu"], wrong: 0.5 * theta["Y_vv"]})
+    kept = extension.kept(judge, before, found)
+    assert kept.axes == ("Y",) and kept.model.values == {right: theta["X_uu"]}
+    assert "Y" in kept.note
+    assert extension.kept(judge, before, found.having({wrong: theta["Y_vv"]})).axes == ()
+    both = found.having({right: 0.3 * theta["X_uu"]})
+    assert extension.kept(judge, before, both).model.values == {}
+    lagging = {("thruster_lag", "time_constant"): 0.5}
+    assert extension.kept(judge, before, both.having(lagging)).model is None
