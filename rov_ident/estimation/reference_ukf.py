@@ -122,7 +122,8 @@ class ReferenceUkf:
         if after.scalars["since"][0] > 0.0:
             return
         walk = self.task.walk
-        if (after.monitor["nis"] > self.task.settings["changed"][0]).any():
+        usual = np.maximum(after.monitor["usual"], 1.0)
+        if (after.monitor["nis"] > self.task.settings["changed"][0] * usual).any():
             walk = np.maximum(walk, 1.0 / RELEARNING_TIME)
         n = len(walk)
         room = np.maximum(1.0 - np.diag(self.filter.P)[6:], 0.0)

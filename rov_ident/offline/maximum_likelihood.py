@@ -320,9 +320,9 @@ def maximise(
     nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
     theta, count, converged = np.append(model.theta[estimated[own]], effects), 0, False
     settled, at, enough = theta, nothing, 1e-6 * len(theta)
-    for stage, gate in enumerate((np.inf, _GATE, _GATE)):
+    for stage, gate in enumerate((np.inf, _GATE, _GATE, _GATE)):
         far = theta - settled
-        if stage == 2 and far @ at.information @ far < 0.1 * len(theta):
+        if stage >= 2 and far @ at.information @ far < 0.1 * len(theta):
             break  # the noise levels would be the same
         # Before the first step, too: with less noise than there is, the likelihood of a model that
         # is not right yet has valleys far from it.
