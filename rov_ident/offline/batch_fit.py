@@ -68,6 +68,7 @@ class _Stage(NamedTuple):
     covariance: Array
     states: dict[str, State]
     more: dict[str, Any]
+    noise: maximum_likelihood.Noise | None = None
 
 
 def fit_batch(
@@ -145,15 +146,15 @@ def _relinearised(
     Samples are linear in these about the values with which they were made: the bags are read anew
     until the estimate stays where they were.
     """
-    first, start = len(config.estimate), None
+    first = len(config.estimate)
+    found: _Stage | None = None
     centre = first_centre(config)
     while True:
         told: list[str] = []
         acting = {n: v for n, v in centre.items() if EFFECTS[n.partition(".")[0]].body is None}
         samples = archive.reread(config.with_values(acting), True)
-        found = _stage(samples, config, kind, MOTIONS, settings, told, say, start)
+        found = _stage(samples, config, kind, MOTIONS, settings, told, say, found)
         assert found is not None
-        start = found.values
         before = np.array(list(centre.values()))
         settings = replace(settings, readings=settings.readings - 1)
         std = np.sqrt(np.diag(found.covariance))[first:]
@@ -172,11 +173,11 @@ def _stage(
     settings: Settings,
     notes: list[str],
     say: Say,
-    start: Array | None = None,
+    before: _Stage | None = None,
 ) -> _Stage | None:
     """Fit some channels; None, and a note, where there is nothing to do.
 
-    ``start`` (n,) are the values to begin with, of maximum likelihood.
+    Maximum likelihood begins with what was found ``before``, where there is that.
     """
     free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
@@ -227,11 +228,13 @@ def _stage(
             "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
         }
     }
-    found, covariance = solution.values, solution.covariance
+    found, covariance, noise = solution.values, solution.covariance, None
     if kind == "ml":
-        if start is None:
+        if before is not None:
+            start, noise = before.values, before.noise
+        else:
             least = Estimate(names, found, covariance, 0.0)
-            start = _start(archive, config, coefficients, least, free)
+            start, noise = _start(archive, config, coefficients, least, free), None
         likelihood = maximum_likelihood.maximise(
             archive.each,
             config,
@@ -241,9 +244,10 @@ def _stage(
             settings.process,
             progress,
             start[len(names) :],
+            noise,
         )
         names = prior.names
-        found, covariance = likelihood.values, likelihood.covariance
+        found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
@@ -276,7 +280,7 @@ def _stage(
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
-    return _Stage(names, values, covariance, states, more)
+    return _Stage(names, values, covariance, states, more, noise)
 
 
 def _start(

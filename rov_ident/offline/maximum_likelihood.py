@@ -275,9 +275,11 @@ def maximise(
     process: bool = True,
     progress: Callable[[str], None] | None = None,
     effects: Array | None = None,
+    first_noise: Noise | None = None,
 ) -> Likelihood:
     """The coefficients of largest likelihood, from ``model``'s values on, and those of the
-    parameters of ``effects`` (p,); None: as configured.
+    parameters of ``effects`` (p,); None: as configured. ``first_noise``: the
+    levels to begin with; None: those of several that explain the data best.
 
     ``precision`` (n,) is that of the prior about the configured values, of coefficients and then of
     the parameters of effects in the samples' columns; ``process``: whether the wrench has errors,
@@ -291,14 +293,16 @@ def maximise(
     own = estimated < len(model.theta)
     effects = mean[~own] if effects is None else effects
     precision = np.zeros(len(mean)) if precision is None else precision
-    noise = assumed(config)
+    likely = assumed(config)
     if process:
-        # From above: where there is next to no process noise, its level hardly shows, and a search
-        # would stay there.
-        doubtful = (_DOUBTFUL * authority(config.dynamics)) ** 2
-        noise = replace(noise, floor=np.maximum(noise.floor, doubtful))
+        # Also from above: where there is next to no process noise, its level hardly shows, and a
+        # search would stay there; from far above it ends before it is there.
+        doubtful = np.maximum(likely.floor, (_DOUBTFUL * authority(config.dynamics)) ** 2)
+        starts = [likely, replace(likely, floor=doubtful)]
     else:
-        noise = replace(noise, floor=np.zeros(6), relative=0.0)
+        starts = [replace(likely, floor=np.zeros(6), relative=0.0)]
+    if first_noise is not None:
+        starts = [first_noise]
     say = progress or (lambda what: None)
 
     def at_values(theta: Array) -> Model:
@@ -306,7 +310,7 @@ def maximise(
         moved[estimated[own]] = theta[own]
         return model.with_theta(moved)
 
-    def look(theta: Array, gate: float) -> tuple[Pass, float]:
+    def look(theta: Array, gate: float, noise: Noise) -> tuple[Pass, float]:
         there = at_values(theta)
         if np.linalg.eigvalsh(there.mass_matrix)[0] <= 0.0:
             return nothing, np.inf
@@ -328,8 +332,14 @@ def maximise(
         # is not right yet has valleys far from it.
         settled = theta
         say("noise levels")
-        noise = _noise_levels(each, at_values(theta), noise, free, process, theta[~own])
-        at, cost = look(theta, gate)
+        levels = [
+            _noise_levels(each, at_values(theta), start, free, process, theta[~own])
+            for start in starts
+        ]
+        costs = [look(theta, _GATE, level)[1] for level in levels]
+        noise = levels[int(np.argmin(costs))]
+        starts = [noise, *starts[:1]] if stage == 0 else [noise]
+        at, cost = look(theta, gate, noise)
         converged = True
         for _ in range(_ITERATIONS):
             say(f"step {count + 1}")
@@ -348,7 +358,7 @@ def maximise(
             factor = 1.0
             while factor > 1e-3:
                 moved = np.clip(theta + factor * change, prior.lower, prior.upper)
-                found, there = look(moved, gate)
+                found, there = look(moved, gate, noise)
                 if there < cost:
                     break
                 factor *= 0.5

@@ -1,0 +1,118 @@
+"""What no vehicle's file knows is estimated by default, and its uncertainty is in the intervals.
+
+The dives come from a simulator that shares no code with the estimators (bench/simulators/sea.py).
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+
+import rov_ident as ri
+from bench.simulators import sea
+from rov_ident import config as configuration
+from rov_ident.config.prior import prior_of, rigid_body_covariance
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.io.write_messages import write_messages
+
+KNOWN = {
+    "vehicle": {"mass_std": 0.0, "inertia_std": 0.0, "buoyancy_std": 0.0, "cog_std": 0.0},
+    "wrench": {"scale_std": 0.0, "lag_std": 0.0},
+    "odometry": {"latency_std": 0.0},
+    "current_std": 0.0,
+}
+
+
+def drawn(case, seed):
+    """What the sea does, of a size that follows from the seed."""
+    rng = np.random.default_rng([seed, 7])
+    return {
+        "scale": {"thrust_scale": rng.uniform(0.8, 1.1)},
+        "current": {"current": tuple(rng.uniform(-0.2, 0.2, 2))},
+        "late": {"velocity_delay": rng.uniform(0.05, 0.12)},
+    }[case]
+
+
+@cache
+def messages_of(case, seed):
+    """The truth, the parameters that a file would have, and the messages of a minute."""
+    rng = np.random.default_rng(seed)
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(**drawn(case, seed))
+    truth = sea.dive(vehicle, unknown, "six-axis", 60.0, rng)
+    return vehicle, unknown, sea.told(vehicle, unknown, rng), sea.measured(truth, unknown, rng)
+
+
+def errors(case, seed, kind, known=None):
+    """(estimate - truth) / std of the coefficients, and the relative error in the median."""
+    vehicle, _, parameters, messages = messages_of(case, seed)
+    parameters = configuration.to_parameters(configuration.from_parameters(parameters))
+    for key, value in (known or {}).items():
+        parameters[key] = parameters.get(key, {}) | value if isinstance(value, dict) else value
+    online = OnlineEstimator(configuration.from_parameters(parameters), kind)
+    for _, role, message in messages:
+        online.push(role, message)
+    online.flush()
+    report = online.report()
+    off = np.array([report.by_name[name] - true for name, true in vehicle.theta.items()])
+    std = np.array([report.std[report.names.index(name)] for name in vehicle.theta])
+    return off / std, np.median(np.abs(off / list(vehicle.theta.values()))), report
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("case", ["scale", "current", "late"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_the_file_does_not_know_is_found(case, seed, kind):
+    """And without it the coefficients are surely wrong: the estimate owes it to this."""
+    sigmas, median, _ = errors(case, seed, kind)
+    assert median < 0.05
+    assert np.mean(np.abs(sigmas) < 2.0) > 0.75  # 94 % are expected of 18
+    _, without, _ = errors(case, seed, kind, KNOWN)
+    assert without > 1.5 * median
+
+
+def test_maximum_likelihood_finds_it_too(tmp_path):
+    vehicle, unknown, parameters, messages = messages_of("scale", 1)
+    write_messages(tmp_path / "dive.mcap", messages)
+    document = {"/**": {"ros__parameters": parameters}}
+    (tmp_path / "vehicle.yaml").write_text(yaml.safe_dump(document))
+    fit = ri.fit(tmp_path / "dive.mcap", tmp_path / "vehicle.yaml", "ml")
+    found = dict(zip(fit.names, fit.values.tolist(), strict=True))
+    off = [abs(found[name] / true - 1.0) for name, true in vehicle.theta.items()]
+    assert np.median(off) < 0.05
+    i = fit.names.index("thrust_scale.scale")
+    assert abs(fit.values[i] - unknown.thrust_scale) < 4.0 * fit.std[i]
+    assert fit.fitted.effects["thrust_scale"]["scale"] == fit.values[i]
+
+
+def test_what_is_known_is_not_estimated(heavy):
+    assert heavy.with_nuisance == heavy
+    parameters = configuration.to_parameters(heavy)
+    for key in KNOWN:
+        parameters.pop(key, None) if key != "vehicle" else [
+            parameters["vehicle"].pop(name) for name in KNOWN["vehicle"]
+        ]
+    usual = configuration.from_parameters(parameters).with_nuisance
+    assert len(usual.effect_names) == 9
+    prior = prior_of(usual, effects=True)
+    assert dict(zip(prior.names, prior.std))["thrust_scale.scale"] == 0.15
+    # a file that gives an effect decides about it
+    parameters["effects"] = {"thruster_lag": {"time_constant": 0.2}}
+    parameters["estimate"] = list(heavy.estimate)
+    held = configuration.from_parameters(parameters).with_nuisance
+    assert "thruster_lag.time_constant" not in held.effect_names
+    assert held.effects["thruster_lag"]["time_constant"] == 0.2
+
+
+def test_an_uncertain_rigid_body_is_one_of_added_mass(heavy):
+    """A mass 1 % off is an error of 0.135 kg of all three added masses, in common."""
+    parameters = configuration.to_parameters(heavy)
+    parameters["vehicle"] |= {"mass_std": 0.01, "inertia_std": 0.05}
+    config = configuration.from_parameters(parameters)
+    names = heavy.estimate
+    covariance = rigid_body_covariance(config, names)
+    at = [names.index(name) for name in ("X_udot", "Y_vdot", "Z_wdot", "K_pdot", "X_u")]
+    part = covariance[np.ix_(at, at)]
+    np.testing.assert_allclose(part[:3, :3], (0.01 * 13.5) ** 2)
+    assert part[3, 3] == pytest.approx((0.05 * 0.26) ** 2) and not part[3, :3].any()
+    assert not part[4].any()
