@@ -66,8 +66,6 @@ class HydrodynamicModel:
         self._stamp: int | None = None  # ns, of the last message in order
         self._renewed = -math.inf  # s, on the caller's clock
 
-    # ---------------------------------------------------------------- messages in
-
     def take(self, message: Any, now: float) -> Taken:
         """Take up what is good in a message; never raises for what is in it.
 
@@ -148,8 +146,6 @@ class HydrodynamicModel:
         if not is_passive(candidate, self._prior, candidate.theta[self._prior.estimated]):
             return "the damping would feed energy to the motion"
         return ""
-
-    # ---------------------------------------------------------------- matrices out
 
     @property
     def model(self) -> Model:

@@ -53,9 +53,6 @@ class FrameDefaults:
 ROS_DEFAULTS = FrameDefaults()
 
 
-# --- quaternions and angles -----------------------------------------------------------------
-
-
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Hamilton product p q of (..., 4) quaternions: first q is applied, then p."""
     pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
@@ -143,9 +140,6 @@ def wrap_angle(angle: ArrayLike) -> Array:
     return np.pi - np.remainder(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)
 
 
-# --- lever arms -----------------------------------------------------------------------------
-
-
 def velocity_of_arm(omega: Array, arm: Array | Sequence[float]) -> Array:
     """``omega x r`` (..., 3): by how much a point at ``arm`` [m] of a body turning with ``omega``
     [rad/s] is faster than the origin, all in body axes."""
@@ -155,9 +149,6 @@ def velocity_of_arm(omega: Array, arm: Array | Sequence[float]) -> Array:
 def acceleration_of_arm(omega: Array, omega_dot: Array, arm: Array | Sequence[float]) -> Array:
     """``omega_dot x r + omega x (omega x r)`` (..., 3): the same of its acceleration."""
     return np.cross(omega_dot, arm) + np.cross(omega, np.cross(omega, arm))
-
-
-# --- messages -------------------------------------------------------------------------------
 
 
 def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyMessage:

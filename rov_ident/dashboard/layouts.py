@@ -81,9 +81,6 @@ def _rows(items: Sequence[Any]) -> list[Sequence[Any]]:
     return [items[i : i + width] for i in range(0, len(items), width)]
 
 
-# ------------------------------------------------------------------ Foxglove
-
-
 def foxglove(config: Config, namespace: str = "") -> str:
     """A layout to import: tabs of plots, one plot a coefficient, and the health of the nodes.
 
@@ -138,9 +135,6 @@ def _split(parts: Sequence[Any], direction: str) -> Any:
         "direction": direction,
         "splitPercentage": 100.0 * half / len(parts),
     }
-
-
-# ------------------------------------------------------------------ PlotJuggler
 
 
 def plotjuggler(config: Config, namespace: str = "") -> str:

@@ -109,8 +109,6 @@ class Store:
         self._estimators: dict[str, Estimator] = {}
         self._bridges: dict[str, Status] = {}  # what goes on to controllers
 
-    # ---------------------------------------------------------------- in
-
     def add(self, name: str) -> None:
         """An estimator exists, even if it has not published yet."""
         with self._lock:
@@ -159,8 +157,6 @@ class Store:
                 self._bridges[name] = status
             elif name in self._estimators:
                 self._estimators[name].statuses[kind] = status
-
-    # ---------------------------------------------------------------- out
 
     @property
     def known(self) -> dict[str, int]:

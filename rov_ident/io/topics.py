@@ -150,8 +150,6 @@ class Reader:
         wrench = Wrench(stamp, _FRAME, tau[:3], tau[3:])
         return [(WRENCH, from_core(wrench, self._frames.body, self._frames.world))]
 
-    # -------------------------------------------------------------- twist and pose
-
     def _joined(self, message: Twist | Pose) -> list[tuple[str, Message]]:
         if isinstance(message, Pose):
             if self._poses and message.stamp <= self._poses[-1].stamp:
@@ -197,9 +195,6 @@ class Reader:
             position=before.position + share * (after.position - before.position),
             orientation=quaternion_between(before.orientation, after.orientation, share),
         )
-
-
-# ------------------------------------------------------------------ bags
 
 
 def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, str]:

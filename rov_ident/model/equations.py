@@ -259,7 +259,6 @@ def skew(a: Sequence[float] | Array) -> Array:
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
-# ------------------------------------------------------------------ kernels
 #
 # ``lanes`` is passed as a literal by a caller that inlines these, so that the inner loops either
 # vanish (one lane) or become vector instructions. These want one long expression a lane and rows of

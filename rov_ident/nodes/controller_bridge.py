@@ -132,8 +132,6 @@ class ControllerBridge(Node):  # type: ignore[misc]
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:
         return self.create_client(type_, f"{self._controller}/{service}", callback_group=group)
 
-    # ---------------------------------------------------------------- coefficients in
-
     def _take(self, message: DiagnosticArray) -> None:
         with self._lock:
             taken = self._model.take(message, time.monotonic())
@@ -159,8 +157,6 @@ class ControllerBridge(Node):  # type: ignore[misc]
             if not self._refusal and not self._model.fresh(time.monotonic()):
                 return {}, {}, "the coefficients are stale"
             return dict(self._wanted), dict(self._std), self._refusal
-
-    # ---------------------------------------------------------------- what to send
 
     def _look(self) -> None:
         """Compare, and send what is due."""
@@ -205,8 +201,6 @@ class ControllerBridge(Node):  # type: ignore[misc]
         self._sent += 1
         self._pending = ()
         self._say(Level.OK, f"sent {'; '.join(change.words for change in pending)}")
-
-    # ---------------------------------------------------------------- the controller
 
     def _exchange(self, before: Values, new: Values) -> None:
         """All of ``new`` is in the controller afterwards; or, with a UserError, nothing of it."""
@@ -314,8 +308,6 @@ class ControllerBridge(Node):  # type: ignore[misc]
         """Wait for no more answers: nothing receives them any more."""
         self._leaving.set()
 
-    # ---------------------------------------------------------------- services
-
     def _approve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Send what `~/pending` shows."""
         try:
@@ -350,8 +342,6 @@ class ControllerBridge(Node):  # type: ignore[misc]
         response.message = "enabled" if request.data else "disabled: nothing is sent"
         self.get_logger().info(response.message)
         return response
-
-    # ---------------------------------------------------------------- telling
 
     def _say(self, level: Level, words: str) -> None:
         self._level, self._words = level, words

@@ -97,8 +97,6 @@ class Diagnostics:
         name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {kind}"
         return to_status(name, self._online.config.name, level, words, values)
 
-    # ---------------------------------------------------------------- inputs
-
     def _complaints(self) -> list[str]:
         """What keeps the inputs from being used, in words."""
         complaints = []
@@ -137,8 +135,6 @@ class Diagnostics:
         level = Level.STALE if stopped else Level.WARN if complaints else Level.OK
         words = "; ".join(complaints) or "all messages are used"
         return self._status("inputs", level, words, values)
-
-    # ---------------------------------------------------------------- estimation
 
     def _estimation_status(
         self, stopped: str, waiting: int, interpreting: bool
@@ -180,8 +176,6 @@ class Diagnostics:
         if interpreting:
             words = f"{words}; interpreted until compiled"
         return self._status("estimation", level, words, values)
-
-    # ---------------------------------------------------------------- model and checkpoint
 
     def _model_status(self) -> DiagnosticStatus:
         """What the model seems to lack, in words and numbers."""

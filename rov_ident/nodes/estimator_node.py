@@ -144,8 +144,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _config(self) -> Config:
         return self._online.config
 
-    # ---------------------------------------------------------------- messages in
-
     def _receive(self, source: str, data: bytes) -> None:
         self._inputs.received[source] += 1
         self._inputs.silence[source] = 0.0
@@ -203,8 +201,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
             self._published_stamp = stamps[-1]
             self._publish()
 
-    # ---------------------------------------------------------------- coefficients out
-
     def _publish_in_time(self) -> None:
         if not self._lockstep:
             self._publish()
@@ -232,8 +228,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
             if self._lockstep:
                 self._monitor.wait_for_loading(begun, interrupted)
 
-    # ---------------------------------------------------------------- checkpoints
-
     def _recalled(self, given: str) -> checkpoint.Keeper | None:
         """The keeper of checkpoints, if a path is given; the last checkpoint is restored."""
         if not given:
@@ -254,8 +248,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
         if self._online.stamp != self._kept or self._keeper.failure:
             self._kept = self._online.stamp
             self._keeper.keep()
-
-    # ---------------------------------------------------------------- inputs that stop
 
     def _check_inputs(self) -> None:
         """Notice that the inputs have stopped, or in lockstep that the player has."""
@@ -292,8 +284,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._diagnostics.publish(
             self._stopped, len(self._waiting), self._compiling.interpreting, self._keeper
         )
-
-    # ---------------------------------------------------------------- services
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._waiting.clear()  # those from before the reset

@@ -108,8 +108,6 @@ class Player(Node):  # type: ignore[misc]
         self._executor.shutdown()
         super().destroy_node()
 
-    # ---------------------------------------------------------------- playing
-
     def wait_for_nodes(self, start: int) -> None:
         """Wait until everything is connected both ways. ``start`` [ns] is the time the bag begins.
 

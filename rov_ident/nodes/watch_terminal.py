@@ -99,9 +99,6 @@ def _hearing() -> Iterator[tuple[Store, Callable[[float], None], threading.Event
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------------------ as JSON
-
-
 def _print_json(heard: Heard, out: Console) -> None:
     for_scripts = {name: _as_json(*entry) for name, entry in heard.items()}
     line = json.dumps({"estimators": for_scripts}, allow_nan=False)
@@ -118,9 +115,6 @@ def _as_json(known: Estimator, silent: float) -> dict[str, Any]:
         "coefficients": for_json(report),
         "health": {kind: vars(status) for kind, status in known.statuses.items()},
     }
-
-
-# ------------------------------------------------------------------ as a table
 
 
 def _picture(heard: Heard, console: Console) -> Group | Text:

@@ -88,9 +88,6 @@ class AxisFit(Result):
     fitted: Array = field(default_factory=lambda: np.zeros(0))
 
 
-# ------------------------------------------------------------------ reading
-
-
 def parse_nondimensional(text: str) -> dict[str, float]:
     """`rho=1000,L=7,T=0.46` as numbers.
 
@@ -340,9 +337,6 @@ def _as_a_hull_resists(nu: Array, forces: Mapping[str, Array], notes: list[str])
     return out
 
 
-# ------------------------------------------------------------------ candidates
-
-
 def pool(axis: str) -> tuple[str, ...]:
     """The terms that may stand on an axis, the more usual first; `A_0` is a constant."""
     if axis == "X":
@@ -374,9 +368,6 @@ def unit(name: str) -> str:
     if name.endswith("_0"):
         return "N" if name[0] in "XYZ" else "N m"
     return (parse_fin(name) or parse(name)).unit
-
-
-# ------------------------------------------------------------------ fitting
 
 
 def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit]:
@@ -541,9 +532,6 @@ def _smallest(
 
 def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
-
-
-# ------------------------------------------------------------------ results
 
 
 def to_json(fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:

@@ -92,9 +92,6 @@ class Preparation:
         return data, kept, notes
 
 
-# ------------------------------------------------------------------ one signal
-
-
 def despiked(x: Array, width: int = 11, limit: float = 5.0) -> tuple[Array, NDArray[np.bool_]]:
     """A signal (N,) with outliers replaced by the local median, and where they were.
 
@@ -143,9 +140,6 @@ def dynamic_stretch(t: Array, wrench: Array, margin: float) -> tuple[float, floa
     if not len(driven):
         raise UserError("the wrench is the same throughout: there is no dynamic stretch to keep")
     return float(driven[0]) - margin, float(driven[-1]) + margin
-
-
-# ------------------------------------------------------------------ several sources
 
 
 @dataclass(frozen=True)

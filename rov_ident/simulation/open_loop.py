@@ -133,8 +133,6 @@ def open_loop(
     return predicted
 
 
-# ------------------------------------------------------------------ kernels
-
 _SCRATCH = record(
     [
         ("state", "f8", (13,)),  # position, quaternion, nu

@@ -104,9 +104,6 @@ def steer(
     return Run(t, out[:, :3], out[:, 3:6], out[:, 6:12], dict(zip("sra", out[:, 12:].T)))
 
 
-# ------------------------------------------------------------------ laws
-
-
 _STEEPEST = float(np.radians(25.0))  # pitch on the way to a depth
 
 

@@ -131,9 +131,6 @@ def to_json(model: Nomoto, validation: float | None = None) -> str:
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
-# ------------------------------------------------------------------ simulation
-
-
 @kernel
 def _respond(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max_step, out):  # type: ignore[no-untyped-def]
     """Classical Runge-Kutta; out (n,) the heading, from first = [psi, x1, x2]."""

@@ -127,9 +127,6 @@ def _text(parent: ET.Element, tag: str, *numbers: float) -> None:
     ET.SubElement(parent, tag).text = " ".join(map(repr, plain(numbers)))
 
 
-# ------------------------------------------------------------------ reading
-
-
 def read(text: str) -> Read:
     """The model that has the hydrodynamics plugin, in a model or world file.
 
