@@ -22,8 +22,11 @@ _HOOKS = {
     "body": "changes the rigid body",
     "wrench": "adds a wrench along the motion",
     "water": "moves the water",
-    "act": "stands between the demanded and the acting wrench",
+    "act": "stands between the commanded and the acting wrench",
     "sense": "stands between the motion and what is measured",
+    "late": "delays the velocities that are measured",
+    "heading": "turns the heading that is measured",
+    "noise": "adds noise to the reading of the wrench",
 }
 
 

@@ -34,7 +34,7 @@ def test_the_whole_procedure(heavy, tmp_path, capsys):
     assert np.median(after / before) < 0.7
     assert "surge: left alone" in told
     fitted = config.load(tmp_path / "fitted.yaml").model
-    assert np.median(np.abs(fitted.theta / heavy.model.theta - 1.0)) < 0.03
+    assert np.median(np.abs(fitted.theta / heavy.model.theta - 1.0)) < 0.04
     assert "<svg" in (tmp_path / "report.html").read_text()
 
 

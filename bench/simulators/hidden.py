@@ -668,7 +668,15 @@ def _configuration(seed: int, vehicle: Vehicle, lacking: set[str], off: float) -
             "cog": vehicle.cog.tolist(),
             "cob": vehicle.cob.tolist(),
             "inertia": [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]],
+            # What is estimated by default is known here: a case has its effects and no others.
+            "mass_std": 0.0,
+            "inertia_std": 0.0,
+            "buoyancy_std": 0.0,
+            "cog_std": 0.0,
         },
+        "wrench": {"scale_std": 0.0, "lag_std": 0.0},
+        "odometry": {"latency_std": 0.0},
+        "current_std": 0.0,
         "coefficients": {n: v for n, v in believed.items() if n not in lacking},
         "imu": {"position": vehicle.imu.tolist()},
     }

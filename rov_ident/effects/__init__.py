@@ -164,11 +164,10 @@ def estimable(name: str) -> dict[str, float | None]:
     With each of them the value at which it is better left alone unless asked for: the null of a
     parameter of one axis, of which an effect has several; None for others. An onset, a frequency
     and a phase are not among them, nor what shows in no velocity (the sampler finds the biases of
-    an IMU itself), nor the age of velocities, which are sorted by it before there is a sample, nor
-    the noise of a reading.
+    an IMU itself), nor the noise of a reading.
     """
     effect = EFFECTS[name]
-    if effect.late or effect.heading or effect.noise:
+    if effect.heading or effect.noise:
         return {}
     if effect.sense is not None and effect.correct is not None:
         given = Reading(*np.arange(1.0, 13.0).reshape(4, 3))

@@ -16,7 +16,7 @@ EFFECT = Effect(
     manoeuvre="steps of thrust along the axis at several levels up to the largest, from rest",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
     parameters=per_axis(
-        "limit", "most thrust", 1e5, 0.0, 1e5, 10.0, ("N", "N m"), moment=0.1, role="limit"
+        "limit", "most thrust", 1e5, 0.0, 1e6, 10.0, ("N", "N m"), moment=0.1, role="limit"
     ),
     act=act,
     order=46,

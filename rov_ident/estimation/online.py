@@ -32,6 +32,7 @@ many seconds to be learnt, and each time costs a report, which is slower than a 
 _RECENTRE = 0.2
 """Standard deviations by which a parameter of an effect must have moved for samples to follow: what
 a sample is then wrong by is of second order in this."""
+_LEARNT = 0.5  # of the prior's standard deviation: three quarters of its variance are gone
 EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
@@ -127,6 +128,7 @@ class OnlineEstimator:
         self.kind = kind
         self.prior = prior_of(config, effects=True)
         self._rigid_body = rigid_body_covariance(config, self.prior.names)
+        self._late = np.array([EFFECTS[e].late is not None for e, _ in config.estimate_effects])
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
@@ -235,11 +237,14 @@ class OnlineEstimator:
     def _recentre(self) -> None:
         """Have the sampler take over the parameters of effects as they are estimated now.
 
-        But not for changes far below their uncertainty: samples are right to first order anyway.
+        But not for changes far below their uncertainty, as samples are right to first order; nor a
+        delay of which the prior says more than the data: a first wrong guess would confirm itself.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         own = slice(len(self.config.estimate), None)
         now = np.clip(raw.values[own], self.prior.lower[own], self.prior.upper[own])
+        vague = self._late & (raw.std[own] > _LEARNT * self.prior.std[own])
+        now = np.where(vague, self._about, now)
         if (np.abs(now - self._about) > _RECENTRE * raw.std[own]).any():
             self._centre(dict(zip(self.config.effect_names, now.tolist(), strict=True)))
 

@@ -50,7 +50,7 @@ from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.least_squares import add_scatter
-from rov_ident.sampling.sample import parts
+from rov_ident.sampling.sample import NO_SIDES, parts
 
 _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; an innovation further off is an outlier
@@ -177,6 +177,7 @@ def _passed(
 ) -> Pass:
     free = np.ones(6, dtype=bool) if free is None else free
     samples, sides = parts(samples)
+    sides = sides if len(effects) else NO_SIDES
     mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
     inverse, at = np.zeros((6, 6)), np.ix_(free, free)
     inverse[at] = np.linalg.inv(mass[at])
