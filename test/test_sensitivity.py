@@ -52,7 +52,8 @@ def moved(config, effect, name, by):
 
 
 def test_every_effect_that_can_be_estimated_is_tried():
-    assert set(GIVEN) == {name for name in EFFECTS if estimable(name)}
+    # a delay moves the samples in time, so that they cannot be compared: see test_nuisance.py
+    assert {*GIVEN, "velocity_latency"} == {name for name in EFFECTS if estimable(name)}
 
 
 @pytest.mark.parametrize("effect", GIVEN)
