@@ -12,7 +12,7 @@ import yaml
 import rov_ident as ri
 from bench.simulators import sea
 from rov_ident import config as configuration
-from rov_ident.config.prior import prior_of, rigid_body_covariance
+from rov_ident.config.prior import drift_of, prior_of, rigid_body_covariance
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
 
@@ -110,9 +110,76 @@ def test_an_uncertain_rigid_body_is_one_of_added_mass(heavy):
     parameters["vehicle"] |= {"mass_std": 0.01, "inertia_std": 0.05}
     config = configuration.from_parameters(parameters)
     names = heavy.estimate
-    covariance = rigid_body_covariance(config, names)
+    covariance = rigid_body_covariance(config, names, np.ones(len(names)))
     at = [names.index(name) for name in ("X_udot", "Y_vdot", "Z_wdot", "K_pdot", "X_u")]
     part = covariance[np.ix_(at, at)]
     np.testing.assert_allclose(part[:3, :3], (0.01 * 13.5) ** 2)
     assert part[3, 3] == pytest.approx((0.05 * 0.26) ** 2) and not part[3, :3].any()
     assert not part[4].any()
+
+
+def test_where_the_thrust_is_not_known_the_mass_scales_everything(heavy):
+    """With mass, moments of inertia, weight, thrust and all coefficients times k, nothing moves
+    otherwise: what a wrong mass does to the estimate is this scaling."""
+    parameters = configuration.to_parameters(heavy)
+    parameters["vehicle"] |= {"mass_std": 0.01}
+    parameters["wrench"].pop("scale_std", None)
+    config = configuration.from_parameters(parameters).with_nuisance
+    prior = prior_of(config, effects=True)
+    covariance = rigid_body_covariance(config, prior.names, prior.mean)
+    moved = np.sqrt(np.diag(covariance)) / 0.01
+    value = dict(zip(prior.names, prior.mean))
+    for name, change in zip(prior.names, moved):
+        if name in ("K_pdot", "M_qdot", "N_rdot"):
+            moment = config.model.body.inertia["KMN".index(name[0]), "KMN".index(name[0])]
+            assert change == pytest.approx(abs(value[name] - moment))
+        elif "." not in name or name.startswith("thrust_scale"):
+            assert change == pytest.approx(abs(value[name]))
+
+
+def test_a_current_may_turn_unless_it_is_known(heavy):
+    parameters = configuration.to_parameters(heavy)
+    parameters.pop("current_std", None)
+    usual = configuration.from_parameters(parameters).with_nuisance
+    names = prior_of(usual, effects=True).names
+    rates = dict(zip(names, drift_of(usual, names), strict=True))
+    assert {name for name, rate in rates.items() if rate > 0.0} == {
+        "ocean_current.north",
+        "ocean_current.east",
+    }
+    parameters["current_std"] = 0.0
+    parameters["effects"] = {"ocean_current": {"north": 0.1, "east": 0.0, "down": 0.0}}
+    parameters["estimate"] = [*heavy.estimate, "ocean_current.north", "ocean_current.east"]
+    given = configuration.from_parameters(parameters).with_nuisance
+    assert not drift_of(given, prior_of(given, effects=True).names).any()
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_a_current_that_turns_is_followed(kind):
+    """A third of its speed in ten minutes: at the end, the present one is known."""
+    rng = np.random.default_rng([3, len(kind)])
+    vehicle, size = sea.draw_vehicle(rng), rng.uniform(0.1, 0.2, 2)
+    unknown = sea.Sea(current=tuple(size), current_swing=tuple(0.5 * size), current_period=300.0)
+    truth = sea.dive(vehicle, unknown, "six-axis", 150.0, rng)
+    online = OnlineEstimator(configuration.from_parameters(sea.told(vehicle, unknown, rng)), kind)
+    for _, role, message in sea.measured(truth, unknown, rng):
+        online.push(role, message)
+    report = online.report()
+    now = sea.Plant(vehicle, unknown).water(truth.t[-1])[0]
+    for axis, name in enumerate(("ocean_current.north", "ocean_current.east")):
+        i = report.names.index(name)
+        assert abs(report.values[i] - now[axis]) < 0.03
+        assert report.std[i] < 0.02
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("seed", [11, 12])
+def test_pilots_show_no_delay_where_there_is_none(seed, kind):
+    """Noise of measured velocities in the column of the delay once drew it to its bound."""
+    rng = np.random.default_rng(seed)
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea()
+    truth = sea.dive(vehicle, unknown, "pilot", 90.0, rng)
+    online = OnlineEstimator(configuration.from_parameters(sea.told(vehicle, unknown, rng)), kind)
+    for _, role, message in sea.measured(truth, unknown, rng):
+        online.push(role, message)
+    assert online.report().by_name["velocity_latency.delay"] < 0.01

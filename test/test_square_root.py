@@ -101,6 +101,14 @@ def test_whitened_rows_have_the_predicted_variance(root, rng):
     np.testing.assert_allclose(squares[1], (last**2).sum(axis=0))
 
 
+def test_a_row_of_next_to_nothing_leaves_the_root_as_it_is(root, rng):
+    """The square of its length is no normal number, and the inverse of that would be infinite."""
+    work, rows = padded(root), rows_of(rng, 0)
+    rows[0, :3] = 1e-155
+    square_root.stack(work, rows, N, 6, 0, np.empty(work.shape[1]))
+    np.testing.assert_allclose(work[:N, : N + 1], root, rtol=1e-12)
+
+
 def test_columns_in_another_order_hold_the_same_information(root, rng):
     work, place = padded(root), rng.permutation(N)
     rows, line = rows_of(rng, 0), np.empty(work.shape[1])
@@ -116,9 +124,9 @@ def test_variance_is_added_to_what_is_marked(rng):
     work, inverse, score = padded(root), padded(np.linalg.inv(root[:, :N])), score_of(rng)
     marked = np.arange(N) % 2 == 0
     x, p = np.linalg.solve(root[:, :N], root[:, N]), np.linalg.inv(root[:, :N].T @ root[:, :N])
-    wide, share = padded(score), 0.1
-    square_root.add_variance(work, inverse, wide, np.zeros_like(work), x, share, marked)
-    added = np.diag(np.where(marked, share * (1.0 - np.diag(p)), 0.0))
+    wide, share = padded(score), np.where(marked, rng.uniform(0.0, 0.2, N), 0.0)
+    square_root.add_variance(work, inverse, wide, np.zeros_like(work), x, share)
+    added = np.diag(share * (1.0 - np.diag(p)))
     new = work[:N, :N]
     grown = np.linalg.inv(new.T @ new)
     np.testing.assert_allclose(grown, p + added, rtol=1e-9, atol=1e-12)

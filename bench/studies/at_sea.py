@@ -87,11 +87,10 @@ def _late(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
 
 
 def _mass(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
-    signs = rng.choice([-1.0, 1.0], 4)
-    inertia = 1.0 + signs[1:] * rng.uniform(0.05, 0.1, 3)
+    """As uncertain as the file takes them to be."""
     return {
-        "mass_factor": 1.0 + signs[0] * rng.uniform(0.01, 0.02),
-        "inertia_factor": tuple(inertia.tolist()),
+        "mass_factor": 1.0 + 0.01 * rng.standard_normal(),
+        "inertia_factor": tuple((1.0 + 0.05 * rng.standard_normal(3)).tolist()),
     }
 
 

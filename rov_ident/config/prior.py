@@ -70,38 +70,60 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
 
 
 _REACH = 3.0  # of 1000 normally distributed supposals, three are further off
-_HALF_NORMAL = np.sqrt(2.0 / np.pi)  # mean of a half-normal variable over its standard deviation
+_CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
+_FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
 def first_centre(config: Config) -> dict[str, float]:
     """The values of effects' parameters, by name, about which samples are linear at first.
 
-    Those configured; but a lag that may be there is taken as long as its prior has it in the mean:
-    of one that is shorter than the interval between commands nothing shows.
+    Those configured; but a lag that may be there is taken as half a standard deviation: from none
+    at all, the columns of samples lead to none ("Times" in docs/live.md).
     """
     prior = prior_of(config, effects=True)
     centre = {}
     for name, mean, std, lower in zip(prior.names, prior.mean, prior.std, prior.lower, strict=True):
         if "." in name:
             is_input = EFFECTS[name.partition(".")[0]].act is not None
-            centre[name] = float(mean + _HALF_NORMAL * std if is_input and mean == lower else mean)
+            centre[name] = float(mean + _FIRST_LAG * std if is_input and mean == lower else mean)
     return centre
 
 
-def rigid_body_covariance(config: Config, names: tuple[str, ...]) -> Array:
-    """What an uncertain rigid body adds to the covariance (n, n) of the coefficients ``names``.
+def drift_of(config: Config, names: tuple[str, ...]) -> Array:
+    """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's.
 
-    A motion shows the sum of rigid body and added mass alone: an error of the mass is one of
-    X_udot, Y_vdot and Z_wdot alike, one of a moment of inertia one of K_pdot, M_qdot or N_rdot.
+    Only that of a current: it turns, and differs from place to place, unless the file says that it
+    is known (``current_std: 0``).
+    """
+    drifting = {".".join(key) for key in config.nuisance_std if key[0] == "ocean_current"}
+    return np.array([1.0 / _CURRENT_TIME if name in drifting else 0.0 for name in names])
+
+
+def rigid_body_covariance(config: Config, names: tuple[str, ...], values: Array) -> Array:
+    """What an uncertain rigid body adds to the covariance (n, n) of the estimates ``values`` (n,).
+
+    An error of a moment of inertia is one of K_pdot, M_qdot or N_rdot, as a motion shows their sum.
+    So is an error of the mass one of X_udot, Y_vdot and Z_wdot, where the thrust is known. Where
+    its scale is estimated, the mass is what all forces are compared with: the equations of motion
+    stay the same with mass, inertia, weight, buoyancy, thrust and all coefficients times k.
     """
     known, body = config.vehicle_uncertainty, config.model.body
-    sources = np.zeros((4, len(names)))  # mass, and the three moments of inertia
-    sizes = [known.mass_std * body.mass] * 3 + (known.inertia_std * np.diag(body.inertia)).tolist()
-    for row, name in enumerate(("X_udot", "Y_vdot", "Z_wdot", "K_pdot", "M_qdot", "N_rdot")):
-        if name in names:
-            sources[max(row - 2, 0), names.index(name)] = sizes[row]
-    covariance: Array = sources.T @ sources
+    value = dict(zip(names, values.tolist(), strict=True))
+    moments = dict(zip(("K_pdot", "M_qdot", "N_rdot"), np.diag(body.inertia).tolist()))
+    if "thrust_scale.scale" in names:
+        scaled = {n: v for n, v in value.items() if "." not in n or n in _SCALED}
+        # relative to the inertia that the file gives and that does not change with the mass
+        of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
+    else:
+        of_mass = dict.fromkeys(("X_udot", "Y_vdot", "Z_wdot"), body.mass)
+    sources = [{n: known.mass_std * v for n, v in of_mass.items()}]
+    sources += [{n: known.inertia_std * moment} for n, moment in moments.items()]
+    rows = np.array([[source.get(name, 0.0) for name in names] for source in sources])
+    covariance: Array = rows.T @ rows
     return covariance
+
+
+_SCALED = ("thrust_scale.scale", "buoyancy.delta")
 
 
 def theta_of(config: Config) -> Array:

@@ -17,9 +17,11 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.effects import EFFECTS
-from rov_ident.estimation import rls, ukf
+from rov_ident.effects import EFFECTS, parameter
+from rov_ident.estimation import innovation_monitor, rls, ukf
+from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
+from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.estimation.shared import INFO
 from rov_ident.sampling.sample import believed
 from rov_ident.sampling.sampler import Sampler
@@ -32,7 +34,11 @@ many seconds to be learnt, and each time costs a report, which is slower than a 
 _RECENTRE = 0.2
 """Standard deviations by which a parameter of an effect must have moved for samples to follow: what
 a sample is then wrong by is of second order in this."""
-_LEARNT = 0.5  # of the prior's standard deviation: three quarters of its variance are gone
+# A time (a lag, a delay) does not act linearly: "Times" in docs/live.md has the study.
+_SETTLING_TIME = 5.0  # s; that samples are made with the same value of a time at least
+_LEARNT = 0.5  # prior standard deviations, below which an estimate of a time is followed
+_OUTDATED = 0.25  # prior standard deviations, from which what was learnt with another value is
+# given up
 EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
@@ -53,7 +59,9 @@ class Report:
     last sample used, 0 before the first. ``excitation`` is the share of the prior variance that the
     motion of the last 20 to 40 seconds would remove by itself. ``condition`` is that of the
     information's root in prior units: 1 before any data, and an estimate has some
-    ``16 - log10(condition)`` digits; NaN where it is not known.
+    ``16 - log10(condition)`` digits; NaN where it is not known. ``consistency`` says whether model
+    and data agree, None where it is not known; where they do not, intervals are wider, and nothing
+    has converged.
     """
 
     stamp: int
@@ -68,6 +76,7 @@ class Report:
     states: tuple[State, ...]
     messages: tuple[str, ...]
     condition: float = math.nan
+    consistency: Consistency | None = None
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -127,8 +136,8 @@ class OnlineEstimator:
         self.config = config
         self.kind = kind
         self.prior = prior_of(config, effects=True)
-        self._rigid_body = rigid_body_covariance(config, self.prior.names)
-        self._late = np.array([EFFECTS[e].late is not None for e, _ in config.estimate_effects])
+        times = [parameter(*key).unit == "s" for key in config.estimate_effects]
+        self._is_time = np.array(times, dtype=bool)
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
@@ -152,6 +161,7 @@ class OnlineEstimator:
         self._sample_counts: Counter[str] = Counter()
         self._safe = self.prior.mean.copy()
         self._centre(first_centre(self.config))
+        self._learnt_about, self._settled = self._about, math.nan
         if self.monitor is not None:
             self.monitor.reset()
         self._origin = self.memory()
@@ -161,7 +171,7 @@ class OnlineEstimator:
         self.config = config = config.with_nuisance
         self._task = self._module.problem(config)
         self.sampler.configure(config)
-        self._centre(first_centre(config))
+        self._centre(self._present)
 
     def attach(self, monitor: Monitor) -> None:
         """Let a monitor see from now on what the estimator sees."""
@@ -231,29 +241,49 @@ class OnlineEstimator:
 
     def next_record(self) -> None:
         """Another record follows: inputs begin anew, what is learnt stays."""
-        self.sampler = Sampler(self.config)
-        self._centre(dict(zip(self.config.effect_names, self._about.tolist(), strict=True)))
+        self.sampler, self._settled = Sampler(self.config), math.nan
+        self._centre(self._present)
 
-    def _recentre(self) -> None:
+    @property
+    def _present(self) -> dict[str, float]:
+        """The parameters of effects as samples have them."""
+        return dict(zip(self.config.effect_names, self._about.tolist(), strict=True))
+
+    def _recentre(self, at_once: bool = False) -> None:
         """Have the sampler take over the parameters of effects as they are estimated now.
 
-        But not for changes far below their uncertainty, as samples are right to first order; nor a
-        delay of which the prior says more than the data: a first wrong guess would confirm itself.
+        But not for changes far below their uncertainty, as samples are right to first order. A time
+        is followed once the data know it. After a long step all is learnt anew: information gained
+        about another value claims to know what it does not. ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         own = slice(len(self.config.estimate), None)
         now = np.clip(raw.values[own], self.prior.lower[own], self.prior.upper[own])
-        vague = self._late & (raw.std[own] > _LEARNT * self.prior.std[own])
-        now = np.where(vague, self._about, now)
-        if (np.abs(now - self._about) > _RECENTRE * raw.std[own]).any():
-            self._centre(dict(zip(self.config.effect_names, now.tolist(), strict=True)))
+        std = np.sqrt(self._module.variance(self._task, self._state)[own])
+        unit = self.prior.std[own]
+        if math.isnan(self._settled):
+            self._settled = self._last_t
+        early = abs(self._last_t - self._settled) < _SETTLING_TIME
+        if not at_once:
+            waits = self._is_time & (early | (std > _LEARNT * unit))
+            now = np.where(waits, self._about, now)
+        if not (np.abs(now - self._about) > _RECENTRE * std).any():
+            return
+        whole = dict(zip(self.prior.names, physical(self.config.dynamics, self.prior, raw)))
+        self._centre({**whole, **dict(zip(self.config.effect_names, now.tolist(), strict=True))})
+        moved = np.abs(self._about - self._learnt_about)
+        if (self._is_time & (moved > _OUTDATED * unit)).any() and not at_once:
+            self._begin_with(self._origin)
 
     def _centre(self, values: Mapping[str, float]) -> None:
-        """Have samples made with these values of the parameters of effects, all of them."""
-        self._centred, self._about = self._last_t, np.array(list(values.values()))
-        if values:
+        """Have samples made with these values of the parameters of effects, all of them, and of
+        coefficients, with which a rigid body is heavier or lighter."""
+        self._centred = self._last_t
+        self._about = np.array([values[name] for name in self.config.effect_names])
+        if self.config.effect_names:
             # The rigid body is the estimator's own, and what acts on it all but linear.
-            acting = {n: v for n, v in values.items() if EFFECTS[n.partition(".")[0]].body is None}
+            bodies = {name for name in self.config.effects if EFFECTS[name].body is not None}
+            acting = {n: v for n, v in values.items() if n.partition(".")[0] not in bodies}
             self.sampler.recentre(self.config.with_values(acting))
 
     def memory(self) -> Memory:
@@ -288,11 +318,13 @@ class OnlineEstimator:
         self.sampler.kinematic_filter.begin_with(memory.kinematics)
         self._paused = True  # whatever has happened in between
         if self.config.estimate_effects:
-            self._recentre()
+            self._recentre(at_once=True)
+            self._learnt_about = self._about
 
     def _begin_with(self, memory: Memory) -> None:
         """Know what is in the memory and nothing else."""
         self._state, self._centred = memory.state, math.nan
+        self._learnt_about, self._settled = self._about, math.nan
         self._gained, self._window = memory.gained.copy(), memory.window.copy()
         self._variance, self._safe = memory.variance, memory.safe
 
@@ -311,7 +343,12 @@ class OnlineEstimator:
     def report(self) -> Report:
         """The present coefficients, made physical, with their state in words."""
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
-        raw = replace(raw, covariance=raw.covariance + self._rigid_body)
+        consistency = consistency_of(
+            self.config, self.prior, raw.values, self._unexplained(),
+            self.sampler.kinematic_filter.test_ratios,
+        )  # fmt: skip
+        covariance = raw.covariance + rigid_body_covariance(self.config, raw.names, raw.values)
+        raw = replace(raw, covariance=consistency.widened(covariance, self.prior.std))
         values = physical(self.config.dynamics, self.prior, raw)
         diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
         if diverged:
@@ -324,7 +361,7 @@ class OnlineEstimator:
         judged = [
             (State.DIVERGED, "diverged: the last good value is held, call reset")
             if diverged
-            else self._judge(i, values, std, raw.values, excitation)
+            else self._judge(i, values, std, raw.values, excitation, consistency.consistent)
             for i in range(len(values))
         ]
         # A bound cuts the interval too: no part of it is physically possible.
@@ -343,7 +380,14 @@ class OnlineEstimator:
             tuple(state for state, _ in judged),
             tuple(text for _, text in judged),
             self._module.condition(self._task, self._state),
+            consistency,
         )
+
+    def _unexplained(self) -> Array:
+        """(6,): force that the model lacks over the working wrench, NaN where that is not known."""
+        monitor, first = self._state.monitor, self._task.process["first"][0]
+        share = FIRST_FORCE * np.sqrt(monitor["density"] / first)
+        return np.where(monitor["seen"] > innovation_monitor.TIME, share, np.nan)
 
     @property
     def stamp(self) -> int:
@@ -353,12 +397,14 @@ class OnlineEstimator:
         return self.sampler.origin + round(self._last_t * 1e9)
 
     def _judge(
-        self, i: int, values: Array, std: Array, raw: Array, excitation: Array
+        self, i: int, values: Array, std: Array, raw: Array, excitation: Array, consistent: bool
     ) -> tuple[State, str]:
         """The state of a coefficient, and a message that begins with the word for it."""
         if abs(raw[i] - values[i]) > CONTRADICTED * std[i]:
             return State.AT_BOUND, "at bound: held at its physical bound, the data contradict it"
         excited = excitation[i] >= _EXCITED
+        if not consistent and (excited or is_known(values[i], std[i], self.prior.std[i])):
+            return State.CONVERGING, "converging: data and model disagree"
         if is_known(values[i], std[i], self.prior.std[i]):
             return State.CONVERGED, "converged" if excited else "converged: not excited now"
         if excited:

@@ -31,7 +31,7 @@ class ReferenceUkf:
         points = MerweScaledSigmaPoints(6 + n, u.alpha, u.beta, u.kappa)
         self.filter = UnscentedKalmanFilter(6 + n, 6, 1.0, None, self._propagated, points)
         self.filter.x, self.filter.P = state.x.copy(), state.p.copy()
-        self._since = 0.0
+        self._since = self._since_walk = 0.0  # s
 
     def step(self, row: np.void, before: ukf.State, after: ukf.State, info: np.void) -> None:
         """One sample of SAMPLE, as ours took it from ``before`` to ``after``; ``info`` of INFO."""
@@ -119,16 +119,18 @@ class ReferenceUkf:
     def _walk(self, after: ukf.State) -> None:
         """The random walk of the coefficients, at the instants of ours."""
         self._since += self._row["dt"]
+        self._since_walk += self._row["dt"]
         if after.scalars["since"][0] > 0.0:
             return
-        walk = self.task.walk
         usual = np.maximum(after.monitor["usual"], 1.0)
-        if (after.monitor["nis"] > self.task.settings["changed"][0] * usual).any():
-            walk = np.maximum(walk, 1.0 / RELEARNING_TIME)
-        n = len(walk)
-        room = np.maximum(1.0 - np.diag(self.filter.P)[6:], 0.0)
-        self.filter.P[6:, 6:][np.diag_indices(n)] += walk * self._since * room
+        changed = (after.monitor["nis"] > self.task.settings["changed"][0] * usual).any()
+        relearnt = min(self._since / RELEARNING_TIME, 1.0) if changed else 0.0
         self._since = 0.0
+        if after.scalars["since_walk"][0] == 0.0:
+            share = np.maximum(self.task.drift * self._since_walk, relearnt)
+            room = np.maximum(1.0 - np.diag(self.filter.P)[6:], 0.0)
+            self.filter.P[6:, 6:][np.diag_indices(len(share))] += share * room
+            self._since_walk = 0.0
 
 
 def raised(mass: Array, least: Array) -> Array:

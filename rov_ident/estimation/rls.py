@@ -71,6 +71,7 @@ from rov_ident.estimation.shared import (
     INFO,
     REACH,
     RELEARNING_TIME,
+    WALK_PERIOD,
     Problem,
     add_score,
     begin,
@@ -113,10 +114,12 @@ _NOISE_PEAK = 16.0  # variances: 4 sigma, which noise exceeds once in 16 000 sam
 _EXCITED = 0.01  # of the prior's information: a hundred such rows would tell as much as the prior
 
 # the corner [rad/s] is that of the published residual
-_SETTINGS = record([*floats((), "corner gate forgetting_factor"), ("variable", "?")])
+_SETTINGS = record(
+    [*floats((), "corner gate forgetting_factor"), ("variable", "?"), ("walks", "?")]
+)
 _SCALARS = record(
     [
-        *floats((), "t since_update"),
+        *floats((), "t since_update since_walk"),
         ("peak", "f8", (6,)),  # squared velocities, their peaks of late
         ("free", "i8"),  # so many of the first columns take rows
         ("started", "?"),
@@ -145,7 +148,9 @@ def problem(config: Config) -> Problem:
     """The constants of the estimation that a configuration asks for."""
     own = config.rls
     factor, variable = own.forgetting_factor, own.forgetting == "variable"
-    return problem_of(config, _SETTINGS, gate=own.gate, forgetting_factor=factor, variable=variable)
+    task = problem_of(config, _SETTINGS, gate=own.gate, forgetting_factor=factor, variable=variable)
+    task.settings["walks"] = task.drift.any()
+    return task
 
 
 def init(task: Problem) -> State:
@@ -574,13 +579,22 @@ def _learn(task, state, work, info):
     if not s.variable and s.forgetting_factor < 1.0:
         info.forgetting = s.forgetting_factor
         _forget(state, work, s.forgetting_factor)
-    elif s.variable and _suspect(state, work):
-        share = min(c.since_update / RELEARNING_TIME, 1.0)
-        info.forgetting = 1.0 - share
-        add_variance(
-            work.root, work.inverse, work.score, work.spare, state.solution, share, work.moves
-        )
+    suspect = s.variable and _suspect(state, work)
+    share = min(c.since_update / RELEARNING_TIME, 1.0)
+    c.since_walk += c.since_update
     c.since_update = 0.0
+    walks = s.walks and c.since_walk >= WALK_PERIOD
+    if not (suspect or walks):
+        return
+    for a in range(n):
+        work.change[a] = share if suspect and work.moves[a] else 0.0
+        if walks:
+            work.change[a] = max(work.change[a], task.drift[state.order[a]] * c.since_walk)
+    add_variance(work.root, work.inverse, work.score, work.spare, state.solution, work.change)
+    if suspect:
+        info.forgetting = 1.0 - share
+    if walks:
+        c.since_walk = 0.0
 
 
 @reordered

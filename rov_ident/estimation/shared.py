@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import prior_of, theta_of
+from rov_ident.config.prior import drift_of, prior_of, theta_of
 from rov_ident.core.jit import inlined, inner, record
 from rov_ident.core.messages import Array
 from rov_ident.estimation.process_noise import process
@@ -17,6 +17,7 @@ LIGHTEST = 0.2  # of the rigid body's own inertia: no model that is tried is lig
 FASTEST = 50.0  # m/s, rad/s; no sane model gets there
 LAG = 4.0  # s; of the window over the score's correlation
 RELEARNING_TIME = 20.0  # s; after a change: coefficients become as uncertain as at first
+WALK_PERIOD = 1.0  # s; parameters that change by themselves gain variance this often
 REACH = 10.0  # prior standard deviations, which no coefficient is off; for RLS's observer alone
 
 INFO = record(
@@ -44,7 +45,7 @@ class Problem(NamedTuple):
     scale: Array  # (n,) prior standard deviations
     start: Array  # (n,) prior means over those
     highest: Array  # (n,) scaled deviation that the coefficients of RLS's observer do not exceed
-    walk: Array  # (n,) variance density of the UKF's random walk of scaled coefficients, 1/s
+    drift: Array  # (n,) variance density of the random walk of scaled parameters, 1/s
     rigid_body: Array  # (6, 6)
     restoring: Array  # (6, 3)
     lightest: Array  # (6,) least pivots of a mass matrix: no hull with added mass is touched
@@ -66,7 +67,7 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         prior.std,
         start,
         np.where(prior.negative, np.minimum(-start, REACH), REACH),
-        (config.ukf.random_walk * prior.mean / prior.std) ** 2 / 3600.0,
+        drift_of(config, prior.names),
         body.mass_matrix,
         body.restoring,
         LIGHTEST * np.diag(np.linalg.cholesky(body.mass_matrix)) ** 2,

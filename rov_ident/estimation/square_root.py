@@ -13,6 +13,7 @@ import numpy as np
 from rov_ident.core.jit import copy, inlined, inner, kernel, reordered
 
 _WIDTH = 32  # numbers in a row are a multiple of it: four vectors of eight
+_NOTHING = 1e-300  # a squared length whose inverse is hardly a number any more
 
 
 @inlined
@@ -122,7 +123,11 @@ def stack(root, rows, free, count, leaving, dot):
             below += rows[i, j] ** 2
         for i in range(6, 6 + leaving):
             below -= rows[i, j] ** 2
-        if below == 0.0:
+        if abs(below) < _NOTHING:
+            for i in range(count):
+                rows[i, j] = 0.0
+            for i in range(6, 6 + leaving):
+                rows[i, j] = 0.0
             continue
         alpha, head, beta = _reflection(root[j, j], below)
         for k in range(columns):
@@ -152,11 +157,11 @@ def stack(root, rows, free, count, leaving, dot):
 
 
 @reordered
-def add_variance(root, inverse, score, spare, solution, share, marked):
+def add_variance(root, inverse, score, spare, solution, share):
     """P <- P + W for the covariance ``P = R^-1 R^-T``; the solution (n,) of R x = z stays.
 
-    W is diagonal: of each ``marked`` (n,) coefficient a ``share`` of what its variance is short of
-    1, the prior's. ``inverse`` is R^-1 on entry, ``spare`` work space, ``score`` the covariance S
+    W is diagonal: of each coefficient a ``share`` (n,) of what its variance is short of 1, the
+    prior's. ``inverse`` is R^-1 on entry, ``spare`` work space, ``score`` the covariance S
     of the accumulated score, with which the sandwich P S P grows by W, too.
 
     ``[R^-1 W^1/2]`` is made triangular from the right by Householder reflections, row by row from
@@ -174,9 +179,8 @@ def add_variance(root, inverse, score, spare, solution, share, marked):
         for k in range(columns):
             extra[a, k] = 0.0
             present += x[a, k] ** 2
-        if marked[a]:
-            extra[a, a] = np.sqrt(share * max(1.0 - present, 0.0))
-            score[a, a] += extra[a, a] ** 2
+        extra[a, a] = np.sqrt(share[a] * max(1.0 - present, 0.0))
+        score[a, a] += extra[a, a] ** 2
     for a in range(n - 1, -1, -1):
         beside = 0.0
         for k in range(columns):

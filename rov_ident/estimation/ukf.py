@@ -52,6 +52,7 @@ from rov_ident.estimation.shared import (
     FASTEST,
     INFO,
     RELEARNING_TIME,
+    WALK_PERIOD,
     Problem,
     add_score,
     begin,
@@ -85,8 +86,8 @@ _ROOM = 1.5  # for innovation_monitor.watch ("Constants of the process noise" in
 # square root of the state's size + lambda (van der Merwe 2004), weight of an outer sigma point,
 # beta - alpha^2; gate, NIS from which the vehicle has changed; corner of the residual [rad/s]
 _SETTINGS = record(floats((), "spread weight centre gate changed corner"))
-# s; "since" is the time since the coefficients walked
-_SCALARS = record([*floats((), "t since"), ("started", "?")])
+# s; since innovations were summed up, since the coefficients walked
+_SCALARS = record([*floats((), "t since since_walk"), ("started", "?")])
 
 
 class State(NamedTuple):
@@ -106,10 +107,11 @@ def problem(config: Config) -> Problem:
     """The constants of the estimation that a configuration asks for."""
     u = config.ukf
     reach = u.alpha**2 * (6 + len(prior_of(config, effects=True).names) + u.kappa)
-    return problem_of(
+    task = problem_of(
         config, _SETTINGS, spread=np.sqrt(reach), weight=0.5 / reach, centre=u.beta - u.alpha**2,
         gate=u.gate, changed=u.change_threshold,
     )  # fmt: skip
+    return task._replace(drift=task.drift + (u.random_walk * task.start) ** 2 / 3600.0)
 
 
 def init(task: Problem) -> State:
@@ -540,7 +542,11 @@ def _look_back(task, state, work, dt):
     changed = False
     for i in range(6):
         changed |= has_changed(state.monitor[i], task.settings[0].changed)
-    _walk(task, state, work, changed, c.since)
+    c.since_walk += c.since
+    if changed or c.since_walk >= WALK_PERIOD:
+        relearnt = min(c.since / RELEARNING_TIME, 1.0) if changed else 0.0
+        _walk(task, state, work, relearnt, c.since_walk)
+        c.since_walk = 0.0
     c.since = 0.0
 
 
@@ -563,8 +569,10 @@ def _sum_up(state, work, since):
 
 
 @reordered
-def _walk(task, state, work, changed, elapsed):
+def _walk(task, state, work, relearnt, elapsed):
     """Variances grow by G, less and less up to the prior's; the sandwich P S P grows alike.
+
+    ``relearnt`` is the share of what they are short of the prior's that each grows by at least.
 
     Hence with ``W = P_new^-1 G``, ``S_new = (1 - W) S (1 - W)' + W P_new^-1``.
     """
@@ -572,10 +580,8 @@ def _walk(task, state, work, changed, elapsed):
     matrix, upper, root = work.block[0], work.block[1], work.block[2]
     grown, most = work.cross[0], 0.0
     for j in range(n):
-        walk = task.walk[j]
-        if changed:
-            walk = max(walk, 1.0 / RELEARNING_TIME)
-        grown[j] = elapsed * walk * max(1.0 - p[6 + j, 6 + j], 0.0)
+        share = max(task.drift[j] * elapsed, relearnt)
+        grown[j] = share * max(1.0 - p[6 + j, 6 + j], 0.0)
         most = max(most, grown[j])
     if most == 0.0:
         return

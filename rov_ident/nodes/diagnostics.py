@@ -159,6 +159,9 @@ class Diagnostics:
                 values[f"test ratio {axis}"] = f"{finite.mean():.3g}"
         for part, ratio in self._online.sampler.kinematic_filter.test_ratios.items():
             values[f"test ratio odom {part}"] = f"{ratio:.3g}"
+        agreement = report.consistency
+        for test in agreement.tests if agreement is not None else ():
+            values[test.name] = f"{test.value:.3g} (limit {test.limit:g})"
         converged = sum(state is State.CONVERGED for state in report.states)
         words = f"{converged} of {len(states)} coefficients have converged"
         wrong = [s for s in State if s.level == Level.ERROR and s in report.states]
@@ -169,6 +172,8 @@ class Diagnostics:
             words = ", ".join([words, *(f"{s.value}: {values[s.value]}" for s in wrong)])
         elif stopped:
             level, words = Level.STALE, f"stale: no samples, {words}"
+        elif agreement is not None and not agreement.consistent:
+            level, words = Level.WARN, f"data and model disagree: {agreement.sentence}"
         else:
             level = Level.OK
         if waiting:

@@ -18,9 +18,11 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.effects import EFFECTS, Acting, compiled
+from rov_ident.estimation.consistency import consistency_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.model.coefficients import MOTIONS, Coefficient
 from rov_ident.model.equations import Model
+from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Samples, total
 from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
@@ -38,7 +40,6 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
-_COLOURED = 2.0  # times the Cramer-Rao bound, from which intervals say that a cause is missing
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
 _POINTS = 1500  # of a curve in a picture
 
@@ -68,6 +69,7 @@ class _Stage(NamedTuple):
     covariance: Array
     states: dict[str, State]
     more: dict[str, Any]
+    unexplained: Array  # (6,): as consistency_of takes it
     noise: maximum_likelihood.Noise | None = None
 
 
@@ -94,11 +96,12 @@ def fit_batch(
     config = config.with_nuisance if effects else config
     prior = prior_of(config, effects)
     values, covariance = prior.mean.copy(), np.diag(prior.std**2)
-    states = dict.fromkeys(prior.names, State.HELD)
+    states, unexplained = dict.fromkeys(prior.names, State.HELD), np.full(6, np.nan)
     now, parts = config, []
     if effects and config.estimate_effects:
         archive, whole = _relinearised(archive, config, kind, settings, notes, tell)
         values, covariance, states = whole.values, whole.covariance, whole.states
+        unexplained = whole.unexplained
         now = config.with_values(dict(zip(whole.names, values.tolist(), strict=True)))
         parts.append(whole.more)
     for stage in () if parts else settings.stages or (MOTIONS,):
@@ -109,10 +112,13 @@ def fit_batch(
         values[at] = found.values
         states.update(found.states)
         covariance[np.ix_(at, at)] = found.covariance
+        unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
         now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
     after = open_loop_rmse(_as_read_by(archive, config, now), now)
+    consistency = consistency_of(config, prior, values, unexplained)
+    consistency = consistency.with_open_loop(before, after)
     motion = archive.each(_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
@@ -125,13 +131,14 @@ def fit_batch(
         names=prior.names,
         units=prior.units,
         values=values,
-        covariance=covariance,
-        states=tuple(states.values()),
+        covariance=consistency.widened(covariance, prior.std),
+        states=consistency.of_states(states.values()),
         given=config,
         fitted=now,
         samples=archive.samples,
         duration=archive.duration,
         rmse=after,
+        consistency=consistency,
         provenance=provenance(((b.path.name, b.sha256) for b in archive.bags), vehicle=config.name),
         notes=tuple(notes),
         more=more,
@@ -148,11 +155,11 @@ def _relinearised(
     """
     first = len(config.estimate)
     found: _Stage | None = None
-    centre = first_centre(config)
+    centre, model = first_centre(config), config.model
     while True:
         told: list[str] = []
         acting = {n: v for n, v in centre.items() if EFFECTS[n.partition(".")[0]].body is None}
-        samples = archive.reread(config.with_values(acting), True)
+        samples = archive.reread(config.with_model(model).with_values(acting), True)
         found = _stage(samples, config, kind, MOTIONS, settings, told, say, found)
         assert found is not None
         before = np.array(list(centre.values()))
@@ -163,6 +170,7 @@ def _relinearised(
             notes += told
             return samples, found
         centre = dict(zip(centre, found.values[first:].tolist(), strict=True))
+        model = model.with_values(dict(zip(found.names[:first], found.values[:first].tolist())))
 
 
 def _stage(
@@ -229,6 +237,7 @@ def _stage(
         }
     }
     found, covariance, noise = solution.values, solution.covariance, None
+    unexplained = np.full(6, np.nan)
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
@@ -248,21 +257,15 @@ def _stage(
         )
         names = prior.names
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
+        unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
         more["cost"] = likelihood.total.cost
         more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
-        wider = float(np.median(np.sqrt(np.diag(covariance)) / bound))
-        if wider > _COLOURED:
-            notes.append(
-                f"{name + ': ' if settings.stages else ''}what remains is no white noise, so that "
-                f"intervals are {wider:.1f} times as wide as they could be: rov-ident explain "
-                "looks for what the model lacks"
-            )
         if not likelihood.converged:
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
-    covariance = covariance + rigid_body_covariance(config, names)
+    covariance = covariance + rigid_body_covariance(config, names, found)
     removed = 1.0 - np.diag(covariance) / prior.std**2
     estimate = Estimate(names, found, covariance, 0.0)
     values = physical(config.dynamics, prior, estimate)
@@ -280,7 +283,7 @@ def _stage(
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
-    return _Stage(names, values, covariance, states, more, noise)
+    return _Stage(names, values, covariance, states, more, unexplained, noise)
 
 
 def _start(

@@ -14,6 +14,7 @@ from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
 from rov_ident.effects import compiled
 from rov_ident.estimation.compilation import ensure_compiled
+from rov_ident.estimation.consistency import Consistency
 from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -53,6 +54,7 @@ class Fit(Shown, Result):
     ``states`` (n,) tell how well each is known: "held" where the prior and not the data made the
     value. ``rmse`` (6,) [m/s, rad/s] is of open-loop windows of HORIZON seconds. ``given`` is the
     configuration that the fit began with, ``fitted`` the same with the values found.
+    ``consistency`` says whether model and data agree; where they do not, intervals are wider.
     """
 
     states: tuple[State, ...]
@@ -61,6 +63,7 @@ class Fit(Shown, Result):
     samples: int
     duration: float
     rmse: Array
+    consistency: Consistency
     more: dict[str, Any] = field(default_factory=dict)
     """Further parts of the JSON that only some estimators have."""
     curves: tuple[Curves, ...] = field(default=(), repr=False)
@@ -78,10 +81,13 @@ class Fit(Shown, Result):
         """What was fitted, by which method, to how much data."""
         bags = len(self.provenance["bags"])
         known = sum(self.identifiable)
-        return (
+        said = (
             f"{TITLES[self.estimator].capitalize()} on {bags} bag{'s' * (bags != 1)}, "
             f"{self.duration:.0f} s: the data determine {known} of {len(self.names)} coefficients."
         )
+        if not self.consistency.consistent:
+            said += f" Data and model disagree: {self.consistency.sentence}."
+        return said
 
     def table(self) -> Table | Tables:
         """Every coefficient with half of its 95 % interval, and the configured value."""
@@ -158,6 +164,7 @@ class Fit(Shown, Result):
             "samples": self.samples,
             "duration_s": self.duration,
             "open_loop": {"horizon_s": HORIZON, "rmse": numbers(self.rmse)},
+            "consistency": self.consistency.to_dict(),
             "notes": list(self.notes),
             **self.more,
             "provenance": self.provenance,
@@ -197,24 +204,36 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     ]
     config = estimator.config
     found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
+    given = records
     if found.effects != config.effects:  # what acts is no longer what was read
         records = [read_record(record.path, found) for record in records]
     samples = sum(len(record.samples) for record in records)
-    moves, effects = found.dynamics, compiled(found.effects)
-    scores = [score(moves, record.samples, effects=effects) for record in records]
-    squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
+    before, after = _open_loop(given, config), _open_loop(records, found)
+    assert report.consistency is not None
+    predicts = Consistency(()).with_open_loop(before, after)
+    consistency = Consistency(report.consistency.tests + predicts.tests)
     return Fit(
         estimator=kind,
         names=report.names,
         units=report.units,
         values=report.values,
-        covariance=report.covariance,
-        states=tuple(states),
+        covariance=predicts.widened(report.covariance, estimator.prior.std),
+        states=consistency.of_states(states),
         given=config,
         fitted=found,
         samples=samples,
         duration=sum(record.duration for record in records),
-        rmse=np.sqrt(np.sum(squares, axis=0) / samples),
+        rmse=after,
+        consistency=consistency,
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
     )
+
+
+def _open_loop(records: Sequence[Record], config: Config) -> Array:
+    """RMSE (6,) of the open-loop simulation in windows over all records."""
+    effects = compiled(config.effects)
+    scores = [score(config.dynamics, record.samples, effects=effects) for record in records]
+    squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
+    rmse: Array = np.sqrt(np.sum(squares, axis=0) / sum(len(r.samples) for r in records))
+    return rmse

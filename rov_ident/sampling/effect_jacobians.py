@@ -41,6 +41,8 @@ from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Structure, coriolis, force_of_one
 
 _ZERO = np.zeros(3)
+_FOLLOWING_TIME = 1.0  # s; longer than a thruster takes, shorter than a vehicle rests
+_ASTRAY = 10.0  # m/s from what is measured: the present model runs away
 
 
 class EffectJacobians:
@@ -123,6 +125,7 @@ class EffectJacobians:
         self._impulse = np.zeros((count, 6))
         self._around = np.zeros((count, 6))
         self._time = 0.0
+        self._followed = np.zeros((2, 3))
 
     def act(self, t: float, dt: float, command: Array) -> None:
         """The command (6,) holds from t to t + dt."""
@@ -133,7 +136,7 @@ class EffectJacobians:
     def about(self, config: Config) -> "EffectJacobians":
         """The same of a configuration with other values of the parameters; what is known stays."""
         new = EffectJacobians(config)
-        for name in ("_memory", "_around", "_impulse", "_time", "_velocity"):
+        for name in ("_memory", "_around", "_impulse", "_time", "_velocity", "_followed"):
             setattr(new, name, getattr(self, name))
         return new
 
@@ -155,7 +158,7 @@ class EffectJacobians:
             self._surround(sample[0])
         _fill(
             self._motion, sample, self._acts, self._impulse, self._time, self._scale,
-            self._velocity, self._about, sides,
+            self._velocity, self._about, self._followed, sides,
         )  # fmt: skip
         self._impulse[:] = 0.0
         self._time = 0.0
@@ -211,13 +214,39 @@ def _surround(variants, t, nu, rotation, thrust, out):
         add_wrenches(_variant(variants, v), t, nu, rotation, thrust, out[v])
 
 
+@inlined
+def _acceleration(motion, sample, nu):
+    """nu_dot (6,) of the configured model at velocities nu (6,)."""
+    h = force_of_one(motion.structure, motion.mass, motion.theta, nu)
+    return motion.inverse @ (sample.wrench + motion.restoring @ sample.down - h)
+
+
+@inlined
+def _follow(motion, sample, followed):
+    """v_dot (3,) of a motion of the configured model, drawn to what was measured before.
+
+    ``followed`` (2, 3) are its velocities and those measured, at the sample before; now at this.
+    """
+    nu, v_dot = sample.nu.copy(), np.zeros(3)
+    for i in range(3):
+        if sample.restart or not abs(followed[0, i] - nu[i]) < _ASTRAY:
+            followed[0, i] = followed[1, i] = nu[i]
+        nu[i] = followed[0, i]
+    nu_dot = _acceleration(motion, sample, nu)
+    for i in range(3):
+        v_dot[i] = nu_dot[i] + (followed[1, i] - followed[0, i]) / _FOLLOWING_TIME
+        followed[0, i] += sample.dt * v_dot[i]
+        followed[1, i] = sample.nu[i]
+    return v_dot
+
+
 @kernel
-def _fill(motion, samples, acts, impulse, time, scale, velocity, about, sides):
+def _fill(motion, samples, acts, impulse, time, scale, velocity, about, followed, sides):
     """sides (13, k): rows of the wrench, of the measured velocity, and the values they are about.
 
     Of a change of the rigid body ``dG down - dM nu_dot - C(dM nu) nu``; of a later velocity
-    ``-nu_dot``, with the acceleration of the configured model: that of the sensors is noisy, and
-    the noise would be in column and innovation alike.
+    ``-v_dot``, in which the noise of the measured velocity must not be ("The column of the delay"
+    in docs/samples.md).
     """
     sample = samples[0]
     for j in range(len(about)):
@@ -235,15 +264,15 @@ def _fill(motion, samples, acts, impulse, time, scale, velocity, about, sides):
         for i in range(3):
             for a in range(3):
                 sides[6 + i, j] += to_world[a, i] * motion.water[a, j]
-    if len(motion.bodies) > 0 or motion.latency >= 0:
-        h = force_of_one(motion.structure, motion.mass, motion.theta, sample.nu)
-        nu_dot = motion.inverse @ (sample.wrench + motion.restoring @ sample.down - h)
+    if len(motion.bodies) > 0:
+        nu_dot = _acceleration(motion, sample, sample.nu)
         for b in range(len(motion.bodies)):
             change = motion.of_restoring[b] @ sample.down - motion.of_mass[b] @ nu_dot
             change -= coriolis(motion.of_mass[b] @ sample.nu, sample.nu)
             for i in range(6):
                 sides[i, motion.bodies[b]] = change[i]
-        # without an IMU a late velocity looks like thrust that comes early, whatever delays it
-        if motion.latency >= 0 and np.isfinite(sample.gyro[0]):
-            for i in range(3):
-                sides[6 + i, motion.latency] = -nu_dot[i]
+    # without an IMU a late velocity looks like thrust that comes early, whatever delays it
+    if motion.latency >= 0 and np.isfinite(sample.gyro[0]):
+        v_dot = _follow(motion, sample, followed)
+        for i in range(3):
+            sides[6 + i, motion.latency] = -v_dot[i]

@@ -1,0 +1,150 @@
+"""Whether model and data agree, so that an interval means what it says.
+
+An estimator finds the values that suit the data best, however badly that is. These tests ask what a
+wrong model or a lying sensor does to a good fit ("Does the model explain the data?" in
+docs/live.md has the study that their limits are from).
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.config.prior import Prior
+from rov_ident.core.linalg import widened
+from rov_ident.core.messages import Array
+from rov_ident.core.states import State
+from rov_ident.estimation.process_noise import FIRST_FORCE
+from rov_ident.model.coefficients import AXES
+from rov_ident.sampling.records import VELOCITIES
+
+_SUPPOSED = (
+    2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
+)
+_SENSORS = 3.0  # standard deviations, as of a lone outlier
+_WORSE = 1.05  # what the scatter of a second dive allows
+
+
+@dataclass(frozen=True)
+class Test:
+    """One question: it is passed while the value is at most the limit."""
+
+    name: str
+    value: float
+    limit: float
+    failure: str
+    """What a value above the limit means, in words."""
+
+    @property
+    def passed(self) -> bool:
+        return self.value <= self.limit
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """The tests, and by how much wider they make every interval."""
+
+    tests: tuple[Test, ...]
+
+    @property
+    def consistent(self) -> bool:
+        return all(test.passed for test in self.tests)
+
+    def widened(self, covariance: Array, prior: Array) -> Array:
+        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``.
+
+        Where a test fails, errors are taken to be as many times larger as its value is than its
+        limit; but what the file says remains.
+        """
+        factor = max([1.0, *(test.value / test.limit for test in self.tests)])
+        variance = np.diag(covariance)
+        return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, prior**2)))
+
+    @property
+    def sentence(self) -> str:
+        """What the worst test says, and what to do; nothing where all are passed."""
+        failed = [test for test in self.tests if not test.passed]
+        if not failed:
+            return "model and data agree"
+        return max(failed, key=lambda test: test.value / test.limit).failure
+
+    def of_states(self, states: Iterable[State]) -> tuple[State, ...]:
+        """The states of a fit: nothing has converged where model and data disagree."""
+        doubted = {} if self.consistent else {State.CONVERGED: State.CONVERGING}
+        return tuple(doubted.get(state, state) for state in states)
+
+    def with_open_loop(self, before: Array, after: Array) -> "Consistency":
+        """The same, asked also whether a fit predicts worse than what it began with.
+
+        ``before`` and ``after`` (6,) are errors of the open-loop simulation, NaN where not known.
+        """
+        tests = list(self.tests)
+        for component, old, new in zip(VELOCITIES, before.tolist(), after.tolist(), strict=True):
+            if np.isfinite([old, new]).all() and old > 0.0:
+                tests.append(
+                    Test(
+                        f"open loop: {component}", new / old, _WORSE,
+                        f"the fit predicts {component} worse than the configuration does (error "
+                        f"{new:.3g} instead of {old:.3g}): rov-ident explain looks for the cause",
+                    )
+                )  # fmt: skip
+        return Consistency(tuple(tests))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in the JSON of a fit."""
+        return {
+            "consistent": self.consistent,
+            "tests": [
+                {"name": t.name, "value": t.value, "limit": t.limit, "passed": t.passed}
+                for t in self.tests
+            ],
+            "sentence": self.sentence,
+        }
+
+
+def consistency_of(
+    config: Config,
+    prior: Prior,
+    values: Array,
+    unexplained: Array,
+    sensors: Mapping[str, float] | None = None,
+) -> Consistency:
+    """Judge an estimate.
+
+    ``values`` (n,) are not yet drawn to what is physically possible. ``unexplained`` (6,) is the
+    force that lasts a second and that the model does not have, relative to the working wrench; NaN
+    where it is not known. ``sensors`` are test ratios of the odometry's parts against the IMU.
+    """
+    tests = []
+    for axis, share in zip(AXES, unexplained.tolist(), strict=True):
+        if np.isfinite(share):
+            tests.append(
+                Test(
+                    f"unexplained: {axis}", share, FIRST_FORCE,
+                    f"something acts along {axis} that the model does not have: {share:.1%} of "
+                    "the working wrench; rov-ident explain looks for the cause",
+                )
+            )  # fmt: skip
+    supposed = {".".join(key) for key in config.nuisance_std}
+    for i in (i for i, name in enumerate(prior.names) if name in supposed):
+        name = prior.names[i]
+        off = abs(values[i] - prior.mean[i]) / prior.std[i]
+        tests.append(
+            Test(
+                f"prior of {name}", float(off), _SUPPOSED,
+                f"the data ask for {name} = {values[i]:.3g} {prior.units[i]}, which the "
+                f"configuration takes for impossible ({prior.mean[i]:.3g} ± {prior.std[i]:.2g}): "
+                "check the wrench, the stamps and the vehicle's file, or say what is known of it",
+            )
+        )  # fmt: skip
+    for part, ratio in (sensors or {}).items():
+        tests.append(
+            Test(
+                f"odometry and IMU: {part}", float(np.sqrt(ratio)), _SENSORS,
+                f"the {part} of the odometry and the IMU contradict each other (they differ by "
+                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings and stamps",
+            )
+        )  # fmt: skip
+    return Consistency(tuple(tests))

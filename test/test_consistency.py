@@ -1,0 +1,126 @@
+"""Whether model and data agree: said of every estimate, and right on clean and on false data.
+
+The dives come from a simulator that shares no code with the estimators (bench/simulators/sea.py).
+"""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+
+import rov_ident as ri
+from bench.simulators import sea
+from rov_ident import config as configuration
+from rov_ident.config.prior import prior_of
+from rov_ident.core.states import State
+from rov_ident.estimation.consistency import Consistency, consistency_of
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.io.write_messages import write_messages
+
+FALSE = {
+    "velocity frozen": lambda rng: {"frozen_from": rng.uniform(20.0, 30.0)},
+    "IMU turned": lambda rng: {"imu_turned": True},
+    "wrench axis reversed": lambda rng: {"reversed_axis": int(rng.integers(3))},
+    "smoothed odometry": lambda rng: {"smoothing": rng.uniform(0.08, 0.15)},
+    "sag": lambda rng: {"resistance": rng.uniform(0.02, 0.03), "advance": rng.uniform(0.2, 0.3)},
+}
+
+
+@cache
+def dive(case, driving, seed):
+    """Vehicle, parameters of its file, and the messages of a minute."""
+    rng = np.random.default_rng([seed, 5])
+    vehicle = sea.draw_vehicle(rng)
+    unknown = sea.Sea(**FALSE[case](rng)) if case else sea.Sea()
+    truth = sea.dive(vehicle, unknown, driving, 60.0, rng)
+    return vehicle, sea.told(vehicle, unknown, rng), sea.measured(truth, unknown, rng)
+
+
+def report_of(case, driving, seed, kind):
+    vehicle, parameters, messages = dive(case, driving, seed)
+    online = OnlineEstimator(configuration.from_parameters(parameters), kind)
+    for _, role, message in messages:
+        online.push(role, message)
+    online.flush()
+    return vehicle, online.report()
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("driving", ["six-axis", "pilot"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_clean_dives_agree(seed, driving, kind):
+    _, report = report_of("", driving, seed, kind)
+    assert report.consistency.consistent, report.consistency.sentence
+    assert State.CONVERGED in report.states
+
+
+@pytest.mark.parametrize(
+    ("case", "kind"), [(c, "ukf" if i % 2 else "rls") for i, c in enumerate(FALSE)]
+)
+def test_what_a_model_cannot_explain_is_said_and_nothing_has_converged(case, kind):
+    _, report = report_of(case, "six-axis", 3, kind)
+    assert not report.consistency.consistent
+    assert State.CONVERGED not in report.states
+    failed = [test for test in report.consistency.tests if not test.passed]
+    assert report.consistency.sentence in [test.failure for test in failed]
+
+
+def test_a_fit_says_so_and_widens_its_intervals(tmp_path):
+    vehicle, parameters, messages = dive("sag", "six-axis", 3)
+    write_messages(tmp_path / "dive.mcap", messages)
+    document = {"/**": {"ros__parameters": parameters}}
+    (tmp_path / "vehicle.yaml").write_text(yaml.safe_dump(document))
+    fit = ri.fit(tmp_path / "dive.mcap", tmp_path / "vehicle.yaml", "rls")
+    told = json.loads(fit.to_json())["consistency"]
+    assert told["consistent"] is False
+    assert not all(test["passed"] for test in told["tests"])
+    for test in told["tests"]:
+        assert set(test) == {"name", "value", "limit", "passed"}
+        assert test["passed"] == (test["value"] <= test["limit"])
+    assert told["sentence"] in fit.sentence
+    assert "converging" in fit.states and State.CONVERGED not in fit.states
+    off = [abs(fit.values[fit.names.index(n)] - true) for n, true in vehicle.theta.items()]
+    std = [fit.std[fit.names.index(n)] for n in vehicle.theta]
+    assert np.mean(np.array(off) < 2.0 * np.array(std)) > 0.75
+
+
+def test_each_question_has_its_limit(heavy):
+    parameters = configuration.to_parameters(heavy)
+    parameters["wrench"].pop("scale_std", None)
+    config = configuration.from_parameters(parameters).with_nuisance
+    prior, quiet = prior_of(config, effects=True), np.full(6, 0.001)
+    names = prior.names
+
+    def failed(values=prior.mean, unexplained=quiet, sensors=None):
+        found = consistency_of(config, prior, values, unexplained, sensors)
+        return [test.name for test in found.tests if not test.passed]
+
+    assert failed() == []
+    assert failed(unexplained=np.array([0.0, 0.0, 0.02, 0.0, np.nan, 0.0])) == ["unexplained: Z"]
+    assert failed(sensors={"velocity": 1.2, "attitude": 16.0}) == ["odometry and IMU: attitude"]
+    far = prior.mean.copy()
+    far[names.index("thrust_scale.scale")] -= 3.0 * 0.15
+    far[names.index("X_uu")] *= 3.0  # nobody has said that a coefficient is well known
+    assert failed(values=far) == ["prior of thrust_scale.scale"]
+
+
+def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):
+    prior = prior_of(heavy)
+    n = len(prior.names)
+    small = np.diag((0.01 * prior.std) ** 2)
+    four = consistency_of(heavy, prior, prior.mean, np.array([0.04, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(np.sqrt(np.diag(four.widened(small, prior.std))), 0.04 * prior.std)
+    thousand = consistency_of(heavy, prior, prior.mean, np.array([10.0, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(np.sqrt(np.diag(thousand.widened(small, prior.std))), prior.std)
+    assert Consistency(()).widened(small, prior.std) == pytest.approx(small)
+    assert len(small) == n
+
+
+def test_a_fit_that_predicts_worse_than_its_file_is_said_to(heavy):
+    before = np.array([0.1, 0.1, np.nan, 0.1, 0.1, 0.1])
+    after = np.array([0.05, 0.2, 0.3, 0.1, 0.1, 0.1])
+    found = Consistency(()).with_open_loop(before, after)
+    assert [test.name for test in found.tests if not test.passed] == ["open loop: v"]
+    assert not found.consistent and "predicts v worse" in found.sentence
