@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bench import HEAVY
-from rov_ident.cli.demo import shipped
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import shipped
 from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.write_messages import write_messages

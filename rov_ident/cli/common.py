@@ -24,6 +24,32 @@ OUT = Console(highlight=False, markup=False, soft_wrap=True)
 LIVE = ("rls", "ukf")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 
+EXAMPLES = {
+    "demo": "--rate 8",
+    "init": "--vehicle bluerov2_heavy dive.mcap --out my_rov.yaml",
+    "identify": "dive_1.mcap dive_2.mcap --config my_rov.yaml --out identified",
+    "replay": "dive.mcap --config my_rov.yaml --rate 4 --out live.mcap",
+    "fit": "dive.mcap --config my_rov.yaml --save fitted.yaml --report fit.html",
+    "check": "dive.mcap --config my_rov.yaml --report check.html",
+    "plan": "--config fitted.yaml --bag dive.mcap --tank 6,4,2",
+    "explain": "dive.mcap --config fitted.yaml --out explained",
+    "compare": "my_rov.yaml fit.json",
+    "simulate": "--config my_rov.yaml --bag dive.mcap --out simulated.mcap",
+    "import": "00000012.BIN --config my_rov.yaml --out dive.mcap",
+    "export": "--config fitted.yaml --format gazebo --out model.sdf",
+    "import-model": "robot.urdf --config my_rov.yaml --out new.yaml",
+    "nomoto": "zigzag_10.csv --validate zigzag_20.csv --json nomoto.json",
+    "forces": 'table.csv --map beta_deg="beta(deg)" --json forces.json',
+    "coast-down": "run_1.csv run_2.csv --json surge.json",
+    "steer": "--out zigzag.csv",
+    "dashboard": "",
+    "watch": "",
+    "layouts": "--config my_rov.yaml --out layouts",
+    "coefficients": "",
+    "completion": "bash",
+}
+"""Of each command, for its --help: what follows its name."""
+
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 _BAG = "an .mcap file or a rosbag2 directory"
@@ -46,7 +72,8 @@ def command(
     paths: str = "",
 ) -> argparse.ArgumentParser:
     """A new command and what runs it, with the common ``paths`` of these names."""
-    parser = commands.add_parser(name, help=text)
+    example = f"example: rov-ident {name} {EXAMPLES[name]}".rstrip()
+    parser = commands.add_parser(name, help=text, description=text, epilog=example)
     parser.set_defaults(run=run)
     for path in paths.split():
         parser.add_argument(path, type=Path, **_PATHS[path])

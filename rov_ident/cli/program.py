@@ -15,7 +15,7 @@ from rov_ident.core.errors import UserError
 
 # The files of this room that hold commands, in the order of --help.
 COMMANDS = (
-    "demo replay fit check plan explain compare simulate import_log models nomoto forces "
+    "demo init replay fit check plan explain compare simulate import_log models nomoto forces "
     "coast_down steer live coefficients"
 ).split()
 

@@ -121,7 +121,7 @@ class Log:
         if rotors:
             get = self.parameters.get
             return {
-                key: [get(f"CA_ROTOR{i}_{kind}{axis}", 0.0) for i in range(rotors) for axis in "XYZ"]
+                key: [get(f"CA_ROTOR{i}_{kind}{x}", 0.0) for i in range(rotors) for x in "XYZ"]
                 for key, kind in (("position", "P"), ("direction", "A"))
             }
         frame = FRAMES.get(int(self.parameters.get("FRAME_CONFIG", -1)))
@@ -193,7 +193,8 @@ def import_log(
         notes.append(f"{dropped} messages with backward or repeated times are left out")
     times = {role: [t for t, kind, _ in messages if kind == role] for role in _ROLES}
     duration = (times[ODOMETRY][-1] - times[ODOMETRY][0]) * 1e-9
-    return LogReport(*(len(times[role]) for role in _ROLES), duration, tuple(notes))
+    odom, imu, wrench = (len(times[role]) for role in _ROLES)
+    return LogReport(odom, imu, wrench, duration, tuple(notes))
 
 
 def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
@@ -219,8 +220,8 @@ def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
         )
     if turned := [str(i + 1) for i in np.flatnonzero(cosine < 0.0)]:
         notes.append(
-            f"by the autopilot's parameters, thruster {', '.join(turned)} pushes the other way than "
-            "the configuration says: the log's way is taken"
+            f"by the autopilot's parameters, thruster {', '.join(turned)} pushes the other way "
+            "than the configuration says: the log's way is taken"
         )
     n = len(along)
     channels = tuple(said.get("channels", range(1, n + 1)))

@@ -38,6 +38,18 @@ from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.cdr import DECODERS, ROLE_TYPES
 
 ROLE_NAMES = {"odom": "odom", "imu": "imu/data", "wrench": "thruster_wrench"}
+"""As the nodes call them."""
+
+_USUAL = {
+    "odom": ("odometry/filtered", "odometry"),
+    "imu": ("imu",),
+    "wrench": ("thruster_manager/input", "wrench"),
+    "velocity": ("velocity_body", "dvl/twist", "twist"),
+    "pose": ("local_position/pose",),
+    "thruster_pwm": ("rc/out",),
+    "battery": ("battery_state",),
+}
+"""As robot_localization, mavros and uuv_simulator call them: taken where no topic has our name."""
 _OPTIONAL_ROLES = ("imu",)
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -223,7 +235,9 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
         return topic
     named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
     typed = [topic for topic in filled if filled[topic] == type_name]
-    candidates = [topic for topic in named if topic in typed] or typed
+    usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
+    tiers = ([topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual)
+    candidates = next(filter(None, tiers), typed)
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
