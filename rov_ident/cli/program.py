@@ -15,8 +15,8 @@ from rov_ident.core.errors import UserError
 
 # The files of this room that hold commands, in the order of --help.
 COMMANDS = (
-    "demo init replay fit check plan explain compare simulate import_log models nomoto forces "
-    "coast_down steer live coefficients"
+    "demo init identify replay fit check plan explain compare simulate import_log models nomoto "
+    "forces coast_down steer live coefficients"
 ).split()
 
 

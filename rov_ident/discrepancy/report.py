@@ -165,10 +165,18 @@ def write_extended(explanation: Explanation, path: Path) -> None:
 
 
 def page(explanation: Explanation) -> str:
+    f = explanation.findings
+    origin = " · ".join(f"{key}: {_plain(value)}" for key, value in f.provenance.items())
+    title = f"{explanation.given.name}: what the simulation lacks"
+    return report.page(title, verdict(f), sections(explanation), origin)
+
+
+def sections(explanation: Explanation) -> list[str]:
+    """The parts of the page below its headline."""
     f, before = explanation.findings, explanation.given
     rmse, shown = _shown(explanation)
     key = _legend(shown)
-    sections = [
+    parts = [
         report.beside(
             [report.heading("What to change"), *_change(before, explanation)],
             [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))],
@@ -182,20 +190,20 @@ def page(explanation: Explanation) -> str:
         *_departures(explanation, shown),
     ]
     if f.effects:
-        sections.append(report.heading("What is missing, and how sure that is"))
-        sections += [_card(finding) for finding in f.effects]
+        parts.append(report.heading("What is missing, and how sure that is"))
+        parts += [_card(finding) for finding in f.effects]
     if f.minor:
         values = [", ".join(valued(n, v) for n, v in m.parameters.items()) for m in f.minor]
         gains = [f"{m.gain.percent:.1f} %" for m in f.minor]
         rows = zip([called(m.effect) for m in f.minor], values, gains, strict=True)
-        sections += [
+        parts += [
             report.heading("Minor effects"),
             report.paragraph("Seen in the data, but of less than 2 % gain or not surely of any."),
             report.table(["effect", "parameters", "gain"], [*map(list, rows)], text=(1,)),
         ]
-    sections.append(report.heading("What is left"))
+    parts.append(report.heading("What is left"))
     if f.residual:
-        sections += [
+        parts += [
             report.bullets([f"{dependence(r)[2:]}." for r in f.residual]),
             report.paragraph(
                 "No effect of the library has this form: look for a cause that depends on the "
@@ -203,13 +211,11 @@ def page(explanation: Explanation) -> str:
             ),
         ]
     else:
-        sections.append(report.paragraph("Nothing that depends on motion, place or time."))
-    sections += _retuned(f)
+        parts.append(report.paragraph("Nothing that depends on motion, place or time."))
+    parts += _retuned(f)
     if f.notes:
-        sections += [report.heading("Notes"), report.bullets(f.notes)]
-    origin = " · ".join(f"{key}: {_plain(value)}" for key, value in f.provenance.items())
-    title = f"{before.name}: what the simulation lacks"
-    return report.page(title, verdict(f), sections, origin)
+        parts += [report.heading("Notes"), report.bullets(f.notes)]
+    return parts
 
 
 def _shown(explanation: Explanation) -> tuple[dict[str, dict[str, float]], dict[str, Array]]:

@@ -17,10 +17,13 @@ _MOST = 4  # bags that are drawn
 
 
 def page(fit: Fit) -> str:
-    """A self-contained HTML document."""
-    judged, drawn, shown = fit.judged, fit.curves, fit.table()
+    """A self-contained HTML document: the coefficients first, then the evidence."""
+    shown = fit.table()
     coefficients = shown.parts[0] if isinstance(shown, Tables) else shown
+    judged, drawn = fit.judged, fit.curves
     sections = [
+        heading("Coefficients"),
+        coefficients.html(),
         heading(f"Open-loop simulation in windows of {HORIZON:g} s, before and after"),
         legend({label: (plots.css(colour), ",".join(str(3 * d) for d in dashes), 1.0)
                 for label, (colour, dashes) in plots.MODELS.items()
@@ -30,7 +33,6 @@ def page(fit: Fit) -> str:
         sections += [heading("On what no fit has seen"), *_curves(judged, "judged")]
     if drawn:
         sections += [heading("On what was fitted"), *_curves(drawn, "fitted")]
-    sections += [heading("Coefficients"), coefficients.html()]
     if fit.notes:
         sections += [heading("Notes"), bullets(fit.notes)]
     return document(f"Fit of {fit.given.name}", fit.sentence, sections, origin(fit))
