@@ -19,7 +19,17 @@ if TYPE_CHECKING:
     from rov_ident.reports.result import Shown
 
 ERR = Console(stderr=True, highlight=False, markup=False)
-OUT = Console(highlight=False, markup=False, soft_wrap=True)
+
+
+class _Output(Console):
+    def on_broken_pipe(self) -> None:
+        """Whoever read our output has seen enough: rich would end with the status of a fault."""
+        with contextlib.suppress(SystemExit):
+            super().on_broken_pipe()
+        raise BrokenPipeError
+
+
+OUT = _Output(highlight=False, markup=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, say, show
+from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, show
 
 
 def add(commands: Commands) -> None:
@@ -15,7 +15,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     identify.add_argument(
         "--validate", type=Path, metavar="BAG",
-        help="judge on this one (default: the shortest of several, 30 % of a single one)",
+        help="judge on this one (default: the shortest of several, 30 %% of a single one)",
     )  # fmt: skip
 
 
@@ -32,4 +32,3 @@ def _identify(options: argparse.Namespace) -> None:
     show(found, found.notes)
     for advice in found.advice:
         OUT.print(advice)
-    say(f"written: {', '.join(map(str, outputs))}")

@@ -31,4 +31,4 @@ def _init(options: argparse.Namespace) -> None:
         draft.save(options.out)
     else:
         OUT.print(draft.text, end="")
-    say(*draft.notes, draft.sentence, *([f"written: {options.out}"] if options.out else []))
+    say(*draft.notes, draft.sentence)

@@ -144,8 +144,9 @@ class Fit(Shown, Result):
 
     @property
     def identifiable(self) -> tuple[bool, ...]:
-        """(n,) whether the data decide about a coefficient."""
-        return tuple(state not in (State.HELD, State.DIVERGED) for state in self.states)
+        """(n,) whether the data, and neither prior nor a bound, decide about a coefficient."""
+        unknown = (State.HELD, State.AT_BOUND, State.DIVERGED)
+        return tuple(state not in unknown for state in self.states)
 
     def to_json(self) -> str:
         """The machine-readable result; numbers that do not exist are null."""
