@@ -19,8 +19,9 @@ from rov_ident.simulation import virtual_sensors as sensors
 pytestmark = pytest.mark.usefixtures("compiled")
 
 COMMANDS = (
-    "demo", "init", "identify", "compare", "replay", "fit", "check", "plan", "explain", "simulate", "import", "export",
-    "import-model", "nomoto", "forces", "coast-down", "steer", "coefficients",
+    "demo", "init", "identify", "compare", "replay", "fit", "check", "plan", "explain",
+    "simulate", "import", "export", "import-model", "nomoto", "forces", "coast-down", "steer",
+    "coefficients",
 )  # fmt: skip
 DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
 
