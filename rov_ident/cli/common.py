@@ -62,7 +62,7 @@ EXAMPLES = {
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-_BAG = "an .mcap file or a rosbag2 directory"
+_BAG = "a bag: .mcap, .db3, ROS 1's .bag, or a rosbag2 directory"
 _PATHS: Mapping[str, Mapping[str, Any]] = {
     "bag": {"metavar": "BAG", "help": _BAG},
     "bags": {"metavar": "BAG", "nargs": "+", "help": _BAG},
