@@ -11,7 +11,7 @@ setup(
     package_data={
         f"{package_name}.dashboard": ["page/*", "*.json", "*.xml"],
         f"{package_name}.nodes": ["*.xml"],
-        f"{package_name}.reports": ["*.css"],
+        f"{package_name}.reports": ["*.css", "*.js", "uplot/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),

@@ -7,8 +7,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from rov_ident.api.functions import (
     File,
     Files,
@@ -28,7 +26,7 @@ from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.experiment.data_quality import BAD, GOOD, Check
 from rov_ident.experiment.design import Proposal
-from rov_ident.offline.fit import Fit
+from rov_ident.offline.fit import Fit, falls
 from rov_ident.reports.result import Shown
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON
@@ -75,15 +73,12 @@ class Identification(Shown):
     @property
     def sentence(self) -> str:
         """Whether the model is good now, in numbers."""
-        before, after = np.array(list(self.errors.values())).T
-        fell = 100.0 * (1.0 - float(np.median(after / np.maximum(before, 1e-12))))
+        before, after = ({n: pair[i] for n, pair in self.errors.items()} for i in (0, 1))
         known, total = sum(self.fit.identifiable), len(self.fit.names)
         where = self.judge or "parts of the dives that were held back"
-        change = f"falls by {fell:.0f} %" if fell >= 1.0 else "does not fall"
         return (
-            f"{self.explanation.sentence} On {where}, the error of a {HORIZON:g} s prediction "
-            f"{change} (median of six velocities); the data determine {known} of {total} "
-            "parameters."
+            f"{self.explanation.sentence} On {where}, {falls(before, after)}; the data determine "
+            f"{known} of {total} parameters."
         )
 
     @property

@@ -71,11 +71,13 @@ def _play(out: Path, rate: float, err: Console, console: Console) -> None:
     write_file(picture, plots.to_png(plots.convergence(histories, truth)))
     for name, history in histories.items():
         true = np.array([truth[n] for n in history.names])
+        begun = np.abs(np.array([config.value(n) for n in history.names]) / true - 1.0)
         error = np.abs(history.values[-1] / true - 1.0)
         z = np.abs(history.values[-1] - true) / history.std[-1]
         console.print(
-            f"{name}: error median {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} "
-            f"% ({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
+            f"{name}: the median error of a coefficient fell from {100 * np.median(begun):.0f} % "
+            f"to {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} % "
+            f"({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
             "values inside their 95 % interval"
         )
     console.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")

@@ -279,7 +279,7 @@ def _gains(rmse: Mapping[str, Mapping[str, float]], held: bool) -> list[str]:
     for name, group in (("linear", VELOCITIES[:3]), ("angular", VELOCITIES[3:])):
         values = {label: np.array([by[c] for c in group]) for label, by in rmse.items()}
         figure = plots.bars([MOTIONS[c] for c in group], values, "", f"RMSE [{UNITS[group[0]]}]")
-        pictures.append(plots.to_svg(figure, f"bars-{name}-"))
+        pictures.append(plots.zoomable(figure, f"bars-{name}-"))
     where = "data that no fit has seen" if held else "the bag given by --validate"
     caption = f"Error of the {BLOCK:.0f} s open-loop prediction on {where}; lower is better."
     return [report.panels(pictures, caption)]
@@ -293,7 +293,7 @@ def _motion(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
             t, {label: run[:, i] for label, run in runs.items()}, MOTIONS[c], "time [s]",
             f"{c} [{UNITS[c]}]", measured=measured[:, i], shaded=explanation.held,
         )  # fmt: skip
-        pictures.append(plots.to_svg(figure, f"motion-{c}-"))
+        pictures.append(plots.zoomable(figure, f"motion-{c}-"))
     block = "held-out block (shaded: seen by no fit)" if explanation.held else "block"
     length = min(_STRETCH, explanation.t[-1] - explanation.t[0])
     caption = (
@@ -353,12 +353,12 @@ def _departures(explanation: Explanation, shown: Mapping[str, Array]) -> list[st
         figure = plots.curves(
             slots, by_time, MOTIONS[c], "time [s]", f"RMS error [{unit}]", shaded=explanation.held
         )
-        over_time.append(plots.to_svg(figure, f"time-{c}-"))
+        over_time.append(plots.zoomable(figure, f"time-{c}-"))
         slots, by_speed = _by_speed(explanation, shown, i)
         figure = plots.curves(
             slots, by_speed, MOTIONS[c], _directions(c), f"RMS error [{unit}]", marker="o"
         )
-        over_speed.append(plots.to_svg(figure, f"speed-{c}-"))
+        over_speed.append(plots.zoomable(figure, f"speed-{c}-"))
     return [
         report.panels(over_time, f"Over the time of the bag, in steps of {step:.0f} s."),
         report.panels(

@@ -7,7 +7,7 @@ import numpy as np
 from rov_ident.core.messages import Array
 from rov_ident.offline.fit import Curves, Fit
 from rov_ident.reports import plots
-from rov_ident.reports.html import bullets, heading, legend, origin, panels, paragraph
+from rov_ident.reports.html import beside, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
 from rov_ident.reports.table import Tables
 from rov_ident.sampling.records import HORIZON, VELOCITIES
@@ -22,8 +22,10 @@ def page(fit: Fit) -> str:
     coefficients = shown.parts[0] if isinstance(shown, Tables) else shown
     judged, drawn = fit.judged, fit.curves
     sections = [
-        heading("Coefficients"),
-        coefficients.html(),
+        beside(
+            [heading("Coefficients"), coefficients.html()],
+            [heading("What to do next"), bullets(fit.advice)],
+        ),
         heading(f"Open-loop simulation in windows of {HORIZON:g} s, before and after"),
         legend({label: (plots.css(colour), ",".join(str(3 * d) for d in dashes), 1.0)
                 for label, (colour, dashes) in plots.MODELS.items()
@@ -75,7 +77,7 @@ def _bars(before: Array, after: Array, key: str) -> str:
     ):  # fmt: skip
         models = {_BEFORE: before[pick], _AFTER: after[pick]}
         drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
-        parts.append(plots.to_svg(drawn, f"{key}-{label}"))
+        parts.append(plots.zoomable(drawn, f"{key}-{label}"))
     return panels(parts, "Root mean square error over all bags.")
 
 
@@ -90,5 +92,5 @@ def _motion(
             label.format(name=name, unit="m/s" if i < 3 else "rad/s"),
             measured=None if measured is None else measured[:, i],
         )  # fmt: skip
-        svgs.append(plots.to_svg(drawn, f"{key}{i}"))
+        svgs.append(plots.zoomable(drawn, f"{key}{i}"))
     return panels(svgs, caption, wide=True)
