@@ -8,6 +8,8 @@ import pytest
 
 import rov_ident as ri
 from bench import ROOT
+from rov_ident.offline import archive
+from rov_ident.offline.batch_fit import validation
 
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
 
@@ -40,6 +42,13 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     assert result["left_out"].keys() == {"rest.mcap"}
     assert [bag["file"] for bag in result["fit"]["provenance"]["bags"]] == ["long.mcap"]
     assert all(row["after"] < 0.5 * row["before"] for row in result["rmse"].values())
+    # what is judged is what is saved
+    given, saved = ri.load(WRONG), ri.load(tmp_path / "found" / "extended.yaml")
+    with archive.opened([dives / "short.mcap"], given) as judge:
+        told = validation(judge, given, saved)
+    for name, row in result["rmse"].items():
+        assert row["before"] == pytest.approx(told["rmse_before"][name])
+        assert row["after"] == pytest.approx(told["rmse"][name], rel=1e-3)
     truth, found = ri.load(VEHICLE), ri.load(tmp_path / "found" / "extended.yaml")
     for name in ("X_udot", "Y_vv", "N_rr"):
         assert found.value(name) == pytest.approx(truth.value(name), rel=0.02)

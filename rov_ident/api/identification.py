@@ -7,10 +7,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rov_ident.api.functions import (
     File,
     Files,
     Progress,
+    _opened,
     _several,
     _silent,
     check,
@@ -26,6 +29,7 @@ from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.experiment.data_quality import BAD, GOOD, Check
 from rov_ident.experiment.design import Proposal
+from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
 from rov_ident.reports.result import Shown
 from rov_ident.reports.table import Table, Tables
@@ -46,7 +50,8 @@ class Identification(Shown):
     has used, those of the same structure fitted without them. ``checks``: of the dives used;
     ``left_out``: why others were not. ``judge``: the name of the dive that was held back, empty
     where parts of each dive were. ``next``: the manoeuvre to fly next; None where none is safe in
-    the free water assumed.
+    the free water assumed. ``judged``: RMSE on the dive that was held back, of the configuration as
+    given and of ``fit.fitted``.
     """
 
     fit: Fit
@@ -55,6 +60,7 @@ class Identification(Shown):
     left_out: Mapping[str, str]
     judge: str
     next: Proposal | None = field(repr=False)
+    judged: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @property
@@ -66,6 +72,9 @@ class Identification(Shown):
     def errors(self) -> dict[str, tuple[float, float]]:
         """RMSE of the open-loop prediction by velocity, as configured and as identified; [m/s],
         [rad/s]."""
+        if self.judged:
+            both = self.judged["rmse_before"], self.judged["rmse"]
+            return {n: (x, both[1][n]) for n, x in both[0].items() if None not in (x, both[1][n])}
         found = self.explanation.findings
         after = found.extended if found.effects else found.retuned
         return {name: (found.baseline[name], after[name]) for name in found.baseline}
@@ -95,11 +104,16 @@ class Identification(Shown):
         ]
         if held:
             advice.append(
-                f"Not determined by these dives, and left as configured: {', '.join(held)}."
+                f"Not determined by these dives (the prior made the value): {', '.join(held)}."
             )
         if self.next is not None:
             advice.append(f"Fly next: {self.next.sentence}.")
-        advice.append("Use extended.yaml in place of the configuration, for nodes and commands.")
+        better = float(np.median([after / before for before, after in self.errors.values()])) < 1.0
+        advice.append(
+            "Use extended.yaml in place of the configuration, for nodes and commands."
+            if better
+            else "Keep the configuration: extended.yaml predicts no better than it does."
+        )
         return tuple(advice)
 
     def table(self) -> Tables:
@@ -223,6 +237,10 @@ def identify(
     extended = explanation.findings.verdict in ("explained", "unexplained")
     start = explanation.extended if extended else given
     fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
+    judged: dict[str, Any] = {}
+    if judge is not None:
+        with _opened([judge], given, say) as held_back:
+            judged = validation(held_back, given, fitted.fitted)
     proposal, why = None, list(fitted.notes)
     try:
         proposal = plan(fitted.fitted, used, progress=say)
@@ -231,7 +249,7 @@ def identify(
     checks = tuple(found for path, found in checked)
     name = judge.name if judge else ""
     notes = (*why, *explanation.findings.notes)
-    return Identification(fitted, explanation, checks, left_out, name, proposal, notes)
+    return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
 
 
 def _why(found: Check) -> str:

@@ -175,6 +175,7 @@ def _of_log(path: Path, found: _Found, vehicle: str) -> None:
     ]
     if lacks:
         found.notes.append(f"{path.name} has no {', no '.join(lacks)}: nothing can be fitted")
+        return
     armed = [log.is_armed(t) for t in log.outputs.t]
     if armed and len(log.armed):
         found.notes.append(f"armed in {100 * np.mean(armed):.0f} % of {path.name}")

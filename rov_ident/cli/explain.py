@@ -4,7 +4,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, show
+from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, say, show
 
 
 def add(commands: Commands) -> None:
@@ -49,3 +49,4 @@ def _explained(options: argparse.Namespace) -> None:
             OUT.print("  tried instead:")
         for a in f.alternatives:
             OUT.print(f"    {a.effect}: {a.why_not}")
+    say(f"report: {options.out / 'report.html'}")

@@ -70,7 +70,8 @@ def verdict(findings: Findings) -> str:
     named, left = _named(findings.effects), "; ".join(map(dependence, findings.residual))
     if findings.verdict == "explained":
         return named
-    return f"Something is left that no effect of the library explains: {left}. {named}".strip()
+    left = f": {left}" if left else ""
+    return f"Something is left that no effect of the library explains{left}. {named}".strip()
 
 
 def _named(effects: Sequence[Finding]) -> str:
