@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bench import HEAVY
+from rov_ident.cli.common import EXAMPLES
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import shipped
 from rov_ident.io.bag_reader import Bag, read_messages, select_topics
@@ -178,6 +179,8 @@ def test_help(command):
     done = run(command, "--help")
     assert done.returncode == 0 and done.stderr == ""
     assert done.stdout.startswith(f"usage: rov-ident {command}")
+    example = done.stdout.splitlines()[-1]  # in one line, to be copied
+    assert example == f"example: rov-ident {command} {EXAMPLES[command]}".rstrip()
 
 
 def test_what_is_shipped():

@@ -83,7 +83,11 @@ def command(
 ) -> argparse.ArgumentParser:
     """A new command and what runs it, with the common ``paths`` of these names."""
     example = f"example: rov-ident {name} {EXAMPLES[name]}".rstrip()
-    parser = commands.add_parser(name, help=text, description=text, epilog=example)
+    # Raw: an example that is broken into lines cannot be copied.
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(
+        name, help=text, description=text, epilog=example, formatter_class=raw
+    )
     parser.set_defaults(run=run)
     for path in paths.split():
         parser.add_argument(path, type=Path, **_PATHS[path])
