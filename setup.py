@@ -11,7 +11,7 @@ setup(
     package_data={
         f"{package_name}.dashboard": ["page/*", "*.json", "*.xml"],
         f"{package_name}.nodes": ["*.xml"],
-        f"{package_name}.reports": ["*.css"],
+        f"{package_name}.reports": ["*.css", "*.js", "uplot/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
@@ -57,6 +57,7 @@ setup(
             "nbformat>=5.7",
             "pymdown-extensions<13",  # 13 is not for the Python 3.11.2 of Debian 12
             "pymavlink>=2.4.40",
+            "pyulog>=1.0",
             "ruff",
             "mypy",
             "types-PyYAML",
@@ -66,6 +67,8 @@ setup(
         "docs": ["mkdocs>=1.6", "mkdocs-material>=9.5"],
         # `rov-ident import` of ArduSub's logs
         "ardupilot": ["pymavlink>=2.4.40"],
+        # and of PX4's
+        "px4": ["pyulog>=1.0"],
         # `rov-ident fit --dask`
         "dask": ["distributed>=2024.1"],
     },

@@ -23,8 +23,12 @@ if TYPE_CHECKING:
     from rov_ident.api.functions import load as load
     from rov_ident.api.functions import plan as plan
     from rov_ident.api.functions import read as read
+    from rov_ident.api.identification import Identification as Identification
+    from rov_ident.api.identification import identify as identify
     from rov_ident.api.simulation import Simulation as Simulation
     from rov_ident.api.simulation import simulate as simulate
+    from rov_ident.api.start import Draft as Draft
+    from rov_ident.api.start import init as init
     from rov_ident.config import Config as Config
     from rov_ident.consumer import HydrodynamicModel as HydrodynamicModel
     from rov_ident.core.errors import UserError as UserError
@@ -46,7 +50,9 @@ if TYPE_CHECKING:
 _PLACES = {
     "api.comparison": "Comparison compare",
     "api.functions": "check coefficients explain fit load plan read",
+    "api.identification": "Identification identify",
     "api.simulation": "Simulation simulate",
+    "api.start": "Draft init",
     "config": "Config",
     "consumer": "HydrodynamicModel",
     "core.errors": "UserError",

@@ -278,3 +278,80 @@ def test_an_odometry_in_the_bag_is_an_ordinary_one(tmp_path, dive):
     found = next(m for role, m in read_messages(bag, select_topics(bag)) if role == ODOMETRY)
     assert isinstance(found, Odometry)
     assert (found.frame_id, found.child_frame_id) == ("world_ned", "base_link_frd")
+
+
+# ------------------------------------------------------------------ PX4
+
+ULOG = {  # of each topic: its fields, and their layout behind the time
+    "vehicle_local_position": ("float vx;float vy;float vz;float x;float y;float z;"
+                               "bool v_xy_valid;", "6f?"),
+    "vehicle_attitude": ("float[4] q;", "4f"),
+    "sensor_combined": ("float[3] gyro_rad;float[3] accelerometer_m_s2;", "6f"),
+    "actuator_motors": ("float[12] control;", "12f"),
+    "battery_status": ("float voltage_v;", "f"),
+    "vehicle_status": ("uint8_t arming_state;", "B"),
+}  # fmt: skip
+
+
+def ulog(path, dive, parameters):
+    """A log as PX4's logger writes it (docs.px4.io, "ULog File Format")."""
+    data = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0))
+
+    def add(kind, content):
+        data.extend(struct.pack("<Hc", len(content), kind) + content)
+
+    def say(topic, t, *values):
+        layout = struct.Struct("<HQ" + ULOG[topic][1])
+        add(b"D", layout.pack([*ULOG].index(topic), t, *values))
+
+    for name, (fields, _) in ULOG.items():
+        add(b"F", f"{name}:uint64_t timestamp;{fields}".encode())
+    for name, value in parameters.items():
+        whole = isinstance(value, int)
+        key = f"{'int32_t' if whole else 'float'} {name}".encode()
+        add(b"P", bytes([len(key)]) + key + struct.pack("<i" if whole else "<f", value))
+    for number, name in enumerate(ULOG):
+        add(b"A", struct.pack("<BH", 0, number) + name.encode())
+    say("battery_status", 0, VOLTAGE)
+    say("vehicle_status", 0, 2)
+    for t, role, m in dive:
+        if role == WRENCH:
+            say("actuator_motors", t, *((m - 1500) / 400.0), *[np.nan] * 4)
+        elif role == IMU:
+            say("sensor_combined", t, *m.angular_velocity, *m.linear_acceleration)
+        else:
+            v = quaternion_to_matrix(m.orientation) @ m.linear
+            say("vehicle_attitude", t, *m.orientation)
+            say("vehicle_local_position", t, *v, *m.position, True)
+    path.write_bytes(bytes(data))
+    return path
+
+
+def rotors(turned=()):
+    """The geometry that PX4's parameters have, some thrusters the other way."""
+    found = {"CA_ROTOR_COUNT": len(DIRECTION)}
+    for i in range(found["CA_ROTOR_COUNT"]):
+        sign = -1.0 if i in turned else 1.0
+        for k, axis in enumerate("XYZ"):
+            found[f"CA_ROTOR{i}_P{axis}"] = float(POSITION[i][k])
+            found[f"CA_ROTOR{i}_A{axis}"] = sign * float(DIRECTION[i][k])
+    return found
+
+
+def test_a_log_of_px4(tmp_path, dive):
+    """The estimate of the dive itself, to the single precision of the log, of its geometry too."""
+    path = ulog(tmp_path / "log.ulg", dive, rotors())
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    counts = {role: sum(own == role for _, own, _ in dive) for role in (ODOMETRY, IMU, WRENCH)}
+    assert (report.odometry, report.imu, report.wrench) == tuple(counts.values())
+    reference = expected(tmp_path / "direct.mcap", dive)
+    assert_close(estimate(tmp_path / "log.mcap", config.load(HEAVY)), reference, 1e-4)
+    turned = ulog(tmp_path / "turned.ulg", dive, rotors(turned=(0,)))
+    report = import_log(turned, tmp_path / "turned.mcap", configured(**GEOMETRY))
+    assert any("thruster 1 pushes the other way" in note for note in report.notes)
+
+
+def test_what_is_no_log_of_px4(tmp_path):
+    (tmp_path / "bad.ulg").write_bytes(b"ULog but not really")
+    with pytest.raises(UserError, match=r"bad\.ulg is no log of PX4"):
+        import_log(tmp_path / "bad.ulg", tmp_path / "bag.mcap", configured(**GEOMETRY))

@@ -19,10 +19,11 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Reader as RosbagsReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Imu, Odometry, Wrench
@@ -145,11 +146,11 @@ def test_a_bag_by_rosbags(tmp_path, storage):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, type_name, typestore=store)
             writer.write(connections[topic], stamp, data)
-    if storage == StoragePlugin.SQLITE3:
-        with pytest.raises(UserError, match="ros2 bag convert"):
-            Bag(path)
-    else:
-        assert [tuple(raw) for raw in Bag(path).iter_raw()] == list(entries(10))
+    (file,) = (p for p in path.iterdir() if p.suffix != ".yaml")
+    for place in (path, file):
+        bag = Bag(place)
+        assert [tuple(raw) for raw in bag.iter_raw()] == list(entries(10))
+        assert bag.damage is None and len(bag.sha256) == 64
 
 
 @pytest.mark.parametrize(
@@ -347,6 +348,46 @@ def test_undecodable_messages_are_given_as_none(tmp_path):
     ]
 
 
+# --- other formats ---------------------------------------------------------------------------
+
+
+def write_ros1(path, rows):
+    store, ros1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
+    with Ros1Writer(path) as writer:
+        topics = {}
+        for topic, kind, stamp, data in rows:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=ros1)
+            writer.write(topics[topic], stamp, bytes(store.cdr_to_ros1(data, kind)))
+    return path
+
+
+def test_a_bag_of_ros_1(tmp_path):
+    rows = list(entries(40))
+    bag = Bag(write_ros1(tmp_path / "dive.bag", rows))
+    assert bag.topics == Bag(write(tmp_path / "dive.mcap", rows)).topics
+    assert [raw[:3] for raw in bag.iter_raw()] == [row[:3] for row in rows]
+    read = [cdr.encode(message) for _, message in read_messages(bag, select_topics(bag))]
+    assert read == [row[3] for row in rows]
+    assert {m.topic for m in bag.iter_raw(["/imu/data"])} == {"/imu/data"}
+
+
+def test_types_of_ros_1_that_ros_2_does_not_ship(tmp_path):
+    """As mavros publishes its outputs: the bag itself says what they are."""
+    kind, ros1 = "mavros_msgs/msg/RCOut", get_typestore(Stores.ROS1_NOETIC)
+    ros1.register(get_types_from_msg("std_msgs/Header header\nuint16[] channels\n", kind))
+    header = ros1.types["std_msgs/msg/Header"](
+        seq=3, stamp=ros1.types["builtin_interfaces/msg/Time"](sec=5, nanosec=6), frame_id=""
+    )
+    message = ros1.types[kind](header=header, channels=np.array([1500, 1600], np.uint16))
+    with Ros1Writer(tmp_path / "rc.bag") as writer:
+        topic = writer.add_connection("/mavros/rc/out", kind, typestore=ros1)
+        writer.write(topic, 1, bytes(ros1.serialize_ros1(message, kind)))
+    (raw,) = Bag(tmp_path / "rc.bag").iter_raw()
+    stamp, values = cdr.decode_channels(raw.data)
+    assert stamp == 5_000_000_006 and values.tolist() == [1500.0, 1600.0]
+
+
 # --- wrong files ----------------------------------------------------------------------------
 
 
@@ -355,8 +396,8 @@ def test_undecodable_messages_are_given_as_none(tmp_path):
     [
         (b"", "is empty"),
         (b"t_s,u,v\n0,1,2\n", "not an MCAP"),
-        (b"SQLite format 3\0....", "ros2 bag convert"),
-        (b"#ROSBAG V2.0\n", "rosbags-convert"),
+        (b"SQLite format 3\0....", "damaged"),
+        (b"#ROSBAG V2.0\n", "damaged"),
         (b"\x89MCAP0\r\n", "killed"),
     ],
 )

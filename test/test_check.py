@@ -232,3 +232,13 @@ def test_less_thrust_is_heeded(heavy):
     manoeuvre = closed_loop_manoeuvres.library(limits)[0]
     flight = fly(heavy, manoeuvre, 10.0, limits)
     assert np.all(np.abs(flight.demand) <= 0.3 * authority(heavy.dynamics) * (1.0 + 1e-12))
+
+
+def test_axes_by_which_the_hull_would_capsize(checked, heavy):
+    """A file in forward-starboard-down that says it is forward-port-up."""
+    body = heavy.model.body
+    turned = dataclasses.replace(body, cob=-body.cob)
+    model = dataclasses.replace(heavy.model, body=turned)
+    found = checked(config=dataclasses.replace(heavy, model=model))
+    (remark,) = [r for r in found.remarks if r.subject == "vehicle.frame"]
+    assert remark.level == BAD and "vehicle.cob" in remark.text and not found.fit

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from bench import HEAVY
-from rov_ident.cli.demo import shipped
+from rov_ident.cli.common import EXAMPLES
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import shipped
 from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.write_messages import write_messages
@@ -19,8 +20,9 @@ from rov_ident.simulation import virtual_sensors as sensors
 pytestmark = pytest.mark.usefixtures("compiled")
 
 COMMANDS = (
-    "demo", "replay", "fit", "check", "plan", "explain", "simulate", "import", "export",
-    "import-model", "nomoto", "forces", "coast-down", "steer", "coefficients",
+    "demo", "init", "identify", "compare", "replay", "fit", "check", "plan", "explain",
+    "simulate", "import", "export", "import-model", "nomoto", "forces", "coast-down", "steer",
+    "coefficients",
 )  # fmt: skip
 DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
 
@@ -123,11 +125,62 @@ def test_the_filter_of_filterpy_beside_ours(tmp_path, bag):
     )
 
 
+def test_what_is_written_is_said(tmp_path, bag):
+    paths = [tmp_path / name for name in ("fitted.yaml", "fit.html", "fit.json")]
+    done = fit(bag, "--save", paths[0], "--report", paths[1], "--json", paths[2])
+    (said,) = [line for line in done.stderr.splitlines() if line.startswith("written: ")]
+    assert all(str(path) in said for path in paths)
+    out = tmp_path / "simulated.mcap"
+    assert f"written: {out}" in simulate(out, source=("--bag", bag)).stderr
+
+
+def test_three_samples_are_no_fit(tmp_path, dive):
+    last = [stamp for _, role, m in dive if role == "odom" for stamp in (m.stamp,)][2]
+    short = [(t, role, m) for t, role, m in dive if role != "imu" and m.stamp <= last]
+    write_messages(tmp_path / "short.mcap", short)
+    for estimator in ("rls", "ls"):
+        done = run("fit", tmp_path / "short.mcap", "--config", HEAVY, "--estimator", estimator)
+        assert done.returncode == 2 and done.stdout == ""
+        assert "samples are too few" in done.stderr
+
+
+def test_a_bag_that_is_not_there_among_others(tmp_path, bag):
+    for command in ("fit", "explain", "identify"):
+        out = ("--out", tmp_path / "out") if command != "fit" else ("--estimator", "ls")
+        done = run(command, bag, tmp_path / "none.mcap", "--config", HEAVY, *out)
+        refused(done, "none.mcap cannot be read")
+
+
+def test_a_bag_in_the_folder_one_is_in(tmp_path, bag):
+    folder = tmp_path / "first dive"
+    folder.mkdir()
+    (folder / "first.mcap").write_bytes(bag.read_bytes())
+    command = [sys.executable, "-m", "rov_ident", "check", ".", "--config", HEAVY]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=240)
+    assert done.stdout.startswith("first dive, 12.0 s")
+
+
+@pytest.mark.parametrize("arguments", ["coefficients", "completion bash", "completion fish"])
+def test_who_reads_the_head_has_seen_enough(arguments):
+    command = f"{sys.executable} -u -m rov_ident {arguments} | head -1; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=240)
+    assert done.stdout.splitlines()[-1] == "0" and done.stderr == ""
+
+
+def test_completion_of_fish():
+    lines = run("completion", "fish").stdout.splitlines()
+    (estimator,) = [s for s in lines if "_from fit'" in s and " -l estimator " in s]
+    assert "-a 'rls ukf ls iv ml'" in estimator
+    assert {f" -a {name} " in "\n".join(lines) for name in COMMANDS} == {True}
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help(command):
     done = run(command, "--help")
     assert done.returncode == 0 and done.stderr == ""
     assert done.stdout.startswith(f"usage: rov-ident {command}")
+    example = done.stdout.splitlines()[-1]  # in one line, to be copied
+    assert example == f"example: rov-ident {command} {EXAMPLES[command]}".rstrip()
 
 
 def test_what_is_shipped():

@@ -75,7 +75,7 @@ def test_every_option_that_is_written_of_exists():
 
 @pytest.mark.parametrize("path", [*PAGES, *FRONT], ids=lambda p: p.name)
 def test_every_file_that_is_named_exists(path):
-    """Whatever begins with `rov_ident/`, every Python file, and what the front pages link to.
+    """Whatever begins with `rov_ident/`, every Python file, and every link (also in a checkout).
 
     A Python file may be named by the end of its path: `sampler.py` or `sampling/sampler.py`.
     """
@@ -85,9 +85,8 @@ def test_every_file_that_is_named_exists(path):
     named |= {f"{m.replace('.', '/')}.py" for m in re.findall(r"python -m (bench\.[\w.]+\w)", text)}
     for name in {name.removeprefix("../") for name in named if "NAME" not in name}:
         assert any(source.endswith(f"/{name}") for source in SOURCES), f"{path.name}: {name}"
-    if path in FRONT:
-        for link in re.findall(r"\]\(([^)#:]+)[#)]", text):
-            assert (ROOT / link).exists(), f"{path.name}: {link}"
+    for link in re.findall(r"\]\(([^)#:]+)[#)]", text):
+        assert (path.parent / link).exists(), f"{path.name}: {link}"
 
 
 @pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md"], ids=lambda p: p.name)

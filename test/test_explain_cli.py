@@ -284,6 +284,9 @@ def test_verdicts_in_words():
         "Something is left that no effect of the library explains: a moment N that depends on "
         "time at 0.31 Hz (40 % of what is left on N)."
     )
+    assert told.verdict(findings("unexplained", [])) == (
+        "Something is left that no effect of the library explains."
+    )
 
 
 def test_error_is_averaged_in_bins_that_hold_enough():

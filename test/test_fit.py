@@ -230,3 +230,12 @@ def test_parameters_of_effects_are_fitted_too(heavy, tmp_path):
     listed = json.loads(result.to_json())["coefficients"]["thruster_lag.time_constant"]
     assert listed["unit"] == "s"
     assert listed["value"] == online.report().values[-1] == pytest.approx(0.13, abs=0.005)
+
+
+def test_a_value_that_a_bound_made_is_not_what_the_data_tell(fits):
+    found = fits["rls"]
+    known = found.identifiable.index(True)
+    states = list(found.states)
+    states[known] = State.AT_BOUND
+    told = json.loads(dataclasses.replace(found, states=tuple(states)).to_json())
+    assert told["coefficients"][found.names[known]]["identifiable"] is False

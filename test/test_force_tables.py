@@ -360,6 +360,14 @@ def test_spheroid_agrees_with_lambs_integrals_and_table(ratio, k1, k2, k):
     assert table == pytest.approx((k1, k2, k), abs=2.5e-3)
 
 
+def test_what_is_left_unused_is_named(tmp_path):
+    path = tmp_path / "table.csv"
+    rows = [f"{u},{-3.0 * u**2},{8.0 + u},x" for u in np.linspace(0.2, 2.0, 12)]
+    path.write_text("\n".join(["u,X,lift force,remark", *rows]))
+    (note,) = force_tables.read_table(path).notes
+    assert note.endswith(": lift force, remark")
+
+
 def test_hull_in_words():
     assert parse_hull("cylinder:L=2,R=0.1,rho=1000") == cylinder(2.0, 0.1, 1000.0)
     for wrong in ("cylinder", "spheroid:L=0.1,R=0.1", "cylinder:L=2", "cylinder:L=-1,R=1"):

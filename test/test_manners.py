@@ -8,12 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
 
 from bench import HEAVY
 from rov_ident.cli import program as cli
 from rov_ident.cli.program import main
+from rov_ident.reports import html, plots
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -113,8 +115,10 @@ def test_pages_of_check_and_plan(tmp_path, capsys):
     text += page.read_text()
     assert "Next manoeuvre for bluerov2_heavy" in text
     assert "from above" in text
-    for outside in ("http:", "https:", "<script", "src=", "@import"):
-        assert outside not in text.replace("http://www.w3.org", "")
+    library = (SHIPPED / "rov_ident/reports/uplot/uPlot.iife.min.js").read_text()
+    assert text.count(library) == 2
+    for outside in ("http:", "https:", "src=", "@import"):
+        assert outside not in text.replace("http://www.w3.org", "").replace(library, "")
     capsys.readouterr()
 
 
@@ -130,7 +134,7 @@ TABLE = """U_mps,beta_deg,X,Y,N
 1.5,10,-329.3,-14.7,-0.29
 """
 SMALLEST = """
-Math.min(...[...document.querySelectorAll("figure text")].map(
+Math.min(...[...document.querySelectorAll("figure text, .u-title, .u-value")].map(
   text => text.getBoundingClientRect().height).filter(height => height > 0))
 """
 
@@ -155,6 +159,58 @@ def test_pages_in_a_browser(tmp_path, capsys):
     pages = sorted(tmp_path.glob("*.html"))
     assert len(pages) == 5
     asyncio.run(_look_at(pages))
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_curves_are_read_out_and_zoomed_together(tmp_path):
+    t = np.linspace(0.0, 60.0, 600)
+    panels = [
+        plots.zoomable(plots.motion(t, np.sin(t), {"rls": np.sin(t + k)}, "u [m/s]"), f"m{k}")
+        for k in range(2)
+    ]
+    path = tmp_path / "page.html"
+    path.write_text(html.page("curves", "", [html.panels(panels, "")], ""))
+    assert path.stat().st_size < 5e6
+    asyncio.run(_zoom(path))
+
+
+async def _zoom(path):
+    async with chromium() as browser:
+
+        async def mouse(kind, share, held=0):
+            left, top, width = await browser.evaluate(
+                "(({left, top, width}) => [left, top, width])"
+                "(document.querySelector('.u-over').getBoundingClientRect())"
+            )
+            how = {"button": "none", "buttons": 0} if kind == "mouseMoved" and not held else {}
+            how = {"button": "left", "buttons": held, "clickCount": 1} | how
+            at = {"x": left + share * width, "y": top + 50.0}
+            await browser.send("Input.dispatchMouseEvent", type=kind, **at, **how)
+
+        async def shown():
+            return await browser.evaluate(
+                "[...document.querySelectorAll('.uplot canvas')].map(each => each.toDataURL())"
+            )
+
+        await browser.open(path.as_uri())
+        await browser.until("document.querySelectorAll('.uplot').length == 2")
+        whole = await shown()
+        assert await browser.evaluate("document.querySelector('.zoom > svg').clientHeight") == 0
+        await mouse("mouseMoved", 0.5)
+        told = "[...document.querySelectorAll('.u-legend .u-value')].map(each => each.textContent)"
+        await browser.until(f"{told}.every(text => text != '\u2013')")  # in both charts
+        read = float((await browser.evaluate(told))[0].removesuffix(" s"))
+        assert abs(read - 30.0) < 0.2  # a sample and a pixel are 0.1 s each
+        await mouse("mousePressed", 0.4, 1)
+        for share in (0.5, 0.6):
+            await mouse("mouseMoved", share, 1)
+        await mouse("mouseReleased", 0.6)
+        await asyncio.sleep(0.3)
+        assert all(now != before for now, before in zip(await shown(), whole, strict=True))
+        assert browser.complaints == []
+        await browser.send("Emulation.setEmulatedMedia", media="print")
+        assert await browser.evaluate("document.querySelector('.zoom > svg').clientHeight") > 0
+        assert await browser.evaluate("document.querySelector('.uplot').clientHeight") == 0
 
 
 async def _look_at(pages):

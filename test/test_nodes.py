@@ -263,6 +263,35 @@ def test_bad_configuration(domain, heavy_path, tmp_path, old, new, sentence):
     assert "Traceback" not in said
 
 
+def test_started_without_a_configuration(domain):
+    command = [sys.executable, "-m", "rov_ident.nodes.rls_node"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 2
+    assert "--ros-args --params-file" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_vehicles_of_a_fleet_save_to_files_of_their_own(domain, heavy_path, tmp_path):
+    """And whoever saves what has learnt nothing is told so."""
+    caller = Vehicle()
+    for name in ("one", "two"):
+        command = [sys.executable, "-m", "rov_ident.nodes.rls_node", "--ros-args"]
+        command += ["-r", f"__ns:=/{name}", "--params-file", heavy_path]
+        process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        try:
+            client = caller.node.create_client(Trigger, f"/{name}/rls_node/save")
+            caller.until(client.service_is_ready, 120.0)
+            future = client.call_async(Trigger.Request())
+            caller.until(future.done, 30.0)
+            assert future.result().success
+            assert "no sample was used yet" in future.result().message
+        finally:
+            status, said = end_node(process)
+        assert status == 0, said
+    caller.close()
+    names = sorted(path.name for path in tmp_path.glob("*.yaml"))
+    assert names == [f"bluerov2_heavy_{name}_rls_node.yaml" for name in ("one", "two")]
+
+
 def test_terminate(domain, heavy, heavy_path, short_dive):
     """SIGTERM, too, is a way to end well; with parting words, which are true."""
     online = OnlineEstimator(heavy, "rls")

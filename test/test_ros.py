@@ -6,9 +6,11 @@ name in them must be one that exists.
 
 import ast
 import importlib
+import json
 import re
 import sys
 from functools import partial
+from itertools import product
 from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
@@ -18,6 +20,8 @@ from rcl_interfaces.msg import ParameterType
 from bench import HEAVY
 from bench.simulators.live import Vehicle, end_node, start_node
 from rov_ident import config
+from rov_ident.config import Inputs, schema
+from rov_ident.io.topics import sources
 from rov_ident.nodes import controller_bridge, dashboard_node, estimator_node, parameters
 
 ROOT = HEAVY.parent.parent
@@ -132,6 +136,48 @@ def test_files_are_looked_for_in_time(name, argument, monkeypatch):
         else:
             with pytest.raises(RuntimeError, match=f"{argument}: there is no .*not_there"):
                 launched.check(None)
+
+
+def test_recorder_of_a_namespace(monkeypatch, tmp_path):
+    """It records what the nodes hear and publish, and replaces nothing."""
+    launched = functions_of(ROOT / "launch" / "identify.launch.py", monkeypatch)
+
+    def recorded(path, namespace):
+        given = {
+            name: SimpleNamespace(perform=lambda _, value=value: value)
+            for name, value in (("record", path), ("namespace", namespace))
+        }
+        monkeypatch.setattr(launched, "LaunchConfiguration", given.__getitem__)
+        return [keywords["cmd"] for _, keywords in launched.recorder(None)]
+
+    assert recorded("", "rov") == []
+    (command,) = recorded(str(tmp_path / "dive"), "/sea/rov/")
+    assert command[command.index("--output") + 1] == str(tmp_path / "dive")
+    kinds = ("nav_msgs/Odometry", "geometry_msgs/TwistStamped")
+    wrenches = ("geometry_msgs/WrenchStamped", schema.FORCE_TYPES[0], schema.PULSE_TYPES[0])
+    known = {
+        source.topic
+        for odom, wrench in product(kinds, wrenches)
+        for source in sources(
+            Inputs(odom=odom, wrench=wrench, battery=schema.BATTERY_TYPE)
+        ).values()
+    }
+    published = {"rls_node/wrench_residual", "ukf_node/coefficients"}
+    assert {f"/sea/rov/{topic}" for topic in known | published} <= set(command)
+    assert "/odom" in recorded(str(tmp_path / "dive"), "")[0]
+    with pytest.raises(RuntimeError, match="exists already"):
+        recorded(str(tmp_path), "")
+
+
+def test_container_is_made_of_what_is_here():
+    """Docker is not at hand: what the file copies and runs is."""
+    text = (ROOT / "Dockerfile").read_text()
+    for source in re.findall(r"^COPY (\S+)", text, re.M):
+        assert (ROOT / source).exists()
+    assert re.search(r'^CMD \["rov-ident", "demo"', text, re.M)
+    folder = ROOT / ".devcontainer"
+    build = json.loads((folder / "devcontainer.json").read_text())["build"]
+    assert (folder / build["dockerfile"]).resolve() == ROOT / "Dockerfile"
 
 
 @pytest.mark.parametrize("path", LAUNCH, ids=lambda path: path.name)

@@ -34,8 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident import config as configuration
-from rov_ident.cli.demo import shipped
 from rov_ident.config import Config
+from rov_ident.core.files import shipped
 from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.jit import kernel, record
 from rov_ident.core.messages import Imu, Odometry, Wrench

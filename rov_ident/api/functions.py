@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -52,7 +53,15 @@ def _silent(what: str, share: float | None = None) -> None:
 
 def _several(files: Files) -> list[Path]:
     one = isinstance(files, str | os.PathLike)
-    return [Path(files)] if one else [Path(file) for file in files]  # type: ignore[arg-type, union-attr]
+    return [_existing(files)] if one else [_existing(file) for file in files]  # type: ignore[arg-type, union-attr]
+
+
+def _existing(file: File) -> Path:
+    """The path, with the name of its folder for `.`; UserError where there is nothing."""
+    path = Path(file)
+    if not path.exists():
+        raise UserError(f"{path} cannot be read (No such file or directory): check the path")
+    return path if path.name not in ("", "..") else path.resolve()
 
 
 def load(config: File | Config, node: str = "") -> Config:
@@ -101,7 +110,7 @@ def read(bag: File, config: File | Config, progress: Progress | None = None) -> 
     UserError
         If the bag cannot be read, lacks a topic or yields no sample.
     """
-    say, path = progress or _silent, Path(bag)
+    say, path = progress or _silent, _existing(bag)
     return read_record(path, load(config), lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
 
 
@@ -189,12 +198,14 @@ def fit(
         if live:
             records = [read(path, given, progress) for path in paths]
             many = archive.of_records(records)
+            _check_enough(many, given)
             say("estimating")
             found = fit_online(records, given, estimator)  # type: ignore[arg-type]
             if reference:
                 found.more["reference"] = _reference(paths[0], given, reference, say)
         else:
             many = stack.enter_context(_opened(paths, given, say, jobs, dask))
+            _check_enough(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("simulating in open loop")
         found = dataclasses.replace(
@@ -202,10 +213,21 @@ def fit(
         )
         if validate is None:
             return found
-        judge = stack.enter_context(_opened([Path(validate)], given, say))
+        judge = stack.enter_context(_opened([_existing(validate)], given, say))
         more = {"validation": batch_fit.validation(judge, given, found.fitted)}
         judged = tuple(batch_fit.curves(judge, given, found.fitted))
         return dataclasses.replace(found, more=found.more | more, judged=judged)
+
+
+def _check_enough(many: archive.Archive, config: Config) -> None:
+    """k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed."""
+    chosen = (c.row for c in config.model.coefficients if c.name in config.estimate)
+    unknowns = max(Counter(chosen).values(), default=0)
+    if many.samples - 1 <= unknowns:
+        raise UserError(
+            f"{many.samples} samples are too few for {unknowns} coefficients of one axis: record "
+            "for longer (rov-ident plan says what)"
+        )
 
 
 def _reference(path: Path, config: Config, duration: float, say: Progress) -> dict[str, Any]:
@@ -281,7 +303,7 @@ def explain(
     """
     given, say = load(config), progress or _silent
     read_bags = [_streams(path, given, say) for path in _several(bags)]
-    judge = None if validate is None else _streams(Path(validate), given, say)
+    judge = None if validate is None else _streams(_existing(validate), given, say)
     found = explain_streams(
         [streams for streams, _ in read_bags], given, judge[0] if judge else None, say
     )
@@ -330,7 +352,7 @@ def check(bag: File, config: File | Config, *, progress: Progress | None = None)
     UserError
         If the bag cannot be read, or has too few messages.
     """
-    return data_quality.check(Path(bag), load(config), progress)
+    return data_quality.check(_existing(bag), load(config), progress)
 
 
 @one_blas_thread()

@@ -19,14 +19,50 @@ if TYPE_CHECKING:
     from rov_ident.reports.result import Shown
 
 ERR = Console(stderr=True, highlight=False, markup=False)
-OUT = Console(highlight=False, markup=False, soft_wrap=True)
+
+
+class _Output(Console):
+    def on_broken_pipe(self) -> None:
+        """Whoever read our output has seen enough: rich would end with the status of a fault."""
+        with contextlib.suppress(SystemExit):
+            super().on_broken_pipe()
+        raise BrokenPipeError
+
+
+OUT = _Output(highlight=False, markup=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
 
+EXAMPLES = {
+    "demo": "--rate 8",
+    "init": "--vehicle bluerov2_heavy dive.mcap --out my_rov.yaml",
+    "identify": "dive_1.mcap dive_2.mcap --config my_rov.yaml --out identified",
+    "replay": "dive.mcap --config my_rov.yaml --rate 4 --out live.mcap",
+    "fit": "dive.mcap --config my_rov.yaml --save fitted.yaml --report fit.html",
+    "check": "dive.mcap --config my_rov.yaml --report check.html",
+    "plan": "--config fitted.yaml --bag dive.mcap --tank 6,4,2",
+    "explain": "dive.mcap --config fitted.yaml --out explained",
+    "compare": "my_rov.yaml fit.json",
+    "simulate": "--config my_rov.yaml --bag dive.mcap --out simulated.mcap",
+    "import": "00000012.BIN --config my_rov.yaml --out dive.mcap",
+    "export": "--config fitted.yaml --format gazebo --out model.sdf",
+    "import-model": "robot.urdf --config my_rov.yaml --out new.yaml",
+    "nomoto": "zigzag_10.csv --validate zigzag_20.csv --json nomoto.json",
+    "forces": 'table.csv --map beta_deg="beta(deg)" --json forces.json',
+    "coast-down": "run_1.csv run_2.csv --json surge.json",
+    "steer": "--out zigzag.csv",
+    "dashboard": "",
+    "watch": "",
+    "layouts": "--config my_rov.yaml --out layouts",
+    "coefficients": "",
+    "completion": "bash",
+}
+"""Of each command, for its --help: what follows its name."""
+
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
-_BAG = "an .mcap file or a rosbag2 directory"
+_BAG = "a bag: .mcap, .db3, ROS 1's .bag, or a rosbag2 directory"
 _PATHS: Mapping[str, Mapping[str, Any]] = {
     "bag": {"metavar": "BAG", "help": _BAG},
     "bags": {"metavar": "BAG", "nargs": "+", "help": _BAG},
@@ -46,7 +82,12 @@ def command(
     paths: str = "",
 ) -> argparse.ArgumentParser:
     """A new command and what runs it, with the common ``paths`` of these names."""
-    parser = commands.add_parser(name, help=text)
+    example = f"example: rov-ident {name} {EXAMPLES[name]}".rstrip()
+    # Raw: an example that is broken into lines cannot be copied.
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(
+        name, help=text, description=text, epilog=example, formatter_class=raw
+    )
     parser.set_defaults(run=run)
     for path in paths.split():
         parser.add_argument(path, type=Path, **_PATHS[path])

@@ -1,7 +1,6 @@
 """The main job on the shipped bag: two live nodes, the coefficients converging, a report."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,13 +14,10 @@ from rich.text import Text
 from rov_ident import config as configuration
 from rov_ident.cli.common import ERR, LIVE, OUT, Commands, check_outputs, command, rate
 from rov_ident.config import Config
-from rov_ident.core.errors import UserError
-from rov_ident.core.files import write_file
+from rov_ident.core.files import shipped, write_file
 
 if TYPE_CHECKING:
     from rov_ident.estimation.online import Report
-
-_FOLDERS = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "rov_ident")
 
 
 def add(commands: Commands) -> None:
@@ -36,17 +32,6 @@ def _demo(options: argparse.Namespace) -> None:
     # Its own pictures are the progress: with --quiet there are none.
     err = Console(stderr=True, quiet=True) if options.quiet else ERR
     _play(options.out, options.rate, err, OUT)
-
-
-def shipped(name: str) -> Path:
-    """A file that comes with the project: beside the package, or where it was installed.
-
-    Raises UserError if it is in neither place.
-    """
-    for folder in _FOLDERS:
-        if (folder / name).exists():
-            return folder / name
-    raise UserError(f"{name} is not here: run the demo from a checkout of the project")
 
 
 def _play(out: Path, rate: float, err: Console, console: Console) -> None:
@@ -86,11 +71,13 @@ def _play(out: Path, rate: float, err: Console, console: Console) -> None:
     write_file(picture, plots.to_png(plots.convergence(histories, truth)))
     for name, history in histories.items():
         true = np.array([truth[n] for n in history.names])
+        begun = np.abs(np.array([config.value(n) for n in history.names]) / true - 1.0)
         error = np.abs(history.values[-1] / true - 1.0)
         z = np.abs(history.values[-1] - true) / history.std[-1]
         console.print(
-            f"{name}: error median {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} "
-            f"% ({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
+            f"{name}: the median error of a coefficient fell from {100 * np.median(begun):.0f} % "
+            f"to {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} % "
+            f"({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
             "values inside their 95 % interval"
         )
     console.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")

@@ -12,9 +12,9 @@ def add(commands: common.Commands) -> None:
     text = "identify offline, by the code of the nodes or from all the data at once"
     fit = common.command(commands, "fit", text, _fit, "bags --config --json --save --report")
     fit.add_argument(
-        "--estimator", choices=(*common.LIVE, *BATCH), required=True,
-        help="rls, ukf: as the nodes; ls: least squares; iv: instrumental variables; "
-        "ml: maximum likelihood",
+        "--estimator", choices=(*common.LIVE, *BATCH), default="ml",
+        help="ml (default): maximum likelihood; ls: least squares; iv: instrumental variables; "
+        "rls, ukf: as the nodes",
     )  # fmt: skip
     fit.add_argument(
         "--validate", type=Path, metavar="BAG", help="judge on this bag, which is not fitted"

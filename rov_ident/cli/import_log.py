@@ -1,4 +1,4 @@
-"""Plain CSV and ArduSub logs into bags."""
+"""Plain CSV and logs of ArduSub or PX4 into bags."""
 
 import argparse
 from pathlib import Path
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 
 def add(commands: common.Commands) -> None:
-    text = "turn plain CSV or ArduSub logs into a bag"
+    text = "turn plain CSV or logs of ArduSub or PX4 into a bag"
     import_ = common.command(commands, "import", text, _import, "--json")
     import_.add_argument(
         "log",
         nargs="+",
         type=Path,
         metavar="LOG",
-        help="CSV files, or one .BIN or .tlog of ArduSub",
+        help="CSV files, or one .BIN or .tlog of ArduSub, one .ulg of PX4",
     )
     import_.add_argument(
         "--config", type=Path, help="of a .BIN or .tlog: its `thrusters` turn pulses into a wrench"

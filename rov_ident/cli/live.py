@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from rov_ident import config as configuration
-from rov_ident.cli.common import ERR, OUT, Commands, check_outputs, command, port, positive, say
+from rov_ident.cli.common import ERR, OUT, Commands, check_outputs, command, port, positive
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
 
@@ -67,4 +67,3 @@ def _layouts(options: argparse.Namespace) -> None:
     config = configuration.load(options.config)
     for path, write in writers.items():
         write_file(path, write(config, options.namespace))
-        say(f"written: {path}")

@@ -35,7 +35,7 @@ def _export(options: argparse.Namespace) -> None:
     written = export(configuration.load(options.config), options.format)
     write_file(options.out, written.content)
     lost = (f"lost in {options.format}: {what}" for what in written.lost)
-    say(*lost, f"written: {options.out}")
+    say(*lost)
     write_json(options.json, {"format": options.format, "lost": list(written.lost)})
 
 
@@ -46,5 +46,5 @@ def _import_model(options: argparse.Namespace) -> None:
     base = configuration.load(options.config) if options.config else None
     config, notes = import_model(options.file, base)
     configuration.dump(config, options.out, comment=f"From {options.file.name}.")
-    say(*(f"note: {note}" for note in notes), f"written: {options.out}")
+    say(*(f"note: {note}" for note in notes))
     write_json(options.json, {"name": config.name, "notes": list(notes)})

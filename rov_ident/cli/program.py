@@ -4,8 +4,10 @@ Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
 """
 
 import argparse
+import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -15,8 +17,8 @@ from rov_ident.core.errors import UserError
 
 # The files of this room that hold commands, in the order of --help.
 COMMANDS = (
-    "demo replay fit check plan explain compare simulate import_log models nomoto forces "
-    "coast_down steer live coefficients"
+    "demo init identify replay fit check plan explain compare simulate import_log models nomoto "
+    "forces coast_down steer live coefficients"
 ).split()
 
 
@@ -26,12 +28,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         options.run(options)
+        sys.stdout.flush()
+        written = (getattr(options, name, None) for name in ("json", "save", "report", "out"))
+        if paths := [str(path) for path in written if isinstance(path, Path) and path.exists()]:
+            say(f"written: {', '.join(paths)}")
     except UserError as error:
         say(f"rov-ident {options.command}: {error}")
         return 2
     except BrokenPipeError:
-        # Whoever read our output has seen enough (`rov-ident coefficients | head`).
-        sys.stderr.close()
+        # Whoever read our output has seen enough (`rov-ident coefficients | head`); what Python
+        # still holds of it goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
         say("interrupted")
@@ -49,23 +56,43 @@ def _parser() -> argparse.ArgumentParser:
     for name in COMMANDS:
         import_module(f"rov_ident.cli.{name}").add(commands)
     completion = command(commands, "completion", "print a shell's completion script", _completion)
-    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="which shell")
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh", "fish"), help="which shell")
     for each in commands.choices.values():
         each.add_argument("--quiet", action="store_true", help="no progress on standard error")
     return parser
 
 
 def _completion(options: argparse.Namespace) -> None:
+    parser = _parser()
+    if options.shell == "fish":  # shtab does not know it
+        print("\n".join(_fish(parser)))
+        return
     try:
         import shtab
     except ImportError as error:
         raise UserError("completion needs shtab: pip install shtab") from error
-    parser = _parser()
     for each in (parser, *_commands(parser).values()):
         for action in each._actions:  # shtab, too, goes through them
             if action.type is Path:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
     print(shtab.complete(parser, options.shell))
+
+
+def _fish(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Lines that tell fish the commands, their options and what these may be."""
+    begin = f"complete -c {parser.prog} -f"
+    for name, each in _commands(parser).items():
+        yield f"{begin} -n __fish_use_subcommand -a {name} -d {shlex.quote(each.description or '')}"
+        for action in each._actions:
+            values = " ".join(map(str, action.choices or ()))
+            takes = f" -x -a {shlex.quote(values)}" if values else " -r -F" * (action.nargs != 0)
+            option = f" -l {action.option_strings[-1][2:]}" if action.option_strings else ""
+            if option or takes:
+                what = shlex.quote(action.help or "")
+                said = f" -d {what}" if option else ""
+                takes = takes if option else takes.replace(" -r", "").replace(" -x", "")
+                seen = f"'__fish_seen_subcommand_from {name}'"
+                yield f"{begin.removesuffix(' -f')} -n {seen}{option}{takes}{said}"
 
 
 def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:

@@ -3,15 +3,23 @@
 import dataclasses
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import yaml
 
 from rov_ident.config.reading import estimated
-from rov_ident.config.schema import Config
+from rov_ident.config.schema import PARAMETERS, VEHICLE_PARAMETERS, Config
 from rov_ident.core.files import write_file
 from rov_ident.core.yaml_file import Dumper
+from rov_ident.model.coefficients import AXES, VELOCITIES, catalogue, fin_catalogue
+
+DIAGONAL = tuple(
+    name.format(a, v)
+    for name in ("{}_{}dot", "{}_{}", "{0}_{1}{1}")
+    for a, v in zip(AXES, VELOCITIES)
+)
+"""The coefficients of a hull without couplings: where an unknown vehicle begins."""
 
 
 def to_parameters(config: Config) -> dict[str, Any]:
@@ -53,6 +61,68 @@ def dump(config: Config, path: str | os.PathLike[str], comment: str = "") -> Non
     text = "".join(f"# {line}\n" for line in comment.splitlines())
     text += yaml.dump(document, Dumper=Dumper, sort_keys=False, width=1000)
     write_file(path, text)
+
+
+def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment: str = "") -> str:
+    """A parameter file in which every option stands with its meaning.
+
+    ``parameters`` are nested plain values; what they lack is commented out at its default, or
+    marked UNKNOWN where there is none. ``remarks``, by dotted name, say where a value comes from.
+    """
+    meanings = {c.name: f"{c.unit}: {c.meaning}" for c in catalogue()}
+    meanings |= {c.name: f"{c.unit}: {c.meaning}" for c in fin_catalogue()}
+    sections: dict[str, dict[str, str]] = {"vehicle": {}, "coefficients": {}}
+    given = dict(_flat(parameters))
+    for p in VEHICLE_PARAMETERS + PARAMETERS:
+        section, _, name = p.key.rpartition(".")
+        value = given.pop(p.key, p.default)
+        active = p.required or p.key in remarks or value != p.default
+        meaning = (f"{p.unit}: " if p.unit else "") + p.description
+        if p.choices and name != "wrench":  # whose types are in docs/inputs.md
+            meaning += f" ({', '.join(p.choices)})"
+        line = _line(name, value, meaning, remarks.get(p.key, ""))
+        if p.required and value is None:
+            line = _line(name, None, f"UNKNOWN. {meaning}", "")
+        sections.setdefault(section, {})[p.key] = line if active else f"# {line}"
+    coefficients = [key for key in given if key.startswith("coefficients.")]
+    for name in DIAGONAL if not coefficients else ():
+        sections["coefficients"][name] = _line(name, None, f"UNKNOWN. {meanings[name]}", "")
+    for key in coefficients:
+        name = key.removeprefix("coefficients.")
+        text = _line(name, given.pop(key), meanings.get(name, ""), remarks.get(key, ""))
+        sections["coefficients"][key] = text
+    for key, value in given.items():  # prior.std, effects: open to names
+        section, _, name = key.rpartition(".")
+        sections.setdefault(section, {})[key] = _line(name, value, "", remarks.get(key, ""))
+    lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), "/**:", "  ros__parameters:"]
+    opened: tuple[str, ...] = ()
+    for section in sorted(sections, key=lambda name: name != "" and list(sections).index(name)):
+        rows = sorted(sections[section].values(), key=lambda row: row.startswith("#"))
+        path = tuple(section.split(".")) if section else ()
+        active = any(not row.startswith("#") for row in rows)
+        for depth, name in enumerate(path):
+            if path[: depth + 1] != opened[: depth + 1]:
+                lines.append(f"    {'  ' * depth}{'' if active else '# '}{name}:")
+        lines += [f"    {'  ' * len(path)}{row}" for row in rows]
+        opened = path
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, value: Any, meaning: str, remark: str) -> str:
+    if isinstance(value, tuple):
+        value = list(value)
+    text = yaml.dump({name: value}, Dumper=Dumper, width=100000).strip()
+    text = text.removesuffix(" null")
+    words = "; ".join(filter(None, (meaning, f"from {remark}" if remark else "")))
+    return f"{text:<40}  # {words}" if words else text
+
+
+def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield above + name, value
 
 
 def _changed(section: Any) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import hashlib
 import os
 import secrets
 import stat
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -12,8 +13,21 @@ from rov_ident.core.errors import UserError
 
 Place = str | os.PathLike[str]
 
+_FOLDERS = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "rov_ident")
+
 _LONGEST = 255  # bytes of a name, in all file systems of Linux
 _BAG = b"\x89MCAP"  # how a bag begins, whatever its name and version
+
+
+def shipped(name: str) -> Path:
+    """A file that comes with the project: beside the package, or where it was installed.
+
+    Raises UserError if it is in neither place.
+    """
+    for folder in _FOLDERS:
+        if (folder / name).exists():
+            return folder / name
+    raise UserError(f"{name} is not here: run this from a checkout of the project")
 
 
 def check_output(path: Place, inputs: Iterable[Place | None] = (), bag: bool = False) -> None:

@@ -70,7 +70,8 @@ def verdict(findings: Findings) -> str:
     named, left = _named(findings.effects), "; ".join(map(dependence, findings.residual))
     if findings.verdict == "explained":
         return named
-    return f"Something is left that no effect of the library explains: {left}. {named}".strip()
+    left = f": {left}" if left else ""
+    return f"Something is left that no effect of the library explains{left}. {named}".strip()
 
 
 def _named(effects: Sequence[Finding]) -> str:
@@ -165,10 +166,18 @@ def write_extended(explanation: Explanation, path: Path) -> None:
 
 
 def page(explanation: Explanation) -> str:
+    f = explanation.findings
+    origin = " · ".join(f"{key}: {_plain(value)}" for key, value in f.provenance.items())
+    title = f"{explanation.given.name}: what the simulation lacks"
+    return report.page(title, verdict(f), sections(explanation), origin)
+
+
+def sections(explanation: Explanation) -> list[str]:
+    """The parts of the page below its headline."""
     f, before = explanation.findings, explanation.given
     rmse, shown = _shown(explanation)
     key = _legend(shown)
-    sections = [
+    parts = [
         report.beside(
             [report.heading("What to change"), *_change(before, explanation)],
             [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))],
@@ -182,20 +191,20 @@ def page(explanation: Explanation) -> str:
         *_departures(explanation, shown),
     ]
     if f.effects:
-        sections.append(report.heading("What is missing, and how sure that is"))
-        sections += [_card(finding) for finding in f.effects]
+        parts.append(report.heading("What is missing, and how sure that is"))
+        parts += [_card(finding) for finding in f.effects]
     if f.minor:
         values = [", ".join(valued(n, v) for n, v in m.parameters.items()) for m in f.minor]
         gains = [f"{m.gain.percent:.1f} %" for m in f.minor]
         rows = zip([called(m.effect) for m in f.minor], values, gains, strict=True)
-        sections += [
+        parts += [
             report.heading("Minor effects"),
             report.paragraph("Seen in the data, but of less than 2 % gain or not surely of any."),
             report.table(["effect", "parameters", "gain"], [*map(list, rows)], text=(1,)),
         ]
-    sections.append(report.heading("What is left"))
+    parts.append(report.heading("What is left"))
     if f.residual:
-        sections += [
+        parts += [
             report.bullets([f"{dependence(r)[2:]}." for r in f.residual]),
             report.paragraph(
                 "No effect of the library has this form: look for a cause that depends on the "
@@ -203,13 +212,11 @@ def page(explanation: Explanation) -> str:
             ),
         ]
     else:
-        sections.append(report.paragraph("Nothing that depends on motion, place or time."))
-    sections += _retuned(f)
+        parts.append(report.paragraph("Nothing that depends on motion, place or time."))
+    parts += _retuned(f)
     if f.notes:
-        sections += [report.heading("Notes"), report.bullets(f.notes)]
-    origin = " · ".join(f"{key}: {_plain(value)}" for key, value in f.provenance.items())
-    title = f"{before.name}: what the simulation lacks"
-    return report.page(title, verdict(f), sections, origin)
+        parts += [report.heading("Notes"), report.bullets(f.notes)]
+    return parts
 
 
 def _shown(explanation: Explanation) -> tuple[dict[str, dict[str, float]], dict[str, Array]]:
@@ -273,7 +280,7 @@ def _gains(rmse: Mapping[str, Mapping[str, float]], held: bool) -> list[str]:
     for name, group in (("linear", VELOCITIES[:3]), ("angular", VELOCITIES[3:])):
         values = {label: np.array([by[c] for c in group]) for label, by in rmse.items()}
         figure = plots.bars([MOTIONS[c] for c in group], values, "", f"RMSE [{UNITS[group[0]]}]")
-        pictures.append(plots.to_svg(figure, f"bars-{name}-"))
+        pictures.append(plots.zoomable(figure, f"bars-{name}-"))
     where = "data that no fit has seen" if held else "the bag given by --validate"
     caption = f"Error of the {BLOCK:.0f} s open-loop prediction on {where}; lower is better."
     return [report.panels(pictures, caption)]
@@ -287,7 +294,7 @@ def _motion(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
             t, {label: run[:, i] for label, run in runs.items()}, MOTIONS[c], "time [s]",
             f"{c} [{UNITS[c]}]", measured=measured[:, i], shaded=explanation.held,
         )  # fmt: skip
-        pictures.append(plots.to_svg(figure, f"motion-{c}-"))
+        pictures.append(plots.zoomable(figure, f"motion-{c}-"))
     block = "held-out block (shaded: seen by no fit)" if explanation.held else "block"
     length = min(_STRETCH, explanation.t[-1] - explanation.t[0])
     caption = (
@@ -347,12 +354,12 @@ def _departures(explanation: Explanation, shown: Mapping[str, Array]) -> list[st
         figure = plots.curves(
             slots, by_time, MOTIONS[c], "time [s]", f"RMS error [{unit}]", shaded=explanation.held
         )
-        over_time.append(plots.to_svg(figure, f"time-{c}-"))
+        over_time.append(plots.zoomable(figure, f"time-{c}-"))
         slots, by_speed = _by_speed(explanation, shown, i)
         figure = plots.curves(
             slots, by_speed, MOTIONS[c], _directions(c), f"RMS error [{unit}]", marker="o"
         )
-        over_speed.append(plots.to_svg(figure, f"speed-{c}-"))
+        over_speed.append(plots.zoomable(figure, f"speed-{c}-"))
     return [
         report.panels(over_time, f"Over the time of the bag, in steps of {step:.0f} s."),
         report.panels(

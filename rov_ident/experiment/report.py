@@ -93,7 +93,7 @@ def _precision(figure: plots.Figure) -> str:
         "Predicted standard deviation relative to the value; left of the dashed line a coefficient "
         "counts as known well."
     )
-    return report.figure(plots.to_svg(figure, "precision"), caption)
+    return report.figure(plots.zoomable(figure, "precision"), caption)
 
 
 def _excitation(found: Check, config: Config) -> str:
@@ -109,7 +109,7 @@ def _excitation(found: Check, config: Config) -> str:
             nu[:, i], tau[:, i], f"{axis} against {name}", f"{name} [{unit}]", f"{axis} [{force}]",
             limits[i],
         )  # fmt: skip
-        pictures.append(plots.to_svg(figure, f"cloud{i}"))
+        pictures.append(plots.zoomable(figure, f"cloud{i}"))
     caption = (
         "Every sample: wrench over velocity. The dashed lines are the wrench that holds working "
         "speed. Two empty halves: what differs ahead and astern does not show."
@@ -128,7 +128,7 @@ def _motion(found: Check, config: Config) -> str:
             t, {"as configured": run[keep][:, i]}, name, "time [s]", f"{name} [{UNITS[i][0]}]",
             measured=nu[:, i],
         )  # fmt: skip
-        pictures.append(plots.to_svg(figure, f"motion{i}"))
+        pictures.append(plots.zoomable(figure, f"motion{i}"))
     caption = f"Measured (grey), and simulated open loop in windows of {HORIZON:g} s."
     return report.panels(pictures, caption, wide=True)
 
@@ -140,7 +140,7 @@ def _pauses(found: Check) -> str:
         if len(t) < 3:
             continue
         figure = plots.steps(t[1:], 1e3 * np.diff(t), name, "time [s]", "ms since the last")
-        pictures.append(plots.to_svg(figure, f"pause-{name}"))
+        pictures.append(plots.zoomable(figure, f"pause-{name}"))
     return report.panels(pictures, "Time between the stamps of two messages, largest of its span.")
 
 
@@ -148,7 +148,7 @@ def _demand(t: Array, demand: Array) -> str:
     pictures = []
     for i, axis in enumerate(AXES):
         figure = plots.steps(t, demand[:, i], axis, "time [s]", f"{axis} [{UNITS[i][1]}]")
-        pictures.append(plots.to_svg(figure, f"demand{i}"))
+        pictures.append(plots.zoomable(figure, f"demand{i}"))
     return report.panels(pictures, "The wrench that is asked for.", wide=True)
 
 
@@ -161,5 +161,5 @@ def _way(position: Array, tank: Sequence[float]) -> str:
     above = plots.way(east, north, "from above", "east [m]", "north [m]", half)
     half = 0.5 * length, 0.5 * depth
     aside = plots.way(north, -down, "from the side", "north [m]", "up [m]", half)
-    svgs = [plots.to_svg(above, "above"), plots.to_svg(aside, "aside")]
+    svgs = [plots.zoomable(above, "above"), plots.zoomable(aside, "aside")]
     return report.panels(svgs, "The way of the simulated vehicle; dashed: the free water.")

@@ -1,4 +1,5 @@
-"""ArduSub's logs, dataflash (`.BIN`) and telemetry (`.tlog`), into a bag of the three topics.
+"""Logs of autopilots into a bag of the three topics: ArduSub's dataflash (`.BIN`) and telemetry
+(`.tlog`) here, PX4's (`.ulg`) in `px4_log`.
 
 Velocity and position are the EKF's (`XKF1`, `LOCAL_POSITION_NED`), the attitude is its quaternion
 or what the autopilot reports, rates and specific force are the first IMU's. The pulses to the
@@ -6,9 +7,14 @@ thrusters (`RCOU`, `SERVO_OUTPUT_RAW`) become a wrench by the configuration's `t
 battery's measured voltage. All of it is in ArduPilot's axes, forward-starboard-down and
 north-east-down, and stamped with the time since the autopilot's start plus one second (no stamp is
 zero). Nothing is resampled but attitude and rates: they are brought to the times of the velocity.
+
+Which way a thruster pushes, and on which output it is, the autopilot knows better than a file: its
+parameters (`FRAME_CONFIG`, `MOT_n_DIRECTION`, `SERVOn_FUNCTION`) overrule the configuration, and a
+contradiction is said. Where the log tells when the vehicle was armed, the rest is left out.
 """
 
 import contextlib
+import dataclasses
 import io
 import itertools
 from bisect import bisect_right
@@ -20,13 +26,14 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.config.schema import Thrusters
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_between, quaternion_from_euler, quaternion_to_matrix
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
 from rov_ident.io.write_messages import write_messages
-from rov_ident.model.thruster_allocation import PWM, Allocator, check
+from rov_ident.model.thruster_allocation import PWM, Allocator, check, matrix
 
-SUFFIXES = (".bin", ".log", ".tlog")
+SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
 
 _WORLD, _BODY = "world_ned", "base_link_frd"
 _MAGIC = b"\xa3\x95"  # of every record of a dataflash log
@@ -36,6 +43,19 @@ _LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
 _LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
 _OUTPUTS = 16
 _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
+_MOTOR_1 = 33  # of SERVOn_FUNCTION
+_SAFETY_ARMED = 128  # of base_mode in HEARTBEAT
+_GROUND_STATION = 255
+_EVENTS = {10: True, 11: False}  # of EV: armed, disarmed
+_ALIGNED = 0.7  # cosine; thrusters of one frame differ by 45 degrees and more from each other
+
+# Where ArduSub's motors push at a positive output, forward-starboard-down, by FRAME_CONFIG: the
+# factors forward, lateral and (its throttle is upward) minus throttle of AP_Motors6DOF.cpp.
+_VECTORED = ((-1, 1, 0), (-1, -1, 0), (1, 1, 0), (1, -1, 0))
+FRAMES = {
+    1: ("BlueROV2, VECTORED", (*_VECTORED, *((0, 0, 1),) * 2)),
+    2: ("BlueROV2 Heavy, VECTORED_6DOF", (*_VECTORED, *((0, 0, 1),) * 4)),
+}
 
 
 @dataclass(frozen=True)
@@ -68,7 +88,7 @@ class _Track:
         return len(self.t)
 
 
-class _Log:
+class Log:
     """What a log says, by what it is."""
 
     def __init__(self) -> None:
@@ -79,6 +99,45 @@ class _Log:
         self.imu = _Track()  # gyro 3 [rad/s], specific force 3 [m/s2], body
         self.outputs = _Track()  # pulses [us]
         self.voltage = _Track()  # V
+        self.armed = _Track()  # 1 or 0, until the next; empty where the log does not say
+        self.parameters: dict[str, float] = {}  # of the autopilot
+        self.signal = PWM  # what the outputs are
+
+    def is_armed(self, t: int) -> bool:
+        """Whether the vehicle is, at t [us]; so it is taken to be where the log does not say."""
+        i = bisect_right(self.armed.t, t) - 1
+        return i < 0 or bool(self.armed.rows[i][0])
+
+    @property
+    def battery(self) -> list[float]:
+        """The voltages that are a battery's."""
+        return [row[0] for row in self.voltage.rows if row[0] >= _LEAST_VOLTAGE]
+
+    @property
+    def motors(self) -> dict[str, list[float]]:
+        """What the autopilot says of its thrusters, as keys of the section `thrusters`; empty where
+        it does not say. PX4 tells positions, too."""
+        rotors = int(self.parameters.get("CA_ROTOR_COUNT", 0))
+        if rotors:
+            get = self.parameters.get
+            return {
+                key: [get(f"CA_ROTOR{i}_{kind}{x}", 0.0) for i in range(rotors) for x in "XYZ"]
+                for key, kind in (("position", "P"), ("direction", "A"))
+            }
+        frame = FRAMES.get(int(self.parameters.get("FRAME_CONFIG", -1)))
+        if frame is None:
+            return {}
+        found: dict[str, list[float]] = {"direction": [], "channels": []}
+        outputs = {
+            int(value): float(name.removeprefix("SERVO").removesuffix("_FUNCTION"))
+            for name, value in self.parameters.items()
+            if name.startswith("SERVO") and name.endswith("_FUNCTION")
+        }
+        for i, pushes in enumerate(frame[1]):
+            sign = -1.0 if self.parameters.get(f"MOT_{i + 1}_DIRECTION", 1.0) < 0.0 else 1.0
+            found["direction"] += [sign * x + 0.0 for x in pushes]
+            found["channels"].append(outputs.get(_MOTOR_1 + i, i + 1.0))
+        return found
 
 
 def import_log(
@@ -97,8 +156,10 @@ def import_log(
     """
     path = Path(path)
     check(config.thrusters, PWM)
-    allocator = Allocator(config.thrusters, PWM)
-    log = _read(path, progress or (lambda share: None))
+    log = read_log(path, progress or (lambda share: None))
+    notes: list[str] = []
+    thrusters = _as_flown(config.thrusters, log, notes)
+    allocator = Allocator(thrusters, log.signal)
     for name, track in (
         ("velocity of an EKF (XKF1 or LOCAL_POSITION_NED)", log.motion),
         ("thruster output (RCOU or SERVO_OUTPUT_RAW)", log.outputs),
@@ -109,35 +170,85 @@ def import_log(
                 f"{path} holds no {name}: log it (LOG_BITMASK, or the stream rates of telemetry), "
                 "and give the EKF a source of velocity"
             )
-    notes: list[str] = []
     messages = [*_wrenches(log, allocator, config.thrusters.voltage, notes), *_inertial(log)]
     odometry = list(_odometry(log, notes))
     if not odometry:
         raise UserError(f"{path} has no attitude at the times of its velocity: log both")
     messages += odometry
+    if len(log.armed):
+        driven = [row for row in messages if log.is_armed(row[0] // 1000 - _START)]
+        share = len(driven) / len(messages)
+        if not any(role == ODOMETRY for _, role, _ in driven):
+            raise UserError(
+                f"{path}: the vehicle was never armed while its velocity was known, so no thruster "
+                "turned: log a dive"
+            )
+        notes.append(f"{100 * share:.0f} % of the log is armed; the rest is left out")
+        messages = driven
     # The wrench first: at equal stamps it already acts on the velocity that follows.
     messages.sort(key=lambda row: (row[0], row[1] != WRENCH))
     write_messages(out, messages)
-    dropped = sum(track.dropped for track in vars(log).values())
+    dropped = sum(track.dropped for track in vars(log).values() if isinstance(track, _Track))
     if dropped:
         notes.append(f"{dropped} messages with backward or repeated times are left out")
-    duration = (odometry[-1][0] - odometry[0][0]) * 1e-9
-    return LogReport(len(odometry), len(log.imu), len(log.outputs), duration, tuple(notes))
+    times = {role: [t for t, kind, _ in messages if kind == role] for role in _ROLES}
+    duration = (times[ODOMETRY][-1] - times[ODOMETRY][0]) * 1e-9
+    odom, imu, wrench = (len(times[role]) for role in _ROLES)
+    return LogReport(odom, imu, wrench, duration, tuple(notes))
+
+
+def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
+    """The thrusters with the outputs and the signs that the autopilot has for them."""
+    said = log.motors
+    if not said:
+        return given
+    B = matrix(given)
+    along = np.reshape(said["direction"], (-1, 3))
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    if B.shape[1] != len(along):
+        raise UserError(
+            f"the autopilot drives {len(along)} thrusters, but the configuration has {B.shape[1]}: "
+            "correct thrusters, or have `rov-ident init` take them from the log"
+        )
+    force = B[:3].T / np.maximum(np.linalg.norm(B[:3], axis=0)[:, None], 1e-9)
+    cosine = np.sum(force * along, axis=1)
+    if (np.abs(cosine) < _ALIGNED).any():
+        i = int(np.argmin(np.abs(cosine))) + 1
+        raise UserError(
+            f"thruster {i} of the configuration does not push along the line that motor {i} has in "
+            "the log: give the thrusters in the order of the autopilot's motors"
+        )
+    if turned := [str(i + 1) for i in np.flatnonzero(cosine < 0.0)]:
+        notes.append(
+            f"by the autopilot's parameters, thruster {', '.join(turned)} pushes the other way "
+            "than the configuration says: the log's way is taken"
+        )
+    n = len(along)
+    channels = tuple(said.get("channels", range(1, n + 1)))
+    if given.channels and given.channels != channels:
+        shown = ", ".join(f"{c:g}" for c in channels)
+        notes.append(f"thrusters.channels contradict the log, whose are taken: {shown}")
+    flown = B * np.where(cosine < 0.0, -1.0, 1.0)
+    return dataclasses.replace(
+        given, position=(), direction=(), allocation=tuple(flown.T.ravel().tolist()),
+        channels=channels,
+    )  # fmt: skip
 
 
 _Row = tuple[int, str, Message]
+_ROLES = (ODOMETRY, IMU, WRENCH)
 
 
 def _ns(t: int) -> int:
     return 1000 * (t + _START)
 
 
-def _wrenches(log: _Log, allocator: Allocator, usual: float, notes: list[str]) -> list[_Row]:
+def _wrenches(log: Log, allocator: Allocator, usual: float, notes: list[str]) -> list[_Row]:
     """The wrench of every change of the outputs, at the voltage last measured before it."""
-    volts = [row[0] for row in log.voltage.rows]
-    known = bool(volts) and max(volts) >= _LEAST_VOLTAGE
+    volts, good = [row[0] for row in log.voltage.rows], log.battery
+    known = bool(good)
     if known:
-        notes.append(f"battery from {min(volts):.1f} to {max(volts):.1f} V, as measured")
+        notes.append(f"battery from {min(good):.1f} to {max(good):.1f} V, as measured")
     else:
         notes.append(f"no voltage of the battery: taken as {usual:g} V (thrusters.voltage)")
     rows: list[_Row] = []
@@ -152,14 +263,14 @@ def _wrenches(log: _Log, allocator: Allocator, usual: float, notes: list[str]) -
     return rows
 
 
-def _inertial(log: _Log) -> Iterator[_Row]:
+def _inertial(log: Log) -> Iterator[_Row]:
     none, zero = np.zeros(4), np.zeros(3)
     for t, row in zip(log.imu.t, log.imu.rows, strict=True):
         gyro, force = np.array(row[:3]), np.array(row[3:])
         yield _ns(t), IMU, Imu(_ns(t), "imu_frd", none, gyro, force, zero, zero)
 
 
-def _odometry(log: _Log, notes: list[str]) -> Iterator[_Row]:
+def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
     if len(log.attitude) >= 2:
         times, quaternions = log.attitude.t, np.array(log.attitude.rows)
     else:
@@ -197,12 +308,20 @@ def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
     return between / np.linalg.norm(between)
 
 
-def _read(path: Path, progress: Callable[[float], None]) -> _Log:
+def read_log(path: Path, progress: Callable[[float], None] = lambda share: None) -> Log:
+    """What a log says.
+
+    Raises UserError: it cannot be read, is no log, or what reads it is not installed.
+    """
+    if path.suffix.lower() == ".ulg":
+        from rov_ident.io.px4_log import read_ulog
+
+        return read_ulog(path)
     try:
         from pymavlink import DFReader, mavutil
     except ImportError as error:
         raise UserError(f"{path} needs pymavlink: pip install 'rov_ident[ardupilot]'") from error
-    log, kind = _Log(), path.suffix.lower()
+    log, kind = Log(), path.suffix.lower()
     # What pymavlink thinks of a damaged log it prints, wherever that may go.
     said = io.StringIO()
     try:
@@ -233,10 +352,21 @@ def _received(reader: Any, kinds: list[str], progress: Callable[[float], None]) 
         yield message
 
 
-def _dataflash(reader: Any, log: _Log, progress: Callable[[float], None]) -> None:
+def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
     kinds = ["XKF1", "NKF1", "XKQ", "XKQ1", "NKQ", "NKQ1", "ATT", "IMU", "RCOU", "BAT", "CURR"]
+    kinds += ["PARM", "ARM", "EV"]
     for m in _received(reader, kinds, progress):
         kind, t = m.get_type(), int(m.TimeUS)
+        if kind == "PARM":
+            log.parameters[m.Name] = float(m.Value)
+            continue
+        if kind in ("ARM", "EV"):
+            state = bool(m.ArmState) if kind == "ARM" else _EVENTS.get(int(m.Id))
+            if state is not None:
+                if not log.armed:
+                    log.armed.add(0, float(not state))  # it is the change that is logged
+                log.armed.add(t, float(state))
+            continue
         # Several EKF cores, IMUs and batteries log under one name: the first counts.
         if any(getattr(m, name, 0) for name in ("C", "I", "Inst", "Instance")):
             continue
@@ -255,20 +385,31 @@ def _dataflash(reader: Any, log: _Log, progress: Callable[[float], None]) -> Non
             log.voltage.add(t, float(m.Volt))
 
 
-def _telemetry(reader: Any, log: _Log, progress: Callable[[float], None]) -> None:
+def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
     kinds = ["ATTITUDE", "LOCAL_POSITION_NED", "RAW_IMU", "SERVO_OUTPUT_RAW", "SYS_STATUS"]
+    kinds += ["PARAM_VALUE", "HEARTBEAT"]
     vehicle: int | None = None
     now: int | None = None  # us, of the autopilot; until it is known nothing is taken
     for m in _received(reader, kinds, progress):
+        if m.get_srcSystem() == _GROUND_STATION:
+            continue
         vehicle = m.get_srcSystem() if vehicle is None else vehicle
         if m.get_srcSystem() != vehicle:
-            continue  # a ground station, or another vehicle
+            continue  # another vehicle
         kind = m.get_type()
+        if kind == "PARAM_VALUE":
+            log.parameters[m.param_id] = float(m.param_value)
+            continue
         if kind in ("ATTITUDE", "LOCAL_POSITION_NED"):
             now = 1000 * int(m.time_boot_ms)
         if now is None:
             continue
-        if kind == "ATTITUDE":
+        if kind == "HEARTBEAT":
+            if m.get_srcComponent() == 1:  # the autopilot, not a camera on the same vehicle
+                state = bool(m.base_mode & _SAFETY_ARMED)
+                if not log.armed or bool(log.armed.rows[-1][0]) != state:
+                    log.armed.add(now if log.armed else 0, float(state))
+        elif kind == "ATTITUDE":
             log.angles.add(now, m.roll, m.pitch, m.yaw)
             log.rates.add(now, m.rollspeed, m.pitchspeed, m.yawspeed)
         elif kind == "LOCAL_POSITION_NED":

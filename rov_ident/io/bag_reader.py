@@ -1,9 +1,9 @@
 """Bags on disk: the only module that knows MCAP.
 
-A bag is one `.mcap` file or a rosbag2 directory of them. Reading goes block by block: a block is a
-chunk, or a run of messages outside chunks (rosbag2's `fastwrite`). Where a file ends well its
-summary lists the blocks; a file whose writer was killed is walked through instead, and every
-complete block of it is kept.
+A bag is one file or a rosbag2 directory of them; what is no MCAP file is read by `other_bags.py`.
+Reading goes block by block: a block is a chunk, or a run of messages outside chunks (rosbag2's
+`fastwrite`). Where a file ends well its summary lists the blocks; a file whose writer was killed is
+walked through instead, and every complete block of it is kept.
 """
 
 import hashlib
@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
+from heapq import merge
 from operator import attrgetter
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -36,8 +37,21 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Message
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.cdr import DECODERS, ROLE_TYPES
+from rov_ident.io.other_bags import OtherFile, Ros1File, SqliteFile
 
 ROLE_NAMES = {"odom": "odom", "imu": "imu/data", "wrench": "thruster_wrench"}
+"""As the nodes call them."""
+
+_USUAL = {
+    "odom": ("odometry/filtered", "odometry"),
+    "imu": ("imu",),
+    "wrench": ("thruster_manager/input", "wrench"),
+    "velocity": ("velocity_body", "dvl/twist", "twist"),
+    "pose": ("local_position/pose",),
+    "thruster_pwm": ("rc/out",),
+    "battery": ("battery_state",),
+}
+"""As robot_localization, mavros and uuv_simulator call them: taken where no topic has our name."""
 _OPTIONAL_ROLES = ("imu",)
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
@@ -82,8 +96,11 @@ class _File:
     damaged: set[int] = field(default_factory=set)  # offsets of unreadable chunks
 
 
+_KINDS = {MCAP0_MAGIC: _File, b"SQLite format 3": SqliteFile, b"#ROSBAG": Ros1File}
+
+
 class Bag:
-    """A recorded dive: the CDR messages of a `.mcap` file or a rosbag2 directory.
+    """A recorded dive: the CDR messages of a file (MCAP, sqlite3, ROS 1) or a rosbag2 directory.
 
     Attributes:
         path: as given.
@@ -96,12 +113,14 @@ class Bag:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._files = [_index(file) for file in _mcap_files(self.path)]
+        files = [_index(file) for file in _files_of_bag(self.path)]
+        self._files = [file for file in files if isinstance(file, _File)]
+        self._others = [file for file in files if isinstance(file, OtherFile)]
         self.lost_bytes = sum(file.lost_bytes for file in self._files)
         self.truncated = self.lost_bytes > 0
         types: dict[str, str] = {}
         counts: Counter[str] = Counter()
-        for file in self._files:
+        for file in files:
             for channel, (topic, type_name) in file.topics.items():
                 if types.setdefault(topic, type_name) == type_name:
                     counts[topic] += file.counts[channel]
@@ -127,10 +146,10 @@ class Bag:
 
     @cached_property
     def sha256(self) -> str:
-        """Hexadecimal digest of the contents of the .mcap files, in order."""
+        """Hexadecimal digest of the contents of the files, in order."""
         digest = hashlib.sha256()
-        for file in self._files:
-            with file.path.open("rb") as stream:
+        for path in [file.path for file in self._files] + [file.path for file in self._others]:
+            with path.open("rb") as stream:
                 while piece := stream.read(1 << 20):
                     digest.update(piece)
         return digest.hexdigest()
@@ -142,20 +161,24 @@ class Bag:
         in memory together.
         """
         names = set(self.topics if topics is None else topics)
-        wanted = [
-            {
+
+        def chosen(file: _File | OtherFile) -> dict[int, tuple[str, str]]:
+            return {
                 channel: (topic, type_name)
                 for channel, (topic, type_name) in file.topics.items()
                 if topic in names and self.topics[topic].type_name == type_name
             }
-            for file in self._files
-        ]
+
+        log_time = attrgetter("log_time")
+        if self._others:
+            yield from merge(*(_raw(file, chosen(file)) for file in self._others), key=log_time)
+            return
+        wanted = [chosen(file) for file in self._files]
         order = sorted(
             (block.start_time, number, block)
             for number, file in enumerate(self._files)
             for block in file.blocks
         )
-        log_time = attrgetter("log_time")
         pending: list[RawMessage] = []
         with ExitStack() as stack:
             streams = [stack.enter_context(file.path.open("rb")) for file in self._files]
@@ -223,7 +246,9 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
         return topic
     named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
     typed = [topic for topic in filled if filled[topic] == type_name]
-    candidates = [topic for topic in named if topic in typed] or typed
+    usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
+    tiers = ([topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual)
+    candidates = next(filter(None, tiers), typed)
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
@@ -242,13 +267,18 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
     )
 
 
-def _mcap_files(path: Path) -> list[Path]:
-    """The .mcap files of a bag in the order of recording, each known to begin like one."""
+def _raw(file: OtherFile, topics: dict[int, tuple[str, str]]) -> Iterator[RawMessage]:
+    for channel, time, data in file.messages(topics):
+        yield RawMessage(*topics[channel], time, data)
+
+
+def _files_of_bag(path: Path) -> list[Path]:
+    """The files of a bag in the order of recording, each known to begin like one."""
     try:
         files = _files_of_directory(path) if path.is_dir() else [path]
-        for file in files:
-            with file.open("rb") as stream:
-                _check_magic(file, stream.read(16))
+        kinds = {_kind(file) for file in files}
+        if len(kinds) > 1:
+            raise UserError(f"{path} has files of several formats: give one of them")
     except OSError as error:
         raise UserError(
             f"{error.filename or path} cannot be read ({error.strerror}): check the path."
@@ -275,9 +305,11 @@ def _files_of_directory(path: Path) -> list[Path]:
                 "`ros2 bag convert` to MCAP without compression_mode."
             )
     else:  # its writer was killed
-        files = sorted(path.glob("*.mcap"), key=_natural_order) or sorted(path.glob("*.db3"))
+        patterns = ("*.mcap", "*.db3", "*.bag")
+        found = (sorted(path.glob(pattern), key=_natural_order) for pattern in patterns)
+        files = next(filter(None, found), [])
     if not files:
-        raise UserError(f"{path} holds no .mcap file: give a rosbag2 directory or a .mcap file.")
+        raise UserError(f"{path} holds no .mcap file, .db3 or .bag: give a bag or its directory.")
     return files
 
 
@@ -296,18 +328,21 @@ def _natural_order(path: Path) -> list[tuple[int, str]]:
     ]
 
 
-def _check_magic(path: Path, head: bytes) -> None:
+def _kind(path: Path) -> type[_File] | type[OtherFile]:
+    with path.open("rb") as stream:
+        head = stream.read(16)
     if not head:
         raise UserError(f"{path} is empty: record the bag anew.")
-    if head.startswith(b"SQLite format 3"):
-        raise UserError(f"{path} is an sqlite3 bag: convert it to MCAP with `ros2 bag convert`.")
-    if head.startswith(b"#ROSBAG"):
-        raise UserError(f"{path} is a ROS 1 bag: convert it to MCAP with `rosbags-convert`.")
-    if not head.startswith(MCAP0_MAGIC):
-        raise UserError(f"{path} is not an MCAP file: give a .mcap file or a rosbag2 directory.")
+    for magic, kind in _KINDS.items():
+        if head.startswith(magic):
+            return kind
+    raise UserError(f"{path} is not an MCAP file: give a .mcap, .db3 or .bag, or a directory.")
 
 
-def _index(path: Path) -> _File:
+def _index(path: Path) -> _File | OtherFile:
+    kind = _kind(path)
+    if issubclass(kind, OtherFile):
+        return kind(path)
     with path.open("rb") as stream:
         return _index_by_summary(path, stream) or _index_by_walking(path, stream)
 

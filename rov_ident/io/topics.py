@@ -21,8 +21,14 @@ import numpy as np
 
 from rov_ident.config import Config, Inputs, schema, thruster_signal
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import from_core, quaternion_between
-from rov_ident.core.messages import Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.core.frames import (
+    from_core,
+    quaternion_between,
+    quaternion_multiply,
+    quaternion_to_euler,
+    quaternion_to_matrix,
+)
+from rov_ident.core.messages import Array, Commands, Message, Odometry, Pose, Twist, Wrench
 from rov_ident.io import cdr
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
@@ -280,3 +286,109 @@ def total(bag: Bag, topics: Mapping[str, str]) -> int:
 def _full(type_name: str) -> str:
     package, _, name = type_name.partition("/")
     return f"{package}/msg/{name}"
+
+
+# ------------------------------------------------------------------ what a bag has
+
+
+class Seen(NamedTuple):
+    """A topic of a bag that can serve: `topic`, its type as `nav_msgs/Odometry`, its rate [Hz], and
+    the frames of its first message."""
+
+    topic: str
+    type_name: str
+    rate: float
+    frame_id: str
+    child_frame_id: str
+
+
+class Survey(NamedTuple):
+    sources: dict[str, Seen]
+    notes: tuple[str, ...]
+
+
+def survey(bag: Bag) -> Survey:
+    """What of a bag can serve as which input, in the order in which the types are preferred."""
+    found: dict[str, Seen] = {}
+    notes: list[str] = []
+
+    def look(role: str, kinds: Collection[str], name: Callable[[str], str]) -> None:
+        for kind in kinds:
+            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full(kind)]
+            if kind.startswith("std_msgs"):  # arrays of numbers are of everything
+                of_kind = [t for t in of_kind if "thrust" in t or "pwm" in t or "rc" in t]
+            if not of_kind or not any(bag.topics[t].message_count for t in of_kind):
+                continue
+            try:
+                topic = select_topic(bag, role, name(kind), _full(kind), "")
+            except UserError as error:
+                topic = max(of_kind, key=lambda t: bag.topics[t].message_count)
+                notes.append(f"{role}: {topic} is taken, the one with most messages. {error}")
+            if topic:
+                found[role] = _seen(bag, topic, kind)
+                return
+
+    def named(role: str) -> Callable[[str], str]:
+        return lambda kind: sources(Inputs(**{role: kind}))[role].topic
+
+    look(ODOMETRY, schema.ODOMETRY_TYPES, named(ODOMETRY))
+    look(IMU, ("sensor_msgs/Imu",), lambda kind: ROLE_NAMES[IMU])
+    look(WRENCH, _CHOICES[WRENCH], named(WRENCH))
+    if ODOMETRY in found and found[ODOMETRY].type_name != schema.ODOMETRY_TYPES[0]:
+        look(POSE, schema.POSE_TYPES, lambda kind: "pose")
+    if WRENCH in found and found[WRENCH].type_name in schema.PULSE_TYPES:
+        look(BATTERY, (schema.BATTERY_TYPE,), lambda kind: "battery")
+    return Survey(found, tuple(notes))
+
+
+def _seen(bag: Bag, topic: str, kind: str) -> Seen:
+    times, first = [], None
+    for raw in bag.iter_raw([topic]):
+        times.append(raw.log_time)
+        if first is None:
+            first = _DECODERS[kind](raw.data)
+    span = max(times) - min(times)
+    frames = (getattr(first, name, "") for name in ("frame_id", "child_frame_id"))
+    return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)
+
+
+def mounting(bag: Bag, seen: Survey) -> dict[str, Array]:
+    """Where `/tf_static` says that the sensors are, (3,) each, forward-left-up in the body frame:
+    `imu.position`, `imu.rotation`, `odometry.position`; what it does not say is left out.
+
+    The body frame is that of the odometry (its child), or `base_link`.
+    """
+    if "/tf_static" not in bag.topics:
+        return {}
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    parents: dict[str, tuple[str, Array, Array]] = {}  # frame: (parent, origin, w x y z)
+    for raw in bag.iter_raw(["/tf_static"]):
+        for each in store.deserialize_cdr(raw.data, raw.type_name).transforms:
+            p, q = each.transform.translation, each.transform.rotation
+            place = np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z])
+            parents[each.child_frame_id] = (each.header.frame_id, *place)
+
+    def placed(frame: str, body: str) -> tuple[Array, Array] | None:
+        """Origin and attitude of a frame in the body's; None where no chain leads there."""
+        origin, attitude = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        for _ in range(len(parents) + 1):
+            if frame == body:
+                return origin, attitude
+            if frame not in parents:
+                return None
+            frame, p, q = parents[frame]
+            origin = p + quaternion_to_matrix(q) @ origin
+            attitude = quaternion_multiply(q, attitude)
+        return None
+
+    motion, imu = seen.sources.get(ODOMETRY), seen.sources.get(IMU)
+    body = motion.child_frame_id if motion and motion.child_frame_id else "base_link"
+    found: dict[str, Array] = {}
+    if imu and (at := placed(imu.frame_id, body)):
+        found["imu.position"] = at[0]
+        found["imu.rotation"] = np.array(quaternion_to_euler(at[1]))
+    if motion and not motion.child_frame_id and (at := placed(motion.frame_id, body)):
+        found["odometry.position"] = at[0]
+    return found

@@ -41,7 +41,8 @@ from rov_ident.nodes.diagnostics import Diagnostics, Inputs
 from rov_ident.nodes.model_monitor import ModelMonitor
 
 _OWN = (
-    Parameter("save_path", str, "", "file that ~/save writes; empty: named by vehicle and node"),
+    Parameter("save_path", str, "",
+        "file that ~/save writes; empty: named by vehicle, namespace and node"),
     Parameter("checkpoint_path", str, "",
         "file in which what is learnt outlives a crash, or a folder for it; empty: none"),
     Parameter("lockstep", bool, False, "a player sets the pace"),
@@ -74,7 +75,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         super().__init__(f"{kind}_node", automatically_declare_parameters_from_overrides=True)
         config = parameters.declare(self, _OWN_NAMES)
         settings = parameters.declare_own(self, _OWN)
-        named = f"{configuration.as_file_name(config.name)}_{self.get_name()}.yaml"
+        named = f"{self._own_name(config)}.yaml"
         self._save_path = os.path.abspath(settings["save_path"] or named)
         self._lockstep: bool = settings["lockstep"]
         self._started = time.monotonic()
@@ -228,14 +229,18 @@ class EstimatorNode(Node):  # type: ignore[misc]
             if self._lockstep:
                 self._monitor.wait_for_loading(begun, interrupted)
 
+    def _own_name(self, config: Config) -> str:
+        """Of the vehicle and the node with its namespace: no two nodes write the same file."""
+        node = self.get_fully_qualified_name().replace("/", "_")
+        return configuration.as_file_name(config.name) + node
+
     def _recalled(self, given: str) -> checkpoint.Keeper | None:
         """The keeper of checkpoints, if a path is given; the last checkpoint is restored."""
         if not given:
             return None
         path = Path(given).expanduser()
         if given.endswith("/") or path.is_dir():
-            node = self.get_fully_qualified_name().replace("/", "_")
-            path /= f"{configuration.as_file_name(self._config.name)}{node}.checkpoint"
+            path /= f"{self._own_name(self._config)}.checkpoint"
         try:
             if checkpoint.read(self._online, path):
                 self.get_logger().info(f"continuing from {path}, of {self._online.stamp} ns")
@@ -315,6 +320,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
             new = self._config.with_values(values)
             configuration.dump(new, self._save_path, "\n".join(lines))
             later = f", {len(self._waiting)} messages still wait" if self._waiting else ""
+            later += "" if report.stamp else ": no sample was used yet, these are the values given"
             response.success, response.message = True, f"saved to {self._save_path}{later}"
         except UserError as error:
             response.success, response.message = False, str(error)

@@ -39,6 +39,11 @@ def declare(node: Node, own: Iterable[str]) -> Config:
         for name, parameter in node.get_parameters_by_prefix("").items()
         if name not in own
     }
+    if not any(name.startswith(("vehicle", "coefficients")) for name in given):
+        raise UserError(
+            "no configuration was given: add --ros-args --params-file FILE "
+            "(`rov-ident init --out FILE` writes one)"
+        )
     checked = config.from_parameters(given)
     for key, declared in _DECLARED.items():
         value = given.pop(key, declared.default)

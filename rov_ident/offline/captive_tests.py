@@ -145,6 +145,8 @@ def read_table(
     if drift == "auto" and reader.has_flow:
         nu = _as_a_hull_resists(nu, forces, notes)
     reader.refuse_unknown_angles()
+    if unused := [heading for heading in table.cells if heading not in reader.used]:
+        notes.append(f"columns that are not used (name them with --map): {', '.join(unused)}")
     return ForceTable(path.name, nu, fins, forces, tuple(notes), table.sha256)
 
 

@@ -1,7 +1,7 @@
 """Offline fits, all with one type of result."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,13 +81,33 @@ class Fit(Shown, Result):
         """What was fitted, by which method, to how much data."""
         bags = len(self.provenance["bags"])
         known = sum(self.identifiable)
-        said = (
+        told = (
             f"{TITLES[self.estimator].capitalize()} on {bags} bag{'s' * (bags != 1)}, "
             f"{self.duration:.0f} s: the data determine {known} of {len(self.names)} coefficients."
         )
         if not self.consistency.consistent:
-            said += f" Data and model disagree: {self.consistency.sentence}."
-        return said
+            return f"{told} Data and model disagree: {self.consistency.sentence}."
+        if judged := self.more.get("validation"):
+            where, before = judged["bags"][0]["file"], judged["rmse_before"]
+            return f"{told} On {where}, {falls(before, judged['rmse'])}."
+        if before := self.more.get("open_loop_before"):
+            return f"{told} On what was fitted, {falls(before['rmse'], numbers(self.rmse))}."
+        return told
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to do next, the most useful first."""
+        held = [n for n, known in zip(self.names, self.identifiable) if not known]
+        advice = []
+        if held:
+            advice.append(
+                f"Not determined by these data: {', '.join(held)}. rov-ident plan says which "
+                "manoeuvre would tell them."
+            )
+        if not self.judged:
+            advice.append("What a fit has seen flatters it: judge it on another dive (--validate).")
+        advice.append("rov-ident explain looks for what the model itself lacks.")
+        return tuple(advice)
 
     def table(self) -> Table | Tables:
         """Every coefficient with half of its 95 % interval, and the configured value."""
@@ -150,8 +170,9 @@ class Fit(Shown, Result):
 
     @property
     def identifiable(self) -> tuple[bool, ...]:
-        """(n,) whether the data decide about a coefficient."""
-        return tuple(state not in (State.HELD, State.DIVERGED) for state in self.states)
+        """(n,) whether the data, and neither prior nor a bound, decide about a coefficient."""
+        unknown = (State.HELD, State.AT_BOUND, State.DIVERGED)
+        return tuple(state not in unknown for state in self.states)
 
     def to_json(self) -> str:
         """The machine-readable result; numbers that do not exist are null."""
@@ -170,6 +191,14 @@ class Fit(Shown, Result):
             "provenance": self.provenance,
         }
         return json.dumps(result, indent=2, allow_nan=False) + "\n"
+
+
+def falls(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
+    """How the RMSE of open-loop prediction changes, by velocity, in half a sentence."""
+    ratios = [a / b for b, a in zip(before.values(), after.values()) if a is not None and b]
+    share = 100.0 * (1.0 - float(np.median(ratios))) if ratios else 0.0
+    change = f"falls by {share:.0f} %" if share >= 1.0 else "does not fall"
+    return f"the error of a {HORIZON:g} s prediction {change} (median of the velocities)"
 
 
 def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:

@@ -7,7 +7,7 @@ import numpy as np
 from rov_ident.core.messages import Array
 from rov_ident.offline.fit import Curves, Fit
 from rov_ident.reports import plots
-from rov_ident.reports.html import bullets, heading, legend, origin, panels, paragraph
+from rov_ident.reports.html import beside, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
 from rov_ident.reports.table import Tables
 from rov_ident.sampling.records import HORIZON, VELOCITIES
@@ -17,10 +17,15 @@ _MOST = 4  # bags that are drawn
 
 
 def page(fit: Fit) -> str:
-    """A self-contained HTML document."""
-    judged, drawn, shown = fit.judged, fit.curves, fit.table()
+    """A self-contained HTML document: the coefficients first, then the evidence."""
+    shown = fit.table()
     coefficients = shown.parts[0] if isinstance(shown, Tables) else shown
+    judged, drawn = fit.judged, fit.curves
     sections = [
+        beside(
+            [heading("Coefficients"), coefficients.html()],
+            [heading("What to do next"), bullets(fit.advice)],
+        ),
         heading(f"Open-loop simulation in windows of {HORIZON:g} s, before and after"),
         legend({label: (plots.css(colour), ",".join(str(3 * d) for d in dashes), 1.0)
                 for label, (colour, dashes) in plots.MODELS.items()
@@ -30,7 +35,6 @@ def page(fit: Fit) -> str:
         sections += [heading("On what no fit has seen"), *_curves(judged, "judged")]
     if drawn:
         sections += [heading("On what was fitted"), *_curves(drawn, "fitted")]
-    sections += [heading("Coefficients"), coefficients.html()]
     if fit.notes:
         sections += [heading("Notes"), bullets(fit.notes)]
     return document(f"Fit of {fit.given.name}", fit.sentence, sections, origin(fit))
@@ -73,7 +77,7 @@ def _bars(before: Array, after: Array, key: str) -> str:
     ):  # fmt: skip
         models = {_BEFORE: before[pick], _AFTER: after[pick]}
         drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
-        parts.append(plots.to_svg(drawn, f"{key}-{label}"))
+        parts.append(plots.zoomable(drawn, f"{key}-{label}"))
     return panels(parts, "Root mean square error over all bags.")
 
 
@@ -88,5 +92,5 @@ def _motion(
             label.format(name=name, unit="m/s" if i < 3 else "rad/s"),
             measured=None if measured is None else measured[:, i],
         )  # fmt: skip
-        svgs.append(plots.to_svg(drawn, f"{key}{i}"))
+        svgs.append(plots.zoomable(drawn, f"{key}{i}"))
     return panels(svgs, caption, wide=True)

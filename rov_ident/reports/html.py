@@ -1,4 +1,4 @@
-"""Self-contained HTML: no script, nothing fetched, light and dark, printable."""
+"""Self-contained HTML: nothing fetched, light and dark, printable; good without its script."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -7,27 +7,37 @@ from importlib.resources import files
 from rov_ident.reports.result import Result
 from rov_ident.reports.table import Table
 
-_STYLES = files("rov_ident.reports")
+_ASSETS = files("rov_ident.reports")
 
 
 def page(title: str, lead: str, sections: Sequence[str], footer: str) -> str:
     """The whole document; ``sections`` are HTML made by the functions below."""
+    body = "".join(sections)
     return (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>{escape(title)}</title><style>{_style('page')}</style></head><body>"
+        f"<title>{escape(title)}</title><style>{_asset('page.css')}</style></head><body>"
         f"<h1>{escape(title)}</h1><p class='lead'>{escape(lead)}</p>"
-        f"{''.join(sections)}<footer><p>{escape(footer)}</p></footer></body></html>\n"
+        f"{body}<footer><p>{escape(footer)}</p></footer>{_script(body)}</body></html>\n"
     )
 
 
 def fragment(parts: Sequence[str]) -> str:
     """A piece of HTML for a notebook, in the notebook's own colours."""
-    return f"<div class='rov-ident'><style>{_style('fragment')}</style>{''.join(parts)}</div>"
+    return f"<div class='rov-ident'><style>{_asset('fragment.css')}</style>{''.join(parts)}</div>"
 
 
-def _style(name: str) -> str:
-    return (_STYLES / f"{name}.css").read_text("utf-8")
+def _asset(name: str) -> str:
+    return (_ASSETS / name).read_text("utf-8")
+
+
+def _script(body: str) -> str:
+    """What makes charts of the curves of a page; nothing for one without."""
+    if "class='curves'" not in body:
+        return ""
+    parts = (_asset("uplot/uPlot.iife.min.js"), _asset("page.js"))
+    style = f"<style>{_asset('uplot/uPlot.min.css')}</style>"
+    return style + "".join(f"<script>{part}</script>" for part in parts)
 
 
 def heading(text: str) -> str:

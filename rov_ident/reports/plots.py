@@ -3,6 +3,7 @@
 matplotlib's settings are those of the caller: ours hold only while we draw.
 """
 
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +11,11 @@ from io import BytesIO
 from typing import Any, TypeVar, cast
 
 import matplotlib
+import matplotlib.colors
 import matplotlib.figure
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 
 from rov_ident.core.messages import Array
 from rov_ident.reports.result import NORMAL
@@ -47,6 +50,9 @@ INK = "#000000"
 PANEL = (4.6, 1.9)  # inches; read at the width of a telephone, and side by side on a screen
 _TALL = (4.6, 3.4)  # inches
 LIMIT = 1.0  # a simulated curve may leave the measured range by so many ranges, then it is cut
+
+_APART = ((None, None), (4.0, 2.0), (1.0, 2.0))
+"""Dashes by which curves that lie on each other are told apart."""
 
 MEASURED = "measured"
 MODELS: Mapping[str, tuple[str, tuple[float, ...]]] = {
@@ -117,9 +123,9 @@ def _draw_history(
 def motion(t: Array, measured: Array, simulated: Mapping[str, Array], y_label: str) -> Figure:
     """One panel: a measured velocity (k,) behind simulated ones, in the order of COLOURS[1:]."""
     figure, ax = panel("", "time [s]", y_label)
-    ax.plot(t, measured, color=INK, lw=3.2, alpha=0.35)
-    for colour, run in zip(COLOURS[1:], simulated.values()):
-        ax.plot(t, run, color=colour, lw=1.1)
+    ax.plot(t, measured, color=INK, lw=3.2, alpha=0.35, label=MEASURED)
+    for colour, dashes, (label, run) in zip(COLOURS[1:], _APART, simulated.items()):
+        ax.plot(t, run, color=colour, lw=1.3, dashes=dashes, label=label)
     return figure
 
 
@@ -194,8 +200,8 @@ def steering(
     upper.plot(t[known], heading[known], color=INK, lw=3.2, alpha=0.35, label=MEASURED)
     for colour, (label, y) in zip(COLOURS, simulated.items()):
         upper.plot(t, y, color=colour, lw=1.3, label=label)
-        middle.plot(t[known], (y - heading)[known], color=colour, lw=1.1)
-    lower.plot(t, rudder, color=INK, lw=1.0)
+        middle.plot(t[known], (y - heading)[known], color=colour, lw=1.1, label=label)
+    lower.plot(t, rudder, color=INK, lw=1.0, label="input")
     upper.set_title(title, loc="left", fontsize=9)
     upper.set_ylabel(f"heading [{units[0]}]")
     middle.set_ylabel(f"error [{units[0]}]")
@@ -294,7 +300,7 @@ def steps(t: Array, y: Array, title: str, x_label: str, y_label: str) -> Figure:
         blocks = y[:whole].reshape(-1, group)
         largest = np.abs(blocks).argmax(axis=1)
         t, y = t[:whole:group], blocks[np.arange(len(blocks)), largest]
-    ax.step(t, y, color=COLOURS[0], lw=1.0, where="post")
+    ax.step(t, y, color=COLOURS[0], lw=1.0, where="post", label=title)
     ax.set_xlim(t[0], t[-1])
     if y.min() >= 0.0:
         ax.set_ylim(0.0, 1.2 * y.max() + 1e-9)
@@ -406,6 +412,66 @@ def to_png(figure: matplotlib.figure.Figure, dpi: int = 110) -> bytes:
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()
+
+
+_TIME = "time [s]"
+
+
+def zoomable(figure: matplotlib.figure.Figure, name: str = "") -> str:
+    """:func:`to_svg`, and where it shows curves over time the numbers that a page makes charts of.
+
+    Axes with the same limits in time are zoomed together; other pictures stay as they are.
+    """
+    drawn = to_svg(figure, name)
+    axes = figure.axes
+    if not axes or _TIME not in {ax.get_xlabel() for ax in axes}:
+        return drawn
+    charts = json.dumps([_chart(ax) for ax in axes], allow_nan=False).replace("<", "\\u003c")
+    script = f"<script type='application/json' class='curves'>{charts}</script>"
+    return f"<div class='zoom'>{drawn}{script}</div>"
+
+
+def _chart(ax: Axes) -> dict[str, Any]:
+    """The curves, bands and shaded spans on a pair of axes."""
+    limits = _numbers(np.array(ax.get_xlim()))
+    lines, bands = [], []
+    for line in ax.get_lines():
+        x, y = (np.asarray(part, dtype=float) for part in line.get_data())
+        if line.get_transform() != ax.transData:  # a level across the axes
+            x, y = np.array(ax.get_xlim()), np.full(2, y[0])
+        label = str(line.get_label())
+        _, dashes = MODELS.get(label, ("", (2.0, 1.0) if line.is_dashed() else ()))
+        lines.append({
+            "x": _numbers(x), "y": _numbers(y), "label": label.lstrip("_"),
+            "width": line.get_linewidth(), "dash": [3.0 * d for d in dashes],
+            "step": "steps" in line.get_drawstyle(),
+            "colour": _named(str(line.get_color())), "alpha": line.get_alpha() or 1.0,
+        })  # fmt: skip
+    for band in ax.collections:
+        corners = np.asarray(band.get_paths()[0].vertices)
+        n = (len(corners) - 3) // 2  # there along one edge, back along the other
+        there, back = corners[1 : n + 1], corners[n + 2 : 2 * n + 2][::-1]
+        colour = matplotlib.colors.to_hex(band.get_facecolor()[0])
+        bands.append({
+            "x": _numbers(there[:, 0]), "low": _numbers(there[:, 1]), "high": _numbers(back[:, 1]),
+            "colour": _named(colour), "alpha": band.get_alpha() or 1.0,
+        })  # fmt: skip
+    patches = [p for p in ax.patches if isinstance(p, Rectangle)]
+    return {
+        "x": limits, "y": _numbers(np.array(ax.get_ylim())), "title": ax.get_title(loc="left"),
+        "label": ax.get_ylabel(), "lines": lines, "bands": bands,
+        "spans": [[p.get_x(), p.get_x() + p.get_width()] for p in patches],
+    }  # fmt: skip
+
+
+def _numbers(values: Array) -> list[float | None]:
+    """To five digits, which is a tenth of a pixel; null for what does not exist."""
+    return [float(f"{x:.5g}") if np.isfinite(x) else None for x in values.tolist()]
+
+
+def _named(colour: str) -> str:
+    """A colour as the page's style may change it."""
+    return "currentColor" if colour == INK else css(colour) if colour in COLOURS else colour
 
 
 @styled

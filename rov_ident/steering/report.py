@@ -6,6 +6,7 @@ import numpy as np
 
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
+from rov_ident.reports.table import estimate
 from rov_ident.steering import nomoto_model
 from rov_ident.steering.nomoto_model import Nomoto
 from rov_ident.steering.zigzag import Zigzag
@@ -29,19 +30,18 @@ def page(
     others: Mapping[str, Nomoto] | None = None,
 ) -> str:
     """The page of a Nomoto fit; ``others`` are fits by other methods, for comparison."""
-    sections = [_run(model, run, "fitted", f"run{i}-") for i, run in enumerate(runs)]
-    if judge is not None:
-        sections.append(report.heading("On a run not used for the fit"))
-        sections.append(_run(model, judge, "predicted", "judge-"))
     cubic = " + n3 r^3" if model.nonlinear else ""
-    sections += [
-        report.heading("Parameters"),
+    sections = [
+        report.numbers(model),
         report.paragraph(
             f"{_EQUATIONS[model.order].format(cubic)}, r = d(heading)/dt; fitted by "
             f"{_METHODS[model.estimator]}."
         ),
-        report.numbers(model),
+        *(_run(model, run, "fitted", f"run{i}-") for i, run in enumerate(runs)),
     ]
+    if judge is not None:
+        sections.append(report.heading("On a run not used for the fit"))
+        sections.append(_run(model, judge, "predicted", "judge-"))
     sections += [report.bullets(model.notes)] if model.notes else []
     if others:
         rows = []
@@ -55,7 +55,14 @@ def page(
         sections.append(
             report.paragraph("± is half of the 95 % interval, coloured noise allowed for.")
         )
-    lead = f"Heading RMSE {np.degrees(model.rmse):.3g} deg on what was fitted"
+    halves = model.quantile * model.std
+    told = zip(model.names, model.values, halves, model.units)
+    main = [
+        f"{n} = {' ± '.join(estimate(float(x), float(h)))} {unit}"
+        for n, x, h, unit in told
+        if n[0] in "KT"
+    ]
+    lead = f"{', '.join(main)}. Heading RMSE {np.degrees(model.rmse):.3g} deg on what was fitted"
     if judge is not None:
         lead += f", {np.degrees(nomoto_model.predict(model, judge)[1]):.3g} deg on {judge.name}"
     names = ", ".join(run.name for run in runs)
@@ -74,4 +81,4 @@ def _run(model: Nomoto, run: Zigzag, word: str, name: str) -> str:
         ("deg", "deg" if angle else run.unit),
     )
     caption = "Open loop from a fitted first state: only the input is given along the way."
-    return report.figure(plots.to_svg(figure, name), caption)
+    return report.figure(plots.zoomable(figure, name), caption)

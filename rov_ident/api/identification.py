@@ -1,0 +1,265 @@
+"""The guided path: check, fit, explain, judge on data not used, and say what to fly next."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rov_ident.api.functions import (
+    File,
+    Files,
+    Progress,
+    _opened,
+    _several,
+    _silent,
+    check,
+    explain,
+    load,
+    plan,
+)
+from rov_ident.api.functions import fit as fit_bags
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.files import write_file
+from rov_ident.core.threads import one_blas_thread
+from rov_ident.discrepancy.explain import Explanation
+from rov_ident.experiment.data_quality import BAD, GOOD, Check
+from rov_ident.experiment.design import Proposal
+from rov_ident.offline.batch_fit import validation
+from rov_ident.offline.fit import Fit, falls
+from rov_ident.reports.result import Shown
+from rov_ident.reports.table import Table, Tables
+from rov_ident.sampling.records import HORIZON
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_UNITS = ("m/s",) * 3 + ("rad/s",) * 3
+
+
+@dataclass(frozen=True)
+class Identification(Shown):
+    """What the guided path found.
+
+    ``fit``: the coefficients, of the extended model where something was missing; its ``fitted`` is
+    the configuration to use. ``explanation``: what was missing, and the errors on data that no fit
+    has used, those of the same structure fitted without them. ``checks``: of the dives used;
+    ``left_out``: why others were not. ``judge``: the name of the dive that was held back, empty
+    where parts of each dive were. ``next``: the manoeuvre to fly next; None where none is safe in
+    the free water assumed. ``judged``: RMSE on the dive that was held back, of the configuration as
+    given and of ``fit.fitted``.
+    """
+
+    fit: Fit
+    explanation: Explanation
+    checks: tuple[Check, ...]
+    left_out: Mapping[str, str]
+    judge: str
+    next: Proposal | None = field(repr=False)
+    judged: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def given(self) -> Config:
+        """The configuration as it was given."""
+        return self.explanation.given
+
+    @property
+    def errors(self) -> dict[str, tuple[float, float]]:
+        """RMSE of the open-loop prediction by velocity, as configured and as identified; [m/s],
+        [rad/s]."""
+        if self.judged:
+            both = self.judged["rmse_before"], self.judged["rmse"]
+            return {n: (x, both[1][n]) for n, x in both[0].items() if None not in (x, both[1][n])}
+        found = self.explanation.findings
+        after = found.extended if found.effects else found.retuned
+        return {name: (found.baseline[name], after[name]) for name in found.baseline}
+
+    @property
+    def sentence(self) -> str:
+        """Whether the model is good now, in numbers."""
+        before, after = ({n: pair[i] for n, pair in self.errors.items()} for i in (0, 1))
+        known, total = sum(self.fit.identifiable), len(self.fit.names)
+        where = self.judge or "parts of the dives that were held back"
+        return (
+            f"{self.explanation.sentence} On {where}, {falls(before, after)}; the data determine "
+            f"{known} of {total} parameters."
+        )
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to do next, the most useful first."""
+        held = [n for n, known in zip(self.fit.names, self.fit.identifiable) if not known]
+        advice = []
+        if self.explanation.findings.verdict == "unexplained":
+            advice.append("Something is left that no known effect explains: see below what.")
+        advice += [
+            f"Fly next: {effect.manoeuvre} (it tells {effect.effect} from its rivals)."
+            for effect in self.explanation.findings.effects
+            if effect.manoeuvre
+        ]
+        if held:
+            advice.append(
+                f"Not determined by these dives (the prior made the value): {', '.join(held)}."
+            )
+        if self.next is not None:
+            advice.append(f"Fly next: {self.next.sentence}.")
+        better = float(np.median([after / before for before, after in self.errors.values()])) < 1.0
+        advice.append(
+            "Use extended.yaml in place of the configuration, for nodes and commands."
+            if better
+            else "Keep the configuration: extended.yaml predicts no better than it does."
+        )
+        return tuple(advice)
+
+    def table(self) -> Tables:
+        """Every coefficient against the configured one, and the errors before and after."""
+        rows = [
+            [name, f"{before:.3g}", f"{after:.3g}", unit]
+            for (name, (before, after)), unit in zip(self.errors.items(), _UNITS)
+        ]
+        title = f"RMSE of {HORIZON:g} s predictions on {self.judge or 'held-out parts'}"
+        errors = Table(title, ["", "as configured", "identified", "unit"], rows, text=(3,))
+        known = dict(zip(self.given.model.names, self.given.model.theta.tolist()))
+        columns = {
+            "configured": [f"{known[n]:.5g}" if n in known else "" for n in self.fit.names],
+            "state": [state.value for state in self.fit.states],
+        }
+        return Tables((self.fit.numbers("coefficients", columns), errors))
+
+    def plot(self) -> "Figure":
+        """The coefficients relative to the configured ones, and the motion."""
+        return self.fit.plot()
+
+    def to_json(self) -> str:
+        """Everything, for machines: the JSON of `fit` and of `explain` among it."""
+        document: dict[str, Any] = {
+            "sentence": self.sentence,
+            "advice": self.advice,
+            "judge": self.judge or None,
+            "rmse": {n: {"before": b, "after": a} for n, (b, a) in self.errors.items()},
+            "left_out": dict(self.left_out),
+            "fit": json.loads(self.fit.to_json()),
+            "explain": json.loads(self.explanation.to_json()),
+        }
+        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+    def page(self) -> str:
+        """One report: the answer, the coefficients, what to do, then the evidence."""
+        from rov_ident.reports import html
+
+        of_explain = import_module("rov_ident.discrepancy.report")
+        coefficients, errors = self.table().parts
+        remarks = [
+            [c.bag, r.level, r.subject, r.text]
+            for c in self.checks
+            for r in c.remarks
+            if r.level != GOOD
+        ]
+        left_out = [f"{name} is left out: {why}" for name, why in self.left_out.items()]
+        sections = [
+            html.beside(
+                [html.heading("Coefficients, against those configured"), coefficients.html()],
+                [html.heading("Is it good now?"), errors.html(), html.heading("What to do next"),
+                 html.bullets(self.advice)],
+            ),
+            *of_explain.sections(self.explanation),
+            html.heading("The dives"),
+            html.bullets([*(c.sentence for c in self.checks), *left_out]),
+            html.table(["dive", "", "subject", ""], remarks, text=(1, 2, 3)) if remarks else "",
+        ]  # fmt: skip
+        return html.page(
+            f"{self.fit.given.name}: identified", self.sentence, sections, html.origin(self.fit)
+        )
+
+    def _writers(self) -> dict[str, Callable[[Path], None]]:
+        return super()._writers() | {".yaml": self.fit.save_config, "": self._write_folder}
+
+    def _write_folder(self, folder: Path) -> None:
+        write_file(folder / "report.html", self.page())
+        write_file(folder / "result.json", self.to_json())
+        self.fit.save_config(folder / "extended.yaml")
+
+
+@one_blas_thread()
+def identify(
+    dives: Files, config: File, *, validate: File | None = None, progress: Progress | None = None
+) -> Identification:
+    """Identify a vehicle from its dives, by the whole path: check, explain, fit, judge, plan.
+
+    Dives that are not fit for identification are left out. Of several that are, the shortest judges
+    and is fitted by nothing; of one, 30 % of it in whole windows.
+
+    Parameters
+    ----------
+    dives
+        Path of an ``.mcap`` file or a rosbag2 directory, or several.
+    config
+        Path of a parameter file, or a Config.
+    validate
+        Path of the bag to judge on, in place of the shortest dive.
+    progress
+        As in :func:`read`.
+
+    Returns
+    -------
+    Identification
+        ``fit``, ``explanation``, ``checks``, ``next``; ``save(folder)`` writes one report and one
+        extended configuration.
+
+    Raises
+    ------
+    UserError
+        If a bag cannot be read, or no dive is fit for identification: why, and what to fly instead.
+    """
+    say, given = progress or _silent, load(config)
+    paths = _several(dives)
+    checked: list[tuple[Path, Check]] = []
+    left_out: dict[str, str] = {}
+    for path in paths:
+        found = check(path, given, progress=say)
+        if found.fit:
+            checked.append((path, found))
+        else:
+            left_out[path.name] = _why(found)
+    if not checked:
+        reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
+        raise UserError(f"no dive is fit for identification: {reasons}{_instead(given, say)}")
+    judge = Path(validate) if validate else None
+    if judge is None and len(checked) > 1:
+        judge, _ = min(checked, key=lambda pair: pair[1].duration)
+    used = [path for path, _ in checked if path != judge]
+    explanation = explain(used, config, judge, progress=say)
+    extended = explanation.findings.verdict in ("explained", "unexplained")
+    start = explanation.extended if extended else given
+    fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
+    judged: dict[str, Any] = {}
+    if judge is not None:
+        with _opened([judge], given, say) as held_back:
+            judged = validation(held_back, given, fitted.fitted)
+    proposal, why = None, list(fitted.notes)
+    try:
+        proposal = plan(fitted.fitted, used, progress=say)
+    except UserError as error:
+        why.append(f"no next manoeuvre: {error}")
+    checks = tuple(found for path, found in checked)
+    name = judge.name if judge else ""
+    notes = (*why, *explanation.findings.notes)
+    return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
+
+
+def _why(found: Check) -> str:
+    bad = [f"{r.subject}: {r.text}" for r in found.remarks if r.level == BAD]
+    return "; ".join(bad) or "its motion would tell no coefficient"
+
+
+def _instead(config: Any, say: Progress) -> str:
+    """The manoeuvre for a vehicle of which nothing is known yet."""
+    try:
+        return f"; fly instead: {plan(config, progress=say).sentence}"
+    except UserError:
+        return ""

@@ -1,0 +1,212 @@
+"""The first configuration of a vehicle, from what a bag, a log or a URDF tells of it."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rov_ident import config as configuration
+from rov_ident.api.functions import File, Progress
+from rov_ident.config.writing import annotated
+from rov_ident.consumer.formats import import_model
+from rov_ident.core.errors import UserError
+from rov_ident.core.files import shipped, write_file
+from rov_ident.core.frames import FLIP_BODY
+from rov_ident.core.yaml_file import parse_file
+from rov_ident.io import topics
+from rov_ident.io.ardupilot_log import FRAMES, SUFFIXES, read_log
+from rov_ident.io.bag_reader import Bag
+
+VEHICLES = ("bluerov2", "bluerov2_heavy", "remus100")
+"""Those with a file in the folder `config`."""
+
+_MODELS = (".urdf", ".xml", ".sdf")
+_OF_FRAME = {1: "bluerov2", 2: "bluerov2_heavy"}  # FRAME_CONFIG of ArduSub
+_HEAD = """Written by `rov-ident init`. Options at their defaults are commented out.
+Lines with UNKNOWN need a value; "from" says where a value comes from; check what is assumed.
+Then: rov-ident check DIVE --config THIS_FILE"""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A commented parameter file: ``text``; ``notes`` on what it is from and what is still open."""
+
+    text: str
+    unknown: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """What is left to do."""
+        if self.unknown:
+            return f"To be given before it can be used: {', '.join(self.unknown)}."
+        return "It can be used as it is; check what is marked as assumed."
+
+    def save(self, path: File) -> None:
+        """Write the file. Raises UserError if it cannot be written."""
+        write_file(path, self.text)
+
+
+@dataclass
+class _Found:
+    """Nested parameters and, by dotted name, where each is from."""
+
+    parameters: dict[str, Any] = field(default_factory=dict)
+    remarks: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def put(self, key: str, value: Any, source: str) -> None:
+        section = self.parameters
+        *above, name = key.split(".")
+        for part in above:
+            section = section.setdefault(part, {})
+        section[name] = value
+        self.remarks[key] = source
+
+    def start_from(self, vehicle: str) -> None:
+        """A shipped vehicle's own file."""
+        document = parse_file(shipped(f"config/{vehicle}.yaml"))
+        self.parameters, self.remarks = document["/**"]["ros__parameters"], {}
+        self.remarks["vehicle.mass"] = f"the shipped {vehicle}.yaml, as all without a source: weigh"
+        self.remarks["vehicle.buoyancy"] = f"{vehicle}.yaml: measure, trim is yours"
+
+
+def init(
+    record: File | None = None, vehicle: str = "", *, progress: Progress | None = None
+) -> Draft:
+    """Draft the configuration of a vehicle.
+
+    Parameters
+    ----------
+    record
+        Path of what tells of it: a bag (topics, frames, rates, mounting from ``/tf_static``), a log
+        of ArduSub or PX4 (thrusters and their directions, battery), or a URDF or SDFormat model.
+    vehicle
+        Name of a shipped vehicle to start from: one of `VEHICLES`.
+    progress
+        As in :func:`rov_ident.read`.
+
+    Returns
+    -------
+    Draft
+        ``text``, the commented parameter file; ``save(path)`` writes it.
+
+    Raises
+    ------
+    UserError
+        If there is no such vehicle, or the record cannot be read.
+    """
+    if vehicle and vehicle not in VEHICLES:
+        raise UserError(f"there is no vehicle {vehicle!r}: use one of {', '.join(VEHICLES)}")
+    found = _Found()
+    if vehicle:
+        found.start_from(vehicle)
+    else:
+        found.put("vehicle.frame", "frd", "the convention of this package")
+    if record is not None:
+        path = Path(record)
+        if progress:
+            progress(f"reading {path.name}")
+        if path.suffix.lower() in SUFFIXES:
+            _of_log(path, found, vehicle)
+        elif path.suffix.lower() in _MODELS:
+            _of_model(path, found, vehicle)
+        else:
+            _of_bag(path, found)
+    return _written(found)
+
+
+def _written(found: _Found) -> Draft:
+    text = annotated(found.parameters, found.remarks, _HEAD)
+    unknown = tuple(re.findall(r"^ *(\w+): *# UNKNOWN", text, re.MULTILINE))
+    if not unknown:  # what is drafted can be read
+        configuration.from_parameters(found.parameters)
+    return Draft(text, unknown, tuple(found.notes))
+
+
+def _of_model(path: Path, found: _Found, vehicle: str) -> None:
+    known = not vehicle and path.suffix.lower() != ".urdf"
+    base = None if known else configuration.load(shipped(f"config/{vehicle or VEHICLES[0]}.yaml"))
+    config, notes = import_model(path, base)
+    found.parameters = configuration.to_parameters(config)
+    found.remarks = dict.fromkeys(("vehicle.mass", "vehicle.inertia", "vehicle.cog"), path.name)
+    if base is None or vehicle:
+        found.notes += notes
+    else:  # a URDF holds no hydrodynamics
+        assumed, read = configuration.to_parameters(base), found.parameters
+        found.parameters = {k: v for k, v in read.items() if v != assumed.get(k)}
+        body = {key: read["vehicle"][key] for key in ("frame", "mass", "inertia", "cog")}
+        found.parameters |= {"vehicle": {"name": path.stem, **body}, "coefficients": {}}
+
+
+# ------------------------------------------------------------------ logs of autopilots
+
+
+def _of_log(path: Path, found: _Found, vehicle: str) -> None:
+    log = read_log(path)
+    frame = int(log.parameters.get("FRAME_CONFIG", -1))
+    if not vehicle and frame in _OF_FRAME:
+        found.start_from(_OF_FRAME[frame])
+        found.notes.append(f"FRAME_CONFIG is {frame} ({FRAMES[frame][0]}): starts from its file")
+    elif frame >= 0 and frame not in FRAMES:
+        found.notes.append(f"FRAME_CONFIG is {frame}, which is not known here: give thrusters")
+    positions = found.parameters.get("thrusters", {}).get("position", [])
+    if motors := log.motors:
+        n = len(motors["direction"])
+        if "position" not in motors and len(positions) != n:
+            found.notes.append(
+                f"the log has {n // 3} thrusters, but not where they are: give thrusters.position"
+            )
+        for key, value in motors.items():
+            found.put(f"thrusters.{key}", value, f"{path.name}, as the autopilot has it")
+    if volts := log.battery:
+        found.put("thrusters.voltage", round(float(np.median(volts)), 2), f"{path.name}, median")
+    lacks = [
+        name
+        for name, track in (
+            ("velocity (a DVL or another aid of the EKF)", log.motion),
+            ("attitude", log.attitude or log.angles),
+            ("angular rates", log.imu or log.rates),
+            ("thruster outputs", log.outputs),
+        )
+        if len(track) < 2
+    ]
+    if lacks:
+        found.notes.append(f"{path.name} has no {', no '.join(lacks)}: nothing can be fitted")
+        return
+    armed = [log.is_armed(t) for t in log.outputs.t]
+    if armed and len(log.armed):
+        found.notes.append(f"armed in {100 * np.mean(armed):.0f} % of {path.name}")
+    found.notes.append(f"next: rov-ident import {path.name} --config THIS_FILE --out dive.mcap")
+
+
+# ------------------------------------------------------------------ bags
+
+
+def _of_bag(path: Path, found: _Found) -> None:
+    bag = Bag(path)
+    seen = topics.survey(bag)
+    for role, source in seen.sources.items():
+        count = f"{source.rate:.3g} Hz in {path.name}" + (
+            f", frame {source.frame_id}" if source.frame_id else ""
+        )
+        if role != topics.IMU and f"inputs.{role}" in configuration.schema.BY_KEY:
+            found.put(f"inputs.{role}", source.type_name, path.name)
+        found.put(f"topics.{role}", source.topic, count)
+    for role in (topics.ODOMETRY, topics.WRENCH):
+        if role not in seen.sources:
+            found.notes.append(
+                f"{path.name} has nothing that can be {role}: record it too (docs/inputs.md)"
+            )
+    if topics.IMU not in seen.sources:
+        found.notes.append(f"{path.name} has no IMU: angular rates come from the odometry alone")
+    for note in seen.notes:
+        found.notes.append(note)
+    signs = FLIP_BODY if found.parameters["vehicle"].get("frame") != "flu" else np.ones(3)
+    mounted = topics.mounting(bag, seen)
+    for key, vector in mounted.items():
+        found.put(key, [round(float(x), 6) + 0.0 for x in signs * vector], "/tf_static")
+    if "/tf_static" in bag.topics and not mounted:
+        found.notes.append("/tf_static does not say where IMU and velocity sensor are")

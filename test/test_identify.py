@@ -1,0 +1,68 @@
+"""`rov-ident identify`: from dives to a judged model, or a reason why not and what to fly."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import rov_ident as ri
+from bench import ROOT
+from rov_ident.offline import archive
+from rov_ident.offline.batch_fit import validation
+
+VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
+
+
+def run(*arguments):
+    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600)
+
+
+@pytest.fixture(scope="module")
+def dives(tmp_path_factory, compiled):
+    """Two dives, the second the shorter one, and one at rest."""
+    folder = tmp_path_factory.mktemp("dives")
+    for name, manoeuvre, duration in (
+        ("long", "steps", 60.0),
+        ("short", "steps", 40.0),
+        ("rest", "rest", 30.0),
+    ):
+        made = ri.simulate(VEHICLE, manoeuvre=manoeuvre, duration=duration, seed=len(name))
+        made.save(folder / f"{name}.mcap")
+    return folder
+
+
+def test_dives_to_a_model_that_is_judged(tmp_path, dives):
+    paths = [dives / f"{name}.mcap" for name in ("long", "short", "rest")]
+    done = run("identify", *paths, "--config", WRONG, "--out", tmp_path / "found")
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "found" / "result.json").read_text())
+    assert result["judge"] == "short.mcap"
+    assert result["left_out"].keys() == {"rest.mcap"}
+    assert [bag["file"] for bag in result["fit"]["provenance"]["bags"]] == ["long.mcap"]
+    assert all(row["after"] < 0.5 * row["before"] for row in result["rmse"].values())
+    # what is judged is what is saved
+    given, saved = ri.load(WRONG), ri.load(tmp_path / "found" / "extended.yaml")
+    with archive.opened([dives / "short.mcap"], given) as judge:
+        told = validation(judge, given, saved)
+    for name, row in result["rmse"].items():
+        assert row["before"] == pytest.approx(told["rmse_before"][name])
+        assert row["after"] == pytest.approx(told["rmse"][name], rel=1e-3)
+    truth, found = ri.load(VEHICLE), ri.load(tmp_path / "found" / "extended.yaml")
+    for name in ("X_udot", "Y_vv", "N_rr"):
+        assert found.value(name) == pytest.approx(truth.value(name), rel=0.02)
+    page = (tmp_path / "found" / "report.html").read_text()
+    # the answer, the coefficients and what to do come before the evidence
+    places = [page.index(text) for text in ("falls by", "X_udot", "Fly next", "Measured and sim")]
+    assert places == sorted(places)
+    assert "Fly next" in done.stdout
+
+
+def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
+    out = tmp_path / "found"
+    done = run("identify", dives / "rest.mcap", "--config", WRONG, "--out", out)
+    assert done.returncode == 2
+    assert "no dive is fit" in done.stderr and "fly instead: " in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not out.exists()

@@ -1,0 +1,133 @@
+"""`rov-ident init`: from what a bag, a log or a model tells, a configuration with every option."""
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+import rov_ident as ri
+from bench import DATA, ROOT
+from rov_ident.cli.program import main
+from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS
+from rov_ident.config.writing import annotated
+from rov_ident.core.messages import Imu, Odometry
+from rov_ident.core.yaml_file import parse
+from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.cdr import encode
+
+DEMO = ROOT / "bags" / "demo.mcap"
+LOGS = DATA / "ardusub"
+SHIPPED = ROOT / "config" / "bluerov2_heavy.yaml"
+
+
+def uncommented(text):
+    """The file with every option that it comments out."""
+    return "\n".join(
+        line.replace("# ", "", 1) if line.lstrip().startswith("# ") and i > 2 else line
+        for i, line in enumerate(text.splitlines())
+    )
+
+
+@pytest.mark.parametrize("vehicle", ["bluerov2", "bluerov2_heavy", "remus100"])
+def test_a_shipped_vehicle_is_that_vehicle(tmp_path, vehicle):
+    assert main(["init", "--vehicle", vehicle, "--out", str(tmp_path / "c.yaml")]) == 0
+    drafted, shipped = ri.load(tmp_path / "c.yaml"), ri.load(ROOT / f"config/{vehicle}.yaml")
+    assert np.array_equal(drafted.model.theta, shipped.model.theta)
+    assert drafted.model.names == shipped.model.names
+    assert drafted.thrusters == shipped.thrusters
+
+
+def test_every_option_stands_there_at_its_default():
+    document = parse(uncommented(annotated({}, {}, "three\nlines\nof head")))
+    parameters = document["/**"]["ros__parameters"]
+    for p in VEHICLE_PARAMETERS + PARAMETERS:
+        value = parameters
+        for name in p.key.split("."):
+            value = value[name]
+        assert value == (list(p.default) if isinstance(p.default, tuple) else p.default), p.key
+
+
+def test_what_is_unknown_is_refused_until_it_is_given(tmp_path, capsys):
+    assert main(["init", str(DEMO), "--out", str(tmp_path / "c.yaml")]) == 0
+    assert "mass, buoyancy" in capsys.readouterr().err
+    with pytest.raises(ri.UserError, match=r"vehicle.name is empty"):
+        ri.load(tmp_path / "c.yaml")
+    assert "20 Hz in demo.mcap, frame odom_ned" in (tmp_path / "c.yaml").read_text()
+
+
+@pytest.fixture
+def mavros(tmp_path):
+    """A bag as mavros publishes it, with a tilted IMU 0.1 m ahead and 0.2 m up."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    T = store.types
+    stamp = T["builtin_interfaces/msg/Time"](0, 0)
+
+    def transform(parent, child, xyz, wxyz):
+        V, Q = T["geometry_msgs/msg/Vector3"], T["geometry_msgs/msg/Quaternion"]
+        inner = T["geometry_msgs/msg/Transform"](V(*xyz), Q(*wxyz[1:], wxyz[0]))
+        header = T["std_msgs/msg/Header"](stamp, parent)
+        return T["geometry_msgs/msg/TransformStamped"](header, child, inner)
+
+    half = np.sqrt(0.5)
+    tree = T["tf2_msgs/msg/TFMessage"]([
+        transform("base_link", "mount", (0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        transform("mount", "imu_link", (0.0, 0.0, 0.2), (half, 0.0, 0.0, half)),
+    ])  # fmt: skip
+    path, zero = tmp_path / "mavros.mcap", np.zeros(3)
+    unit = np.array([1.0, 0.0, 0.0, 0.0])
+    with BagWriter(path) as bag:
+        data = bytes(store.serialize_cdr(tree, "tf2_msgs/msg/TFMessage"))
+        bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, data)
+        for k in range(20):
+            t = 1_000_000_000 + 50_000_000 * k
+            odometry = Odometry(t, "map", "base_link", zero, unit, zero, zero, np.zeros(6))
+            imu = Imu(t, "imu_link", unit, zero, zero, zero, zero)
+            for topic in ("/mavros/local_position/odom", "/mavros/global_position/local"):
+                bag.write(topic, "nav_msgs/msg/Odometry", t, encode(odometry))
+            for topic in ("/mavros/imu/data", "/mavros/imu/data_raw"):
+                bag.write(topic, "sensor_msgs/msg/Imu", t, encode(imu))
+    return path
+
+
+def test_a_bag_of_mavros_by_its_usual_names(tmp_path, mavros, capsys):
+    out = tmp_path / "c.yaml"
+    assert main(["init", str(mavros), "--vehicle", "bluerov2_heavy", "--out", str(out)]) == 0
+    made = ri.load(out)
+    assert made.topics.odom == "/mavros/local_position/odom"
+    assert made.topics.imu == "/mavros/imu/data"
+    # forward-left-up in the tree, forward-starboard-down in the file
+    np.testing.assert_allclose(made.imu.position, [0.1, 0.0, -0.2], atol=1e-9)
+    np.testing.assert_allclose(made.imu.rotation, [0.0, 0.0, -np.pi / 2], atol=1e-6)
+    assert "nothing that can be wrench" in capsys.readouterr().err
+
+
+def test_a_urdf_gives_the_body_and_leaves_the_rest_open(tmp_path, capsys):
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(
+        '<robot name="r"><link name="base_link"><inertial><mass value="9"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+    )
+    assert main(["init", str(urdf), "--out", str(tmp_path / "c.yaml")]) == 0
+    text = (tmp_path / "c.yaml").read_text()
+    assert "mass: 9.0" in text and "from robot.urdf" in text
+    assert "buoyancy" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not LOGS.exists(), reason="the logs of measured vehicles are not here")
+def test_the_thrusters_of_a_real_heavy(tmp_path, capsys):
+    out = tmp_path / "c.yaml"
+    assert main(["init", str(LOGS / "small.tlog"), "--out", str(out)]) == 0
+    assert "armed in 6 %" in capsys.readouterr().err
+    flown = ri.load(out).thrusters
+    # FRAME_CONFIG 2 with MOT_n_DIRECTION -1 -1 1 1 -1 1 1 -1
+    assert flown.direction[:3] == (1.0, -1.0, 0.0) and flown.direction[-3:] == (0.0, 0.0, -1.0)
+    assert flown.position == ri.load(SHIPPED).thrusters.position
+    assert flown.voltage == pytest.approx(16.2, abs=0.1)
+    bag = tmp_path / "dive.mcap"
+    log = str(LOGS / "small.tlog")
+    assert main(["import", log, "--config", str(SHIPPED), "--out", str(bag)]) == 0
+    said = capsys.readouterr().err
+    assert "thruster 1, 2, 5, 8 pushes the other way than the configuration says" in said
+    assert "6 % of the log is armed" in said
+    assert main(["init", str(LOGS / "a.tlog"), "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "no velocity (a DVL" in said and "next: " not in said
