@@ -18,6 +18,7 @@ _METHODS = {
     "oe": "output error: the simulated heading fitted to the measured one",
     "fd": "least squares on forward differences",
     "iv": "forward differences with instruments from the simulated heading",
+    "ukf": "an unscented Kalman filter whose state holds the parameters",
     "rls": "recursive least squares on forward differences, with dynamic forgetting",
 }
 
@@ -42,7 +43,13 @@ def page(
         ),
         report.numbers(model),
     ]
-    sections += [report.bullets(model.notes)] if model.notes else []
+    sections.append(report.bullets(model.notes))
+    if model.cross_validation:
+        errors = " and ".join(
+            f"{np.degrees(error):.3g} deg with order {order}"
+            for order, error in model.cross_validation.items()
+        )
+        sections.append(report.paragraph(f"Parts of the runs left out are predicted to {errors}."))
     if others:
         rows = []
         for name, other in {model.estimator: model, **others}.items():
