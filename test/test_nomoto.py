@@ -114,7 +114,42 @@ def test_norrbin_of_an_unstable_vehicle():
     model = nomoto.fit([every(run, 0.2)], nonlinear=True)
     assert model.value("T") == pytest.approx(-15.0, rel=0.02)
     assert model.value("K") == pytest.approx(-0.3, rel=0.02)
-    assert "no course stability" in model.notes[0]
+    assert model.stable is False and "no course stability" in model.notes[0]
+
+
+@pytest.mark.parametrize("order, lags", [(1, {}), (2, {"T2": 1.0, "T3": 2.0})])
+def test_the_data_choose_the_order(order, lags):
+    run = every(simulated(0.4, 5.0, 0.1, noise=1e-3, seed=4, **lags), 0.2)
+    model = nomoto.fit([run], "auto")
+    assert model.order == order
+    first, second = model.cross_validation[1], model.cross_validation[2]
+    assert (second < 0.5 * first) == (order == 2)
+
+
+def test_a_cubic_term_that_helps_the_turn_is_not_fitted():
+    """Its model would run away as soon as a manoeuvre is faster than those fitted."""
+    model = nomoto.fit([every(simulated(0.3, 4.0, 0.1, n3=-5.0), 0.2)], nonlinear=True)
+    assert model.value("n3") == pytest.approx(0.0, abs=1e-9)
+    assert any("held at zero" in note for note in model.notes)
+
+
+def test_stability_is_said():
+    stable = every(simulated(0.3, 4.0, 0.2), 0.2)
+    model = nomoto.fit([stable])
+    assert model.stable is True and model.growth == pytest.approx(-0.25, rel=0.01)
+    assert "course-stable" in model.notes[0] and "4 s" in model.notes[0]
+    noise = 0.5 * np.random.default_rng(0).standard_normal(len(stable.t))
+    open_question = nomoto.fit([replace(stable, heading=stable.heading + noise)], order=2)
+    assert open_question.stable is None and "leave open" in open_question.notes[0]
+
+
+def test_unscented_filter():
+    run = every(simulated(0.3, 4.0, 0.2, noise=3e-3, seed=1), 0.2)
+    model = nomoto.fit([run], method="ukf")
+    for name, truth in (("K", 0.3), ("T", 4.0)):
+        entry = model.entries()[name]
+        assert entry["value"] == pytest.approx(truth, rel=0.01)
+        assert abs(entry["value"] - truth) < 3.0 * entry["std"] < 0.02 * truth
 
 
 def test_instruments_cure_what_noise_does_to_differences():
@@ -346,6 +381,19 @@ def test_measured_zigzags_are_predicted(fitted, judged, limit, order):
     assert np.degrees(nomoto_model.predict(model, runs[judged])[1]) < limit
 
 
+@pytest.mark.skipif(not KVLCC2.is_dir(), reason="the measured zigzags are not here")
+@pytest.mark.parametrize("nonlinear", [False, True])
+@pytest.mark.parametrize("fitted", ["10_05", "20_05", "25_05"])
+def test_measured_zigzags_choose_the_second_order(fitted, nonlinear):
+    """An unstable ship, and K of one sign, whichever run is fitted; with the cubic term, too,
+    the smallest zigzag is predicted."""
+    model = nomoto.fit([read(KVLCC2 / f"hsva_Z_{fitted}.csv")], "auto", nonlinear)
+    assert model.order == 2 and model.value("K") > 0.0 and model.stable is not True
+    assert model.cross_validation[2] < 0.8 * model.cross_validation[1] < np.radians(2.1)
+    small = read(KVLCC2 / "hsva_Z_10_01.csv")
+    assert np.degrees(nomoto_model.predict(model, small)[1]) < 2.5
+
+
 # ------------------------------------------------------------------ files
 
 
@@ -385,9 +433,24 @@ def test_json_as_promised(short, tmp_path):
     )
 
 
+def test_a_prediction_that_diverges_is_said(short, tmp_path, capsys):
+    """Written all the same, but not with exit status 0."""
+    ship = replace(short, heading=0.01 * short.heading)  # turns a hundred times less
+    files = [write(tmp_path / "a.csv", short), write(tmp_path / "b.csv", ship, "heading_rad")]
+    result = tmp_path / "n.json"
+    words = ["nomoto", str(files[0]), "--validate", str(files[1]), "--json", str(result)]
+    assert main(words) == 2
+    assert "the prediction of b.csv diverges" in capsys.readouterr().err
+    document = json.loads(result.read_text())
+    assert document["validation"]["diverges"] is True
+    assert document["stability"]["course_stable"] is True
+    assert set(document["cross_validation"]) == {"1", "2"}
+
+
 @pytest.mark.parametrize(
     "options", [["--order", "2"], ["--nonlinear"], ["--interpolate", "spline"],
-                ["--interpolate", "spiral"], ["--method", "iv"], ["--method", "rls"]]
+                ["--interpolate", "spiral"], ["--method", "iv"], ["--method", "rls"],
+                ["--method", "ukf"]]
 )  # fmt: skip
 def test_options(short, tmp_path, options):
     result = tmp_path / "n.json"

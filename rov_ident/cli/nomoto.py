@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 from rov_ident.cli.common import OUT, Commands, check_outputs, command, positive, progress, say
+from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
 
 
@@ -18,7 +19,10 @@ def add(commands: Commands) -> None:
     nomoto.add_argument(
         "--config", type=Path, help="says the types, topics and axes of a bag (inputs, frames)"
     )
-    nomoto.add_argument("--order", type=int, choices=(1, 2), default=1, help="of the model (1)")
+    nomoto.add_argument(
+        "--order", choices=("auto", "1", "2"), default="auto",
+        help="of the model (auto: what predicts parts of the runs left out)",
+    )  # fmt: skip
     nomoto.add_argument("--nonlinear", action="store_true", help="with Norrbin's cubic term")
     nomoto.add_argument(
         "--interpolate", choices=("none", "spline", "spiral"), default="none",
@@ -29,8 +33,8 @@ def add(commands: Commands) -> None:
         help="of the densified heading (default: that of the rows, or a fifth of the heading's)",
     )  # fmt: skip
     nomoto.add_argument(
-        "--method", choices=("oe", "fd", "iv", "rls"), default="oe",
-        help="output error (default), forward differences, instruments, recursive",
+        "--method", choices=("oe", "fd", "iv", "rls", "ukf"), default="oe",
+        help="output error (default), forward differences, instruments, recursive, Kalman filter",
     )  # fmt: skip
     nomoto.add_argument("--validate", type=Path, metavar="FILE", help="predict this run as well")
 
@@ -48,12 +52,13 @@ def _nomoto(options: argparse.Namespace) -> None:
     with progress(options) as tell:
         tell("fitting")
         model = nomoto.fit(
-            runs, options.order, options.nonlinear, options.method, options.interpolate,
-            options.step,
+            runs, options.order if options.order == "auto" else int(options.order),
+            options.nonlinear, options.method, options.interpolate, options.step,
         )  # fmt: skip
     validation = nomoto_model.predict(model, judge)[1] if judge else None
+    diverges = judge is not None and nomoto.diverges(model, judge)
     if options.json:
-        write_file(options.json, nomoto_model.to_json(model, validation))
+        write_file(options.json, nomoto_model.to_json(model, validation, diverges))
     if options.report:
         from rov_ident.steering.report import page
 
@@ -63,4 +68,12 @@ def _nomoto(options: argparse.Namespace) -> None:
     OUT.print(f"heading RMSE {model.rmse:.4g} rad ({math.degrees(model.rmse):.3g} deg)")
     if judge and validation is not None:
         OUT.print(f"on {judge.name} {validation:.4g} rad ({math.degrees(validation):.3g} deg)")
+    for order, error in model.cross_validation.items():
+        OUT.print(f"parts left out, predicted with order {order}: {math.degrees(error):.3g} deg")
     say(*model.notes)
+    if judge and diverges:
+        raise UserError(
+            f"the prediction of {judge.name} diverges: its RMSE is larger than all that the "
+            "heading moves in the run; fit more runs like it, or another order, and do not use "
+            "this model there"
+        )

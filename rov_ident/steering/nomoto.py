@@ -1,8 +1,9 @@
 """Nomoto's steering model fitted to zigzag tests: see `nomoto_model` for its equations.
 
-Four estimators: output error (`oe`: the simulated heading is fitted, first state estimated; white
+Five estimators: output error (`oe`: the simulated heading is fitted, first state estimated; white
 heading noise does not bias it), forward differences (`fd`: the equation itself, least squares, as
-in the literature on sparse zigzags), the same with instruments (`iv`) and recursive (`rls`).
+in the literature on sparse zigzags), the same with instruments (`iv`) and recursive (`rls`), and an
+unscented Kalman filter whose state holds the parameters (`ukf`).
 """
 
 import contextlib
@@ -12,20 +13,24 @@ from collections.abc import Sequence
 import numpy as np
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array
 from rov_ident.reports.result import provenance
 from rov_ident.steering import heading_interpolation as densify
 from rov_ident.steering.nomoto_equation_error import equation_error
+from rov_ident.steering.nomoto_filter import unscented
 from rov_ident.steering.nomoto_model import Nomoto, predict, rmse
-from rov_ident.steering.nomoto_output_error import output_error
+from rov_ident.steering.nomoto_output_error import descend, output_error
 from rov_ident.steering.zigzag import Zigzag
 
-METHODS = ("oe", "fd", "iv", "rls")
+METHODS = ("oe", "fd", "iv", "rls", "ukf")
+ORDERS = (1, 2)
 _MIN_SAMPLES = 20
+_PARTS = 6  # of each run in cross-validation
 
 
 def fit(
     runs: Sequence[Zigzag],
-    order: int = 1,
+    order: int | str = 1,
     nonlinear: bool = False,
     method: str = "oe",
     interpolate: str = "none",
@@ -33,19 +38,21 @@ def fit(
 ) -> Nomoto:
     """One model for all runs.
 
-    ``interpolate`` densifies sparse headings first (:func:`dense`), to ``step`` [s].
+    ``order`` is 1, 2 or `auto`: the second where it predicts parts of the runs left out of its fit
+    better than the first (:func:`cross_validated`). ``interpolate`` densifies sparse headings
+    first (:func:`dense`), to ``step`` [s].
 
     Raises UserError for runs too short, at rest, of different kinds, or with which the fit does not
     converge.
     """
-    if order not in (1, 2):
-        raise UserError(f"the order is 1 or 2, not {order}")
+    if order not in (*ORDERS, "auto"):
+        raise UserError(f"the order is 1, 2 or auto, not {order}")
     if method not in METHODS:
         raise UserError(f"there is no method '{method}': choose one of {', '.join(METHODS)}")
     if not runs:
         raise UserError("no run is given: name at least one file")
     for run in runs:
-        check(run, order, nonlinear)
+        check(run)
         if run.unit != runs[0].unit:
             raise UserError(
                 f"{run.name} has an input in {run.unit}, but {runs[0].name} in {runs[0].unit}: fit "
@@ -54,19 +61,19 @@ def fit(
     used = [run.cornered() for run in runs]
     if interpolate != "none":
         used = [dense(run, interpolate, step) for run in runs]
-    model = output_error(used, order, nonlinear)
-    if method != "oe":
+    if isinstance(order, str):
+        model = cross_validated(used, nonlinear)
+    else:
+        model = output_error(used, order, nonlinear)
+    if method == "ukf":
+        model = unscented(used, model)
+    elif method != "oe":
         model = equation_error(used, model, method)
     measured = np.concatenate(
         [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
     )
-    notes = list(model.notes)
-    if model.theta[0] <= 0.0:
-        notes.append(
-            "T is not positive: the vehicle has no course stability in this model; K and T then "
-            "describe the slope of an unstable balance"
-        )
-    elif order == 2 and "T1" not in model.names:
+    notes = [_stability(model), *model.notes]
+    if model.order == 2 and "T1" not in model.names:
         notes.append("T1 and T2 are complex: only T1T2 and T1_plus_T2 are given")
     return dataclasses.replace(
         model,
@@ -74,6 +81,73 @@ def fit(
         notes=tuple(notes),
         provenance=provenance((run.name, run.sha256) for run in runs),
     )
+
+
+def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:
+    """Output error of the order that the runs themselves choose.
+
+    Each run is cut in parts of equal length. Each part but the first and the last is left out in
+    turn, from all runs at once, and predicted by what is fitted to the rest: the model runs through
+    it, so that no state is fitted to it. (Before the first and after the last part kept, the
+    course of a vehicle without course stability would be a matter of the state, not of the order.)
+    The second order is chosen if its mean squared error is less by more than
+    one standard error of the difference over the parts (Breiman et al. 1984, sec. 3.4.3).
+    """
+    models: dict[int, Nomoto] = {}
+    for order in ORDERS:
+        with contextlib.suppress(UserError):
+            models[order] = output_error(runs, order, nonlinear)
+    if not models:
+        raise UserError("the fit does not converge with either order: try without --nonlinear")
+    errors = {order: _left_out(runs, model) for order, model in models.items()}
+    chosen = min(models)
+    if len(models) == 2:
+        gain = errors[1] - errors[2]
+        if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
+            chosen = 2
+    found = {order: float(np.sqrt(error.mean())) for order, error in errors.items()}
+    return dataclasses.replace(models[chosen], cross_validation=found)
+
+
+def _left_out(runs: Sequence[Zigzag], model: Nomoto) -> Array:
+    """Mean squared heading error (runs x parts left out,) [rad2]."""
+    errors = []
+    for part in range(1, _PARTS - 1):
+        kept, gone = [], []
+        for run in runs:
+            place = np.floor(_PARTS * (run.t - run.t[0]) / (run.t[-1] - run.t[0]))
+            out = np.minimum(place, _PARTS - 1) == part
+            kept.append(dataclasses.replace(run, heading=np.where(out, np.nan, run.heading)))
+            gone.append(out & run.known)
+        fitted = descend(kept, model.order, model.nonlinear, model.theta)
+        for run, rest, out in zip(runs, kept, gone):
+            if out.any():
+                heading = predict(fitted, rest)[0]
+                errors.append(float(np.mean((heading - run.heading)[out] ** 2)))
+    return np.array(errors)
+
+
+def _stability(model: Nomoto) -> str:
+    """In words, whether the straight course is stable."""
+    if model.stable is None:
+        return (
+            "the intervals leave open whether the vehicle is course-stable, and with it the signs "
+            "of K and T: fit more runs, also with small rudder angles"
+        )
+    if model.stable:
+        return (
+            "the vehicle is course-stable: a disturbance dies out with a time constant of "
+            f"{-1.0 / model.growth:.3g} s"
+        )
+    return (
+        "the vehicle has no course stability: a disturbance of the straight course grows e-fold in "
+        f"{1.0 / model.growth:.3g} s; K and T describe the slope of an unstable balance"
+    )
+
+
+def diverges(model: Nomoto, run: Zigzag) -> bool:
+    """Whether a prediction is farther off (RMSE) than the heading ever moves in the run."""
+    return predict(model, run)[1] > float(np.nanmax(run.heading) - np.nanmin(run.heading))
 
 
 def others(
@@ -88,7 +162,7 @@ def others(
     return found
 
 
-def check(run: Zigzag, order: int = 1, nonlinear: bool = False) -> None:
+def check(run: Zigzag) -> None:
     """Whether a run can tell anything about the model.
 
     Raises UserError: too few headings, or a rudder or heading that never moves.
@@ -96,8 +170,8 @@ def check(run: Zigzag, order: int = 1, nonlinear: bool = False) -> None:
     known = run.heading[run.known]
     if len(known) < _MIN_SAMPLES:
         raise UserError(
-            f"{run.name} has {len(known)} headings, but a fit of order {order} needs at least "
-            f"{_MIN_SAMPLES}: give a longer run"
+            f"{run.name} has {len(known)} headings, but a fit needs at least {_MIN_SAMPLES}: "
+            "give a longer run"
         )
     for name, values in (("rudder", run.rudder), ("heading", known)):
         if np.ptp(values) < 1e-6:

@@ -1,5 +1,6 @@
 """Nomoto's model by its equation in forward differences."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -63,7 +64,8 @@ def equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomoto
     b0 = names_of(order, nonlinear).index("b0")
     jacobian[-1, -1], jacobian[-1, b0] = 1.0 / theta[b0], -theta[-1] / theta[b0]
     covariance = jacobian @ covariance @ jacobian.T
-    return model_of(order, nonlinear, method, theta, covariance, model.unit, model.rmse)
+    found = model_of(order, nonlinear, method, theta, covariance, model.unit, model.rmse)
+    return dataclasses.replace(found, cross_validation=model.cross_validation)
 
 
 def _evenly(run: Zigzag) -> Zigzag:

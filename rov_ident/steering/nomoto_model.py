@@ -16,16 +16,17 @@ infinite or negative)::
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
 from rov_ident.core.messages import Array
 from rov_ident.core.runge_kutta import NODES, runge_kutta
-from rov_ident.reports.result import Result
+from rov_ident.reports.result import NORMAL, Result
 from rov_ident.steering.zigzag import Zigzag
 
 STEP = 0.05  # s, largest of the integration
@@ -38,7 +39,9 @@ class Nomoto(Result):
     where they are complex.
 
     ``theta`` (n,) is what was fitted: order 1 ``a0 b0 [c] delta_0``, order 2 ``a0 a1 b0 b1 [c]
-    delta_0``, see the head of the module. ``unit`` is that of the input.
+    delta_0``, see the head of the module. ``unit`` is that of the input. ``stable``: whether the
+    straight course is; None where the 95 % intervals leave it open. ``cross_validation`` has by
+    order the heading RMSE [rad] on parts left out of the fit; empty where the order was given.
     """
 
     order: int
@@ -46,6 +49,14 @@ class Nomoto(Result):
     theta: Array
     unit: str
     rmse: float  # rad, of the heading
+    stable: bool | None
+    cross_validation: Mapping[int, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def growth(self) -> float:
+        """The slowest pole [1/s] of a disturbance of the straight course: negative, it dies out."""
+        characteristic = [1.0, self.theta[0]] if self.order == 1 else [1.0, *self.theta[1::-1]]
+        return float(np.roots(characteristic).real.max())
 
 
 def model_of(
@@ -58,6 +69,10 @@ def model_of(
         for name, (function, of) in _functions(order, nonlinear, unit).items()
         if np.isfinite(function(theta))
     }
+    half = NORMAL * np.sqrt(np.diag(covariance)[:order])  # of a0 (a1), all positive: stable
+    stable = True if (theta[:order] > half).all() else None
+    if (theta[:order] < -half).any():
+        stable = False
     slopes = np.array([_gradient(function, theta) for function, _ in functions.values()])
     return Nomoto(
         estimator=estimator,
@@ -70,6 +85,7 @@ def model_of(
         theta=theta,
         unit=unit,
         rmse=rmse,
+        stable=stable,
     )
 
 
@@ -115,25 +131,33 @@ def names_of(order: int, nonlinear: bool) -> tuple[str, ...]:
     return (*linear, *(("c",) if nonlinear else ()), "delta_0")
 
 
-def to_json(model: Nomoto, validation: float | None = None) -> str:
-    """The result as JSON; ``validation`` is the heading RMSE [rad] on another run."""
+def to_json(model: Nomoto, validation: float | None = None, diverges: bool = False) -> str:
+    """The result as JSON; ``validation`` is the heading RMSE [rad] on another run, ``diverges``
+    whether that prediction does."""
     document: dict[str, object] = {
         "order": model.order,
         **model.entries(),
         "heading_rmse_rad": model.rmse,
         "nonlinear": model.nonlinear,
         "method": model.estimator,
+        "stability": {"course_stable": model.stable, "growth_per_s": model.growth},
         "notes": list(model.notes),
         "provenance": model.provenance,
     }
+    if model.cross_validation:
+        document["cross_validation"] = {
+            str(order): {"heading_rmse_rad": error}
+            for order, error in model.cross_validation.items()
+        }
     if validation is not None:
-        document["validation"] = {"heading_rmse_rad": validation}
+        document["validation"] = {"heading_rmse_rad": validation, "diverges": diverges}
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 @kernel
-def _respond(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max_step, out):  # type: ignore[no-untyped-def]
-    """Classical Runge-Kutta; out (n,) the heading, from first = [psi, x1, x2]."""
+def simulate_heading(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max_step, out):  # type: ignore[no-untyped-def]
+    """Classical Runge-Kutta; out (n,) the heading, from first = [psi, x1, x2], which ends as the
+    last state."""
     state, reached, slope, end = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     n = len(t)
     for j in range(3):
@@ -161,6 +185,8 @@ def _respond(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max_step, o
             out[i + 1 :] = 1e6
             return
         out[i + 1] = end[0]
+    for j in range(3):
+        first[j] = end[j]
 
 
 def respond(
@@ -194,7 +220,7 @@ def respond(
             rudder, twice, np.column_stack([rudder[after - 1], rudder[after]]).ravel()
         )
     out = np.empty(len(t))
-    _respond(
+    simulate_heading(
         order, x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0),
         x["delta_0"], t, rudder, run.held, state, STEP, out,
     )  # fmt: skip
@@ -247,26 +273,32 @@ def jumps_of(run: Zigzag) -> int:
 
 
 def first_state(order: int, nonlinear: bool, theta: Array, run: Zigzag) -> tuple[Array, Array]:
-    """First state (order + 1,) and shares (see :func:`respond`) that fit the heading best:
-    Gauss-Newton."""
+    """First state (order + 1,) and shares (see :func:`respond`) that fit the heading best.
+
+    Levenberg-Marquardt's damping matters where the model is unstable: a full step from rest may
+    lead to a motion that leaves all reason, from where no slope leads back.
+    """
     known, jumps, states = run.known, jumps_of(run), order + 1
-    x = np.concatenate([[run.heading[known][0]], np.zeros(order), np.full(jumps, 0.5)])
+    begins = [np.concatenate([[run.heading[known][0]], np.zeros(order), np.full(jumps, 0.5)])]
+    if nonlinear:  # also from the linear part's, which cannot run away within the run
+        linear = np.delete(theta, names_of(order, True).index("c"))
+        begins.append(np.concatenate(first_state(order, False, linear, run)))
+    speed = max(float(np.std(np.gradient(run.heading[known], run.t[known]))), 1e-9)
+    sizes = np.concatenate([[0.1], np.full(order, speed), np.ones(jumps)])
+    free = np.full(states, np.inf)
 
-    def simulated(x: Array) -> Array:
-        return respond(order, nonlinear, theta, run, x[:states], x[states:])[known]
+    def error(x: Array) -> Array:
+        x = x * sizes
+        return (respond(order, nonlinear, theta, run, x[:states], x[states:]) - run.heading)[known]
 
-    for _ in range(12 if nonlinear or jumps else 2):
-        base = simulated(x)
-        columns = [np.ones(len(base))]
-        for i in range(1, len(x)):
-            moved = x.copy()
-            moved[i] += 1e-5 if moved[i] < 0.5 else -1e-5
-            columns.append((simulated(moved) - base) / (moved[i] - x[i]))
-        step = np.linalg.lstsq(np.column_stack(columns), run.heading[known] - base, rcond=None)[0]
-        if not np.isfinite(step).all():
-            break
-        x = x + step
-        x[states:] = np.clip(x[states:], 0.0, 1.0)
-        if np.abs(step).max() < 1e-9:
-            break
-    return x[:states], x[states:]
+    best, cost = begins[0], np.inf
+    for begin in begins:
+        begin[states:] = np.clip(begin[states:], 0.01, 0.99)
+        found = least_squares(
+            error, begin / sizes, xtol=1e-9, ftol=1e-9, gtol=1e-9,
+            max_nfev=30 if jumps else 30 * (1 + len(begin)), method="trf" if jumps else "lm",
+            bounds=(np.append(-free, np.zeros(jumps)), np.append(free, np.ones(jumps))),
+        )  # fmt: skip
+        if found.cost < cost:
+            best, cost = found.x * sizes, found.cost
+    return best[:states], best[states:]

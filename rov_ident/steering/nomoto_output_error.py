@@ -21,30 +21,57 @@ from rov_ident.steering.nomoto_model import (
 )
 from rov_ident.steering.zigzag import Zigzag
 
+_NO_CUBIC = "the cubic term would help the turn instead of resisting it and is held at zero"
 _DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
 
 
 def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
-    """Output error from the best linear model of a grid, and for the second order also from the
-    fitted first-order one with a fast second time constant: the better of the two."""
-    start, firsts = _linear_start(runs, order)
-    best = _descend(runs, order, nonlinear, _with_cubic(start, nonlinear), firsts)
+    """Output error, the best of several starts.
+
+    They are the best linear model of a grid and its mirror image without course stability; for the
+    second order also the fitted first-order one with a fast second time constant, and with the
+    cubic term the fitted linear one. A start that ends with another sign of K is noted.
+
+    Raises UserError if none converges.
+    """
+    grid = _linear_start(runs, order)
+    mirrored = grid.copy()
+    mirrored[0] *= -1.0
+    starts = [(grid, 0.0), (mirrored, 0.0)]
+    if nonlinear:
+        # Of an unstable balance the cubic term is what bounds the rate, here to about that seen.
+        fast = max(float(np.nanvar(np.gradient(r.heading[r.known], r.t[r.known]))) for r in runs)
+        starts[1] = mirrored, 2.0 * abs(grid[0]) / fast
+        starts.append((output_error(runs, order, False).theta, 0.0))
     if order == 2:
         simple = output_error(runs, 1, nonlinear)
         x = dict(zip(names_of(1, nonlinear), simple.theta))
-        fast = 0.1 * abs(x["a0"]) ** -1.0
-        start = np.array([x["a0"] / fast, x["a0"] + 1.0 / fast, x["b0"] / fast, 0.0, x["delta_0"]])
-        start = _with_cubic(start, nonlinear, x.get("c", 0.0) / fast)
-        states, shares = zip(*(first_state(2, nonlinear, start, run) for run in runs))
-        other = _descend(runs, 2, nonlinear, start, states, shares)
-        best = min(best, other, key=lambda m: m.rmse)
+        short = 0.1 * abs(x["a0"]) ** -1.0
+        a0, a1, b0 = x["a0"] / short, x["a0"] + 1.0 / short, x["b0"] / short
+        starts.append((np.array([a0, a1, b0, 0.0, x["delta_0"]]), x.get("c", 0.0) / short))
+    found = []
+    for start, c in starts:
+        theta = np.insert(start, len(start) - 1, c) if nonlinear else start
+        found.append(descend(runs, order, nonlinear, theta))
+    best = min(found, key=lambda m: m.rmse)
     if not math.isfinite(best.rmse):
         raise UserError("the fit does not converge: try --order 1 without --nonlinear")
+    others = [m for m in found if math.isfinite(m.rmse) and m.value("K") * best.value("K") < 0.0]
+    if others:
+        other = min(others, key=lambda m: m.rmse)
+        note = (
+            f"from another start the fit ends at K = {other.value('K'):.3g} {best.units[0]} with a "
+            f"heading RMSE of {math.degrees(other.rmse):.3g} instead of "
+            f"{math.degrees(best.rmse):.3g} deg: compare the two before you use the sign of K"
+        )
+        best = dataclasses.replace(best, notes=(*best.notes, note))
     return best
 
 
-def _with_cubic(theta: Array, nonlinear: bool, c: float = 0.0) -> Array:
-    return np.insert(theta, len(theta) - 1, c) if nonlinear else theta
+def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, theta: Array) -> Nomoto:
+    """Output error from theta (n,); an RMSE of infinity where it does not converge."""
+    states, shares = zip(*(first_state(order, nonlinear, theta, run) for run in runs))
+    return _descend(runs, order, nonlinear, theta, states, shares)
 
 
 def _descend(
@@ -73,6 +100,10 @@ def _descend(
     jumps = [jumps_of(run) for run in runs]
     scales, x0 = [scale], [start / scale]
     lower, upper = [np.full(n, -np.inf)], [np.full(n, np.inf)]
+    if nonlinear:
+        # The cubic term is a resistance. One that helps the turn lets the rate run away as soon as
+        # a manoeuvre is faster than those fitted.
+        lower[0][names.index("c")] = 0.0
     size = np.array([0.1, *[speed] * order])
     for i, (first, count) in enumerate(zip(firsts, jumps)):
         guess = np.clip(shares[i], 0.01, 0.99) if shares else np.full(count, 0.5)
@@ -91,15 +122,15 @@ def _descend(
             parts.append((respond(order, nonlinear, x[:n], run, first, shares) - run.heading)[seen])
         return np.concatenate(parts)
 
-    bounded = any(jumps)
+    bounded = nonlinear or any(jumps)
     result = least_squares(
         residual,
         np.concatenate(x0),
         bounds=(np.concatenate(lower), np.concatenate(upper)),
         method="trf" if bounded else "lm",
-        xtol=1e-12,
-        ftol=1e-12,
-        gtol=1e-12,
+        xtol=1e-10,
+        ftol=1e-10,
+        gtol=1e-10,
         max_nfev=100 if bounded else 200 * len(sizes),
     )
     if not result.cost < _DIVERGED:
@@ -110,13 +141,16 @@ def _descend(
     covariance = np.zeros((len(sizes), len(sizes)))
     covariance[np.ix_(free, free)] = robust_covariance(result.jac[:, free], result.fun, lengths)
     covariance *= np.outer(sizes, sizes)
-    return model_of(
+    model = model_of(
         order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], runs[0].unit,
         rmse(result.fun),
     )  # fmt: skip
+    if nonlinear and not free[names.index("c")]:
+        model = dataclasses.replace(model, notes=(_NO_CUBIC,))
+    return model
 
 
-def _linear_start(runs: Sequence[Zigzag], order: int) -> tuple[Array, list[Array]]:
+def _linear_start(runs: Sequence[Zigzag], order: int) -> Array:
     """Start of the search: over a grid of time constants all else of the linear model is linear."""
     states = order + 1
     total = sum(int(run.known.sum()) for run in runs)
@@ -157,7 +191,7 @@ def _linear_start(runs: Sequence[Zigzag], order: int) -> tuple[Array, list[Array
         )
     a0, a1, x = best
     start = [a0, x[0], -x[1] / x[0]] if order == 1 else [a0, a1, x[0], x[1], -x[2] / x[0]]
-    return np.array(start), list(x[order + 1 :].reshape(len(runs), states))
+    return np.array(start)
 
 
 def robust_covariance(jac: Array, error: Array, lengths: Sequence[int]) -> Array:

@@ -19,6 +19,7 @@ _METHODS = {
     "oe": "output error: the simulated heading fitted to the measured one",
     "fd": "least squares on forward differences",
     "iv": "forward differences with instruments from the simulated heading",
+    "ukf": "an unscented Kalman filter whose state holds the parameters",
     "rls": "recursive least squares on forward differences, with dynamic forgetting",
 }
 
@@ -43,6 +44,12 @@ def page(
         sections.append(report.heading("On a run not used for the fit"))
         sections.append(_run(model, judge, "predicted", "judge-"))
     sections += [report.bullets(model.notes)] if model.notes else []
+    if model.cross_validation:
+        errors = " and ".join(
+            f"{np.degrees(error):.3g} deg with order {order}"
+            for order, error in model.cross_validation.items()
+        )
+        sections.append(report.paragraph(f"Parts of the runs left out are predicted to {errors}."))
     if others:
         rows = []
         for name, other in {model.estimator: model, **others}.items():
