@@ -52,6 +52,8 @@ class WatchNode(Node):  # type: ignore[misc]
             name = topic.removesuffix(_COEFFICIENTS)
             if name in self._known or name in ("", topic) or _DIAGNOSTIC_TYPE not in types:
                 continue
+            if "/_" in topic:  # hidden, as ROS calls it: a replay beside the vehicle
+                continue
             if not self.count_publishers(topic):
                 continue
             self._known.add(name)
