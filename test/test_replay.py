@@ -1,7 +1,6 @@
 """Bags through live nodes: the same numbers as offline, and no process left behind."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -145,14 +144,15 @@ def test_pace_without_imu(domain, brief):
     assert Level.STALE not in result.reports["rls"].levels
 
 
-class Bystander:
-    """A vehicle's own nodes in the same domain: hears all that it should not, and publishes too."""
+TOPICS = {
+    "/odom": Odometry, "/imu/data": Imu, "/thruster_wrench": WrenchStamped, "/clock": Clock,
+    "/diagnostics": DiagnosticArray, "/rosout": Log, "/parameter_events": ParameterEvent,
+    "/rls_node/coefficients": DiagnosticArray,
+}  # fmt: skip
 
-    TOPICS = {
-        "/odom": Odometry, "/imu/data": Imu, "/thruster_wrench": WrenchStamped, "/clock": Clock,
-        "/diagnostics": DiagnosticArray, "/rosout": Log, "/parameter_events": ParameterEvent,
-        "/rls_node/coefficients": DiagnosticArray,
-    }  # fmt: skip
+
+class Bystander:
+    """A vehicle's own nodes in the same domain: hear all that they should not, and publish, too."""
 
     def __init__(self):
         self.context = rclpy.Context()
@@ -163,7 +163,7 @@ class Bystander:
         self.heard, self.seen, self.ended = Counter(), set(), threading.Event()
         self.odometry = self.node.create_publisher(Odometry, "/odom", 10)
         self.clock = self.node.create_publisher(Clock, "/clock", 10)
-        for topic, type_ in self.TOPICS.items():
+        for topic, type_ in TOPICS.items():
             hear = partial(self.hear, topic)
             self.node.create_subscription(type_, topic, hear, QoSProfile(depth=1000), raw=True)
         self.thread = threading.Thread(target=self.run)
@@ -197,7 +197,7 @@ def test_a_replay_is_heard_by_nobody_and_hears_nobody(domain, brief):
     own = {"/odom", "/clock"}  # what it publishes itself
     assert {topic for topic in bystander.heard if topic not in own} <= {"/parameter_events"}
     others = {topic for topic in bystander.seen if not topic.startswith("/_replay_")}
-    assert others == set(bystander.TOPICS)
+    assert others == set(TOPICS)
 
 
 def test_wrong_use(brief, tmp_path):

@@ -2,10 +2,13 @@
 
 import ast
 import math
+import os
+import signal
 import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
+from importlib.metadata import distributions
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,7 @@ from rclpy.parameter import Parameter
 from rov_ident import config
 from rov_ident.config import PARAMETERS
 from rov_ident.core.errors import UserError
+from rov_ident.io.write_messages import write_messages
 from rov_ident.nodes.common import LATCHED
 
 ROOT = Path(__file__).parent.parent
@@ -135,6 +139,58 @@ def test_a_configuration_does_not_say_where_to_write(tmp_path, heavy_path):
     assert {p for p in tmp_path.rglob("*") if p.is_file()} == {
         stranger, work / "dive" / "dive_0.mcap", work / "dive" / "metadata.yaml",
     }  # fmt: skip
+
+
+@pytest.fixture
+def hostile(tmp_path):
+    """A folder with a module of every name that Python or a library may ask for; it says if run."""
+    folder, marker = tmp_path / "hostile", tmp_path / "run"
+    folder.mkdir()
+    installed = {d.metadata["Name"].replace("-", "_").lower() for d in distributions()}
+    for name in {*sys.stdlib_module_names, *installed, "yaml", "usercustomize", "rov_ident"}:
+        (folder / f"{name}.py").write_text(f"open({str(marker)!r}, 'a').write(__name__ + ' ')")
+    (folder / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path / 'kernels'}\n")
+    yield folder
+    assert not marker.exists(), marker.read_text()
+    assert not (tmp_path / "kernels").exists()
+
+
+def program(name, *arguments, cwd, **variables):
+    """As a shell starts it, in a folder."""
+    script = Path(sys.executable).with_name(name)
+    command, environment = [script, *map(str, arguments)], {**os.environ, **variables}
+    return subprocess.Popen(command, cwd=cwd, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def test_workers_take_no_code_from_the_current_folder(tmp_path, hostile, heavy_path, short_dive):
+    bags = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for bag in bags:
+        write_messages(bag, short_dive)
+    command = ["fit", *bags, "--config", heavy_path, "--estimator", "ls", "--jobs", "2"]
+    process = program("rov-ident", *command, cwd=hostile)
+    _, said = process.communicate(timeout=240)
+    assert process.returncode == 0, said
+
+
+@pytest.mark.parametrize("name", ["rls_node", "ukf_node", "replay"])
+def test_compilers_and_nodes_take_no_code_from_the_current_folder(
+    tmp_path, hostile, heavy_path, short_dive, domain, name
+):
+    """With a cold cache, until the first kernel is there."""
+    bag, cache = tmp_path / "dive.mcap", tmp_path / "cache"
+    write_messages(bag, short_dive)
+    if name == "replay":
+        command = ["rov-ident", "replay", bag, "--config", heavy_path, "--rate", "0"]
+    else:
+        command = [name, "--ros-args", "--params-file", heavy_path]
+    process = program(*command, cwd=hostile, ROV_IDENT_CACHE="../cache")
+    end = time.monotonic() + 240.0
+    while not any(cache.rglob("*.nbi")):
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < end
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=120)
 
 
 # ------------------------------------------------------------------ parameters

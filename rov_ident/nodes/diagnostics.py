@@ -93,7 +93,7 @@ class Diagnostics:
     def _status(
         self, kind: str, level: Level, words: str, values: dict[str, str]
     ) -> DiagnosticStatus:
-        # By the full name: all vehicles share /diagnostics. The namespace of a replay means nothing.
+        # By the full name: all vehicles share /diagnostics. That of a replay says nothing.
         full = self._node.get_name() if self._lockstep else self._node.get_fully_qualified_name()
         name = f"{full.lstrip('/')}: {kind}"
         return to_status(name, self._online.config.name, level, words, values)

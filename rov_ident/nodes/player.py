@@ -121,7 +121,7 @@ class Player(Node):  # type: ignore[misc]
         super().destroy_node()
 
     def wait_for_nodes(self, start: int) -> None:
-        """Wait until everything is connected both ways. ``start`` [ns] is the time the bag begins."""
+        """Until everything is connected both ways. ``start`` [ns] is the time the bag begins."""
         self._now = start
         self._wait(self._connected, "to start", _START_TIME)
 

@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from rov_ident import config as configuration
 from rov_ident.config import Inputs, Qos
+from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output
 from rov_ident.estimation.online import ESTIMATORS, Report
@@ -52,8 +53,8 @@ def replay(
     """Play a bag over DDS into live nodes and record what they publish into the bag ``out``.
 
     ``rate`` is the speed relative to the recording; 0: as fast as the nodes can follow. No message
-    is lost at any rate. A replayed thruster wrench must not reach a vehicle: player and nodes have a
-    namespace of their own, hidden from whatever runs beside them; and unless
+    is lost at any rate. A replayed thruster wrench must not reach a vehicle: player and nodes have
+    a namespace of their own, hidden from whatever runs beside them; and unless
     ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this computer or comes in.
 
     Raises UserError if the bag or configuration cannot be used.
@@ -150,17 +151,12 @@ class _Process:
 
     def __init__(self, name: str, parameters: Path, namespace: str) -> None:
         self.name = name
-        command = [sys.executable, "-m", f"rov_ident.nodes.{name}", *apart(namespace)]
+        command = ["-m", f"rov_ident.nodes.{name}", *apart(namespace)]
         command += ["--params-file", str(parameters), "--log-level", "warn"]
         command += ["-p", "use_sim_time:=true", "-p", "lockstep:=true"]
-        # A session of its own: Ctrl-C interrupts this process only, which then interrupts the node.
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
+        # Ctrl-C interrupts this process only, which then interrupts the node.
+        self._process = children.start(
+            *command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
         )
         self._last_line = ""
         self._reader = threading.Thread(target=self._forward, daemon=True)
