@@ -87,8 +87,9 @@ def places(tmp_path):
     (tmp_path / "link").symlink_to("dive.mcap")
     (tmp_path / "loop").symlink_to("loop")
     os.link(tmp_path / "dive.mcap", tmp_path / "hard")
-    with BagWriter(tmp_path / "recorded") as writer:
-        writer.write("/x", "std_msgs/msg/Empty", 1, b"\0\1\0\0\0")
+    for name in ("recorded", "other"):  # the second is no input
+        with BagWriter(tmp_path / name) as writer:
+            writer.write("/x", "std_msgs/msg/Empty", 1, b"\0\1\0\0\0")
     return tmp_path
 
 
@@ -104,6 +105,8 @@ REFUSED = {
     "recorded/result": "lies within the bag",
     "recorded/new/result": "lies within the bag",
     "recorded/../recorded/metadata.yaml": "lies within the bag",
+    "other/metadata.yaml": "lies within a bag",
+    "other/result": "lies within a bag",
     "loop": "Too many levels of symbolic links",
     "a\0b": "no file can have that name",
     "x" * 256: "longer than 255 bytes",

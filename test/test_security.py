@@ -172,7 +172,7 @@ def test_workers_take_no_code_from_the_current_folder(tmp_path, hostile, heavy_p
     assert process.returncode == 0, said
 
 
-@pytest.mark.parametrize("name", ["rls_node", "ukf_node", "replay"])
+@pytest.mark.parametrize("name", ["rls_node", "replay"])
 def test_compilers_and_nodes_take_no_code_from_the_current_folder(
     tmp_path, hostile, heavy_path, short_dive, domain, name
 ):

@@ -236,12 +236,16 @@ class EstimatorNode(Node):  # type: ignore[misc]
         if given.endswith("/") or path.is_dir():
             node = self.get_fully_qualified_name().replace("/", "_")
             path /= f"{configuration.as_file_name(self._config.name)}{node}.checkpoint"
+        keeper = checkpoint.Keeper(path, self._online)
+        if keeper.refused:
+            self.get_logger().error(f"{keeper.failure}; beginning with the prior")
+            return keeper
         try:
             if checkpoint.read(self._online, path):
                 self.get_logger().info(f"continuing from {path}, of {self._online.stamp} ns")
         except UserError as error:
             self.get_logger().error(f"{error}; beginning with the prior")
-        return checkpoint.Keeper(path, self._online)
+        return keeper
 
     def _keep(self) -> None:
         assert self._keeper is not None
