@@ -10,8 +10,10 @@ import time
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from bench.simulators.live import (
@@ -32,6 +34,7 @@ from rov_ident.core.states import Level
 from rov_ident.estimation import rls
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io import cdr
+from rov_ident.nodes.common import STREAM
 from rov_ident.nodes.conversions import from_diagnostics, from_time
 from rov_ident.simulation.virtual_sensors import dive
 
@@ -238,6 +241,25 @@ def test_services_and_parameters(live, heavy, short_dive, tmp_path):
     vehicle.coefficients.clear()
     vehicle.listen(1.0)
     assert len(vehicle.coefficients) > 12
+
+
+def test_a_node_outlives_its_callbacks(live, short_dive, tmp_path):
+    """A clock before 1970, bytes that are no clock, a folder to save in that has gone."""
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    vehicle = live("use_sim_time:=true", f"save_path:={folder / 'saved.yaml'}")
+    clock = vehicle.node.create_publisher(Clock, "/clock", STREAM)
+    vehicle.until(clock.get_subscription_count)
+    for message in (Clock(clock=Time(sec=-1)), b"\0\1\0\0", b"", Clock(clock=Time(sec=-(2**31)))):
+        clock.publish(message)
+    vehicle.until(lambda: "/clock: ValueError" in vehicle.words())
+    folder.rmdir()
+    folder.write_text("in the way")
+    answer = vehicle.call(Trigger, "save", Trigger.Request())
+    assert not answer.success and "cannot be written" in answer.message
+    clock.publish(Clock(clock=Time(sec=5)))
+    vehicle.drive(short_dive)
+    vehicle.until(lambda: vehicle.coefficients[-1].header.stamp.sec > 0)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 import signal
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection
+from functools import wraps
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -29,9 +31,64 @@ try:  # costs half as much, and keeps the order of arrival across topics
 except ImportError:
     from rclpy.executors import SingleThreadedExecutor as Executor
 
-__all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "live", "subscribed"]
+__all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "GuardedNode", "live", "subscribed"]
 
 AnyNode = TypeVar("AnyNode", bound=Node)
+
+
+class GuardedNode(Node):  # type: ignore[misc]
+    """A node that outlives what its callbacks raise, those of rclpy's own services included.
+
+    ``faults`` counts them by name; the log has them, too. Where ``outlives`` is False they end the
+    process.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.faults: Counter[str] = Counter()
+        self.outlives = True
+        super().__init__(*arguments, **options)  # which listens to /clock
+
+    def create_subscription(
+        self, type_: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Any:
+        guarded = self._guarded(topic, callback)
+        return super().create_subscription(type_, topic, guarded, *arguments, **options)
+
+    def create_timer(
+        self, period: float, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Any:
+        guarded = self._guarded("timer", callback)
+        return super().create_timer(period, guarded, *arguments, **options)
+
+    def create_service(
+        self,
+        type_: Any,
+        service: str,
+        callback: Callable[..., Any],
+        *arguments: Any,
+        **options: Any,
+    ) -> Any:
+        guarded = self._guarded(service, callback)
+        return super().create_service(type_, service, guarded, *arguments, **options)
+
+    def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(callback)  # rclpy looks at its arguments
+        def guarded(*arguments: Any) -> Any:
+            try:
+                return callback(*arguments)
+            except Exception as error:
+                if not self.outlives:
+                    raise
+                self.faults[f"{name}: {type(error).__name__}"] += 1
+                words = f"{name}: {error!r}"
+                self.get_logger().error(words, throttle_duration_sec=10.0)
+                response: Any = arguments[-1] if arguments else None  # of a service
+                if hasattr(response, "success"):
+                    response.success, response.message = False, words
+                return response
+
+        return guarded
+
 
 INPUTS = {
     ODOMETRY: ("odom", Odometry),

@@ -18,7 +18,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
@@ -34,7 +33,7 @@ from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Repor
 from rov_ident.io.cdr import encode
 from rov_ident.io.topics import Reader
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
+from rov_ident.nodes.common import LATCHED, STREAM, GuardedNode, live, subscribed
 from rov_ident.nodes.compile_state import CompileState, settle
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix
 from rov_ident.nodes.diagnostics import Diagnostics, Inputs
@@ -60,7 +59,7 @@ _SWITCHING = 0.0005
 hundred samples (docs/speed.md)."""
 
 
-class EstimatorNode(Node):  # type: ignore[misc]
+class EstimatorNode(GuardedNode):
     """One online estimator on three topics.
 
     With the parameter `lockstep` a player sets the pace: messages are acknowledged by their count
@@ -77,6 +76,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         named = f"{configuration.as_file_name(config.name)}_{self.get_name()}.yaml"
         self._save_path = os.path.abspath(settings["save_path"] or named)
         self._lockstep: bool = settings["lockstep"]
+        self.outlives = not self._lockstep  # a replay tells its caller instead
         self._started = time.monotonic()
         self._compiling = compiling
         compiling.begin(config, self.get_logger(), wait=self._lockstep)
