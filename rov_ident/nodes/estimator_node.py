@@ -89,7 +89,6 @@ class EstimatorNode(GuardedNode):
         self._resting_until = 0.0
         self._idle = 0.0  # s since the last sample
         self._stopped = ""  # why there are no samples
-        self._wrench_frame: str | None = None
         self._used = 0  # samples
         self._published_stamp = 0  # ns
         self._kept = self._online.stamp  # ns; of the last checkpoint asked for
@@ -172,9 +171,6 @@ class EstimatorNode(GuardedNode):
     def _take(self, source: str, data: bytes, arrival: int) -> None:
         for role, message in self._reader.read(source, data, arrival):
             info = self._online.push(role, message)
-            # The sampler keeps to the frame of the first message that it takes.
-            if role == WRENCH and self._wrench_frame is None and self._online.counts[WRENCH]:
-                self._wrench_frame = message.frame_id
             if len(info):
                 self._idle = 0.0
                 self._show(info)
@@ -191,10 +187,9 @@ class EstimatorNode(GuardedNode):
         origin = self._online.sampler.origin or 0
         stamps = [origin + round(float(t) * 1e9) for t in info["t"]]
         residuals = info["residual"]
-        frames = self._config.frames
+        frames, frame_id = self._config.frames, self._online.sampler.validation.frame_id(WRENCH)
         for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)):
-            frame, both = self._wrench_frame or "", residuals[i]
-            wrench = Wrench(stamps[i], frame, both[:3], both[3:])
+            wrench = Wrench(stamps[i], frame_id, residuals[i, :3], residuals[i, 3:])
             self._residual.publish(encode(from_core(wrench, frames.body, frames.world)))
         since = stamps[-1] - self._published_stamp
         if self._lockstep and not 0 <= since < 1e9 / self._config.publish_rate:

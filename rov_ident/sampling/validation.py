@@ -10,6 +10,9 @@ from rov_ident.core.messages import Imu, Message, Odometry
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
 """Counted where stamps begin anew: a bag that starts over, another computer."""
+NEW_FRAME = "frame: another has the majority, buffers restarted"
+"""Counted where a topic goes on in another frame."""
+RESTARTS = (NEW_CLOCK, NEW_FRAME)
 REPEATED = 2e3
 """The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""
 
@@ -32,7 +35,9 @@ class Validation:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._frame_ids: dict[str, tuple[str, ...]] = {}  # by topic, those of its first message
+        self._frame_ids: dict[str, tuple[str, ...]] = {}  # by topic, those of most of its messages
+        self._votes: Counter[str] = Counter()  # by topic, for them less those against them
+        self._other_frames: dict[str, tuple[str, ...]] = {}  # by topic, those last refused
         self._last_stamp: dict[str, int] = {}  # ns
         self._suspect: dict[str, int] = {}  # ns; a stamp out of line, by topic
         self.forget_motion()
@@ -42,16 +47,24 @@ class Validation:
         self._velocity = b""  # bytes of the last one
         self._fine = 0  # messages for which velocities still count as not rounded to a grid
 
+    def forget_frames(self) -> None:
+        """Have the next message of each topic decide in which frame it is."""
+        self._votes.clear()
+
+    def frame_id(self, role: str) -> str:
+        """In which a topic's vectors are; empty before its first message."""
+        return self._frame_ids.get(role, ("",))[-1]
+
     def judge(self, role: str, message: Message) -> str:
         """Why a message is refused, after counting it; empty if it is taken.
 
-        :data:`NEW_CLOCK` if it is the first to be taken of another clock.
+        One of :data:`RESTARTS` if it is the first to be taken of another clock, or in other frames.
         """
         reason = self._fault(role, message) or self._stamp_fault(role, message.stamp)
         if not reason:
             self._last_stamp[role] = message.stamp
             self._suspect.pop(role, None)
-        elif reason == NEW_CLOCK:
+        elif reason in RESTARTS:
             self.counts[reason] += 1
             self._last_stamp = {role: message.stamp}
         else:
@@ -86,13 +99,20 @@ class Validation:
         # 50,000 km, 100 g, 1 MN, 1 MN m.
         if not size < 2500.0:
             return "not finite or absurdly large"
-        if self._frame_ids.get(role) == frames:
+        held = self._frame_ids.get(role)
+        if held == frames:
+            self._votes[role] += 1
             return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
             return f"frame {_shown(frames[-1:])} is a world frame, body axes are needed"
-        if self._frame_ids.setdefault(role, frames) != frames:
-            return f"frame changed from {_shown(self._frame_ids[role])} to {_shown(frames)}"
-        return ""
+        # Boyer and Moore's vote: what most of the messages say is held, whichever came first. Two
+        # in a row must agree: a frame that is another each time takes nothing over.
+        suspect, self._other_frames[role] = self._other_frames.get(role), frames
+        if held is None or (self._votes[role] == 0 and suspect == frames):
+            self._frame_ids[role], self._votes[role] = frames, 1
+            return "" if held is None else NEW_FRAME
+        self._votes[role] = max(self._votes[role] - 1, 0)
+        return f"frame changed from {_shown(held)} to {_shown(frames)}"
 
     def _stamp_fault(self, role: str, stamp: int) -> str:
         """What is wrong with the stamp [ns] after the last one of its topic, or an empty string."""
