@@ -1,5 +1,6 @@
 """Bags on real files: read back with the peers' readers, cut, damaged, killed."""
 
+import contextlib
 import os
 import random
 import signal
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
+from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -27,7 +28,7 @@ from rosbags.typesys import Stores, get_typestore
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Imu, Odometry, Wrench
 from rov_ident.io import cdr
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_reader import Bag, _records, read_messages, select_topics
 from rov_ident.io.bag_writer import BagWriter
 
 STEP = 20_000_000  # ns
@@ -481,3 +482,25 @@ def test_a_choice_that_cannot_be_made(tmp_path, topics, overrides, words):
     bag = bag_of(tmp_path, **topics)
     with pytest.raises(UserError, match=words):
         select_topics(bag, overrides)
+
+
+def test_a_damaged_schema_or_channel_outside_chunks_is_passed_over(tmp_path):
+    """Each of its bytes in turn, and its length: what is left is read, or refused in words."""
+    path = tmp_path / "dive.mcap"
+    write_mcap(path, entries(20), use_chunking=False)
+    data = path.read_bytes()[: -len(MCAP0_MAGIC)]  # no summary: the walk
+    records = [r for r in _records(data, len(MCAP0_MAGIC)) if r[0] in (3, 4)][:6]
+    for _, _, body, end in records:
+        for at in range(body, min(end, body + 40)):
+            for value in (0, 255):
+                path.write_bytes(data[:at] + bytes([value]) + data[at + 1 :])
+                with contextlib.suppress(UserError):
+                    for raw in Bag(path).iter_raw():
+                        assert raw.topic
+
+
+def test_numbers_in_names_may_be_of_any_script(tmp_path):
+    (tmp_path / "bag").mkdir()
+    for name in ("²0a", "٣", "dive_10", "dive_2"):
+        write(tmp_path / "bag" / f"{name}.mcap", entries(5))
+    assert Bag(tmp_path / "bag").topics["/odom"].message_count > 0

@@ -1,6 +1,7 @@
-"""Where a file may be written, and writing it whole or not at all."""
+"""Which files are read; where one may be written, and writing it whole or not at all."""
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -33,6 +34,32 @@ def check_output(path: Place, inputs: Iterable[Place | None] = (), bag: bool = F
         refusal = "no file can have that name"
     if refusal:
         raise UserError(f"{_shown(path)} cannot be written: {refusal}")
+
+
+def open_input(path: Place) -> IO[bytes]:
+    """A regular file for reading. A pipe, for whose writer one would wait, and a device are none.
+
+    Raises OSError, whose ``strerror`` says in words why it cannot be read.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except ValueError as error:
+        raise OSError(errno.EINVAL, "no file can have that name", str(path)) from error
+    kind = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(kind):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    what = "it is a folder" if stat.S_ISDIR(kind) else "it is a pipe or a device, not a file"
+    raise OSError(errno.EINVAL, what, str(path))
+
+
+def read_input(path: Place, largest: int) -> bytes:
+    """What is in a regular file of at most ``largest`` bytes. Raises OSError as above."""
+    with open_input(path) as stream:
+        data = stream.read(largest + 1)
+    if len(data) > largest:
+        raise OSError(errno.EFBIG, f"it is larger than {largest >> 20} MiB", str(path))
+    return data
 
 
 def write_file(path: Place, content: str | bytes) -> None:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import PARAMETERS, Config, to_parameters
 from rov_ident.core.errors import UserError
-from rov_ident.core.files import lock, write_file
+from rov_ident.core.files import lock, open_input, write_file
 from rov_ident.estimation.online import Memory, OnlineEstimator
 
 FORMAT = 1
@@ -97,7 +97,7 @@ def read(online: OnlineEstimator, path: Path) -> bool:
     Raises UserError, one sentence that names the file and why it cannot be used.
     """
     try:
-        with path.open("rb") as stream:
+        with open_input(path) as stream:
             data = stream.read(LARGEST + 1)
     except FileNotFoundError:
         return False

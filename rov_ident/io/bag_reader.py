@@ -33,6 +33,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import open_input
 from rov_ident.core.messages import Message
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.cdr import DECODERS, ROLE_TYPES
@@ -130,7 +131,7 @@ class Bag:
         """Hexadecimal digest of the contents of the .mcap files, in order."""
         digest = hashlib.sha256()
         for file in self._files:
-            with file.path.open("rb") as stream:
+            with open_input(file.path) as stream:
                 while piece := stream.read(1 << 20):
                     digest.update(piece)
         return digest.hexdigest()
@@ -158,7 +159,7 @@ class Bag:
         log_time = attrgetter("log_time")
         pending: list[RawMessage] = []
         with ExitStack() as stack:
-            streams = [stack.enter_context(file.path.open("rb")) for file in self._files]
+            streams = [stack.enter_context(open_input(file.path)) for file in self._files]
             for start_time, number, block in order:
                 # No later block can hold anything earlier than this one begins.
                 ready = bisect_left(pending, start_time, key=log_time)
@@ -247,7 +248,7 @@ def _mcap_files(path: Path) -> list[Path]:
     try:
         files = _files_of_directory(path) if path.is_dir() else [path]
         for file in files:
-            with file.open("rb") as stream:
+            with open_input(file) as stream:
                 _check_magic(file, stream.read(16))
     except OSError as error:
         raise UserError(
@@ -292,7 +293,7 @@ def _inside(folder: Path, name: str) -> Path:
 def _natural_order(path: Path) -> list[tuple[int, str]]:
     """Sorts dive_2 before dive_10."""
     return [
-        (int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.stem)
+        (int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", path.stem)
     ]
 
 
@@ -308,7 +309,7 @@ def _check_magic(path: Path, head: bytes) -> None:
 
 
 def _index(path: Path) -> _File:
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         return _index_by_summary(path, stream) or _index_by_walking(path, stream)
 
 
@@ -351,24 +352,24 @@ def _index_by_walking(path: Path, stream: IO[bytes]) -> _File:
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
         for opcode, start, body, end in _records(buffer, reached):
             reached = end
-            if opcode == Opcode.CHUNK:
-                try:
+            if opcode == Opcode.DATA_END:
+                finished = True
+                break
+            try:
+                if opcode == Opcode.CHUNK:
                     chunk = Chunk.read(_stream(buffer[body:end]))
                     data = _unpack(chunk)
                     for inner, _, inner_body, inner_end in _records(data, 0):
-                        _note(file, schemas, inner, data, inner_body, inner_end)
-                except _DAMAGE:
-                    file.damaged.add(start)
-                    continue
-                file.blocks.append(_Block(chunk.message_start_time, start, end - start))
-            elif opcode == Opcode.DATA_END:
-                finished = True
-                break
-            else:
-                _note(file, schemas, opcode, buffer, body, end)
-            if opcode == Opcode.MESSAGE:
-                run.append((_MESSAGE.unpack_from(buffer, body)[2], start, end))
-            if run and (opcode == Opcode.CHUNK or len(run) == _RUN_LENGTH):
+                        _note(file, schemas, inner, data[inner_body:inner_end])
+                    file.blocks.append(_Block(chunk.message_start_time, start, end - start))
+                elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                    _note(file, schemas, opcode, buffer[body:end])
+                    if opcode == Opcode.MESSAGE:
+                        run.append((_MESSAGE.unpack_from(buffer, body)[2], start, end))
+            except _DAMAGE:
+                file.damaged.add(start)
+                opcode = 0
+            if run and (opcode in (0, Opcode.CHUNK) or len(run) == _RUN_LENGTH):
                 file.blocks.append(_block_of_run(run))
                 run = []
         if not finished:
@@ -397,18 +398,15 @@ def _records(buffer: bytes | mmap.mmap, position: int) -> Iterator[tuple[int, in
         position = body + length
 
 
-def _note(
-    file: _File, schemas: dict[int, Schema], opcode: int, buffer: bytes | mmap.mmap, body: int,
-    end: int,
-) -> None:  # fmt: skip
+def _note(file: _File, schemas: dict[int, Schema], opcode: int, body: bytes) -> None:
     """Enters a schema, channel or message that was met on the walk into the index."""
     if opcode == Opcode.MESSAGE:
-        file.counts[_MESSAGE.unpack_from(buffer, body)[0]] += 1
+        file.counts[_MESSAGE.unpack_from(body)[0]] += 1
     elif opcode == Opcode.SCHEMA:
-        schema = Schema.read(_stream(buffer[body:end]))
+        schema = Schema.read(_stream(body))
         schemas[schema.id] = schema
     elif opcode == Opcode.CHANNEL:
-        _register(file, Channel.read(_stream(buffer[body:end])), schemas)
+        _register(file, Channel.read(_stream(body)), schemas)
 
 
 def _register(file: _File, channel: Channel, schemas: Mapping[int, Schema]) -> None:

@@ -6,7 +6,7 @@ Bad data never raises. Whatever is refused leaves everything as it was.
 from collections import Counter
 from collections.abc import Mapping
 
-from rov_ident.core.messages import Imu, Message, Odometry
+from rov_ident.core.messages import Message, Odometry, fault
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
 """Counted where stamps begin anew: a bag that starts over, another computer."""
@@ -19,7 +19,6 @@ REPEATED = 2e3
 _LARGEST_JUMP = 10.0  # s; a stamp this far ahead, or _LARGEST_STEP_BACK behind, is another clock:
 _LARGEST_STEP_BACK = 1.0  # s; topics that are reordered or lost for a while stay well within both
 _AGREEMENT = 1.0  # s; two stamps out of line that are so close to one another are of one new clock
-_LAST_STAMP = (2**31 - 1) * 10**9  # ns; the end of ROS time, 32 bits of seconds
 _REASONS = 100  # so many names of refusals are kept, so that a log cannot be flooded with them
 _GRID = 1e-4  # m/s; drivers that round velocities round to no finer grid than this
 _OFF_GRID = 0.01  # of a grid step; single precision of 10 m/s is that near
@@ -76,29 +75,11 @@ class Validation:
 
     def _fault(self, role: str, message: Message) -> str:
         """What is wrong with the fields or the frame, or an empty string."""
-        if message.stamp <= 0:
-            return "zero stamp"
-        if message.stamp >= _LAST_STAMP:
-            return "stamp at the end of time"
-        frames: tuple[str, ...]
+        if wrong := fault(message):
+            return wrong
+        frames: tuple[str, ...] = (message.frame_id,)
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)
-            p, q, v, w = message.position, message.orientation, message.linear, message.angular
-            if not 0.5 < q.dot(q) < 2.0:  # NaN too
-                return "orientation is not a unit quaternion"
-            size = v.dot(v) + w.dot(w) + 1e-12 * p.dot(p)
-        elif isinstance(message, Imu):
-            frames = (message.frame_id,)
-            w, f = message.angular_velocity, message.linear_acceleration
-            size = w.dot(w) + f.dot(f) / 400.0
-        else:
-            frames = (message.frame_id,)
-            f, w = message.force, message.torque
-            size = 2.5e-9 * (f.dot(f) + w.dot(w))
-        # One comparison refuses NaN, infinities and what no vehicle reaches: 50 m/s, 50 rad/s,
-        # 50,000 km, 100 g, 1 MN, 1 MN m.
-        if not size < 2500.0:
-            return "not finite or absurdly large"
         held = self._frame_ids.get(role)
         if held == frames:
             self._votes[role] += 1
