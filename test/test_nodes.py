@@ -416,6 +416,25 @@ def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, nothing_co
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_while_an_object_of_a_start_is_finalised(number):
+    """What is raised there is lost, and within a library of C++ it aborts the process."""
+    program = f"""if True:
+        import os, time
+        from rov_ident.nodes.common import live
+        class Finalised:
+            def __del__(self):
+                os.kill(os.getpid(), {number:d})
+                time.sleep(0.1)
+        def make():
+            Finalised()
+            time.sleep(60.0)
+        live("node", make, own=())
+    """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path, number):
     """It starts a thread then; one that was half started kept the process for ever."""
     for delay in (0.0, 0.0003, 0.001, 0.003):

@@ -24,7 +24,7 @@ from rov_ident.config import Inputs
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.io.topics import sources
-from rov_ident.nodes.programs import INTERRUPTS
+from rov_ident.nodes.programs import INTERRUPTS, end_at_once
 
 try:  # costs half as much, and keeps the order of arrival across topics
     from rclpy.experimental import EventsExecutor as Executor
@@ -138,23 +138,16 @@ def live(
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # open, so that the last messages can be published.
-    interrupted = threading.Event()
-
-    def interrupt(*_: object) -> None:
-        interrupted.set()  # the exception may be lost: one raised in a finaliser is ignored
-        raise KeyboardInterrupt
-
-    for number in INTERRUPTS:
-        signal.signal(number, interrupt)
+    end_at_once()
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy gives its RCLError no public name
         return _refused(name, _why_unreadable(name, own, error))
     try:
-        _spin(make(), executor(), begin, leave, interrupted)
+        _spin(make(), executor(), begin, leave)
     except UserError as error:
         return _refused(name, str(error))
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
     finally:
         rclpy.try_shutdown()
@@ -166,9 +159,9 @@ def _spin(
     executor: Any,
     begin: Callable[[AnyNode, threading.Event], None],
     leave: Callable[[AnyNode], None],
-    interrupted: threading.Event,
 ) -> None:
     executor.add_node(node)
+    interrupted = threading.Event()
     # From here on an interrupt waits for the end of a callback.
     for number in INTERRUPTS:
         signal.signal(number, lambda *_: interrupted.set())
