@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,6 +75,26 @@ def all_finite(vehicle):
 def is_stale(vehicle):
     last = vehicle.coefficients[-1:]
     return bool(last) and all(status.level == STALE for status in last[0].status)
+
+
+def test_publishing_leaves_time_for_the_inputs(domain, heavy_path):
+    """However often it is asked for; a fifth of the time, and as much to wake up for it."""
+    process = start_node("ukf", heavy_path, "publish_rate:=1000.0")
+    until_said(process, "]: active")
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    time.sleep(2.0)  # what follows a start
+    began, before = time.monotonic(), processor_time(process.pid)
+    time.sleep(4.0)
+    used = processor_time(process.pid) - before
+    assert used < 0.4 * (time.monotonic() - began)
+    process.kill()
+    process.wait()
+
+
+def processor_time(pid):
+    """Of a process so far, in s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_outputs(live, heavy, short_dive):
