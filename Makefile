@@ -66,6 +66,7 @@ sdf: .venv/drake.stamp
 torture: .venv/test.stamp
 	$(BIN)/python -m bench.studies.torture
 	$(BIN)/python -m bench.studies.torture_live
+	$(BIN)/python -m bench.studies.fuzz
 
 ## known faults of the dependencies, and suspicious places in the source; needs the network
 audit: .venv/audit.stamp

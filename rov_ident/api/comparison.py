@@ -197,7 +197,7 @@ def _estimates(source: Any) -> Estimates:
     if path.suffix in (".yaml", ".yml"):
         return _of_config(configuration.load(path), path.name)
     try:
-        return _of_document(json.loads(read_input(path, _LARGEST_FILE)), path.name)
+        return _of_document(json.loads(read_input(path, _LARGEST_FILE), parse_int=float), path.name)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

@@ -82,6 +82,7 @@ LAST_STAMP = (2**31 - 1) * 10**9
 """ns; the end of ROS time, 32 bits of seconds."""
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def fault(message: Message) -> str:
     """Why no vehicle can have sent this, or an empty string."""
     if message.stamp <= 0:

@@ -11,6 +11,8 @@ zero). Nothing is resampled but attitude and rates: they are brought to the time
 import contextlib
 import io
 import itertools
+import os
+import sys
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -239,12 +241,28 @@ def _read(path: Path, progress: Callable[[float], None]) -> _Log:
                     _telemetry(reader, log, progress)
             else:
                 read = DFReader.DFReader_text if kind == ".log" else DFReader.DFReader_binary
-                _dataflash(read(str(path)), log, progress)
+                with _silent():
+                    reader = read(str(path))
+                _dataflash(reader, log, progress)
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): check the path") from error
     except Exception as error:  # pymavlink raises whatever the bytes make it
         raise UserError(f"{path} is no log of ArduPilot, or a damaged one: {error}") from error
     return log
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Nothing reaches standard error, not even from C: the indexer names each damaged byte."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _received(reader: Any, kinds: list[str], progress: Callable[[float], None]) -> Iterator[Any]:

@@ -48,7 +48,9 @@ LARGEST_CHUNK = 1 << 28
 """Bytes: recorders make chunks of about a megabyte; a larger claim is damage, or meant to harm."""
 
 # What zstd, lz4, mcap and struct raise on bytes that are not what they should be.
-_DAMAGE = (zstandard.ZstdError, RuntimeError, McapError, ValueError, struct.error)
+_DAMAGE = (
+    zstandard.ZstdError, RuntimeError, McapError, ValueError, OverflowError, struct.error
+)  # fmt: skip
 
 
 class Topic(NamedTuple):
