@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
-from importlib.metadata import distributions
+from importlib.metadata import distributions, requires
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,8 @@ import pytest
 import rclpy
 import rclpy.node
 from diagnostic_msgs.msg import DiagnosticArray
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
@@ -332,3 +334,31 @@ def test_a_node_does_what_its_policy_says(live, estimator):
     vehicle.coefficients.clear()
     vehicle.until(lambda: len(vehicle.coefficients) > 2)
     assert np.isfinite(vehicle.values[-1].data).all()
+
+
+# ------------------------------------------------------------------ locks
+
+
+@pytest.mark.parametrize("lock", ["demo", "test", "bench", "docs", "audit"])
+@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
+def test_a_lock_has_one_version_with_hashes_for_each_python(lock, version):
+    environment = {"python_version": version, "python_full_version": f"{version}.1"}
+    text = (ROOT / "requirements" / f"{lock}.txt").read_text()
+    locked = {}
+    for entry in text.replace("\\\n", " ").splitlines():
+        line, *hashes = entry.partition("    # ")[0].split(" --hash=sha256:")
+        requirement = Requirement(line)
+        if requirement.marker is None or requirement.marker.evaluate(environment):
+            assert hashes and requirement.name not in locked
+            locked[requirement.name] = str(requirement.specifier).removeprefix("==")
+    if lock == "audit":
+        assert {"bandit", "pip-audit", "uv"} <= locked.keys()
+        return
+    for line in requires("rov_ident"):
+        requirement = Requirement(line)
+        extras = {"demo": ["wheels"]}.get(lock, ["wheels", lock])
+        if not requirement.marker or any(
+            requirement.marker.evaluate({**environment, "extra": extra}) for extra in extras
+        ):
+            name = canonicalize_name(requirement.name)
+            assert requirement.specifier.contains(locked[name]), requirement
