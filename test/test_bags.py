@@ -3,6 +3,7 @@
 import contextlib
 import os
 import random
+import resource
 import signal
 import struct
 import subprocess
@@ -27,7 +28,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Imu, Odometry, Wrench
-from rov_ident.io import cdr
+from rov_ident.io import bag_reader, cdr
 from rov_ident.io.bag_reader import Bag, _records, read_messages, select_topics
 from rov_ident.io.bag_writer import BagWriter
 
@@ -504,3 +505,26 @@ def test_numbers_in_names_may_be_of_any_script(tmp_path):
     for name in ("²0a", "٣", "dive_10", "dive_2"):
         write(tmp_path / "bag" / f"{name}.mcap", entries(5))
     assert Bag(tmp_path / "bag").topics["/odom"].message_count > 0
+
+
+def test_a_bag_of_more_files_than_may_be_open(tmp_path):
+    (tmp_path / "bag").mkdir()
+    for k in range(40):
+        write(tmp_path / "bag" / f"dive_{k}.mcap", entries(1))
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    used = len(os.listdir("/proc/self/fd"))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 10, before[1]))
+    try:
+        bag = Bag(tmp_path / "bag")
+        assert sum(1 for _ in bag.iter_raw()) == sum(t.message_count for t in bag.topics.values())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_chunks_that_overlap_in_time_are_bounded(tmp_path, monkeypatch):
+    rows = [(topic, kind, STEP, data) for topic, kind, _, data in entries(200)]
+    path = write_mcap(tmp_path / "dive.mcap", rows, chunk_size=500)
+    assert sum(1 for _ in Bag(path).iter_raw()) == len(rows)
+    monkeypatch.setattr(bag_reader, "LARGEST_OVERLAP", 10_000)
+    with pytest.raises(UserError, match="out of order: bring it in order"):
+        list(Bag(path).iter_raw())

@@ -16,7 +16,6 @@ import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
@@ -46,6 +45,9 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _RUN_LENGTH = 4096  # messages outside chunks that make one block
 LARGEST_CHUNK = 1 << 28
 """Bytes: recorders make chunks of about a megabyte; a larger claim is damage, or meant to harm."""
+
+LARGEST_OVERLAP = 1 << 29
+"""Bytes of messages that wait for their turn; two chunks of the largest kind."""
 
 # What zstd, lz4, mcap and struct raise on bytes that are not what they should be.
 _DAMAGE = (
@@ -160,19 +162,25 @@ class Bag:
         )
         log_time = attrgetter("log_time")
         pending: list[RawMessage] = []
-        with ExitStack() as stack:
-            streams = [stack.enter_context(open_input(file.path)) for file in self._files]
-            for start_time, number, block in order:
-                # No later block can hold anything earlier than this one begins.
-                ready = bisect_left(pending, start_time, key=log_time)
-                yield from pending[:ready]
-                del pending[:ready]
-                try:
-                    data = _read_block(streams[number], block)
-                    pending += _messages(data, wanted[number])
-                except _DAMAGE:
-                    self._files[number].damaged.add(block.offset)
-                pending.sort(key=log_time)
+        for start_time, number, block in order:
+            # No later block can hold anything earlier than this one begins.
+            ready = bisect_left(pending, start_time, key=log_time)
+            yield from pending[:ready]
+            del pending[:ready]
+            file = self._files[number]
+            try:
+                with open_input(file.path) as stream:  # a bag may have more than can be open
+                    pending += _messages(_read_block(stream, block), wanted[number])
+            except _DAMAGE:
+                file.damaged.add(block.offset)
+            except OSError as error:
+                raise UserError(f"{file.path} cannot be read: {error.strerror}") from error
+            if sum(len(message.data) for message in pending) > LARGEST_OVERLAP:
+                raise UserError(
+                    f"{file.path} holds more than {LARGEST_OVERLAP >> 20} MiB out of order: "
+                    "bring it in order with `mcap sort`"
+                )
+            pending.sort(key=log_time)
         yield from pending
 
 
