@@ -528,3 +528,12 @@ def test_chunks_that_overlap_in_time_are_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(bag_reader, "LARGEST_OVERLAP", 10_000)
     with pytest.raises(UserError, match="out of order: bring it in order"):
         list(Bag(path).iter_raw())
+
+
+def test_a_bag_of_many_topics_is_refused_in_a_sentence(tmp_path):
+    rows = [(f"/topic_{k}", cdr.WRENCH_TYPE, STEP, cdr.encode(wrench(STEP))) for k in range(2_000)]
+    path = write_mcap(tmp_path / "dive.mcap", rows)
+    for overrides in ({}, {"wrench": "/none"}, {"odom": "/topic_1"}):
+        with pytest.raises(UserError) as refusal:
+            select_topics(Bag(path), overrides, ["wrench", "odom"])
+        assert len(str(refusal.value)) < 6_000
