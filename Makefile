@@ -1,7 +1,6 @@
 # Everything runs in .venv, built here on first use; again when setup.py changes.
 PYTHON ?= python3
 BIN := .venv/bin
-VERSION := $(shell $(PYTHON) -c 'import sys; print("py%d%d" % sys.version_info[:2])')
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pep517
 
 # A shell that has sourced a ROS workspace, or runs inside another venv, must not leak into .venv.
@@ -66,25 +65,33 @@ sdf: .venv/drake.stamp
 torture: .venv/test.stamp
 	$(BIN)/python -m bench.studies.torture
 	$(BIN)/python -m bench.studies.torture_live
+	$(BIN)/python -m bench.studies.fuzz
 
-## known faults of the dependencies, and suspicious places in the source; needs the network
+## known faults of the dependencies, suspicious places in the source, and the list of what `make demo`
+## installs (out/sbom.json, CycloneDX); needs the network
 audit: .venv/audit.stamp
+	@mkdir -p out
 	.venv/audit/bin/bandit --quiet --configfile pyproject.toml --recursive rov_ident
-	.venv/audit/bin/pip-audit --strict --disable-pip --no-deps --requirement requirements/test-$(VERSION).txt
+	$(AUDIT) --requirement requirements/demo.txt --format cyclonedx-json --output out/sbom.json
+	for name in test bench docs audit; do $(AUDIT) --requirement requirements/$$name.txt || exit 1; done
 
-## the versions and hashes of what `make demo` and `make test` install, anew, for this Python
+AUDIT := .venv/audit/bin/pip-audit --strict --disable-pip --no-deps
+
+## the versions and hashes of all that this file installs, anew, for Python 3.10 to 3.13
 lock: .venv/audit.stamp
-	@mkdir -p requirements
-	$(COMPILE) --extra wheels --extra test --output-file requirements/test-$(VERSION).txt setup.py
-	$(COMPILE) --extra wheels --constraint requirements/test-$(VERSION).txt \
-	  --output-file requirements/demo-$(VERSION).txt setup.py
+	$(COMPILE) --extra wheels --extra test --output-file requirements/test.txt setup.py
+	$(COMPILE) --extra wheels --constraint requirements/test.txt --output-file requirements/demo.txt setup.py
+	for name in bench docs; do $(COMPILE) --extra wheels --extra $$name \
+	  --constraint requirements/test.txt --output-file requirements/$$name.txt setup.py || exit 1; done
+	printf 'bandit\npip-audit\nuv\n' | $(COMPILE) --output-file requirements/audit.txt -
 
-COMPILE := .venv/audit/bin/pip-compile --quiet --no-header --generate-hashes --allow-unsafe --upgrade \
-  --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
+COMPILE := .venv/audit/bin/uv pip compile --quiet --no-header --no-annotate --generate-hashes --upgrade \
+  --universal --python-version 3.10
 
-.venv/audit.stamp:
+.venv/audit.stamp: requirements/audit.txt
 	@$(PYTHON) -m venv .venv/audit
-	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check bandit pip-audit pip-tools
+	@.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes \
+	  --requirement requirements/audit.txt
 	@touch $@
 
 ## how often explain finds what is hidden, the tables of docs/explain-bench.md (many hours; it may be
@@ -103,12 +110,13 @@ picture: .venv/demo.stamp
 clean:
 	rm -rf .venv build install log out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 
-# Locked versions, with their hashes, where there is a lock for this Python; else what setup.py allows.
+# Locked versions, with their hashes, of requirements/$(1).txt; elsewhere what setup.py allows for $(2).
 define install
-if [ -f requirements/$(1)-$(VERSION).txt ]; then \
-  $(PIP) --require-hashes --requirement requirements/$(1)-$(VERSION).txt && \
+if $(BIN)/python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))'; then \
+  $(PIP) --require-hashes --requirement requirements/$(1).txt && \
   $(PIP) --no-deps --no-build-isolation --editable .; \
-else $(PIP) --editable '.[$(2)$(if $(3),$(comma)$(3))]'; fi
+else echo "The locks are for Python 3.10 to 3.13: what is installed now is not checked." >&2; \
+  $(PIP) --editable '.[$(2)]'; fi
 endef
 comma := ,
 
@@ -121,15 +129,15 @@ comma := ,
 
 .venv/bench.stamp: .venv/demo.stamp
 	@echo "Installing the peers into .venv ..." >&2
-	@$(PIP) --editable '.[wheels,bench]'
+	@$(call install,bench,wheels$(comma)bench)
 	@touch $@
 
 .venv/docs.stamp: .venv/demo.stamp
 	@echo "Installing mkdocs into .venv ..." >&2
-	@$(PIP) --editable '.[wheels,docs]'
+	@$(call install,docs,wheels$(comma)docs)
 	@touch $@
 
 .venv/test.stamp: .venv/demo.stamp
 	@echo "Installing the test tools into .venv ..." >&2
-	@$(call install,test,wheels,test)
+	@$(call install,test,wheels$(comma)test)
 	@touch $@

@@ -12,12 +12,14 @@ from rov_ident import config
 from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, quaternion_to_matrix, to_core
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench, fault
 from rov_ident.io.ardupilot_log import import_log
+from rov_ident.io.bag_reader import ROLE_NAMES, Bag, read_messages
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model import thruster_allocation as thrusters
 
 VOLTAGE = 15.2
+TOPICS = {role: f"/{name}" for role, name in ROLE_NAMES.items()}
 FORMATS = {  # type: (name, format, columns), as ArduPilot's LogStructure.h has them
     128: ("FMT", "BBnNZ", "Type,Length,Name,Format,Columns"),
     1: ("XKF1", "QBccCfffffffccce", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD,GX,GY,GZ,OH"),
@@ -278,6 +280,35 @@ def test_an_odometry_in_the_bag_is_an_ordinary_one(tmp_path, dive):
     found = next(m for role, m in read_messages(bag, select_topics(bag)) if role == ODOMETRY)
     assert isinstance(found, Odometry)
     assert (found.frame_id, found.child_frame_id) == ("world_ned", "base_link_frd")
+
+
+@pytest.mark.parametrize(
+    ("kind", "column", "value"), [(1, 6, 1e30), (2, 3, 0.0), (3, 3, 1e30), (1, 1, 1 << 63)]
+)
+def test_what_no_vehicle_does_is_left_out(tmp_path, dive, kind, column, value):
+    """A velocity, a quaternion of zeros, a rate, a time: once, and what follows is read."""
+    rows = [list(row) for row in rows_of(dive)]
+    damaged = [row for row in rows if row[0] == kind and row[2] == 0][5]
+    if kind == 2:
+        damaged[3:7] = 4 * [value]
+    else:
+        damaged[column] = value
+    path = dataflash(tmp_path / "log.bin", rows)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    assert "left out" in report.notes[-1]
+    whole = [role for _, role, _ in dive]
+    assert report.odometry >= whole.count(ODOMETRY) - 3 and report.imu >= whole.count(IMU) - 1
+    for role, message in read_messages(Bag(tmp_path / "log.mcap"), TOPICS):
+        assert not fault(message), role
+
+
+def test_a_log_of_zero_quaternions_is_refused(tmp_path, dive):
+    rows = [[*row[:3], 0.0, 0.0, 0.0, 0.0] if row[0] == 2 else row for row in rows_of(dive)]
+    with pytest.raises(UserError, match="holds no odometry"):
+        import_log(
+            dataflash(tmp_path / "log.bin", rows), tmp_path / "x.mcap", configured(**GEOMETRY)
+        )
+    assert not (tmp_path / "x.mcap").exists()
 
 
 # ------------------------------------------------------------------ PX4

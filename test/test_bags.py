@@ -1,7 +1,9 @@
 """Bags on real files: read back with the peers' readers, cut, damaged, killed."""
 
+import contextlib
 import os
 import random
+import resource
 import signal
 import struct
 import subprocess
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
+from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -27,8 +29,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Imu, Odometry, Wrench
-from rov_ident.io import cdr
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io import bag_reader, cdr
+from rov_ident.io.bag_reader import Bag, _records, read_messages, select_topics
 from rov_ident.io.bag_writer import BagWriter
 
 STEP = 20_000_000  # ns
@@ -522,3 +524,57 @@ def test_a_choice_that_cannot_be_made(tmp_path, topics, overrides, words):
     bag = bag_of(tmp_path, **topics)
     with pytest.raises(UserError, match=words):
         select_topics(bag, overrides)
+
+
+def test_a_damaged_schema_or_channel_outside_chunks_is_passed_over(tmp_path):
+    """Each of its bytes in turn, and its length: what is left is read, or refused in words."""
+    path = tmp_path / "dive.mcap"
+    write_mcap(path, entries(20), use_chunking=False)
+    data = path.read_bytes()[: -len(MCAP0_MAGIC)]  # no summary: the walk
+    records = [r for r in _records(data, len(MCAP0_MAGIC)) if r[0] in (3, 4)][:6]
+    for _, _, body, end in records:
+        for at in range(body, min(end, body + 40)):
+            for value in (0, 255):
+                path.write_bytes(data[:at] + bytes([value]) + data[at + 1 :])
+                with contextlib.suppress(UserError):
+                    for raw in Bag(path).iter_raw():
+                        assert raw.topic
+
+
+def test_numbers_in_names_may_be_of_any_script(tmp_path):
+    (tmp_path / "bag").mkdir()
+    for name in ("²0a", "٣", "dive_10", "dive_2"):
+        write(tmp_path / "bag" / f"{name}.mcap", entries(5))
+    assert Bag(tmp_path / "bag").topics["/odom"].message_count > 0
+
+
+def test_a_bag_of_more_files_than_may_be_open(tmp_path):
+    (tmp_path / "bag").mkdir()
+    for k in range(40):
+        write(tmp_path / "bag" / f"dive_{k}.mcap", entries(1))
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    used = len(os.listdir("/proc/self/fd"))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 10, before[1]))
+    try:
+        bag = Bag(tmp_path / "bag")
+        assert sum(1 for _ in bag.iter_raw()) == sum(t.message_count for t in bag.topics.values())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_chunks_that_overlap_in_time_are_bounded(tmp_path, monkeypatch):
+    rows = [(topic, kind, STEP, data) for topic, kind, _, data in entries(200)]
+    path = write_mcap(tmp_path / "dive.mcap", rows, chunk_size=500)
+    assert sum(1 for _ in Bag(path).iter_raw()) == len(rows)
+    monkeypatch.setattr(bag_reader, "LARGEST_OVERLAP", 10_000)
+    with pytest.raises(UserError, match="out of order: bring it in order"):
+        list(Bag(path).iter_raw())
+
+
+def test_a_bag_of_many_topics_is_refused_in_a_sentence(tmp_path):
+    rows = [(f"/topic_{k}", cdr.WRENCH_TYPE, STEP, cdr.encode(wrench(STEP))) for k in range(2_000)]
+    path = write_mcap(tmp_path / "dive.mcap", rows)
+    for overrides in ({}, {"wrench": "/none"}, {"odom": "/topic_1"}):
+        with pytest.raises(UserError) as refusal:
+            select_topics(Bag(path), overrides, ["wrench", "odom"])
+        assert len(str(refusal.value)) < 6_000

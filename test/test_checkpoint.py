@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from std_srvs.srv import Trigger
 
-from bench.simulators.live import Dive, end_node, start_connected
+from bench import HEAVY
+from bench.simulators.live import Dive, end_node, start_connected, start_node, until_said
 from bench.studies.torture_live import kill_writers, lives
 from rov_ident import config
 from rov_ident.core.errors import UserError
@@ -187,6 +188,23 @@ def test_a_place_that_cannot_be_written(heavy, learnt, tmp_path):
     assert keeper.saved == 0
 
 
+def test_a_path_has_one_writer(heavy, learnt, tmp_path):
+    """Of several keepers only the first writes; the next one has it after that is closed."""
+    path = tmp_path / "x.checkpoint"
+    first = checkpoint.Keeper(path, learnt)
+    other = checkpoint.Keeper(tmp_path / "." / "x.checkpoint", OnlineEstimator(heavy, learnt.kind))
+    other.keep()
+    other.close()
+    assert other.refused and "another node writes" in other.failure
+    assert not path.exists()
+    first.keep()
+    first.close()
+    assert first.failure == "" and path.read_bytes() == contents(learnt)
+    third = checkpoint.Keeper(path, learnt)
+    third.close()
+    assert not third.refused
+
+
 # ------------------------------------------------------------------ nodes
 
 
@@ -238,6 +256,9 @@ def test_a_damaged_checkpoint_and_a_full_disk(begun, heavy, tmp_path):
     dive = Dive(sensors.dive(heavy, duration=20.0, seed=4).messages)
     dive.play(vehicle, 1.5)
     vehicle.until(lambda: "what is learnt is on disk" in vehicle.words())
+    second = start_node("rls", HEAVY, f"checkpoint_path:={path}")
+    until_said(second, "another node writes")
+    assert end_node(second)[0] == 0
     there = path.read_bytes()
     online = OnlineEstimator(heavy, "rls")
     checkpoint.restore(online, there)
@@ -249,7 +270,7 @@ def test_a_damaged_checkpoint_and_a_full_disk(begun, heavy, tmp_path):
     vehicle.until(lambda: "cannot be written: File too large" in vehicle.words())
     stamp = from_diagnostics(vehicle.coefficients[-1]).stamp
     assert checkpoint.read(online, path) and online.stamp < stamp
-    assert list(tmp_path.glob(".*")) == []
+    assert list(tmp_path.glob(".*.part")) == []
     answer = vehicle.call(Trigger, "save", Trigger.Request())
     assert not answer.success and "cannot be written" in answer.message
 

@@ -25,7 +25,7 @@ from bench.simulators.live import in_pace, same_to_rounding
 from rov_ident import config
 from rov_ident.core.states import State
 from rov_ident.dashboard import server
-from rov_ident.dashboard.store import BINS, POINTS, Series, Status, Store, plain
+from rov_ident.dashboard.store import BINS, MOST, POINTS, Series, Status, Store, plain
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -243,6 +243,73 @@ async def _close_code(live):
 def test_many_pages(report):
     """So many and no more; what is closed makes room; the end of the server closes all."""
     asyncio.run(_many_pages(report))
+
+
+def test_numbers_of_others_are_data(report):
+    """Whatever they are, the state is JSON; a good covariance comes back."""
+    store = Store(Clock())
+    fill(store, report, seconds=1)
+    n = len(report.names)
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        matrix = np.diag(10.0 ** random.uniform(-320.0, 300.0, n))
+        matrix[random.integers(n), random.integers(n)] = random.choice([-1e300, 1e300, 1e-320, 0.0])
+        store.take_covariance("/rls_node", matrix)
+        store.take_residual("/rls_node", random.integers(2**40), 10 ** random.uniform(0, 308, 6))
+        server._to_json(store.changes()[0])
+    store.take_covariance("/rls_node", np.eye(n) + 0.25)
+    store.take_covariance("/rls_node", 1e300 * (np.eye(n) - 2.0))  # no covariance
+    correlation = store.changes()[0]["estimators"]["/rls_node"]["correlation"]
+    np.testing.assert_allclose(correlation, np.eye(n) + 0.2 * (1.0 - np.eye(n)))
+
+
+def test_what_others_invent_is_bounded(report):
+    store = Store(Clock())
+    fill(store, report, seconds=1)
+    values = {f"{k}": "x" * 10_000 for k in range(2_000)}
+    for k in range(2_000):
+        status = Status(0, "x" * 100_000, values if k < 3 else {})
+        store.take_status("/rls_node", f"kind {k}", status)
+        store.take_status(f"/invented_{k}", "bridge", status)
+        store.add(f"/invented_{k}")
+        store.take_report(f"/invented_{k}", "heavy", report)
+        store.take_status("/real", "bridge", Status(0, "well", {}))
+    state = store.changes()[0]
+    assert len(state["bridges"]) == len(state["estimators"]) == MOST
+    assert state["bridges"]["/real"]["message"] == "well"
+    assert set(state["estimators"]["/rls_node"]["statuses"]) == {"inputs", "estimation", "model"}
+    store.take_status("/rls_node", "inputs", Status(0, "x" * 100_000, values))
+    assert len(server._to_json(store.changes()[0])) < 4e6
+
+
+def test_slow_connections_are_not_held(report, monkeypatch):
+    monkeypatch.setattr(server, "PATIENCE", 1.0)
+    asyncio.run(_slow_connections(report))
+
+
+async def _slow_connections(report):
+    store = Store(Clock())
+    fill(store, report, seconds=1)
+    async with aiohttp.ClientSession() as session, server.serving(store, 0) as url:
+        page = await session.ws_connect(url + "live")
+        port = int(url.rstrip("/").rpartition(":")[2])
+        slow = [await asyncio.open_connection(server.HOST, port) for _ in range(300)]
+        for _, writer in slow:
+            writer.write(b"GET / HTTP/1.1\r\n")  # and no more
+        ends = [asyncio.create_task(_ended(reader)) for reader, _ in slow]
+        await asyncio.sleep(0.5)
+        assert sum(not end.done() for end in ends) < server.CONNECTIONS
+        await asyncio.wait_for(asyncio.gather(*ends), 10.0)
+        async with session.get(url) as answer:
+            assert answer.status == 200
+        assert (await asyncio.wait_for(page.receive_json(), 5.0))["estimators"]
+        for _, writer in slow:
+            writer.close()
+
+
+async def _ended(reader):
+    with contextlib.suppress(ConnectionError):
+        await reader.read()
 
 
 async def _many_pages(report):

@@ -7,14 +7,20 @@ import threading
 from pathlib import Path
 
 import pytest
+from test_inputs import GEOMETRY, configured
 
-from rov_ident.cli import main
+from rov_ident import config as configuration
+from rov_ident.api.comparison import compare
+from rov_ident.cli import common, main
+from rov_ident.consumer.formats import import_model
 from rov_ident.core import yaml_file
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output, part_of, write_file
+from rov_ident.io.ardupilot_log import import_log
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
-from rov_ident.io.csv_log import parse_columns
+from rov_ident.io.csv_log import import_csv, parse_columns
+from rov_ident.steering import zigzag
 
 ROOT = Path(__file__).parent.parent
 DEMO, HEAVY = ROOT / "bags/demo.mcap", ROOT / "bench/bluerov2_heavy_known.yaml"
@@ -87,8 +93,9 @@ def places(tmp_path):
     (tmp_path / "link").symlink_to("dive.mcap")
     (tmp_path / "loop").symlink_to("loop")
     os.link(tmp_path / "dive.mcap", tmp_path / "hard")
-    with BagWriter(tmp_path / "recorded") as writer:
-        writer.write("/x", "std_msgs/msg/Empty", 1, b"\0\1\0\0\0")
+    for name in ("recorded", "other"):  # the second is no input
+        with BagWriter(tmp_path / name) as writer:
+            writer.write("/x", "std_msgs/msg/Empty", 1, b"\0\1\0\0\0")
     return tmp_path
 
 
@@ -104,6 +111,8 @@ REFUSED = {
     "recorded/result": "lies within the bag",
     "recorded/new/result": "lies within the bag",
     "recorded/../recorded/metadata.yaml": "lies within the bag",
+    "other/metadata.yaml": "lies within a bag",
+    "other/result": "lies within a bag",
     "loop": "Too many levels of symbolic links",
     "a\0b": "no file can have that name",
     "x" * 256: "longer than 255 bytes",
@@ -270,6 +279,35 @@ def test_yaml_that_is_taken():
     assert yaml_file.parse("") is None
 
 
-def test_endless_files_are_not_read_to_the_end():
-    with pytest.raises(UserError, match="larger than 1 MiB"):
-        yaml_file.parse_file(Path("/dev/zero"))
+READERS = {
+    "yaml": lambda path: configuration.load(path),
+    "bag": Bag,
+    "csv": lambda path: import_csv([path], path.with_name("out.mcap")),
+    "bin": lambda path: import_log(path, path.with_name("out.mcap"), configured(**GEOMETRY)),
+    "tlog": lambda path: import_log(path, path.with_name("out.mcap"), configured(**GEOMETRY)),
+    "zigzag": zigzag.read,
+    "model": import_model,
+    "json": lambda path: compare(path, path),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_pipe_or_device_is_not_waited_for(tmp_path, kind):
+    pipe = tmp_path / f"input.{kind}"
+    os.mkfifo(pipe)
+    endless = tmp_path / f"endless.{kind}"
+    endless.symlink_to("/dev/zero")
+    for path in (pipe, endless):
+        with pytest.raises(UserError, match="it is a pipe or a device"):
+            READERS[kind](path)
+    for path in (tmp_path, Path("a\0b")):
+        with pytest.raises(UserError):
+            READERS[kind](path)
+
+
+def test_names_do_not_reach_the_terminal_as_they_are(capsys):
+    assert main(["check", "\x1b[2Ja\nb\x9b\u202e\udc80", "--config", str(HEAVY)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and r"\x1b[2Ja\nb\x9b\u202e\udc80" in said
+    common.OUT.print("a\x1bb\nc")
+    assert capsys.readouterr().out == "a\\x1bb\nc\n"

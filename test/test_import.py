@@ -244,6 +244,9 @@ def with_cell(columns, heading, row, text):
         ),
         (with_cell(table([*BASE, "qw", "qx", "qy", "qz"]), "u", 0, "0"), "length 1"),
         (",".join(BASE), "has no rows below its headings"),
+        (with_cell(table(BASE), "u", 3, "1e308"), "line 5: no vehicle has this odom, not finite"),
+        (with_cell(table(BASE), "X", 3, "-1e200"), "line 5: no vehicle has this wrench"),
+        (with_cell(table([*BASE, "x"]), "x", 3, "1e12"), "line 5: no vehicle has this odom"),
     ],
 )
 def test_a_log_that_cannot_be_used(tmp_path, out, text, words):

@@ -7,11 +7,14 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from bench.simulators.live import (
@@ -32,6 +35,7 @@ from rov_ident.core.states import Level
 from rov_ident.estimation import rls
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io import cdr
+from rov_ident.nodes.common import STREAM
 from rov_ident.nodes.conversions import from_diagnostics, from_time
 from rov_ident.simulation.virtual_sensors import dive
 
@@ -71,6 +75,26 @@ def all_finite(vehicle):
 def is_stale(vehicle):
     last = vehicle.coefficients[-1:]
     return bool(last) and all(status.level == STALE for status in last[0].status)
+
+
+def test_publishing_leaves_time_for_the_inputs(domain, heavy_path):
+    """However often it is asked for; a fifth of the time, and as much to wake up for it."""
+    process = start_node("ukf", heavy_path, "publish_rate:=1000.0")
+    until_said(process, "]: active")
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    time.sleep(2.0)  # what follows a start
+    began, before = time.monotonic(), processor_time(process.pid)
+    time.sleep(4.0)
+    used = processor_time(process.pid) - before
+    assert used < 0.4 * (time.monotonic() - began)
+    process.kill()
+    process.wait()
+
+
+def processor_time(pid):
+    """Of a process so far, in s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def test_outputs(live, heavy, short_dive):
@@ -238,6 +262,25 @@ def test_services_and_parameters(live, heavy, short_dive, tmp_path):
     vehicle.coefficients.clear()
     vehicle.listen(1.0)
     assert len(vehicle.coefficients) > 12
+
+
+def test_a_node_outlives_its_callbacks(live, short_dive, tmp_path):
+    """A clock before 1970, bytes that are no clock, a folder to save in that has gone."""
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    vehicle = live("use_sim_time:=true", f"save_path:={folder / 'saved.yaml'}")
+    clock = vehicle.node.create_publisher(Clock, "/clock", STREAM)
+    vehicle.until(clock.get_subscription_count)
+    for message in (Clock(clock=Time(sec=-1)), b"\0\1\0\0", b"", Clock(clock=Time(sec=-(2**31)))):
+        clock.publish(message)
+    vehicle.until(lambda: "/clock: ValueError" in vehicle.words())
+    folder.rmdir()
+    folder.write_text("in the way")
+    answer = vehicle.call(Trigger, "save", Trigger.Request())
+    assert not answer.success and "cannot be written" in answer.message
+    clock.publish(Clock(clock=Time(sec=5)))
+    vehicle.drive(short_dive)
+    vehicle.until(lambda: vehicle.coefficients[-1].header.stamp.sec > 0)
 
 
 @pytest.mark.parametrize(
@@ -420,6 +463,25 @@ def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, nothing_co
         _, said = end_node(process, number)
         assert time.monotonic() - began < 10.0 * slowness()  # of some thirty
         assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_while_an_object_of_a_start_is_finalised(number):
+    """What is raised there is lost, and within a library of C++ it aborts the process."""
+    program = f"""if True:
+        import os, time
+        from rov_ident.nodes.common import live
+        class Finalised:
+            def __del__(self):
+                os.kill(os.getpid(), {number:d})
+                time.sleep(0.1)
+        def make():
+            Finalised()
+            time.sleep(60.0)
+        live("node", make, own=())
+    """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,20 +1,30 @@
 """Bags through live nodes: the same numbers as offline, and no process left behind."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu
 
 from bench import HEAVY
 from bench.simulators.live import Vehicle, children, is_alive, slowness
@@ -24,6 +34,7 @@ from rov_ident.core.states import Level
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
 from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.io.write_messages import write_messages
+from rov_ident.nodes.common import Executor
 from rov_ident.nodes.conversions import from_diagnostics
 from rov_ident.nodes.replay import _Process, replay
 from rov_ident.simulation import virtual_sensors as sensors
@@ -133,13 +144,60 @@ def test_pace_without_imu(domain, brief):
     assert Level.STALE not in result.reports["rls"].levels
 
 
-def test_topics_taken(domain, brief):
-    """Another publisher of an input would spoil the result: it is refused."""
-    message = r"something else publishes /odom: .*ROS_DOMAIN_ID"
-    before = children(os.getpid())  # what pytest or another test has started
-    with closing(Vehicle(roles=["odom"])), pytest.raises(UserError, match=message):
-        replay(brief, HEAVY, rate=0.0)
-    assert set(children(os.getpid())) <= set(before)
+TOPICS = {
+    "/odom": Odometry, "/imu/data": Imu, "/thruster_wrench": WrenchStamped, "/clock": Clock,
+    "/diagnostics": DiagnosticArray, "/rosout": Log, "/parameter_events": ParameterEvent,
+    "/rls_node/coefficients": DiagnosticArray,
+}  # fmt: skip
+
+
+class Bystander:
+    """A vehicle's own nodes in the same domain: hear all that they should not, and publish, too."""
+
+    def __init__(self):
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context)
+        self.node = rclpy.create_node("bystander", context=self.context, enable_rosout=False)
+        self.executor = Executor(context=self.context)
+        self.executor.add_node(self.node)
+        self.heard, self.seen, self.ended = Counter(), set(), threading.Event()
+        self.odometry = self.node.create_publisher(Odometry, "/odom", 10)
+        self.clock = self.node.create_publisher(Clock, "/clock", 10)
+        for topic, type_ in TOPICS.items():
+            hear = partial(self.hear, topic)
+            self.node.create_subscription(type_, topic, hear, QoSProfile(depth=1000), raw=True)
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def hear(self, topic, data):
+        self.heard[topic] += 1
+
+    def run(self):
+        while not self.ended.is_set():
+            self.odometry.publish(Odometry())
+            self.clock.publish(Clock(clock=Time(sec=5)))
+            self.seen |= {topic for topic, _ in self.node.get_topic_names_and_types()}
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def close(self):
+        self.ended.set()
+        self.thread.join()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def test_a_replay_is_heard_by_nobody_and_hears_nobody(domain, brief):
+    """Two at once beside a vehicle whose odometry and clock say something else."""
+    with closing(Bystander()) as bystander, ThreadPoolExecutor(2) as threads:
+        jobs = [threads.submit(replay, brief, HEAVY, rate=0.0) for _ in range(2)]
+        for job in jobs:
+            assert_same(job.result().reports["rls"], offline(brief, "rls"))
+    assert len({topic.split("/")[1] for topic in bystander.seen if "coeff" in topic}) == 3
+    own = {"/odom", "/clock"}  # what it publishes itself
+    assert {topic for topic in bystander.heard if topic not in own} <= {"/parameter_events"}
+    others = {topic for topic in bystander.seen if not topic.startswith("/_replay_")}
+    assert others == set(TOPICS)
 
 
 def test_wrong_use(brief, tmp_path):
@@ -159,7 +217,7 @@ def test_node_refuses(domain, tmp_path):
     """What a node says before it ends is what the caller hears."""
     bad = tmp_path / "bad.yaml"
     bad.write_text(HEAVY.read_text().replace("mass:", "mas:", 1))
-    with _Process("rls_node", bad) as process:
+    with _Process("rls_node", bad, "/_replay") as process:
         process._process.wait(240)
         with pytest.raises(UserError, match=r"^vehicle\.mas is an unknown key"):
             process.check()

@@ -11,10 +11,11 @@ from textbook import with_section
 
 from rov_ident.core.frames import from_core, quaternion_to_matrix
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
+from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
 from rov_ident.sampling.sample import SAMPLE, believed
 from rov_ident.sampling.sampler import Sampler
-from rov_ident.sampling.validation import describe
+from rov_ident.sampling.validation import NEW_FRAME, describe
 from rov_ident.simulation import virtual_sensors as sensors
 
 SECOND = 1_000_000_000
@@ -491,6 +492,37 @@ def test_uneven_axes_of_the_topics(heavy):
 
 
 # ------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize("role", [ODOMETRY, IMU, WRENCH])
+@pytest.mark.parametrize("strays", [1, 5])
+def test_the_first_message_does_not_decide_the_frame(heavy, role, strays):
+    """Most do: some of another frame, first or in between, cost as many and no more."""
+    dive = list(without_arrival(sensors.dive(heavy, "steps", 4.0, seed=9)))
+    mine = [i for i, (of, _) in enumerate(dive) if of == role]
+
+    def stray(message):
+        name = "child_frame_id" if role == ODOMETRY else "frame_id"
+        return message._replace(**{name: "another_flu"})
+
+    for first in (0, 20):  # among the first of the topic, or once it is known
+        chosen = set(mine[first : first + strays])
+        mixed = [(of, stray(m) if i in chosen else m) for i, (of, m) in enumerate(dive)]
+        _, sampler = taken(heavy, mixed)
+        assert sampler.counts[NEW_FRAME] == (first == 0)
+        assert sampler.counts[role] >= len(mine) - 2 * strays - 1
+
+
+def test_a_reset_takes_whatever_frame_comes(heavy):
+    dive = list(without_arrival(sensors.dive(heavy, "steps", 4.0, seed=9)))
+    online = OnlineEstimator(heavy, "rls")
+    for i, (role, message) in enumerate(dive):
+        if i == len(dive) // 2:
+            online.reset()
+        if role == IMU and i > len(dive) // 2:
+            message = message._replace(frame_id="another_frd")
+        online.push(role, message)
+    assert online.counts[IMU] > 0.95 * sum(role == IMU for role, _ in dive)
 
 
 def odometry(t=1.0, **changed):

@@ -2,10 +2,13 @@
 
 import ast
 import math
+import os
+import signal
 import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
+from importlib.metadata import distributions, requires
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +16,15 @@ import pytest
 import rclpy
 import rclpy.node
 from diagnostic_msgs.msg import DiagnosticArray
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from rov_ident import config
 from rov_ident.config import PARAMETERS
 from rov_ident.core.errors import UserError
+from rov_ident.io.write_messages import write_messages
 from rov_ident.nodes.common import LATCHED
 
 ROOT = Path(__file__).parent.parent
@@ -135,6 +141,58 @@ def test_a_configuration_does_not_say_where_to_write(tmp_path, heavy_path):
     assert {p for p in tmp_path.rglob("*") if p.is_file()} == {
         stranger, work / "dive" / "dive_0.mcap", work / "dive" / "metadata.yaml",
     }  # fmt: skip
+
+
+@pytest.fixture
+def hostile(tmp_path):
+    """A folder with a module of every name that Python or a library may ask for; it says if run."""
+    folder, marker = tmp_path / "hostile", tmp_path / "run"
+    folder.mkdir()
+    installed = {d.metadata["Name"].replace("-", "_").lower() for d in distributions()}
+    for name in {*sys.stdlib_module_names, *installed, "yaml", "usercustomize", "rov_ident"}:
+        (folder / f"{name}.py").write_text(f"open({str(marker)!r}, 'a').write(__name__ + ' ')")
+    (folder / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path / 'kernels'}\n")
+    yield folder
+    assert not marker.exists(), marker.read_text()
+    assert not (tmp_path / "kernels").exists()
+
+
+def program(name, *arguments, cwd, **variables):
+    """As a shell starts it, in a folder."""
+    script = Path(sys.executable).with_name(name)
+    command, environment = [script, *map(str, arguments)], {**os.environ, **variables}
+    return subprocess.Popen(command, cwd=cwd, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def test_workers_take_no_code_from_the_current_folder(tmp_path, hostile, heavy_path, short_dive):
+    bags = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for bag in bags:
+        write_messages(bag, short_dive)
+    command = ["fit", *bags, "--config", heavy_path, "--estimator", "ls", "--jobs", "2"]
+    process = program("rov-ident", *command, cwd=hostile)
+    _, said = process.communicate(timeout=240)
+    assert process.returncode == 0, said
+
+
+@pytest.mark.parametrize("name", ["rls_node", "replay"])
+def test_compilers_and_nodes_take_no_code_from_the_current_folder(
+    tmp_path, hostile, heavy_path, short_dive, domain, name
+):
+    """With a cold cache, until the first kernel is there."""
+    bag, cache = tmp_path / "dive.mcap", tmp_path / "cache"
+    write_messages(bag, short_dive)
+    if name == "replay":
+        command = ["rov-ident", "replay", bag, "--config", heavy_path, "--rate", "0"]
+    else:
+        command = [name, "--ros-args", "--params-file", heavy_path]
+    process = program(*command, cwd=hostile, ROV_IDENT_CACHE="../cache")
+    end = time.monotonic() + 240.0
+    while not any(cache.rglob("*.nbi")):
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < end
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=120)
 
 
 # ------------------------------------------------------------------ parameters
@@ -276,3 +334,31 @@ def test_a_node_does_what_its_policy_says(live, estimator):
     vehicle.coefficients.clear()
     vehicle.until(lambda: len(vehicle.coefficients) > 2)
     assert np.isfinite(vehicle.values[-1].data).all()
+
+
+# ------------------------------------------------------------------ locks
+
+
+@pytest.mark.parametrize("lock", ["demo", "test", "bench", "docs", "audit"])
+@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
+def test_a_lock_has_one_version_with_hashes_for_each_python(lock, version):
+    environment = {"python_version": version, "python_full_version": f"{version}.1"}
+    text = (ROOT / "requirements" / f"{lock}.txt").read_text()
+    locked = {}
+    for entry in text.replace("\\\n", " ").splitlines():
+        line, *hashes = entry.partition("    # ")[0].split(" --hash=sha256:")
+        requirement = Requirement(line)
+        if requirement.marker is None or requirement.marker.evaluate(environment):
+            assert hashes and requirement.name not in locked
+            locked[requirement.name] = str(requirement.specifier).removeprefix("==")
+    if lock == "audit":
+        assert {"bandit", "pip-audit", "uv"} <= locked.keys()
+        return
+    for line in requires("rov_ident"):
+        requirement = Requirement(line)
+        extras = {"demo": ["wheels"]}.get(lock, ["wheels", lock])
+        if not requirement.marker or any(
+            requirement.marker.evaluate({**environment, "extra": extra}) for extra in extras
+        ):
+            name = canonicalize_name(requirement.name)
+            assert requirement.specifier.contains(locked[name]), requirement

@@ -13,6 +13,7 @@ import numpy as np
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
 from rov_ident.reports.result import NORMAL, Result, Shown
 from rov_ident.reports.table import PLUS_MINUS, Table, estimate
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from rov_ident.discrepancy.explain import Explanation
 
-_LARGEST_FILE = 100_000_000  # bytes; more than any result has
+_LARGEST_FILE = 100 << 20  # bytes; more than any result has
 
 
 @dataclass(frozen=True)
@@ -196,9 +197,7 @@ def _estimates(source: Any) -> Estimates:
     if path.suffix in (".yaml", ".yml"):
         return _of_config(configuration.load(path), path.name)
     try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise UserError(f"{path} is larger than any result")
-        return _of_document(json.loads(path.read_text(encoding="utf-8")), path.name)
+        return _of_document(json.loads(read_input(path, _LARGEST_FILE), parse_int=float), path.name)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

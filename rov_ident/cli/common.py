@@ -4,12 +4,14 @@ import argparse
 import contextlib
 import json
 import math
+import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rich import progress as bars
 from rich.console import Console
+from rich.text import Text
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output, write_file
@@ -18,10 +20,13 @@ if TYPE_CHECKING:
     from rov_ident.api.functions import Progress
     from rov_ident.reports.result import Shown
 
-ERR = Console(stderr=True, highlight=False, markup=False)
 
+class _Console(Console):
+    """Shows text of whatever origin: what would steer a terminal, or cannot be written, escaped."""
 
-class _Output(Console):
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
     def on_broken_pipe(self) -> None:
         """Whoever read our output has seen enough: rich would end with the status of a fault."""
         with contextlib.suppress(SystemExit):
@@ -29,7 +34,8 @@ class _Output(Console):
         raise BrokenPipeError
 
 
-OUT = _Output(highlight=False, markup=False, soft_wrap=True)
+ERR = _Console(stderr=True, highlight=False, markup=False)
+OUT = _Console(highlight=False, markup=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
@@ -188,10 +194,19 @@ def write_result(
         write_file(options.json, result.to_json())
 
 
+def printable(text: str, kept: str = "\n\t") -> str:
+    """Text whose control characters, but for those ``kept``, are written as escapes."""
+    return "".join(
+        char if char in kept or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp")
+        else ascii(char)[1:-1]
+        for char in text
+    )  # fmt: skip
+
+
 def say(*sentences: str) -> None:
     """Sentences on standard error, each on its own line however long it is."""
     for sentence in sentences:
-        ERR.print(sentence, soft_wrap=True)
+        ERR.print(printable(sentence, ""), soft_wrap=True)
 
 
 def show(result: "Shown", notes: Sequence[str] = ()) -> None:

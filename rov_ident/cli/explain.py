@@ -21,8 +21,8 @@ def add(commands: Commands) -> None:
 
 def _explain(options: argparse.Namespace) -> None:
     outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
-    new = not options.out.exists()
     check_outputs(outputs, [*options.bags, options.config, options.validate])
+    new = not options.out.exists()
     try:
         _explained(options)
     except BaseException:

@@ -1,6 +1,8 @@
-"""Where a file may be written, and writing it whole or not at all."""
+"""Which files are read; where one may be written, and writing it whole or not at all."""
 
 import contextlib
+import errno
+import fcntl
 import hashlib
 import os
 import secrets
@@ -8,6 +10,7 @@ import stat
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO
 
 from rov_ident.core.errors import UserError
 
@@ -17,6 +20,7 @@ _FOLDERS = (Path(__file__).resolve().parents[2], Path(sys.prefix) / "share" / "r
 
 _LONGEST = 255  # bytes of a name, in all file systems of Linux
 _BAG = b"\x89MCAP"  # how a bag begins, whatever its name and version
+_ROSBAG2 = b"rosbag2_bagfile_information"  # and how the metadata.yaml of a rosbag2 directory does
 
 
 def shipped(name: str) -> Path:
@@ -44,6 +48,32 @@ def check_output(path: Place, inputs: Iterable[Place | None] = (), bag: bool = F
         refusal = "no file can have that name"
     if refusal:
         raise UserError(f"{_shown(path)} cannot be written: {refusal}")
+
+
+def open_input(path: Place) -> IO[bytes]:
+    """A regular file for reading. A pipe, for whose writer one would wait, and a device are none.
+
+    Raises OSError, whose ``strerror`` says in words why it cannot be read.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except ValueError as error:
+        raise OSError(errno.EINVAL, "no file can have that name", str(path)) from error
+    kind = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(kind):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    what = "it is a folder" if stat.S_ISDIR(kind) else "it is a pipe or a device, not a file"
+    raise OSError(errno.EINVAL, what, str(path))
+
+
+def read_input(path: Place, largest: int) -> bytes:
+    """What is in a regular file of at most ``largest`` bytes. Raises OSError as above."""
+    with open_input(path) as stream:
+        data = stream.read(largest + 1)
+    if len(data) > largest:
+        raise OSError(errno.EFBIG, f"it is larger than {largest >> 20} MiB", str(path))
+    return data
 
 
 def write_file(path: Place, content: str | bytes) -> None:
@@ -83,17 +113,38 @@ def replace_file(path: Place, content: bytes) -> None:
         os.close(folder)
 
 
+def lock(path: Place) -> IO[bytes]:
+    """A file beside ``path`` that is locked until it is closed, or its process ends.
+
+    Raises BlockingIOError if another process or thread has it, OSError if there can be none.
+    """
+    place = Path(os.path.realpath(path))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    stream = place.with_name(f".{_digest(place)}.lock").open("ab")
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        stream.close()
+        raise
+    return stream
+
+
 def part_of(path: Path) -> Path:
     """A hidden name in the same folder, which nobody else uses, for a file in the making.
 
     What a process that was killed has left of this file goes.
     """
-    name = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:12]  # short, whatever the path's
+    name = _digest(path)
     for old in path.parent.glob(f".{name}.*.part"):
         with contextlib.suppress(OSError, ValueError):
             if not Path(f"/proc/{int(old.name.split('.')[2])}").exists():
                 old.unlink()
     return path.with_name(f".{name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+
+
+def _digest(path: Path) -> str:
+    """Short, whatever the length of the name."""
+    return hashlib.sha256(os.fsencode(path.name)).hexdigest()[:12]
 
 
 def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
@@ -123,8 +174,10 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
     if kind and not stat.S_ISREG(kind):
         return "there is a device, a pipe or a socket, so give the name of a file"
     try:
-        if kind and not bag and _is_bag(place):
+        if kind and not bag and _begins(place, _BAG):
             return "there is a bag, so choose another name"
+        if _begins(place.parent / "metadata.yaml", _ROSBAG2):
+            return "it lies within a bag, so choose another folder"
     except OSError as error:
         return error.strerror or str(error)
     folder = place.parent
@@ -137,9 +190,11 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
     return ""
 
 
-def _is_bag(path: Path) -> bool:
+def _begins(path: Path, how: bytes) -> bool:
+    if not path.is_file():
+        return False
     with path.open("rb") as stream:
-        return stream.read(len(_BAG)) == _BAG
+        return stream.read(len(how)) == how
 
 
 def _shown(path: Place) -> str:

@@ -41,6 +41,8 @@ import numpy as np
 from llvmlite import binding
 from numba.core.registry import CPUDispatcher, cpu_target
 
+from rov_ident.core import children
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 _PACKAGE = Path(__file__).parents[1]
@@ -53,10 +55,10 @@ def _cache_folder() -> Path:
         digest.update(path.read_bytes())
     for version in (sys.version, np.__version__, numba.__version__, binding.get_host_cpu_name()):
         digest.update(version.encode())
-    root = Path(
-        os.environ.get("ROV_IDENT_CACHE")
-        or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rov_ident"
-    )
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or "")
+    if not caches.is_absolute():  # to be ignored, says the XDG standard
+        caches = Path.home() / ".cache"
+    root = Path(os.environ.get("ROV_IDENT_CACHE") or caches / "rov_ident")
     folder = root / digest.hexdigest()[:16]
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -69,11 +71,10 @@ def _cache_folder() -> Path:
 
 
 # A folder given by NUMBA_CACHE_DIR is used as it is. We do not set that variable for ourselves:
-# a child process that runs another version of the package would inherit it.
-if not os.environ.get("NUMBA_CACHE_DIR"):
-    numba.config.CACHE_DIR = str(_cache_folder())
-
-CACHE = Path(numba.config.CACHE_DIR)
+# a child process that runs another version of the package would inherit it. What numba has read of
+# a settings file in the current folder is overruled: what is in the cache is run.
+CACHE = Path(os.environ.get("NUMBA_CACHE_DIR") or _cache_folder()).absolute()
+numba.config.CACHE_DIR = str(CACHE)
 """The folder of the compiled kernels, for this version of everything."""
 
 
@@ -167,15 +168,13 @@ class Compiler:
         """Compile in another process, without waiting; not after :meth:`stop`.
 
         The process ends with this one, however this one ends: the pipe between them is closed then.
-        An interrupt from the terminal does not reach it.
         """
-        command = [sys.executable, "-c", _AS_CHILD, self._exercise.__module__]
-        command += [self._exercise.__name__, *self._arguments]
+        command = ["-c", _AS_CHILD, self._exercise.__module__, self._exercise.__name__]
         cache = {"NUMBA_CACHE_DIR": str(CACHE)}  # it may be a temporary folder of this process
         with self._lock:
             if not self._stopped:
-                self._process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, start_new_session=True, env=os.environ | cache
+                self._process = children.start(
+                    *command, *self._arguments, environment=cache, stdin=subprocess.PIPE
                 )
 
     def poll(self) -> int | None:

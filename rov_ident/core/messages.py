@@ -77,3 +77,29 @@ class Commands(NamedTuple):
 
 
 Message = Odometry | Imu | Wrench
+
+LAST_STAMP = (2**31 - 1) * 10**9
+"""ns; the end of ROS time, 32 bits of seconds."""
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def fault(message: Message) -> str:
+    """Why no vehicle can have sent this, or an empty string."""
+    if message.stamp <= 0:
+        return "zero stamp"
+    if message.stamp >= LAST_STAMP:
+        return "stamp at the end of time"
+    if isinstance(message, Odometry):
+        p, q, v, w = message.position, message.orientation, message.linear, message.angular
+        if not 0.5 < q.dot(q) < 2.0:  # NaN too
+            return "orientation is not a unit quaternion"
+        size = v.dot(v) + w.dot(w) + 1e-12 * p.dot(p)
+    elif isinstance(message, Imu):
+        w, f = message.angular_velocity, message.linear_acceleration
+        size = w.dot(w) + f.dot(f) / 400.0
+    else:
+        f, w = message.force, message.torque
+        size = 2.5e-9 * (f.dot(f) + w.dot(w))
+    # One comparison refuses NaN, infinities and what no vehicle reaches: 50 m/s, 50 rad/s,
+    # 50,000 km, 100 g, 1 MN, 1 MN m.
+    return "" if size < 2500.0 else "not finite or absurdly large"

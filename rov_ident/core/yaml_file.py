@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import read_input
 
 LARGEST_FILE = 1 << 20
 """Bytes. The longest configuration has a hundredth of it; the metadata of a bag of a thousand files
@@ -104,17 +105,11 @@ def parse(text: str) -> Any:
 def parse_file(path: Path) -> Any:
     """The same of a file in UTF-8."""
     try:
-        with path.open("rb") as stream:
-            data = stream.read(LARGEST_FILE + 1)
-        if len(data) > LARGEST_FILE:
-            raise UserError(f"is larger than {LARGEST_FILE >> 20} MiB: give a YAML file")
-        return parse(data.decode())
+        return parse(read_input(path, LARGEST_FILE).decode())
     except OSError as error:
-        raise UserError(f"cannot be read: {error.strerror}") from error
+        raise UserError(f"cannot be read, {error.strerror}: give a YAML file") from error
     except UnicodeDecodeError as error:
         raise UserError("is not a text file: give a YAML file") from error
-    except ValueError as error:
-        raise UserError(f"cannot be read: {error}") from error
 
 
 def _refused(why: str, at: Any) -> yaml.YAMLError:

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import json
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -22,7 +22,8 @@ from rov_ident.dashboard.store import Store
 HOST = "127.0.0.1"
 PERIOD = 0.5  # s; between two messages to a page: curves that look alive, at little cost
 CLIENTS = 16  # pages open at a time; each costs a message every PERIOD
-_PATIENCE = 10.0  # s; for a page to take a message, twenty times PERIOD
+CONNECTIONS = 8 * CLIENTS  # a browser opens six at a time
+PATIENCE = 10.0  # s; for a page to take a message, or ask for anything: twenty times PERIOD
 _LEAVE = 0.5  # s; for a page to answer that it is closed
 _LARGEST = 4096  # bytes of a message to us, of which there should be none
 _PAGE = files("rov_ident.dashboard") / "page"
@@ -38,14 +39,15 @@ _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 PORT = web.AppKey("port", int)
 STORE = web.AppKey("store", Store)
-PAGES: web.AppKey[set[web.WebSocketResponse]] = web.AppKey("pages")
+PAGES: web.AppKey[dict[web.WebSocketResponse, asyncio.Protocol]] = web.AppKey("pages")
+"""Those that are open, each with its connection."""
 
 
 def application(store: Store, port: int) -> web.Application:
     """The page at `/`, the state at `/state.json`, what is new at `/live` (web socket)."""
     app = web.Application(middlewares=[_guard(port)], client_max_size=_LARGEST)
     app[PORT], app[STORE] = port, store
-    app[PAGES] = set()
+    app[PAGES] = {}
     app.on_response_prepare.append(_protect)
     app.on_shutdown.append(_hang_up)
     for path in _FILES:
@@ -115,7 +117,7 @@ async def _live(request: web.Request) -> web.StreamResponse:
     page = web.WebSocketResponse(
         timeout=_LEAVE, heartbeat=20.0, max_msg_size=_LARGEST, compress=False
     )
-    pages.add(page)
+    pages[page] = request.protocol
     try:
         await page.prepare(request)
         sender = asyncio.create_task(_send(page, request.app[STORE]))
@@ -127,7 +129,7 @@ async def _live(request: web.Request) -> web.StreamResponse:
             with contextlib.suppress(asyncio.CancelledError):
                 await sender
     finally:
-        pages.discard(page)
+        del pages[page]
     return page
 
 
@@ -136,7 +138,7 @@ async def _send(page: web.WebSocketResponse, store: Store) -> None:
     with contextlib.suppress(ConnectionError, asyncio.TimeoutError):
         while not page.closed:
             state, marks = store.changes(marks)
-            await asyncio.wait_for(page.send_str(_to_json(state)), _PATIENCE)
+            await asyncio.wait_for(page.send_str(_to_json(state)), PATIENCE)
             await asyncio.sleep(PERIOD)
         return
     await page.close(code=WSCloseCode.GOING_AWAY)
@@ -167,10 +169,39 @@ async def serving(store: Store, port: int) -> AsyncIterator[str]:
                 f"port {port} cannot be used ({error.strerror}): give another one, or 0 for any"
             ) from None
         port = own.getsockname()[1]
-        runner = web.AppRunner(application(store, port), access_log=None, shutdown_timeout=2.0)
+        app = application(store, port)
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=2.0)
         await runner.setup()
+        assert runner.server is not None
+        pages = app[PAGES]
+        accept = _accept(runner.server, pages)
+        door = await asyncio.get_running_loop().create_server(accept, sock=own)
         try:
-            await web.SockSite(runner, own).start()
             yield f"http://{HOST}:{port}/"
         finally:
+            door.close()
             await runner.cleanup()
+
+
+def _accept(
+    server: web.Server, pages: Mapping[web.WebSocketResponse, asyncio.Protocol]
+) -> Callable[[], asyncio.Protocol]:
+    """What answers a connection: nothing beyond so many, and for so long unless it is a page."""
+
+    def end(handler: Any) -> None:
+        if handler not in pages.values():
+            handler.force_close()
+
+    def accept() -> asyncio.Protocol:
+        if len(server.connections) >= CONNECTIONS:
+            return _Closed()
+        handler = server()
+        asyncio.get_running_loop().call_later(PATIENCE, end, handler)
+        return handler
+
+    return accept
+
+
+class _Closed(asyncio.Protocol):
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        transport.close()

@@ -7,6 +7,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ POINTS = 600  # of a coefficient's history: more than a picture has pixels
 BIN = 0.5  # s of residuals drawn as one: a pixel or two
 BINS = 240  # two minutes
 DIGITS = 6  # significant; a picture shows three
+MOST = 64  # nodes shown: six times those of five vehicles; anybody on the network may invent more
+LONGEST = 1000  # characters of a text, and entries of a status: ours have a tenth
+KINDS = ("inputs", "estimation", "model", "checkpoint")  # of an estimator's statuses
 GONE = 3.0  # s without a message after which an estimator is silent: three of its /diagnostics
 
 Mark = tuple[int, int]
@@ -112,11 +116,19 @@ class Store:
     def add(self, name: str) -> None:
         """An estimator exists, even if it has not published yet."""
         with self._lock:
-            self._estimators.setdefault(name, Estimator(name))
+            self._estimator(name)
+
+    def _estimator(self, name: str) -> Estimator:
+        """The one of that name; beyond :data:`MOST`, one that is not shown."""
+        new = Estimator(name)
+        known = self._estimators.get(name, new)
+        if len(self._estimators) < MOST:
+            self._estimators[name] = known
+        return known
 
     def take_report(self, name: str, vehicle: str, report: Report) -> None:
         with self._lock:
-            known = self._estimators.setdefault(name, Estimator(name))
+            known = self._estimator(name)
             if report.names != known.names:
                 known.names, known.correlation = report.names, None
                 known.history.clear()
@@ -129,11 +141,14 @@ class Store:
 
     def take_covariance(self, name: str, matrix: Array) -> None:
         """(n, n), in the order of the coefficients."""
-        std = np.sqrt(np.diag(matrix))
+        with np.errstate(all="ignore"):  # anybody may publish 1e-320 beside 1e300
+            std = np.sqrt(np.diag(matrix))
+            correlation = matrix / std / std[:, None]
         with self._lock:
-            known = self._estimators.setdefault(name, Estimator(name))
-            if len(std) == len(known.names) and (std > 0.0).all():
-                known.correlation = matrix / np.outer(std, std)
+            known = self._estimator(name)
+            # None is larger than one, but for rounding; NaN is refused, too.
+            if len(std) == len(known.names) and (np.abs(correlation) < 1.0 + 1e-6).all():
+                known.correlation = correlation
 
     def take_residual(self, name: str, stamp: int, residual: Array) -> None:
         """(6,), at a time in ns; drawn in bins, each with its extremes and its mean square."""
@@ -141,21 +156,27 @@ class Store:
         if not np.isfinite(residual).all():
             return
         with self._lock:
-            known = self._estimators.setdefault(name, Estimator(name))
+            known = self._estimator(name)
             if not 0.0 <= t - known.bin_start < BIN:
                 if known.bin:
                     rows = np.stack(known.bin)
-                    rms = np.sqrt(np.mean(rows**2, axis=0))
+                    with np.errstate(over="ignore"):
+                        rms = np.sqrt(np.mean(rows**2, axis=0))
                     known.residuals.append(known.bin_start, rows.min(0), rows.max(0), rms)
                 known.bin, known.bin_start = [], t
             known.bin.append(residual)
 
     def take_status(self, name: str, kind: str, status: Status) -> None:
-        """`inputs`, `estimation` or `model` of a node that is known already; `bridge` of any."""
+        """One of :data:`KINDS` of a node that is known already; `bridge` of any."""
+        values = {k[:LONGEST]: v[:LONGEST] for k, v in islice(status.values.items(), LONGEST)}
+        status = Status(status.level, status.message[:LONGEST], values)
         with self._lock:
             if kind == "bridge":
+                self._bridges.pop(name, None)
                 self._bridges[name] = status
-            elif name in self._estimators:
+                if len(self._bridges) > MOST:
+                    del self._bridges[next(iter(self._bridges))]  # the one silent for longest
+            elif kind in KINDS and name in self._estimators:
                 self._estimators[name].statuses[kind] = status
 
     @property

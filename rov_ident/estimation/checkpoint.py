@@ -19,14 +19,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import PARAMETERS, Config, to_parameters
 from rov_ident.core.errors import UserError
-from rov_ident.core.files import write_file
+from rov_ident.core.files import lock, open_input, write_file
 from rov_ident.estimation.online import Memory, OnlineEstimator
 
 FORMAT = 1
@@ -97,7 +97,7 @@ def read(online: OnlineEstimator, path: Path) -> bool:
     Raises UserError, one sentence that names the file and why it cannot be used.
     """
     try:
-        with path.open("rb") as stream:
+        with open_input(path) as stream:
             data = stream.read(LARGEST + 1)
     except FileNotFoundError:
         return False
@@ -116,15 +116,25 @@ def read(online: OnlineEstimator, path: Path) -> bool:
 class Keeper:
     """Writes checkpoints in a thread of its own: a slow disk must not hold up samples.
 
-    ``saved`` [ns] is the stamp of the last checkpoint written, ``took`` [s] how long that took;
-    ``failure`` why the last attempt failed, or empty.
+    Only one has a path: it is locked until the keeper is closed. Another one, of whichever process,
+    is ``refused`` and writes nothing. ``saved`` [ns] is the stamp of the last checkpoint written,
+    ``took`` [s] how long that took; ``failure`` why the last attempt failed, or empty.
     """
 
     def __init__(self, path: Path, online: OnlineEstimator) -> None:
         self.path = path
+        self.saved, self.took, self.failure = 0, 0.0, ""
+        self._lock: IO[bytes] | None = None
+        self.refused = False
+        try:
+            self._lock = lock(path)
+        except BlockingIOError:
+            self.refused = True
+            self.failure = f"another node writes {path}: give each a checkpoint_path of its own"
+        except (OSError, ValueError):
+            pass  # writing will say why, and there may be a folder by then
         self._online = online
         self._identity = identity(online)
-        self.saved, self.took, self.failure = 0, 0.0, ""
         self._waiting: Memory | None = None
         self._asked = 0.0  # s, time.monotonic() since when something waits
         self._unwritten = 0.0  # s, the same of the oldest that is not on disk; 0: none
@@ -135,6 +145,8 @@ class Keeper:
 
     def keep(self) -> None:
         """Write what is learnt by now, as soon as the disk allows; only the newest is kept."""
+        if self.refused:
+            return
         memory = self._online.memory()  # it does not change any more
         with self._changed:
             if self._waiting is None:
@@ -154,6 +166,8 @@ class Keeper:
             self._ended = True
             self._changed.notify()
         self._thread.join(patience)
+        if self._lock is not None:
+            self._lock.close()
 
     def _run(self) -> None:
         while True:

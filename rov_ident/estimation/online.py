@@ -149,7 +149,8 @@ class OnlineEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Back to the prior; the input buffers and counts go on."""
+        """Back to the prior; the input buffers and counts go on, in whatever frames come next."""
+        self.sampler.validation.forget_frames()
         self._state = self._module.init(self._task)
         self._last_t = math.nan
         self._recalled = 0  # ns: the stamp before the first sample

@@ -17,7 +17,10 @@ import contextlib
 import dataclasses
 import io
 import itertools
+import os
+import sys
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,8 +31,20 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.config.schema import Thrusters
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import open_input
 from rov_ident.core.frames import quaternion_between, quaternion_from_euler, quaternion_to_matrix
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
+from rov_ident.core.messages import (
+    IMU,
+    LAST_STAMP,
+    ODOMETRY,
+    WRENCH,
+    Array,
+    Imu,
+    Message,
+    Odometry,
+    Wrench,
+    fault,
+)
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.thruster_allocation import PWM, Allocator, check, matrix
 
@@ -38,6 +53,7 @@ SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
 _WORLD, _BODY = "world_ned", "base_link_frd"
 _MAGIC = b"\xa3\x95"  # of every record of a dataflash log
 _START = 1_000_000  # us
+_END = LAST_STAMP // 1000 - _START  # us; a stamp holds no more
 _WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
 _LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
 _LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
@@ -71,14 +87,14 @@ class LogReport:
 
 @dataclass
 class _Track:
-    """Numbers over the autopilot's time; backward and repeated times are dropped and counted."""
+    """Numbers over the autopilot's time; other times than later ones are dropped and counted."""
 
     t: list[int] = field(default_factory=list)  # us
     rows: list[tuple[float, ...]] = field(default_factory=list)
     dropped: int = 0
 
     def add(self, t: int, *row: float) -> None:
-        if self.t and t <= self.t[-1]:
+        if not (self.t[-1] if self.t else -1) < t < _END:
             self.dropped += 1
         else:
             self.t.append(t)
@@ -171,7 +187,8 @@ def import_log(
                 "and give the EKF a source of velocity"
             )
     messages = [*_wrenches(log, allocator, config.thrusters.voltage, notes), *_inertial(log)]
-    odometry = list(_odometry(log, notes))
+    with np.errstate(all="ignore"):  # a quaternion of zeros: left out below
+        odometry = list(_odometry(log, notes))
     if not odometry:
         raise UserError(f"{path} has no attitude at the times of its velocity: log both")
     messages += odometry
@@ -185,16 +202,23 @@ def import_log(
             )
         notes.append(f"{100 * share:.0f} % of the log is armed; the rest is left out")
         messages = driven
+    faults = [(row[1], fault(row[2])) for row in messages]
+    messages = [row for row, (_, wrong) in zip(messages, faults, strict=True) if not wrong]
+    for (role, wrong), count in Counter(faults).items():
+        if wrong:
+            notes.append(f"{count} of {role} are left out: {wrong}")
+    counts = Counter(role for _, role, _ in messages)
+    if not counts[ODOMETRY] or not counts[WRENCH]:
+        raise UserError(f"{path} holds no odometry or wrench that a vehicle can have: log both")
     # The wrench first: at equal stamps it already acts on the velocity that follows.
     messages.sort(key=lambda row: (row[0], row[1] != WRENCH))
     write_messages(out, messages)
     dropped = sum(track.dropped for track in vars(log).values() if isinstance(track, _Track))
     if dropped:
-        notes.append(f"{dropped} messages with backward or repeated times are left out")
-    times = {role: [t for t, kind, _ in messages if kind == role] for role in _ROLES}
-    duration = (times[ODOMETRY][-1] - times[ODOMETRY][0]) * 1e-9
-    odom, imu, wrench = (len(times[role]) for role in _ROLES)
-    return LogReport(odom, imu, wrench, duration, tuple(notes))
+        notes.append(f"{dropped} messages with backward, repeated or impossible times are left out")
+    times = [t for t, role, _ in messages if role == ODOMETRY]
+    duration = (times[-1] - times[0]) * 1e-9
+    return LogReport(counts[ODOMETRY], counts[IMU], counts[WRENCH], duration, tuple(notes))
 
 
 def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
@@ -326,19 +350,36 @@ def read_log(path: Path, progress: Callable[[float], None] = lambda share: None)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-            if kind == ".bin" and path.read_bytes()[:2] != _MAGIC:
-                raise ValueError("it does not begin like one")
+            with open_input(path) as stream:
+                if kind == ".bin" and stream.read(2) != _MAGIC:
+                    raise ValueError("it does not begin like one")
             if kind == ".tlog":
                 with contextlib.closing(mavutil.mavlink_connection(str(path))) as reader:
                     _telemetry(reader, log, progress)
             else:
                 read = DFReader.DFReader_text if kind == ".log" else DFReader.DFReader_binary
-                _dataflash(read(str(path)), log, progress)
+                with _silent():
+                    reader = read(str(path))
+                _dataflash(reader, log, progress)
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): check the path") from error
     except Exception as error:  # pymavlink raises whatever the bytes make it
         raise UserError(f"{path} is no log of ArduPilot, or a damaged one: {error}") from error
     return log
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Nothing reaches standard error, not even from C: the indexer names each damaged byte."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _received(reader: Any, kinds: list[str], progress: Callable[[float], None]) -> Iterator[Any]:

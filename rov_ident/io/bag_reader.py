@@ -16,7 +16,6 @@ import zlib
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from heapq import merge
@@ -34,6 +33,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import open_input
 from rov_ident.core.messages import Message
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.cdr import DECODERS, ROLE_TYPES
@@ -60,8 +60,13 @@ _RUN_LENGTH = 4096  # messages outside chunks that make one block
 LARGEST_CHUNK = 1 << 28
 """Bytes: recorders make chunks of about a megabyte; a larger claim is damage, or meant to harm."""
 
+LARGEST_OVERLAP = 1 << 29
+"""Bytes of messages that wait for their turn; two chunks of the largest kind."""
+
 # What zstd, lz4, mcap and struct raise on bytes that are not what they should be.
-_DAMAGE = (zstandard.ZstdError, RuntimeError, McapError, ValueError, struct.error)
+_DAMAGE = (
+    zstandard.ZstdError, RuntimeError, McapError, ValueError, OverflowError, struct.error
+)  # fmt: skip
 
 
 class Topic(NamedTuple):
@@ -149,7 +154,7 @@ class Bag:
         """Hexadecimal digest of the contents of the files, in order."""
         digest = hashlib.sha256()
         for path in [file.path for file in self._files] + [file.path for file in self._others]:
-            with path.open("rb") as stream:
+            with open_input(path) as stream:
                 while piece := stream.read(1 << 20):
                     digest.update(piece)
         return digest.hexdigest()
@@ -180,19 +185,25 @@ class Bag:
             for block in file.blocks
         )
         pending: list[RawMessage] = []
-        with ExitStack() as stack:
-            streams = [stack.enter_context(file.path.open("rb")) for file in self._files]
-            for start_time, number, block in order:
-                # No later block can hold anything earlier than this one begins.
-                ready = bisect_left(pending, start_time, key=log_time)
-                yield from pending[:ready]
-                del pending[:ready]
-                try:
-                    data = _read_block(streams[number], block)
-                    pending += _messages(data, wanted[number])
-                except _DAMAGE:
-                    self._files[number].damaged.add(block.offset)
-                pending.sort(key=log_time)
+        for start_time, number, block in order:
+            # No later block can hold anything earlier than this one begins.
+            ready = bisect_left(pending, start_time, key=log_time)
+            yield from pending[:ready]
+            del pending[:ready]
+            file = self._files[number]
+            try:
+                with open_input(file.path) as stream:  # a bag may have more than can be open
+                    pending += _messages(_read_block(stream, block), wanted[number])
+            except _DAMAGE:
+                file.damaged.add(block.offset)
+            except OSError as error:
+                raise UserError(f"{file.path} cannot be read: {error.strerror}") from error
+            if sum(len(message.data) for message in pending) > LARGEST_OVERLAP:
+                raise UserError(
+                    f"{file.path} holds more than {LARGEST_OVERLAP >> 20} MiB out of order: "
+                    "bring it in order with `mcap sort`"
+                )
+            pending.sort(key=log_time)
         yield from pending
 
 
@@ -236,7 +247,7 @@ def read_messages(
 def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) -> str | None:
     """As :func:`select_topics` for one role, which is called ``name`` and of ``type_name``."""
     filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
-    holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
+    holds = _listed([f"{topic} ({type_})" for topic, type_ in filled.items()])
     if override:
         topic = "/" + override.lstrip("/")
         if topic not in filled:
@@ -253,7 +264,7 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
         return candidates[0]
     if candidates:
         raise UserError(
-            f"{bag.path} has several topics that may be {role}: {', '.join(candidates)}; "
+            f"{bag.path} has several topics that may be {role}: {_listed(candidates)}; "
             f"name the one to use, as in topics.{role}: {candidates[0]}."
         )
     if named:
@@ -270,6 +281,12 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
 def _raw(file: OtherFile, topics: dict[int, tuple[str, str]]) -> Iterator[RawMessage]:
     for channel, time, data in file.messages(topics):
         yield RawMessage(*topics[channel], time, data)
+
+
+def _listed(names: list[str]) -> str:
+    """In a sentence, however many there are: a vehicle has a hundred topics, and may have more."""
+    more = f" and {len(names) - 100} more" if len(names) > 100 else ""
+    return ", ".join(names[:100]) + more
 
 
 def _files_of_bag(path: Path) -> list[Path]:
@@ -324,12 +341,12 @@ def _inside(folder: Path, name: str) -> Path:
 def _natural_order(path: Path) -> list[tuple[int, str]]:
     """Sorts dive_2 before dive_10."""
     return [
-        (int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.stem)
+        (int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", path.stem)
     ]
 
 
 def _kind(path: Path) -> type[_File] | type[OtherFile]:
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         head = stream.read(16)
     if not head:
         raise UserError(f"{path} is empty: record the bag anew.")
@@ -343,7 +360,7 @@ def _index(path: Path) -> _File | OtherFile:
     kind = _kind(path)
     if issubclass(kind, OtherFile):
         return kind(path)
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         return _index_by_summary(path, stream) or _index_by_walking(path, stream)
 
 
@@ -386,24 +403,24 @@ def _index_by_walking(path: Path, stream: IO[bytes]) -> _File:
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
         for opcode, start, body, end in _records(buffer, reached):
             reached = end
-            if opcode == Opcode.CHUNK:
-                try:
+            if opcode == Opcode.DATA_END:
+                finished = True
+                break
+            try:
+                if opcode == Opcode.CHUNK:
                     chunk = Chunk.read(_stream(buffer[body:end]))
                     data = _unpack(chunk)
                     for inner, _, inner_body, inner_end in _records(data, 0):
-                        _note(file, schemas, inner, data, inner_body, inner_end)
-                except _DAMAGE:
-                    file.damaged.add(start)
-                    continue
-                file.blocks.append(_Block(chunk.message_start_time, start, end - start))
-            elif opcode == Opcode.DATA_END:
-                finished = True
-                break
-            else:
-                _note(file, schemas, opcode, buffer, body, end)
-            if opcode == Opcode.MESSAGE:
-                run.append((_MESSAGE.unpack_from(buffer, body)[2], start, end))
-            if run and (opcode == Opcode.CHUNK or len(run) == _RUN_LENGTH):
+                        _note(file, schemas, inner, data[inner_body:inner_end])
+                    file.blocks.append(_Block(chunk.message_start_time, start, end - start))
+                elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                    _note(file, schemas, opcode, buffer[body:end])
+                    if opcode == Opcode.MESSAGE:
+                        run.append((_MESSAGE.unpack_from(buffer, body)[2], start, end))
+            except _DAMAGE:
+                file.damaged.add(start)
+                opcode = 0
+            if run and (opcode in (0, Opcode.CHUNK) or len(run) == _RUN_LENGTH):
                 file.blocks.append(_block_of_run(run))
                 run = []
         if not finished:
@@ -432,18 +449,15 @@ def _records(buffer: bytes | mmap.mmap, position: int) -> Iterator[tuple[int, in
         position = body + length
 
 
-def _note(
-    file: _File, schemas: dict[int, Schema], opcode: int, buffer: bytes | mmap.mmap, body: int,
-    end: int,
-) -> None:  # fmt: skip
+def _note(file: _File, schemas: dict[int, Schema], opcode: int, body: bytes) -> None:
     """Enters a schema, channel or message that was met on the walk into the index."""
     if opcode == Opcode.MESSAGE:
-        file.counts[_MESSAGE.unpack_from(buffer, body)[0]] += 1
+        file.counts[_MESSAGE.unpack_from(body)[0]] += 1
     elif opcode == Opcode.SCHEMA:
-        schema = Schema.read(_stream(buffer[body:end]))
+        schema = Schema.read(_stream(body))
         schemas[schema.id] = schema
     elif opcode == Opcode.CHANNEL:
-        _register(file, Channel.read(_stream(buffer[body:end])), schemas)
+        _register(file, Channel.read(_stream(body)), schemas)
 
 
 def _register(file: _File, channel: Channel, schemas: Mapping[int, Schema]) -> None:

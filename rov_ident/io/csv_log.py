@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core import frames
 from rov_ident.core.errors import UserError
-from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Message, Odometry, Wrench
+from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Message, Odometry, Wrench, fault
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.csv_table import read_csv
 from rov_ident.io.write_messages import write_messages
@@ -121,15 +121,22 @@ def import_csv(
     world, body = _FRAME_IDS[body_frame]
     force, torque = log.matrix(_WRENCH[:3]), log.matrix(_WRENCH[3:])
 
-    def messages() -> Iterator[tuple[int, str, Message]]:
+    def rows() -> Iterator[tuple[int, int, str, Message]]:
         for k, (at, acts) in enumerate(zip(stamps.tolist(), wrench_stamps.tolist(), strict=True)):
             # The wrench first: at equal stamps it already acts on the velocity that follows.
-            yield acts, WRENCH, Wrench(acts, body, force[k], torque[k])
+            yield k, acts, WRENCH, Wrench(acts, body, force[k], torque[k])
             if kept[k]:
                 motion = position[k], orientation[k], linear[k], angular[k], np.zeros(6)
-                yield at, ODOMETRY, Odometry(at, world, body, *motion)
+                yield k, at, ODOMETRY, Odometry(at, world, body, *motion)
 
-    write_messages(out, messages())
+    def messages() -> Iterator[tuple[int, str, Message]]:
+        for k, arrival, role, message in rows():
+            if wrong := fault(message):
+                raise UserError(f"{log.place(k)}: no vehicle has this {role}, {wrong}: correct it")
+            yield arrival, role, message
+
+    with np.errstate(all="ignore"):  # what is absurdly large is refused above
+        write_messages(out, messages())
     odometry, left_out, averaged = (int(np.count_nonzero(n)) for n in (kept, masked, wrapped))
     duration = float(time[-1] - time[0])
     return ImportReport(len(stamps), odometry, left_out, averaged, duration, tuple(notes))

@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
+
+_LARGEST = 1 << 30  # bytes: a day at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ def read_csv(path: Path) -> CsvTable:
     lines: list[int] = []
     header: list[str] = []
     try:
-        data = path.read_bytes()
+        data = read_input(path, _LARGEST)
         # utf-8-sig: spreadsheets begin their files with a byte order mark.
         text = io.StringIO(data.decode("utf-8-sig"), newline="")
         reader = csv.reader(text, skipinitialspace=True)

@@ -3,7 +3,9 @@
 import signal
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection
+from functools import wraps
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -22,16 +24,71 @@ from rov_ident.config import Inputs
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.io.topics import sources
-from rov_ident.nodes.programs import INTERRUPTS
+from rov_ident.nodes.programs import INTERRUPTS, end_at_once
 
 try:  # costs half as much, and keeps the order of arrival across topics
     from rclpy.experimental import EventsExecutor as Executor
 except ImportError:
     from rclpy.executors import SingleThreadedExecutor as Executor
 
-__all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "live", "subscribed"]
+__all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "GuardedNode", "live", "subscribed"]
 
 AnyNode = TypeVar("AnyNode", bound=Node)
+
+
+class GuardedNode(Node):  # type: ignore[misc]
+    """A node that outlives what its callbacks raise, those of rclpy's own services included.
+
+    ``faults`` counts them by name; the log has them, too. Where ``outlives`` is False they end the
+    process.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.faults: Counter[str] = Counter()
+        self.outlives = True
+        super().__init__(*arguments, **options)  # which listens to /clock
+
+    def create_subscription(
+        self, type_: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Any:
+        guarded = self._guarded(topic, callback)
+        return super().create_subscription(type_, topic, guarded, *arguments, **options)
+
+    def create_timer(
+        self, period: float, callback: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> Any:
+        guarded = self._guarded("timer", callback)
+        return super().create_timer(period, guarded, *arguments, **options)
+
+    def create_service(
+        self,
+        type_: Any,
+        service: str,
+        callback: Callable[..., Any],
+        *arguments: Any,
+        **options: Any,
+    ) -> Any:
+        guarded = self._guarded(service, callback)
+        return super().create_service(type_, service, guarded, *arguments, **options)
+
+    def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(callback)  # rclpy looks at its arguments
+        def guarded(*arguments: Any) -> Any:
+            try:
+                return callback(*arguments)
+            except Exception as error:
+                if not self.outlives:
+                    raise
+                self.faults[f"{name}: {type(error).__name__}"] += 1
+                words = f"{name}: {error!r}"
+                self.get_logger().error(words, throttle_duration_sec=10.0)
+                response: Any = arguments[-1] if arguments else None  # of a service
+                if hasattr(response, "success"):
+                    response.success, response.message = False, words
+                return response
+
+        return guarded
+
 
 INPUTS = {
     ODOMETRY: ("odom", Odometry),
@@ -81,23 +138,16 @@ def live(
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # open, so that the last messages can be published.
-    interrupted = threading.Event()
-
-    def interrupt(*_: object) -> None:
-        interrupted.set()  # the exception may be lost: one raised in a finaliser is ignored
-        raise KeyboardInterrupt
-
-    for number in INTERRUPTS:
-        signal.signal(number, interrupt)
+    end_at_once()
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy gives its RCLError no public name
         return _refused(name, _why_unreadable(name, own, error))
     try:
-        _spin(make(), executor(), begin, leave, interrupted)
+        _spin(make(), executor(), begin, leave)
     except UserError as error:
         return _refused(name, str(error))
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
     finally:
         rclpy.try_shutdown()
@@ -109,9 +159,9 @@ def _spin(
     executor: Any,
     begin: Callable[[AnyNode, threading.Event], None],
     leave: Callable[[AnyNode], None],
-    interrupted: threading.Event,
 ) -> None:
     executor.add_node(node)
+    interrupted = threading.Event()
     # From here on an interrupt waits for the end of a callback.
     for number in INTERRUPTS:
         signal.signal(number, lambda *_: interrupted.set())

@@ -18,7 +18,6 @@ from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, Set
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
@@ -30,7 +29,7 @@ from rov_ident.consumer.parameter_bridge import Change, Values
 from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, live
+from rov_ident.nodes.common import LATCHED, GuardedNode, live
 from rov_ident.nodes.conversions import from_diagnostics, to_status
 
 _LOOK_PERIOD = 0.5  # s; between two comparisons of controller and estimator: a second at most late
@@ -69,7 +68,7 @@ _OWN = (
 )  # fmt: skip
 
 
-class ControllerBridge(Node):  # type: ignore[misc]
+class ControllerBridge(GuardedNode):
     """`coefficients` in; the parameters of one controller out.
 
     Publishes `~/pending` (what would be sent) and `/diagnostics`; services `~/approve`, `~/revert`

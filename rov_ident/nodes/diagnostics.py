@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from numpy.typing import NDArray
-from rclpy.node import Node
 
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.core.states import Level, State
 from rov_ident.estimation.checkpoint import Keeper
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.topics import BATTERY, Reader
+from rov_ident.nodes.common import GuardedNode
 from rov_ident.nodes.conversions import to_status
 from rov_ident.sampling.validation import describe
 
@@ -56,7 +56,12 @@ class Diagnostics:
     """
 
     def __init__(
-        self, node: Node, online: OnlineEstimator, reader: Reader, inputs: Inputs, lockstep: bool
+        self,
+        node: GuardedNode,
+        online: OnlineEstimator,
+        reader: Reader,
+        inputs: Inputs,
+        lockstep: bool,
     ) -> None:
         self._node, self._online, self._reader = node, online, reader
         self._inputs, self._lockstep = inputs, lockstep
@@ -93,8 +98,9 @@ class Diagnostics:
     def _status(
         self, kind: str, level: Level, words: str, values: dict[str, str]
     ) -> DiagnosticStatus:
-        # By the full name: all vehicles share /diagnostics.
-        name = f"{self._node.get_fully_qualified_name().lstrip('/')}: {kind}"
+        # By the full name: all vehicles share /diagnostics. That of a replay says nothing.
+        full = self._node.get_name() if self._lockstep else self._node.get_fully_qualified_name()
+        name = f"{full.lstrip('/')}: {kind}"
         return to_status(name, self._online.config.name, level, words, values)
 
     def _complaints(self) -> list[str]:
@@ -115,7 +121,7 @@ class Diagnostics:
                 )
             else:
                 complaints.append(f"no message received on {topic}: remap it or start the driver")
-        counts = self._online.counts + self._reader.counts
+        counts = self._online.counts + self._reader.counts + self._node.faults
         refused = counts - self._counts
         complaints += describe(
             {k: n for k, n in refused.items() if k not in _NO_WARNING and n > _CHANCE.get(k, 0)}

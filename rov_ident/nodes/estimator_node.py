@@ -18,7 +18,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
@@ -34,7 +33,7 @@ from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Repor
 from rov_ident.io.cdr import encode
 from rov_ident.io.topics import Reader
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, STREAM, live, subscribed
+from rov_ident.nodes.common import LATCHED, STREAM, GuardedNode, live, subscribed
 from rov_ident.nodes.compile_state import CompileState, settle
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix
 from rov_ident.nodes.diagnostics import Diagnostics, Inputs
@@ -51,6 +50,9 @@ _OWN_NAMES = [parameter.key for parameter in _OWN]
 _SILENCE_PERIOD = 0.1  # s; between looks at the inputs: a tenth of the default timeout
 _DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
+_INPUT_SHARE = (
+    4.0  # s left to the inputs for each that publishing takes, whatever publish_rate says
+)
 _TURN = 0.02  # s; of using messages that wait before anything else is done: one input at 50 Hz
 _MOST_WAITING = 200_000
 """messages, of half a kilobyte: what 100 MB hold, a quarter of an hour at 200 Hz. More than enough
@@ -61,7 +63,7 @@ _SWITCHING = 0.0005
 hundred samples (docs/speed.md)."""
 
 
-class EstimatorNode(Node):  # type: ignore[misc]
+class EstimatorNode(GuardedNode):
     """One online estimator on three topics.
 
     With the parameter `lockstep` a player sets the pace: messages are acknowledged by their count
@@ -78,6 +80,7 @@ class EstimatorNode(Node):  # type: ignore[misc]
         named = f"{self._own_name(config)}.yaml"
         self._save_path = os.path.abspath(settings["save_path"] or named)
         self._lockstep: bool = settings["lockstep"]
+        self.outlives = not self._lockstep  # a replay tells its caller instead
         self._started = time.monotonic()
         self._compiling = compiling
         compiling.begin(config, self.get_logger(), wait=self._lockstep)
@@ -90,9 +93,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
         self._resting_until = 0.0
         self._idle = 0.0  # s since the last sample
         self._stopped = ""  # why there are no samples
-        self._wrench_frame: str | None = None
         self._used = 0  # samples
         self._published_stamp = 0  # ns
+        self._publish_again = 0.0  # s, of time.monotonic
         self._kept = self._online.stamp  # ns; of the last checkpoint asked for
         self._checked = time.monotonic()
         self._parent = os.getppid()
@@ -173,9 +176,6 @@ class EstimatorNode(Node):  # type: ignore[misc]
     def _take(self, source: str, data: bytes, arrival: int) -> None:
         for role, message in self._reader.read(source, data, arrival):
             info = self._online.push(role, message)
-            # The sampler keeps to the frame of the first message that it takes.
-            if role == WRENCH and self._wrench_frame is None and self._online.counts[WRENCH]:
-                self._wrench_frame = message.frame_id
             if len(info):
                 self._idle = 0.0
                 self._show(info)
@@ -192,10 +192,9 @@ class EstimatorNode(Node):  # type: ignore[misc]
         origin = self._online.sampler.origin or 0
         stamps = [origin + round(float(t) * 1e9) for t in info["t"]]
         residuals = info["residual"]
-        frames = self._config.frames
+        frames, frame_id = self._config.frames, self._online.sampler.validation.frame_id(WRENCH)
         for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)):
-            frame, both = self._wrench_frame or "", residuals[i]
-            wrench = Wrench(stamps[i], frame, both[:3], both[3:])
+            wrench = Wrench(stamps[i], frame_id, residuals[i, :3], residuals[i, 3:])
             self._residual.publish(encode(from_core(wrench, frames.body, frames.world)))
         since = stamps[-1] - self._published_stamp
         if self._lockstep and not 0 <= since < 1e9 / self._config.publish_rate:
@@ -203,8 +202,12 @@ class EstimatorNode(Node):  # type: ignore[misc]
             self._publish()
 
     def _publish_in_time(self) -> None:
-        if not self._lockstep:
-            self._publish()
+        began = time.monotonic()
+        if self._lockstep or began < self._publish_again:
+            return
+        self._publish()
+        ended = time.monotonic()
+        self._publish_again = ended + _INPUT_SHARE * (ended - began)
 
     def _publish(self) -> Report:
         report = self._online.report()
@@ -241,12 +244,16 @@ class EstimatorNode(Node):  # type: ignore[misc]
         path = Path(given).expanduser()
         if given.endswith("/") or path.is_dir():
             path /= f"{self._own_name(self._config)}.checkpoint"
+        keeper = checkpoint.Keeper(path, self._online)
+        if keeper.refused:
+            self.get_logger().error(f"{keeper.failure}; beginning with the prior")
+            return keeper
         try:
             if checkpoint.read(self._online, path):
                 self.get_logger().info(f"continuing from {path}, of {self._online.stamp} ns")
         except UserError as error:
             self.get_logger().error(f"{error}; beginning with the prior")
-        return checkpoint.Keeper(path, self._online)
+        return keeper
 
     def _keep(self) -> None:
         assert self._keeper is not None

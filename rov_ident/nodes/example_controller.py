@@ -15,7 +15,6 @@ from geometry_msgs.msg import Twist, WrenchStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
@@ -31,7 +30,7 @@ from rov_ident.core.messages import Array, Wrench
 from rov_ident.io.cdr import decode_odometry, encode
 from rov_ident.model.scales import authority
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, live
+from rov_ident.nodes.common import LATCHED, GuardedNode, live
 from rov_ident.simulation.manoeuvres import LEVEL
 
 _LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -44,7 +43,7 @@ _OWN_PARAMETERS = {
 }
 
 
-class ExampleController(Node):  # type: ignore[misc]
+class ExampleController(GuardedNode):
     """`odom`, `cmd_vel` (Twist, body axes) and `coefficients` in, `thruster_wrench` out.
 
     Without odometry or commands for `timeout` the wrench is zero; without fresh coefficients it

@@ -15,7 +15,6 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import Trigger
 
-from rov_ident.core.errors import UserError
 from rov_ident.estimation.online import Report
 from rov_ident.io.bag_reader import RawMessage
 from rov_ident.io.bag_writer import BagWriter
@@ -29,6 +28,7 @@ _CLOCK_PERIOD = 25_000_000  # ns, of the bag; as `ros2 bag play --clock`
 _PATIENCE = 60.0  # s; far longer than a busy computer holds a node up: it will not come back
 _START_TIME = 300.0  # s; for a node to compile, ten times what docs/speed.md has measured
 
+_GLOBAL = ("/clock", "/diagnostics", "/parameter_events", "/rosout")  # topics in no namespace
 _OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
     "coefficients": (DiagnosticArray, LATCHED),
     "coefficients/values": (Float64MultiArray, LATCHED),
@@ -37,8 +37,18 @@ _OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
 }
 
 
+def apart(namespace: str) -> list[str]:
+    """The arguments of a node that talks to nobody outside a namespace, not even by global names.
+
+    A namespace rather than a DDS partition or domain: every middleware has it, and as many as
+    anybody needs.
+    """
+    rules = [f"__ns:={namespace}", *(f"{topic}:={namespace}{topic}" for topic in _GLOBAL)]
+    return ["--ros-args", *(word for rule in rules for word in ("-r", rule))]
+
+
 class Player(Node):  # type: ignore[misc]
-    """Plays one bag into the nodes ``{estimator}_node`` of the same DDS domain.
+    """Plays one bag into the nodes ``{estimator}_node`` of a namespace, which is theirs alone.
 
     ``check`` is called while waiting; it raises if there is nothing left to wait for.
     """
@@ -46,12 +56,13 @@ class Player(Node):  # type: ignore[misc]
     def __init__(
         self,
         context: Context,
+        namespace: str,
         estimators: Iterable[str],
         writer: BagWriter | None,
         on_report: OnReport | None,
         check: Callable[[], None],
     ) -> None:
-        super().__init__("rov_ident_player", context=context, cli_args=[])
+        super().__init__("rov_ident_player", context=context, cli_args=apart(namespace))
         self.reports: dict[str, Report] = {}
         self._estimators = tuple(estimators)
         self._writer = writer
@@ -73,7 +84,7 @@ class Player(Node):  # type: ignore[misc]
         self._outputs = [self._record("/diagnostics", DiagnosticArray, STREAM)]
         self._flushes = {}
         for estimator in self._estimators:
-            node = f"/{estimator}_node"
+            node = f"{estimator}_node"
             for name, (type_, qos) in _OUTPUTS.items():
                 self._outputs.append(self._record(f"{node}/{name}", type_, qos, estimator))
             self._flushes[estimator] = self.create_client(Trigger, f"{node}/flush")
@@ -83,9 +94,10 @@ class Player(Node):  # type: ignore[misc]
     def _record(self, topic: str, type_: type, qos: QoSProfile, estimator: str = "") -> Any:
         package, _, rest = type_.__module__.partition(".")
         type_name = f"{package}/{rest.partition('.')[0]}/{type_.__name__}"
+        recorded = "/" + topic.lstrip("/")
         if self._writer:
-            self._writer.add_topic(topic, type_name, latched=qos is LATCHED)
-        take = partial(self._take_output, topic, type_name, estimator)
+            self._writer.add_topic(recorded, type_name, latched=qos is LATCHED)
+        take = partial(self._take_output, recorded, type_name, estimator)
         depth = QoSProfile(
             depth=STREAM.depth, reliability=qos.reliability, durability=qos.durability
         )
@@ -109,17 +121,9 @@ class Player(Node):  # type: ignore[misc]
         super().destroy_node()
 
     def wait_for_nodes(self, start: int) -> None:
-        """Wait until everything is connected both ways. ``start`` [ns] is the time the bag begins.
-
-        Raises UserError if other nodes of the same names, or other publishers of the inputs, are
-        running.
-        """
+        """Until everything is connected both ways. ``start`` [ns] is the time the bag begins."""
         self._now = start
         self._wait(self._connected, "to start", _START_TIME)
-        for publisher in self._inputs.values():
-            self._refuse_others(publisher.topic_name, 1)
-        for subscription in self._outputs[1:]:
-            self._refuse_others(subscription.topic_name, 1)
 
     def _connected(self) -> bool:
         count = len(self._estimators)
@@ -129,12 +133,6 @@ class Player(Node):  # type: ignore[misc]
             and all(client.service_is_ready() for client in self._flushes.values())
             and all(count >= 0 for count in self._acknowledged.values())
         )
-
-    def _refuse_others(self, topic: str, expected: int) -> None:
-        if self.count_publishers(topic) > expected:
-            raise UserError(
-                f"something else publishes {topic}: stop it, or set ROS_DOMAIN_ID to a free number"
-            )
 
     def play(self, messages: Iterable[tuple[str, RawMessage]], rate: float) -> int:
         """Play (role, message) at the recorded speed times ``rate``; 0: as fast as the nodes can.

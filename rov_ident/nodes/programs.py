@@ -14,14 +14,21 @@ from rov_ident.core.threads import limit_process
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
-def _run(name: str) -> int:
-    # Not by an exception: modules that are being loaded catch some. Nothing is open yet.
+def end_at_once() -> None:
+    """Have an interrupt end the process, until the node has handlers of its own.
+
+    Not by an exception: some are caught where modules are loaded or objects finalised, and one that
+    crosses a C++ library aborts the process. There is nothing to be tidied up yet: files are
+    written whole or not at all, and compilers end with their parent.
+    """
     for number in INTERRUPTS:
         signal.signal(number, lambda *_: os._exit(0))
+
+
+def _run(name: str) -> int:
+    end_at_once()
     limit_process()  # before numpy is loaded
     module = import_module(f"rov_ident.nodes.{name}")
-    for number in INTERRUPTS:
-        signal.signal(number, signal.default_int_handler)
     try:
         return int(module.main())
     except KeyboardInterrupt:

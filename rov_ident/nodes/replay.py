@@ -1,6 +1,7 @@
 """Plays a bag into live nodes: starts and ends their processes, records what they publish."""
 
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -18,13 +19,14 @@ from rclpy.signals import SignalHandlerOptions
 
 from rov_ident import config as configuration
 from rov_ident.config import Inputs, Qos
+from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output
 from rov_ident.estimation.online import ESTIMATORS, Report
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
-from rov_ident.nodes.player import OnReport, Player
+from rov_ident.nodes.player import OnReport, Player, apart
 
 _LOOPBACK = Path(__file__).with_name("loopback.xml")
 _EXIT_TIME = 10.0  # s; for a node to end after an interrupt, which takes under a second
@@ -51,11 +53,11 @@ def replay(
     """Play a bag over DDS into live nodes and record what they publish into the bag ``out``.
 
     ``rate`` is the speed relative to the recording; 0: as fast as the nodes can follow. No message
-    is lost at any rate. Unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this
-    computer, as a replayed thruster wrench must not reach a vehicle, and nothing comes in.
+    is lost at any rate. A replayed thruster wrench must not reach a vehicle: player and nodes have
+    a namespace of their own, hidden from whatever runs beside them; and unless
+    ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this computer or comes in.
 
-    Raises UserError if the bag or configuration cannot be used, or the topics are taken by someone
-    else.
+    Raises UserError if the bag or configuration cannot be used.
     """
     if not 0.0 <= rate < float("inf"):
         raise UserError(f"rate is {rate}, but must be positive, or 0 for as fast as possible")
@@ -67,6 +69,8 @@ def replay(
     config = configuration.load(config_path)
     topics = inputs.select(recorded, config)
     started = time.monotonic()
+    # ROS lists and records no name that begins with an underscore unless it is asked to.
+    namespace = f"/_replay_{secrets.token_hex(8)}"
     with ExitStack() as stack:
         stack.enter_context(_on_this_computer())
         writer = None if out is None else stack.enter_context(BagWriter(out))
@@ -82,7 +86,7 @@ def replay(
                 inputs=Inputs(),  # the player converts: see inputs.as_played
             )
             configuration.dump(settings, parameters)
-            nodes.append(stack.enter_context(_Process(name, parameters)))
+            nodes.append(stack.enter_context(_Process(name, parameters, namespace)))
 
         raise_interrupt = stack.enter_context(_noted_interrupts())
 
@@ -94,7 +98,7 @@ def replay(
         context = Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stack.callback(rclpy.try_shutdown, context=context)
-        player = Player(context, estimators, writer, on_report, check)
+        player = Player(context, namespace, estimators, writer, on_report, check)
         stack.callback(player.destroy_node)
         player.wait_for_nodes(next(recorded.iter_raw(topics.values())).log_time)
         if writer is not None:
@@ -145,19 +149,14 @@ def _on_this_computer() -> Iterator[None]:
 class _Process:
     """A node in a process of its own, ended with the `with` block."""
 
-    def __init__(self, name: str, parameters: Path) -> None:
+    def __init__(self, name: str, parameters: Path, namespace: str) -> None:
         self.name = name
-        command = [sys.executable, "-m", f"rov_ident.nodes.{name}", "--ros-args"]
+        command = ["-m", f"rov_ident.nodes.{name}", *apart(namespace)]
         command += ["--params-file", str(parameters), "--log-level", "warn"]
         command += ["-p", "use_sim_time:=true", "-p", "lockstep:=true"]
-        # A session of its own: Ctrl-C interrupts this process only, which then interrupts the node.
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
+        # Ctrl-C interrupts this process only, which then interrupts the node.
+        self._process = children.start(
+            *command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace"
         )
         self._last_line = ""
         self._reader = threading.Thread(target=self._forward, daemon=True)

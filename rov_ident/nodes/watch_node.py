@@ -1,7 +1,7 @@
 """Listens to every estimator in this DDS domain, in any namespace, and publishes nothing."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -21,7 +20,7 @@ from std_msgs.msg import Float64MultiArray
 from rov_ident.core.errors import UserError
 from rov_ident.dashboard.store import Status, Store
 from rov_ident.io.cdr import decode_wrench
-from rov_ident.nodes.common import LATCHED, Executor
+from rov_ident.nodes.common import LATCHED, Executor, GuardedNode
 from rov_ident.nodes.conversions import from_diagnostics
 
 _SEARCH_PERIOD = 0.5  # s; between searches for new estimators, which nobody notices
@@ -31,7 +30,7 @@ _DIAGNOSTIC_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 _BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-class WatchNode(Node):  # type: ignore[misc]
+class WatchNode(GuardedNode):
     """Subscribes to all that estimators publish and puts it into a store.
 
     An estimator is known by its topic: ``NAME/coefficients``, a DiagnosticArray that someone
@@ -42,7 +41,8 @@ class WatchNode(Node):  # type: ignore[misc]
         super().__init__(name, context=context)
         self._store = store
         self._known: set[str] = set()
-        self._listen("/diagnostics", DiagnosticArray, _BEST_EFFORT, self._take_diagnostics)
+        take = self._take_diagnostics
+        self.create_subscription(DiagnosticArray, "/diagnostics", take, _BEST_EFFORT, raw=True)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_SEARCH_PERIOD, self._search, clock=steady)
 
@@ -51,6 +51,8 @@ class WatchNode(Node):  # type: ignore[misc]
         for topic, types in self.get_topic_names_and_types():
             name = topic.removesuffix(_COEFFICIENTS)
             if name in self._known or name in ("", topic) or _DIAGNOSTIC_TYPE not in types:
+                continue
+            if "/_" in topic:  # hidden, as ROS calls it: a replay beside the vehicle
                 continue
             if not self.count_publishers(topic):
                 continue
@@ -61,18 +63,7 @@ class WatchNode(Node):  # type: ignore[misc]
                 (f"{topic}/covariance", Float64MultiArray, LATCHED, self._take_covariance),
                 (f"{name}/wrench_residual", WrenchStamped, _BEST_EFFORT, self._take_residual),
             ):
-                self._listen(heard, type_, qos, partial(take, name))
-
-    def _listen(
-        self, topic: str, type_: type, qos: QoSProfile, take: Callable[[bytes], None]
-    ) -> None:
-        def receive(data: bytes) -> None:
-            try:
-                take(data)
-            except ValueError as error:
-                self.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=10.0)
-
-        self.create_subscription(type_, topic, receive, qos, raw=True)
+                self.create_subscription(type_, heard, partial(take, name), qos, raw=True)
 
     def _take_report(self, name: str, data: bytes) -> None:
         message = deserialize_message(data, DiagnosticArray)

@@ -486,7 +486,9 @@ def _grow(x: Array, y: Array, most: int) -> list[tuple[int, ...]]:
                 if i not in current
             ]
             better = min(exchanged, key=cost, default=current)
-            if cost(better) >= cost(current) * (1.0 - 1e-9):
+            # Where a table is exact only rounding is left, at times below zero, which has no end.
+            least = max(1e-9 * cost(current), 1e-15 * power)
+            if cost(better) >= cost(current) - least:
                 break
             current = better
         errors.append(_rms(_left_out(x[:, current], y)))

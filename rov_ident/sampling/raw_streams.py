@@ -18,7 +18,7 @@ from rov_ident.core.frames import quaternion_multiply, to_core
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Message, Odometry
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.dropped_commands import SILENCE, completed
-from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, Validation, describe
+from rov_ident.sampling.validation import REPEATED, RESTARTS, Validation, describe
 
 _USUAL = 2.0  # times what 99 % of the messages keep to
 _PAUSE = 60.0  # s between two bags that are searched as one
@@ -134,7 +134,7 @@ def _taken(
     taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: []}
     for role, message in messages:
         reason = validation.judge(role, message)
-        if reason == NEW_CLOCK:
+        if reason in RESTARTS:
             validation.forget_motion()
         elif reason:
             continue

@@ -31,7 +31,7 @@ from rov_ident.sampling.kinematic_filter import KinematicFilter
 from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.queues import Instant, Queues, Waiting
 from rov_ident.sampling.sample import joined, one_sample, sample_type
-from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, Validation
+from rov_ident.sampling.validation import REPEATED, RESTARTS, Validation
 
 _LONGEST_INTERVAL = 0.5  # s without a measurement: restart rather than bridge
 _NO_VALUES = np.zeros(6)
@@ -47,8 +47,8 @@ class Sampler:
     """
 
     def __init__(self, config: Config) -> None:
-        self._validation = Validation()
-        self.counts = self._validation.counts
+        self.validation = Validation()
+        self.counts = self.validation.counts
         self.origin: int | None = None
         self._frames = config.frames
         self._queues = Queues()
@@ -85,7 +85,7 @@ class Sampler:
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
-        self._validation.forget_motion()
+        self.validation.forget_motion()
         self._queues.clear()
         self._late.clear()
         self._despiker.clear()
@@ -97,8 +97,8 @@ class Sampler:
 
     def push(self, role: str, message: Message) -> NDArray[np.void]:
         """Take a message as it is on the wire; the samples (k,) of SAMPLE that are now complete."""
-        reason = self._validation.judge(role, message)
-        if reason == NEW_CLOCK:
+        reason = self.validation.judge(role, message)
+        if reason in RESTARTS:
             done = self.flush()
             self._clear()
             self._enqueue(role, message)
@@ -126,7 +126,7 @@ class Sampler:
         self.counts[role] += 1
         t = (message.stamp - self.origin) * 1e-9
         if isinstance(message, Odometry):
-            message = self._validation.marked(message)
+            message = self.validation.marked(message)
         message = to_core(message, self._frames)
         if isinstance(message, Odometry):
             timed, waiting = self._late.push(t, message), self._queues.odometry

@@ -6,17 +6,19 @@ Bad data never raises. Whatever is refused leaves everything as it was.
 from collections import Counter
 from collections.abc import Mapping
 
-from rov_ident.core.messages import Imu, Message, Odometry
+from rov_ident.core.messages import Message, Odometry, fault
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
 """Counted where stamps begin anew: a bag that starts over, another computer."""
+NEW_FRAME = "frame: another has the majority, buffers restarted"
+"""Counted where a topic goes on in another frame."""
+RESTARTS = (NEW_CLOCK, NEW_FRAME)
 REPEATED = 2e3
 """The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""
 
 _LARGEST_JUMP = 10.0  # s; a stamp this far ahead, or _LARGEST_STEP_BACK behind, is another clock:
 _LARGEST_STEP_BACK = 1.0  # s; topics that are reordered or lost for a while stay well within both
 _AGREEMENT = 1.0  # s; two stamps out of line that are so close to one another are of one new clock
-_LAST_STAMP = (2**31 - 1) * 10**9  # ns; the end of ROS time, 32 bits of seconds
 _REASONS = 100  # so many names of refusals are kept, so that a log cannot be flooded with them
 _GRID = 1e-4  # m/s; drivers that round velocities round to no finer grid than this
 _OFF_GRID = 0.01  # of a grid step; single precision of 10 m/s is that near
@@ -32,7 +34,9 @@ class Validation:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._frame_ids: dict[str, tuple[str, ...]] = {}  # by topic, those of its first message
+        self._frame_ids: dict[str, tuple[str, ...]] = {}  # by topic, those of most of its messages
+        self._votes: Counter[str] = Counter()  # by topic, for them less those against them
+        self._other_frames: dict[str, tuple[str, ...]] = {}  # by topic, those last refused
         self._last_stamp: dict[str, int] = {}  # ns
         self._suspect: dict[str, int] = {}  # ns; a stamp out of line, by topic
         self.forget_motion()
@@ -42,16 +46,24 @@ class Validation:
         self._velocity = b""  # bytes of the last one
         self._fine = 0  # messages for which velocities still count as not rounded to a grid
 
+    def forget_frames(self) -> None:
+        """Have the next message of each topic decide in which frame it is."""
+        self._votes.clear()
+
+    def frame_id(self, role: str) -> str:
+        """In which a topic's vectors are; empty before its first message."""
+        return self._frame_ids.get(role, ("",))[-1]
+
     def judge(self, role: str, message: Message) -> str:
         """Why a message is refused, after counting it; empty if it is taken.
 
-        :data:`NEW_CLOCK` if it is the first to be taken of another clock.
+        One of :data:`RESTARTS` if it is the first to be taken of another clock, or in other frames.
         """
         reason = self._fault(role, message) or self._stamp_fault(role, message.stamp)
         if not reason:
             self._last_stamp[role] = message.stamp
             self._suspect.pop(role, None)
-        elif reason == NEW_CLOCK:
+        elif reason in RESTARTS:
             self.counts[reason] += 1
             self._last_stamp = {role: message.stamp}
         else:
@@ -63,36 +75,25 @@ class Validation:
 
     def _fault(self, role: str, message: Message) -> str:
         """What is wrong with the fields or the frame, or an empty string."""
-        if message.stamp <= 0:
-            return "zero stamp"
-        if message.stamp >= _LAST_STAMP:
-            return "stamp at the end of time"
-        frames: tuple[str, ...]
+        if wrong := fault(message):
+            return wrong
+        frames: tuple[str, ...] = (message.frame_id,)
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)
-            p, q, v, w = message.position, message.orientation, message.linear, message.angular
-            if not 0.5 < q.dot(q) < 2.0:  # NaN too
-                return "orientation is not a unit quaternion"
-            size = v.dot(v) + w.dot(w) + 1e-12 * p.dot(p)
-        elif isinstance(message, Imu):
-            frames = (message.frame_id,)
-            w, f = message.angular_velocity, message.linear_acceleration
-            size = w.dot(w) + f.dot(f) / 400.0
-        else:
-            frames = (message.frame_id,)
-            f, w = message.force, message.torque
-            size = 2.5e-9 * (f.dot(f) + w.dot(w))
-        # One comparison refuses NaN, infinities and what no vehicle reaches: 50 m/s, 50 rad/s,
-        # 50,000 km, 100 g, 1 MN, 1 MN m.
-        if not size < 2500.0:
-            return "not finite or absurdly large"
-        if self._frame_ids.get(role) == frames:
+        held = self._frame_ids.get(role)
+        if held == frames:
+            self._votes[role] += 1
             return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
             return f"frame {_shown(frames[-1:])} is a world frame, body axes are needed"
-        if self._frame_ids.setdefault(role, frames) != frames:
-            return f"frame changed from {_shown(self._frame_ids[role])} to {_shown(frames)}"
-        return ""
+        # Boyer and Moore's vote: what most of the messages say is held, whichever came first. Two
+        # in a row must agree: a frame that is another each time takes nothing over.
+        suspect, self._other_frames[role] = self._other_frames.get(role), frames
+        if held is None or (self._votes[role] == 0 and suspect == frames):
+            self._frame_ids[role], self._votes[role] = frames, 1
+            return "" if held is None else NEW_FRAME
+        self._votes[role] = max(self._votes[role] - 1, 0)
+        return f"frame changed from {_shown(held)} to {_shown(frames)}"
 
     def _stamp_fault(self, role: str, stamp: int) -> str:
         """What is wrong with the stamp [ns] after the last one of its topic, or an empty string."""

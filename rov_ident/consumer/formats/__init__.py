@@ -6,9 +6,12 @@ from rov_ident.config import Config, from_parameters
 from rov_ident.consumer.formats import auv_controllers, gazebo, mss, urdf
 from rov_ident.consumer.formats.base import Written
 from rov_ident.core.errors import UserError
+from rov_ident.core.files import read_input
 
 WRITERS = {"auv_controllers": auv_controllers, "gazebo": gazebo, "mss": mss}
 READERS = {"auv_controllers": auv_controllers, "gazebo": gazebo}
+
+_LARGEST = 1 << 24  # bytes; a model without meshes has a thousandth
 
 __all__ = ["READERS", "WRITERS", "export", "import_model"]
 
@@ -28,9 +31,11 @@ def import_model(path: str | Path, base: Config | None = None) -> tuple[Config, 
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
+        text = read_input(path, _LARGEST).decode()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not a text file: {error}") from error
     is_xml, is_urdf = text.lstrip().startswith("<"), "<robot" in text
     if base is not None and not (is_xml and is_urdf):
         raise UserError(f"{path} is no URDF: --config adds to a URDF alone")

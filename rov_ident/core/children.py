@@ -1,0 +1,53 @@
+"""Child processes, whose code is where this process has its own: never in the current folder.
+
+Python looks there first when it is told what to run by `-m` or `-c`, and so does numba for its
+settings; but a folder of somebody's records may hold a `yaml.py`.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+_ROOT = str(Path(__file__).parents[2])
+_NEUTRAL = "/"  # nobody but root writes there
+_SAFE = {"PYTHONSAFEPATH": "1"}  # from Python 3.11 on, also where others start the process
+_PATHS = (
+    "PYTHONPATH", "ROV_IDENT_CACHE", "NUMBA_CACHE_DIR", "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+)  # fmt: skip
+
+
+def start(
+    *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
+) -> "subprocess.Popen[Any]":
+    """Python with these arguments, in a neutral folder; ``options`` are those of Popen.
+
+    An interrupt from the terminal does not reach it.
+    """
+    variables = os.environ | _SAFE | dict(environment or {})
+    for name in _PATHS:
+        if name in variables:  # relative ones would be those of another folder
+            parts = filter(None, variables[name].split(os.pathsep))
+            variables[name] = os.pathsep.join(map(os.path.abspath, parts))
+    # behind all others: where this package is not installed
+    path = filter(None, (variables.get("PYTHONPATH"), _ROOT))
+    variables["PYTHONPATH"] = os.pathsep.join(path)
+    return subprocess.Popen(
+        [sys.executable, *arguments], env=variables, cwd=_NEUTRAL, start_new_session=True, **options
+    )
+
+
+@contextmanager
+def safe_workers() -> Iterator[None]:
+    """The same for processes that a pool of workers starts within this context."""
+    added = {name: value for name, value in _SAFE.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
