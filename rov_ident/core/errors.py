@@ -1,8 +1,16 @@
 """The one family of exceptions for what the user can mend."""
 
+_LONGEST = 2000  # characters
+
 
 class UserError(Exception):
     """Wrong use or unusable input: the message is one sentence naming the thing and the change.
 
     The command line turns it into exit status 2; bad data *in a stream* never raises it.
     """
+
+    def __str__(self) -> str:
+        sentence = super().__str__()  # which may quote a file: its middle goes beyond a screen
+        if len(sentence) <= _LONGEST:
+            return sentence
+        return f"{sentence[: _LONGEST - 505]} ... {sentence[-500:]}"

@@ -247,7 +247,7 @@ def read_messages(
 def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) -> str | None:
     """As :func:`select_topics` for one role, which is called ``name`` and of ``type_name``."""
     filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
-    holds = _listed([f"{topic} ({type_})" for topic, type_ in filled.items()])
+    holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
     if override:
         topic = "/" + override.lstrip("/")
         if topic not in filled:
@@ -264,7 +264,7 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
         return candidates[0]
     if candidates:
         raise UserError(
-            f"{bag.path} has several topics that may be {role}: {_listed(candidates)}; "
+            f"{bag.path} has several topics that may be {role}: {', '.join(candidates)}; "
             f"name the one to use, as in topics.{role}: {candidates[0]}."
         )
     if named:
@@ -281,12 +281,6 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
 def _raw(file: OtherFile, topics: dict[int, tuple[str, str]]) -> Iterator[RawMessage]:
     for channel, time, data in file.messages(topics):
         yield RawMessage(*topics[channel], time, data)
-
-
-def _listed(names: list[str]) -> str:
-    """In a sentence, however many there are: a vehicle has a hundred topics, and may have more."""
-    more = f" and {len(names) - 100} more" if len(names) > 100 else ""
-    return ", ".join(names[:100]) + more
 
 
 def _files_of_bag(path: Path) -> list[Path]:
