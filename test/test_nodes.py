@@ -523,6 +523,21 @@ def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
     same_to_rounding(report.values, report.std, expected)
     assert abs(report.values[-1] - 0.12) < 0.01
 
+    assert not expected.consistency.consistent
+    told = f"data and model disagree: {expected.consistency.sentence}"
+    vehicle.until(lambda: told in vehicle.words())
+    status = next(
+        status
+        for message in vehicle.diagnostics
+        for status in message.status
+        if status.message == told
+    )
+    assert status.name == f"{estimator}_node: estimation"
+    assert status.level == bytes([Level.WARN])
+    values = {v.key: v.value for v in status.values}
+    for test in expected.consistency.tests:
+        assert values[test.name] == f"{test.value:.3g} (limit {test.limit:g})"
+
     vehicle.until(lambda: "quadratic damping missing?" in vehicle.words())
     status = next(
         status
