@@ -80,7 +80,7 @@ def test_a_fit_says_so_and_widens_its_intervals(tmp_path):
         assert set(test) == {"name", "value", "limit", "passed"}
         assert test["passed"] == (test["value"] <= test["limit"])
     assert told["sentence"] in fit.sentence
-    assert "converging" in fit.states and State.CONVERGED not in fit.states
+    assert State.CONVERGED not in fit.states
     off = [abs(fit.values[fit.names.index(n)] - true) for n, true in vehicle.theta.items()]
     std = [fit.std[fit.names.index(n)] for n in vehicle.theta]
     assert np.mean(np.array(off) < 2.0 * np.array(std)) > 0.75
