@@ -163,6 +163,7 @@ class OnlineEstimator:
         self._safe = self.prior.mean.copy()
         self._centre(first_centre(self.config))
         self._learnt_about, self._settled = self._about, math.nan
+        self._firmest = np.full(len(self._about), np.inf)  # std of times, when last learnt anew
         if self.monitor is not None:
             self.monitor.reset()
         self._origin = self.memory()
@@ -255,7 +256,8 @@ class OnlineEstimator:
 
         But not for changes far below their uncertainty, as samples are right to first order. A time
         is followed once the data know it. After a long step all is learnt anew: information gained
-        about another value claims to know what it does not. ``at_once``: a memory was recalled.
+        about another value claims to know what it does not. Each such step needs more information
+        than the one before. ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         own = slice(len(self.config.estimate), None)
@@ -266,14 +268,16 @@ class OnlineEstimator:
             self._settled = self._last_t
         early = abs(self._last_t - self._settled) < _SETTLING_TIME
         if not at_once:
-            waits = self._is_time & (early | (std > _LEARNT * unit))
-            now = np.where(waits, self._about, now)
+            far = np.abs(now - self._learnt_about) > _OUTDATED * unit
+            known = std < np.where(far, np.minimum(_LEARNT * unit, self._firmest), _LEARNT * unit)
+            now = np.where(self._is_time & (early | ~known), self._about, now)
         if not (np.abs(now - self._about) > _RECENTRE * std).any():
             return
         whole = dict(zip(self.prior.names, physical(self.config.dynamics, self.prior, raw)))
         self._centre({**whole, **dict(zip(self.config.effect_names, now.tolist(), strict=True))})
-        moved = np.abs(self._about - self._learnt_about)
-        if (self._is_time & (moved > _OUTDATED * unit)).any() and not at_once:
+        outdated = self._is_time & (np.abs(now - self._learnt_about) > _OUTDATED * unit)
+        if outdated.any() and not at_once:
+            self._firmest = np.where(outdated, std, self._firmest)
             self._begin_with(self._origin)
 
     def _centre(self, values: Mapping[str, float]) -> None:
