@@ -343,7 +343,9 @@ def test_a_file_that_is_no_parameter_file(file, text, message):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(UserError, match="none.yaml: cannot be read, No such file or directory: give a YAML file$"):
+    with pytest.raises(
+        UserError, match="none.yaml: cannot be read, No such file or directory: give a YAML"
+    ):
         load(tmp_path / "none.yaml")
     with pytest.raises(UserError, match="cannot be read, it is a folder: give a YAML file$"):
         load(tmp_path)

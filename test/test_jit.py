@@ -124,7 +124,7 @@ def test_the_minors_of_numba_that_may_be_installed_were_tested():
     tested = sorted({int(minor) for minor in re.findall(r"numba 0\.(\d+)\.\d", table)})
     least, most = tested[0], tested[-1]
     assert [m for m in range(40, 100) if allowed.contains(f"0.{m}.0")] == [*range(least, most + 1)]
-    for locked in (ROOT / "requirements").glob("*.txt"):
+    for locked in {*(ROOT / "requirements").glob("*.txt")} - {ROOT / "requirements" / "audit.txt"}:
         (pin,) = re.findall(r"^numba==(\S+)", locked.read_text(), re.M)
         assert allowed.contains(pin), locked
 

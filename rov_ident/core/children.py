@@ -16,9 +16,10 @@ _ROOT = str(Path(__file__).parents[2])
 _NEUTRAL = "/"  # nobody but root writes there
 _SAFE = {"PYTHONSAFEPATH": "1"}  # from Python 3.11 on, also where others start the process
 _PATHS = (
-    "PYTHONPATH", "ROV_IDENT_CACHE", "NUMBA_CACHE_DIR", "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "PYTHONPATH", "ROV_IDENT_CACHE", "FASTRTPS_DEFAULT_PROFILES_FILE",
     "FASTDDS_DEFAULT_PROFILES_FILE",
 )  # fmt: skip
+_CACHES = "_CACHE_DIR"  # how the names of compilers' own folders end
 
 
 def start(
@@ -29,9 +30,9 @@ def start(
     An interrupt from the terminal does not reach it.
     """
     variables = os.environ | _SAFE | dict(environment or {})
-    for name in _PATHS:
-        if name in variables:  # relative ones would be those of another folder
-            parts = filter(None, variables[name].split(os.pathsep))
+    for name, value in variables.items():
+        if name in _PATHS or name.endswith(_CACHES):  # relative: those of another folder
+            parts = filter(None, value.split(os.pathsep))
             variables[name] = os.pathsep.join(map(os.path.abspath, parts))
     # behind all others: where this package is not installed
     path = filter(None, (variables.get("PYTHONPATH"), _ROOT))
