@@ -9,7 +9,8 @@ from rov_ident import config
 from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
 from rov_ident.io.csv_table import read_csv
-from rov_ident.model.coefficients import catalogue, fin_catalogue, parse_fin
+from rov_ident.model.coefficients import catalogue, input_catalogue, parse, parse_input
+from rov_ident.model.equations import extended_states
 from rov_ident.model.fins import CROSS, X
 from rov_ident.steering import autopilot
 
@@ -23,20 +24,35 @@ def remus():
 
 
 def test_names_say_what_they_multiply():
-    assert parse_fin("N_uudr").factor(2.0, -0.1) == pytest.approx(-0.4)
-    assert parse_fin("X_uudsds").factor(2.0, -0.1) == pytest.approx(0.04)
-    assert parse_fin("N_uudrdr").factor(2.0, -0.1) == pytest.approx(-0.04)  # |dr| dr
-    assert parse_fin("Y_udr").factor(2.0, 0.1) == pytest.approx(0.2)
-    assert parse_fin("Y_dr").factor(2.0, 0.1) == pytest.approx(0.1)
-    assert parse_fin("N_uudr").unit == "N m s2/(m2 rad)"
+    """At u = 2 m/s, 5 revolutions a second backwards, every angle 0.1 rad to its negative side."""
+    nu, inputs = np.array([[2.0, 0, 0, 0, 0, 0]]), np.array([[-0.1, -0.1, -0.1, -5.0]])
+    row = extended_states(nu, inputs)[0]
+    for name, factor, unit in (
+        ("N_uudr", -0.4, "N m s2/(m2 rad)"),
+        ("X_uudsds", 0.04, "N s2/(m2 rad2)"),
+        ("N_uudrdr", -0.04, "N m s2/(m2 rad2)"),
+        ("Y_udr", -0.2, "N s/(m rad)"),
+        ("Y_dr", -0.1, "N/rad"),
+        ("Y_nndr", 2.5, "N s2/rad"),
+        ("X_n", -5.0, "N s"),
+        ("X_nn", -25.0, "N s2"),
+        ("X_un", -10.0, "N s2/m"),
+        ("K_nn", -25.0, "N m s2"),
+    ):
+        c = parse(name)
+        assert row[c.left] * row[c.right] == pytest.approx(factor), name
+        assert c.unit == unit
+    with pytest.raises(UserError, match="is written X_nn"):
+        parse("T_nn")
+    assert parse("X_nu").place == parse("X_un").place
 
 
 def test_fin_names_and_others_are_told_apart():
-    assert all(parse_fin(c.name) is None for c in catalogue())
-    names = [c.name for c in fin_catalogue()]
-    assert len(set(names)) == len(names) == 3 * 6 * 3 * 2
-    for name in ("N_uudx", "N_uuudr", "N_uudrds", "N_vdr", "uudr"):
-        assert parse_fin(name) is None
+    assert all(parse_input(c.name) is None for c in catalogue())
+    every = input_catalogue()
+    assert len({c.place for c in every}) == len(every) == 4 * 6 * 3 * 2 + 3 * 6
+    for name in ("N_uudx", "N_uuudr", "N_uudrds", "N_vdr", "uudr", "X_nnn", "X_vn"):
+        assert parse_input(name) is None
 
 
 def to_fins(tail, angles):
@@ -85,15 +101,17 @@ def test_both_tails_push_alike_for_the_same_equivalents():
 
 
 def test_fin_wrench(remus):
-    wrench = remus.fin_wrench(2.0, {"r": 0.1})
-    np.testing.assert_allclose(wrench, [0, 9.64 * 0.4, 0, 0, 0, -6.15 * 0.4])
-    np.testing.assert_array_equal(remus.fin_wrench(2.0, {}), np.zeros(6))
+    nu = np.array([2.0, 0.3, -0.2, 0.1, 0.2, -0.3])
+    wrench = remus.input_wrench(nu, np.array([0.0, 0.1, 0.0, 0.0]))
+    np.testing.assert_allclose(wrench, [0, 9.64 * 0.4, 0, 0, 0, -6.15 * 0.4], atol=1e-12)
+    np.testing.assert_array_equal(remus.input_wrench(nu, np.zeros(4)), np.zeros(6))
 
 
-def test_fins_do_not_change_what_estimators_see(remus):
-    assert "N_uudr" in remus.fins and "N_uudr" not in remus.names
-    assert len(remus.theta) == len(remus.names)
-    assert remus.with_theta(2.0 * remus.theta).fins == remus.fins
+def test_fins_are_parameters_like_any_other(remus):
+    assert set(remus.fins) == {"Y_uudr", "N_uudr", "Z_uuds", "M_uuds"} < set(remus.names)
+    assert remus.inputs == ("delta_s", "delta_r")
+    doubled = remus.with_theta(2.0 * remus.theta).fins
+    assert doubled == {name: 2.0 * value for name, value in remus.fins.items()}
 
 
 def test_configuration_keeps_its_fins(tmp_path):

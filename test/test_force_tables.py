@@ -117,7 +117,7 @@ def steady_forces(model, nu, fins):
             ]
         )
         force = of_body + model.restoring_force(np.array([0.0, 0.0, 1.0])) - moving
-        forces.append(force + model.fin_wrench(state[0], {"r": r, "s": s}))
+        forces.append(force + model.input_wrench(state, np.array([s, r, 0.0, 0.0])))
     return np.array(forces)
 
 
@@ -142,7 +142,7 @@ def test_remus_from_its_table_into_a_configuration(remus_table, tmp_path):
     assert main([*arguments, "--json", str(result), "--out", str(out)]) == 0
     axes = json.loads(result.read_text())["axes"]
     truth = config.load(REMUS).model
-    known = dict(zip(truth.names, truth.theta)) | truth.fins
+    known = truth.values
     for axis, name in (("X", "X_uu"), ("Y", "Y_uudr"), ("N", "N_uudr"), ("M", "M_uuds"),
                        ("N", "N_uv"), ("N", "N_ur"), ("Y", "Y_uv"), ("M", "M_uw")):  # fmt: skip
         term = axes[axis]["terms"][name]

@@ -16,7 +16,7 @@ from rov_ident import config as configuration
 from rov_ident.consumer.formats import READERS, WRITERS, export, import_model
 from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
-from rov_ident.model.coefficients import catalogue, fin_catalogue, parse
+from rov_ident.model.coefficients import catalogue, input_catalogue, parse
 from rov_ident.model.equations import GRAVITY
 from rov_ident.simulation.open_loop import simulate
 
@@ -338,7 +338,7 @@ def vehicles(draw, heavy):
         size = rng.uniform(0.001, 0.02) if c.is_added_mass else rng.uniform(0.5, 5.0)
         hull = c.is_diagonal or c.is_one_sided
         values[c.name] = float(size * (-1.0 if hull else rng.choice([-1.0, 1.0])))
-    fins = [c.name for c in fin_catalogue()]
+    fins = [c.name for c in input_catalogue()]
     for name in draw(st.lists(st.sampled_from(fins), max_size=2, unique=True)):
         values[name] = float(rng.normal())
     plain = parameters(heavy, values)
@@ -363,7 +363,7 @@ def vehicles(draw, heavy):
 def without(config, lost):
     """The model and the effects outside the body, less all that ``lost`` names."""
     words = " ".join(lost)
-    kind = r"the (?:coefficients of fins|coefficients|effects|settings) ([\w., ]+)"
+    kind = r"the (?:coefficients of fins and propeller|coefficients|effects|settings) ([\w., ]+)"
     lists = [match[1] for what in lost if (match := re.match(kind, what))]
     named = set(re.split(", | ", " ".join(lists)))
     for name, there in (
@@ -421,7 +421,7 @@ def test_every_coefficient_and_effect_is_held_or_named(name, heavy, tmp_path):
     """One by one: what the file has not is among the words."""
     base = export(heavy, name)
     assert base.lost == ()
-    for coefficient in (*catalogue(), *fin_catalogue()):
+    for coefficient in (*catalogue(), *input_catalogue()):
         value = (
             -0.01
             if coefficient.name not in heavy.model.names

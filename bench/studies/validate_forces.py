@@ -123,14 +123,16 @@ def vehicle() -> None:
         rigid = np.append(
             np.cross(state[3:], p[:3]), np.cross(state[3:], p[3:]) + np.cross(state[:3], p[:3])
         )
-        push = own.model.fin_wrench(state[0], {k: float(v[i]) for k, v in fins.items()})
+        push = own.model.input_wrench(
+            state, np.array([fins[k][i] if k in fins else 0.0 for k in "sran"])
+        )
         needed = own.model.wrench(state, still, down) - own.model.restoring_force(down)
         forces[i] = rigid - needed + push
     forces += 0.02 * np.abs(forces) * rng.standard_normal(forces.shape)
     measured = {axis: forces[:, AXES.index(axis)] for axis in "XYZMN"}
     fits = force_tables.fit(force_tables.ForceTable("REMUS 100", nu, fins, measured), own.model)
     made = force_tables.configured(own, fits).model
-    known = dict(zip(own.model.names, own.model.theta)) | own.model.fins
+    known = own.model.values
     rows = []
     for axis, f in fits.items():
         cells = [f"{n} {v:.4g} ± {h:.2g} ({known.get(n, 0.0):g})"

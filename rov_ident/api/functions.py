@@ -24,13 +24,7 @@ from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Limits, Proposal
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
-from rov_ident.model.coefficients import (
-    MOTIONS,
-    Coefficient,
-    FinCoefficient,
-    catalogue,
-    fin_catalogue,
-)
+from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
 from rov_ident.offline import archive, batch_fit
 from rov_ident.offline.batch_fit import CHANNELS, KINDS, Settings
 from rov_ident.offline.fit import Fit, fit_online
@@ -398,6 +392,6 @@ def plan(
         return design.propose(given, bags, duration, limits, say)
 
 
-def coefficients() -> tuple[Coefficient | FinCoefficient, ...]:
+def coefficients() -> tuple[Coefficient, ...]:
     """Every coefficient a configuration may name, each with ``name``, ``unit``, ``meaning``."""
-    return (*catalogue(), *fin_catalogue())
+    return (*catalogue(), *input_catalogue())

@@ -28,13 +28,15 @@ from rov_ident.sampling.records import (
     predicted,
     score,
 )
-from rov_ident.simulation.virtual_sensors import Suite, dive, odometry_of
+from rov_ident.simulation.virtual_sensors import Dive, Suite, dive, measure, odometry_of
+from rov_ident.steering import autopilot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 _POINTS = 2000  # of a curve in a picture
+_FIN_ANGLE = float(np.radians(20.0))  # of zigzags (IMO MSC.137(76)), and of changes of course
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,8 @@ def simulate(
     bag
         Path of an ``.mcap`` file or a rosbag2 directory whose wrench drives the simulation.
     manoeuvre
-        Instead of a bag: ``steps``, ``multisine``, ``single-axis``, ``pilot`` or ``rest``.
+        Instead of a bag: ``steps``, ``multisine``, ``single-axis``, ``pilot`` or ``rest``; of a
+        vehicle under its fins ``waypoints``, ``zigzag``, ``turn``, ``heading`` or ``dive``.
     channels
         With a bag: simulate these axes alone (``"surge,yaw"``), the others follow the measurement.
     duration
@@ -164,7 +167,11 @@ def simulate(
     if progress:
         progress("simulating")
     if manoeuvre is not None:
-        run = dive(given, manoeuvre, duration, sensors or Suite(), seed)
+        suite = sensors or Suite()
+        if manoeuvre in autopilot.MANOEUVRES:
+            run = _steered(given, manoeuvre, duration, suite, seed)
+        else:
+            run = dive(given, manoeuvre, duration, suite, seed)
         return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
     assert bag is not None
     record = read(bag, given, progress)
@@ -188,3 +195,17 @@ def simulate(
         record.notes,
         record.duration,
     )
+
+
+def _steered(given: Config, name: str, duration: float, suite: Suite, seed: int) -> Dive:
+    """A manoeuvre under fins, as simulated sensors see it."""
+    for missing, names in given.unheard.items():
+        raise UserError(
+            f"{names[0]} depends on {missing}, which no joint would show: name one in "
+            f"inputs.{missing}.joint"
+        )
+    model, step = given.dynamics, 1.0 / suite.wrench_rate
+    run = autopilot.manoeuvre(model, name, _FIN_ANGLE, duration=duration, step=step, seed=seed)
+    demand = run.thrust[:, None] * np.eye(6)[0]
+    rng = np.random.default_rng(seed)
+    return measure(given, run.t, demand, duration, suite, rng, run.inputs, run.nu[0])

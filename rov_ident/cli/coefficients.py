@@ -3,7 +3,7 @@
 import argparse
 
 from rov_ident.cli.common import OUT, Commands, check_outputs, command, write_json
-from rov_ident.model.coefficients import Coefficient, FinCoefficient, catalogue, fin_catalogue
+from rov_ident.model.coefficients import catalogue, input_catalogue
 
 
 def add(commands: Commands) -> None:
@@ -13,7 +13,7 @@ def add(commands: Commands) -> None:
 
 def _coefficients(options: argparse.Namespace) -> None:
     check_outputs([options.json], [])
-    entries: list[Coefficient | FinCoefficient] = [*catalogue(), *fin_catalogue()]
+    entries = [*catalogue(), *input_catalogue()]
     for c in entries:
         OUT.print(f"{c.name:<10} {c.unit:<18} {c.meaning}")
     write_json(options.json, {c.name: {"unit": c.unit, "meaning": c.meaning} for c in entries})

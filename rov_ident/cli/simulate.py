@@ -12,7 +12,11 @@ def add(commands: common.Commands) -> None:
     simulate = common.command(commands, "simulate", text, _simulate, "--config --json")
     source = simulate.add_mutually_exclusive_group(required=True)
     source.add_argument("--bag", type=Path, help="drive by the wrench of this bag and compare")
-    source.add_argument("--manoeuvre", help="steps, multisine, single-axis, pilot or rest")
+    source.add_argument(
+        "--manoeuvre",
+        help="steps, multisine, single-axis, pilot or rest; under fins: waypoints, zigzag, turn, "
+        "heading or dive",
+    )
     simulate.add_argument(
         "--channels", metavar="surge,sway,...",
         help="with --bag: simulate these alone, the other velocities and the attitude as measured",

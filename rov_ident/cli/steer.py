@@ -16,7 +16,7 @@ def add(commands: common.Commands) -> None:
     text = "simulate a vehicle under its fins: zigzag, turn, heading change, dive"
     steer = common.command(commands, "steer", text, _steer, "--config --json")
     steer.add_argument(
-        "--manoeuvre", required=True, choices=("zigzag", "turn", "heading", "dive"),
+        "--manoeuvre", required=True, choices=("zigzag", "turn", "heading", "dive", "waypoints"),
         help="what to steer",
     )  # fmt: skip
     steer.add_argument(

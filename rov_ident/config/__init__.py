@@ -10,15 +10,27 @@ from rov_ident.config.schema import (
     PARAMETERS,
     VEHICLE_PARAMETERS,
     Config,
+    Fin,
     Inputs,
     Names,
     Parameter,
     Qos,
+    Shaft,
     Thrusters,
     Vector,
 )
 from rov_ident.config.writing import as_file_name, dump, to_parameters
 
-__all__ = ["LARGEST", "PARAMETERS", "VEHICLE_PARAMETERS", "Config", "Inputs", "Names", "Parameter"]
-__all__ += ["Qos", "Thrusters", "Vector", "as_file_name", "checked", "dump", "from_parameters"]
+__all__ = ["LARGEST", "PARAMETERS", "VEHICLE_PARAMETERS", "Config", "Fin", "Inputs", "Names"]
+__all__ += [
+    "Parameter",
+    "Qos",
+    "Shaft",
+    "Thrusters",
+    "Vector",
+    "as_file_name",
+    "checked",
+    "dump",
+    "from_parameters",
+]
 __all__ += ["load", "thruster_signal", "to_parameters"]

@@ -132,10 +132,18 @@ def theta_of(config: Config) -> Array:
     return np.concatenate([config.model.theta, effects])
 
 
+_WORKING_INPUTS = (0.3, 0.3, 0.3, 10.0)
+"""rad, 1/s; of INPUTS. Half of where fins stall, and a small propeller at 600 revolutions a minute;
+by such a share of the working wrench a published zero may be off."""
+
+
 def typical(model: Model) -> Array:
     """(m,) the size at which each term alone would take its axis's whole working wrench."""
     wrench, inertia = authority(model), np.diag(model.body.mass_matrix)
-    speed = np.concatenate([[1.0], WORKING_SPEED, WORKING_SPEED, WORKING_SPEED])
+    motion, driven = [1.0, *WORKING_SPEED, *WORKING_SPEED, *WORKING_SPEED], []
+    for x in _WORKING_INPUTS:
+        driven += [x, x * x, x * x]
+    speed = np.array([*motion, WORKING_SPEED[0] ** 2, *driven])
     sizes = [
         np.sqrt(inertia[c.row] * inertia[c.column])
         if c.is_added_mass

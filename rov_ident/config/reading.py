@@ -25,6 +25,7 @@ from rov_ident.config.schema import (
     Vector,
     Vehicle,
     VehicleUncertainty,
+    missing_inputs,
 )
 from rov_ident.config.words import expected, shown, suggestion
 from rov_ident.core.errors import UserError
@@ -33,7 +34,7 @@ from rov_ident.core.yaml_file import parse_file
 from rov_ident.effects import EFFECTS, estimable
 from rov_ident.effects.base import EffectParameter
 from rov_ident.model import thruster_allocation as thrusters
-from rov_ident.model.coefficients import catalogue, parse, parse_fin
+from rov_ident.model.coefficients import catalogue, parse
 from rov_ident.model.equations import Array, Model, RigidBody, build
 
 # Parameters that ROS itself adds to any node.
@@ -85,7 +86,10 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
     settings = _read_section(Config, values, "")
     model = _model(vehicle, coefficients, settings.get("gravity", Config.gravity))
     settings["estimate"], settings["estimate_effects"] = estimated(
-        model, settings.get("effects", {}), settings.get("estimate", ())
+        model,
+        settings.get("effects", {}),
+        settings.get("estimate", ()),
+        settings.get("inputs", Inputs()),
     )
     signs = _signs(vehicle.frame)
     for section in _VECTORS.keys() & settings.keys():
@@ -260,8 +264,6 @@ def _model(vehicle: Vehicle, coefficients: Mapping[str, float], gravity: float) 
     if not coefficients:
         raise UserError("coefficients is empty: give at least one, such as X_udot or X_u")
     for name in coefficients:
-        if parse_fin(name) is not None:
-            continue
         try:
             parse(name)
         except UserError as error:
@@ -288,9 +290,10 @@ def _model(vehicle: Vehicle, coefficients: Mapping[str, float], gravity: float) 
 
 
 def estimated(
-    model: Model, effects: Mapping[str, Mapping[str, float]], names: Names
+    model: Model, effects: Mapping[str, Mapping[str, float]], names: Names, inputs: Inputs
 ) -> tuple[Names, tuple[tuple[str, str], ...]]:
-    """What to estimate, in the order of the model and of the effects; no names given: all."""
+    """What to estimate, in the order of the model and of the effects; no names given: all, but for
+    coefficients whose input no joint gives."""
     possible = {f"{e}.{p}": (e, p) for e, values in effects.items() for p in values}
     for name in names:
         effect, _, parameter = name.partition(".")
@@ -301,6 +304,13 @@ def estimated(
         if parameter not in estimable(effect):
             raise UserError(f"estimate: {name} cannot be estimated live: leave it out")
     chosen = {_in_model(model, n, f"estimate: {n}") for n in names if "." not in n}
+    waiting = {c.name: m for c in model.coefficients if (m := missing_inputs(c, inputs))}
+    for name in sorted(chosen & waiting.keys()):
+        missing = waiting[name][0]
+        raise UserError(
+            f"estimate: {name} depends on {missing}, which no joint gives: name it in "
+            f"inputs.{missing}.joint"
+        )
     usual = [
         f"{name}.{p}"
         for name, values in effects.items()
@@ -308,7 +318,7 @@ def estimated(
         if null is None or values[p] != null
     ]
     return (
-        tuple(name for name in model.names if not names or name in chosen),
+        tuple(n for n in model.names if n in chosen or not (names or n in waiting)),
         tuple(key for name, key in possible.items() if name in (names or usual)),
     )
 

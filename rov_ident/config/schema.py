@@ -18,6 +18,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FrameDefaults
 from rov_ident.effects import EFFECTS, rigid_body
 from rov_ident.model import thruster_allocation as thrusters
+from rov_ident.model.coefficients import INPUTS, Coefficient
 from rov_ident.model.equations import GRAVITY, Model
 
 T = TypeVar("T")
@@ -139,6 +140,7 @@ class Topics:
     wrench: str = option("", "topic in a bag of the type inputs.wrench")
     pose: str = option("", "topic in a bag of the type inputs.pose, where inputs.odom is a twist")
     battery: str = option("", "topic in a bag of the type inputs.battery")
+    inputs: str = option("", "sensor_msgs/JointState topic in a bag, of the joints of inputs")
 
 
 ODOMETRY_TYPES = (
@@ -151,6 +153,24 @@ WRENCH_TYPES = ("geometry_msgs/WrenchStamped", "geometry_msgs/Wrench")
 FORCE_TYPES = ("sensor_msgs/JointState", "std_msgs/Float64MultiArray", "std_msgs/Float32MultiArray")
 BATTERY_TYPE = "sensor_msgs/BatteryState"
 PULSE_TYPES = ("std_msgs/UInt16MultiArray", "std_msgs/Int16MultiArray", "mavros_msgs/RCOut")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fin:
+    """`inputs.delta_s`, `delta_r`, `delta_a`: an angle, by the position of a joint."""
+
+    joint: str = option("", "name of the joint; empty: none, the angle counts as zero")
+    scale: float = option(
+        1.0, "rad of the angle per rad of the joint: -1 where the joint counts the other way round"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shaft:
+    """`inputs.n`: revolutions a second of the propeller, by the velocity of a joint."""
+
+    joint: str = option("", "name of the joint; empty: none, the speed counts as zero")
+    scale: float = option(0.5 / math.pi, "revolutions per rad of the joint, with its sign", "1/rad")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +199,22 @@ class Inputs:
         "type of the supply of the thrusters, for the curve of the T200; none: thrusters.voltage",
         choices=("none", BATTERY_TYPE),
     )
+
+    delta_s: Fin = Fin()
+    delta_r: Fin = Fin()
+    delta_a: Fin = Fin()
+    n: Shaft = Shaft()
+
+    @property
+    def joints(self) -> dict[str, Fin | Shaft]:
+        """What drives the vehicle beside the wrench: of model.coefficients.INPUTS, those heard."""
+        every: dict[str, Fin | Shaft] = {name: getattr(self, name) for name in INPUTS}
+        return {name: given for name, given in every.items() if given.joint}
+
+    @property
+    def standard(self) -> "Inputs":
+        """The same joints beside odometry and a wrench."""
+        return Inputs(delta_s=self.delta_s, delta_r=self.delta_r, delta_a=self.delta_a, n=self.n)
 
     @property
     def is_twist(self) -> bool:
@@ -460,6 +496,15 @@ class Config:
         )
 
     @property
+    def unheard(self) -> dict[str, Names]:
+        """Coefficients that wait for an input which no joint gives: {input: names}."""
+        found: dict[str, list[str]] = {}
+        for c in self.model.coefficients:
+            for name in missing_inputs(c, self.inputs):
+                found.setdefault(name, []).append(c.name)
+        return {name: tuple(names) for name, names in found.items()}
+
+    @property
     def with_effects_held(self) -> "Config":
         """The same, with the parameters of effects as they are: samples need not follow them."""
         return dataclasses.replace(self, estimate_effects=())
@@ -483,10 +528,16 @@ class Config:
     def with_model(self, model: Model) -> "Config":
         """The same with another model: what was held stays held, new coefficients are estimated."""
         held = set(self.model.names) - set(self.estimate)
+        held |= {c.name for c in model.coefficients if missing_inputs(c, self.inputs)}
         estimate = tuple(name for name in model.names if name not in held)
         std = {name: value for name, value in self.prior.std.items() if name in model.names}
         prior = dataclasses.replace(self.prior, std=std)
         return dataclasses.replace(self, model=model, estimate=estimate, prior=prior)
+
+
+def missing_inputs(coefficient: Coefficient, inputs: Inputs) -> Names:
+    """The inputs that a coefficient depends on and that no joint gives."""
+    return tuple(name for name in coefficient.inputs if name not in inputs.joints)
 
 
 def _declared(section: type, prefix: str = "") -> tuple[Parameter, ...]:

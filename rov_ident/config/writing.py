@@ -12,7 +12,7 @@ from rov_ident.config.reading import estimated
 from rov_ident.config.schema import PARAMETERS, VEHICLE_PARAMETERS, Config
 from rov_ident.core.files import write_file
 from rov_ident.core.yaml_file import Dumper
-from rov_ident.model.coefficients import AXES, VELOCITIES, catalogue, fin_catalogue
+from rov_ident.model.coefficients import AXES, VELOCITIES, catalogue, input_catalogue
 
 DIAGONAL = tuple(
     name.format(a, v)
@@ -41,10 +41,11 @@ def to_parameters(config: Config) -> dict[str, Any]:
         **_changed(config.vehicle_uncertainty),
     }
     coefficients = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
-    coefficients |= config.model.fins
     settings = _changed(config)
     settings.pop("estimate", None)
-    if (config.estimate, config.estimate_effects) != estimated(config.model, config.effects, ()):
+    if (config.estimate, config.estimate_effects) != estimated(
+        config.model, config.effects, (), config.inputs
+    ):
         parameters = (f"{effect}.{name}" for effect, name in config.estimate_effects)
         settings["estimate"] = [*config.estimate, *parameters]
     return {"vehicle": vehicle, "coefficients": coefficients, **settings}
@@ -70,7 +71,7 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
     marked UNKNOWN where there is none. ``remarks``, by dotted name, say where a value comes from.
     """
     meanings = {c.name: f"{c.unit}: {c.meaning}" for c in catalogue()}
-    meanings |= {c.name: f"{c.unit}: {c.meaning}" for c in fin_catalogue()}
+    meanings |= {c.name: f"{c.unit}: {c.meaning}" for c in input_catalogue()}
     sections: dict[str, dict[str, str]] = {"vehicle": {}, "coefficients": {}}
     given = dict(_flat(parameters))
     for p in VEHICLE_PARAMETERS + PARAMETERS:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.messages import Array, Imu, Odometry, Wrench
+from rov_ident.core.messages import Array, Imu, Joints, Odometry, Wrench
 
 # `base_link_ned` is the widespread name (uuv_simulator) of a body frame with FRD axes.
 _FRD_SUFFIXES = ("_frd", "_fsd", "_ned")
@@ -30,7 +30,7 @@ FLIP_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 for _constant in (FLIP_BODY, FLIP_WORLD):
     _constant.setflags(write=False)
 
-AnyMessage = TypeVar("AnyMessage", bound=Odometry | Imu | Wrench)
+AnyMessage = TypeVar("AnyMessage", bound=Odometry | Imu | Wrench | Joints)
 
 
 @dataclass(frozen=True)
@@ -185,6 +185,8 @@ def _turned(
     message: AnyMessage, defaults: FrameDefaults, turns: dict[tuple[bool, bool], Array]
 ) -> AnyMessage:
     """The message with axes other than FRD, NED turned, or back, by the ``turns`` of attitudes."""
+    if isinstance(message, Joints):
+        return message
     if isinstance(message, Odometry):
         turn_body = not body_is_frd(message.child_frame_id, defaults)
         turn_world = not world_is_ned(message.frame_id, defaults)

@@ -67,3 +67,8 @@ def widened(covariance: Array, variance: Array) -> Array:
     factor = np.sqrt(np.maximum(variance / own, 1.0))
     wide: Array = covariance * np.outer(factor, factor)
     return wide
+
+
+def interpolated(t: Array, y: Array, at: Array) -> Array:
+    """Columns y (N, n) at times t (N,), straight in between, at the times ``at`` (k,): (k, n)."""
+    return np.stack([np.interp(at, t, column) for column in y.T], axis=1)

@@ -1,4 +1,4 @@
-"""The three input messages, and what else they are made from, free of middleware.
+"""The input messages, and what else they are made from, free of middleware.
 
 The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
 forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
@@ -14,6 +14,9 @@ Array = NDArray[np.float64]
 
 ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
 """The roles of the three inputs."""
+
+DRIVE = "inputs"
+"""The role of fin angles and shaft speeds, where a vehicle has such."""
 
 
 class Odometry(NamedTuple):
@@ -50,6 +53,16 @@ class Wrench(NamedTuple):
     torque: Array  # (3,) N m
 
 
+class Joints(NamedTuple):
+    """sensor_msgs/JointState: of fins and shafts, by name. What is not measured is left empty."""
+
+    stamp: int  # ns
+    frame_id: str
+    names: tuple[str, ...]  # (k,)
+    position: Array  # (k,) rad
+    velocity: Array  # (k,) rad/s
+
+
 class Twist(NamedTuple):
     """geometry_msgs/Twist(WithCovariance)Stamped: velocity in body axes."""
 
@@ -76,7 +89,7 @@ class Commands(NamedTuple):
     values: Array  # (k,)
 
 
-Message = Odometry | Imu | Wrench
+Message = Odometry | Imu | Wrench | Joints
 
 LAST_STAMP = (2**31 - 1) * 10**9
 """ns; the end of ROS time, 32 bits of seconds."""
@@ -89,6 +102,8 @@ def fault(message: Message) -> str:
         return "zero stamp"
     if message.stamp >= LAST_STAMP:
         return "stamp at the end of time"
+    if isinstance(message, Joints):
+        return ""  # what is not finite in it may be a joint that nobody asked for
     if isinstance(message, Odometry):
         p, q, v, w = message.position, message.orientation, message.linear, message.angular
         if not 0.5 < q.dot(q) < 2.0:  # NaN too

@@ -95,7 +95,7 @@ class Hypothesis:
             if change is not None:
                 body = change(body, **parameters)
         theta = np.array([values[c.name] for c in found])
-        return Model(body, tuple(found), theta, self.config.model.fins)
+        return Model(body, tuple(found), theta)
 
     @cached_property
     def equations(self) -> Equations:

@@ -208,4 +208,7 @@ def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
     nu[:, :3] += water
     unknown, none = np.zeros((len(t), 3)), np.zeros((0, 3))
     held = demands[:, 0].copy(), demands[:, 1:].copy()
-    return Streams(t, unknown, orientation, nu, np.zeros(0), none, none, *held)
+    inputs = samples["inputs"][:, 1]
+    return Streams(
+        t, unknown, orientation, nu, np.zeros(0), none, none, *held, samples["t"].copy(), inputs
+    )

@@ -24,6 +24,7 @@ from rov_ident.model.equations import (
     Model,
     Structure,
     columns,
+    extend_inputs,
     generalized_force,
     momentum_columns,
     six,
@@ -45,6 +46,7 @@ class Steps(NamedTuple):
     piece_t: Array  # (J + 1,) s
     demand: Array  # (J, 6)
     piece: Indices  # (K,)
+    inputs: Array  # (K, 4): mean of INPUTS over each step
     given: Array  # (K, 6) accelerations that guided axes are measured to have, else 0; or (0, 6)
 
 
@@ -136,11 +138,11 @@ def adjoint(motion: Motion, first: Indices, last: Indices, error: Array, nodes: 
     return out
 
 
-def regressors(eq: Equations, motion: Motion) -> Array:
+def regressors(eq: Equations, steps: Steps, motion: Motion) -> Array:
     """What a unit of each coefficient adds to the wrench side of the equations, (K, 6, n)."""
     n, extended = len(eq.theta), np.empty((EXTENDED_SIZE, 1))
     out, work = np.empty((len(motion.middle), 6, n)), np.empty((3, 6, n))
-    _regressors(eq.structure, motion.middle, motion.nu_dot, work, extended, out)
+    _regressors(eq.structure, motion.middle, motion.nu_dot, steps.inputs, work, extended, out)
     return out
 
 
@@ -166,6 +168,7 @@ def _wrenches(around, current, structure, added, theta, steps, thrust, nu, scrat
     t, middle, s = steps.t, steps.middle, scratch[0]
     for k in range(len(nu)):
         now = 0.5 * (t[k] + t[k + 1])
+        extend_inputs(1, structure, steps.inputs[k], s.extended)
         add_surroundings(
             around, current, structure, added, theta, now, nu[k], middle[k], thrust[k], s, out[k]
         )
@@ -288,6 +291,7 @@ def _shoot(
                 s.nearby_mass[i, j, k] = mass[i, j, 0]
     slope, nu, given = s.slope, s.end, s.end[:0]
     node, rotations, middles, guided = steps.t, steps.rotation, steps.middle, steps.given
+    inputs = steps.inputs
     reached, halfway, nu_dots = motion.nu, motion.middle, motion.nu_dot
     phi, gamma = motion.phi, motion.gamma
     for w in range(len(first)):
@@ -295,6 +299,9 @@ def _shoot(
             nu[i] = reached[first[w], i] = start[w, i]
         for k in range(first[w], last[w]):
             t, dt = node[k], node[k + 1] - node[k]
+            extend_inputs(1, structure, inputs[k], s.extended)
+            extend_inputs(1, structure, inputs[k], s.current.extended)
+            extend_inputs(_LANES, structure, inputs[k], s.nearby_extended)
             if len(guided) > 0:
                 given = guided[k]
             for i in range(6):
@@ -388,11 +395,12 @@ def _adjoint(phi, gamma, first, last, error, nodes, work, out):
 
 
 @released
-def _regressors(structure, nu, nu_dot, work, extended, out):
+def _regressors(structure, nu, nu_dot, inputs, work, extended, out):
     """work (3, 6, n)."""
     of_nu_dot, momentum, force = work[0], work[1], work[2]
     for k in range(len(nu)):
         momentum_columns(structure, nu_dot[k], of_nu_dot)
+        extend_inputs(1, structure, inputs[k], extended)
         columns(structure, nu[k], momentum, force, extended)
         for i in range(6):
             for j in range(out.shape[2]):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rov_ident.core.linalg import scaled_solve
+from rov_ident.core.linalg import interpolated, scaled_solve
 from rov_ident.discrepancy.hypothesis import UNKNOWN, Key, bounds, effect_of
 from rov_ident.discrepancy.linearisation import Linearisation
 from rov_ident.discrepancy.multiple_shooting import Steps
@@ -20,7 +20,6 @@ from rov_ident.discrepancy.selection import PENALTY, scores_of
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
-from rov_ident.sampling.raw_streams import interpolated
 
 _KNOTS = 12.0  # s between the knots of a function of time
 _MOST_KNOTS = 40

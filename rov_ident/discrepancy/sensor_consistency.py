@@ -29,7 +29,7 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
 )
 from rov_ident.core.jit import kernel
-from rov_ident.core.linalg import scaled_inverse
+from rov_ident.core.linalg import interpolated, scaled_inverse
 from rov_ident.core.quaternions import turned
 from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
@@ -38,7 +38,7 @@ from rov_ident.discrepancy.windowed_problem import within
 from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array
-from rov_ident.sampling.raw_streams import Streams, integral, interpolated, orientation_at
+from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
 
 # Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
 # which the white noise is nothing, about a factor of three apart.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix
+from rov_ident.core.linalg import interpolated
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key
 from rov_ident.discrepancy.multiple_shooting import (
     Motion,
@@ -31,7 +32,7 @@ from rov_ident.effects import EFFECTS, compiled
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, parse
 from rov_ident.model.equations import Array, Model, RigidBody
-from rov_ident.sampling.raw_streams import Streams, interpolated, orientation_at
+from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
 from rov_ident.simulation.open_loop import Guide, simulate
 
 MAX_STEP = 0.05  # s; of integration, where odometry is slower
@@ -83,6 +84,7 @@ class WindowedProblem:
             pieces,
             streams.demand[held],
             np.searchsorted(pieces, nodes[:-1]),
+            _means(streams, nodes),
             given,
         )
         at = np.searchsorted(nodes, t)
@@ -180,7 +182,7 @@ class WindowedProblem:
             found = sorted((parse(n) for n in names), key=lambda c: not c.is_added_mass)
             model = Model(h.model.body, tuple(found), np.zeros(len(found)))
             at, eq = [place[COEFFICIENTS, c.name] for c in found], h.equations.acting
-            out[:, :, at] = regressors(equations(model, eq), self._relative(h, motion))
+            out[:, :, at] = regressors(equations(model, eq), self.steps, self._relative(h, motion))
         for key in keys:
             if key in self.patterns:
                 out[:, :, place[key]] = self.patterns[key]
@@ -287,6 +289,16 @@ def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:
     coriolis = np.hstack([np.cross(omega, linear), np.cross(omega, angular) + np.cross(v, linear)])
     wrench: Array = steps.middle[:, 2] @ body.restoring.T - motion.nu_dot @ mass.T - coriolis
     return wrench
+
+
+def _means(streams: Streams, nodes: Array) -> Array:
+    """The inputs' means (K, 4) over the steps between nodes (K + 1,)."""
+    if not len(streams.inputs_t):
+        return np.zeros((len(nodes) - 1, streams.inputs.shape[1]))
+    t = np.unique(np.concatenate([nodes, streams.inputs_t]))
+    total = integral(t, interpolated(streams.inputs_t, streams.inputs, t))
+    means: Array = np.diff(total[np.searchsorted(t, nodes)], axis=0) / np.diff(nodes)[:, None]
+    return means
 
 
 def _subdivided(t: Array) -> Array:

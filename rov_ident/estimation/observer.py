@@ -14,7 +14,7 @@ with the regressor Y of ``tau = known + Y theta``. A measurement corrects nu, P 
 from rov_ident.core.jit import floats, inlined, reordered
 from rov_ident.core.runge_kutta import NODES, runge_kutta
 from rov_ident.model.coefficients import EXTENDED_SIZE
-from rov_ident.model.equations import columns, generalized_force
+from rov_ident.model.equations import columns, extend_inputs, generalized_force
 
 LANES = 8  # a velocity and its displacements along six axes, side by side; one is spare
 _SHIFT = 1e-6  # m/s, rad/s; of a displacement: it loses to rounding what it gains in curvature
@@ -33,7 +33,8 @@ OBSERVER = [
     # wrench in the step to the velocity at its end
     *floats((6, 6), "inverse jacobian square transition into product"),
 ]
-"""Fields of the work space. The caller sets mass, one_mass, inverse, force, slope and guide."""
+"""Fields of the work space. The caller sets mass, one_mass, inverse, force, slope and guide, and
+the inputs by :func:`take_inputs`."""
 
 
 @inlined
@@ -45,6 +46,13 @@ def force_of(sample, wrench, restoring, force, slope):
             middle = sample.down[j] - 0.5 * sample.dt * sample.down_slope[j]
             force[i] += restoring[i, j] * middle
             slope[i] += restoring[i, j] * sample.down_slope[j]
+
+
+@inlined
+def take_inputs(structure, inputs, s):
+    """The inputs (4,) of an interval, in which they count as constant: their mean."""
+    extend_inputs(LANES, structure, inputs, s.extended)
+    extend_inputs(1, structure, inputs, s.one_extended)
 
 
 @inlined

@@ -148,7 +148,7 @@ def is_passive(model: Model, prior: Prior, values: Array) -> bool:
         both = value + known.get(c.symmetric, 0.0) if c.is_one_sided else value
         if (c.is_diagonal or c.is_one_sided) and both > 0.0:
             return False
-        if not c.is_added_mass and (c.left == ONE or c.left >= ABSOLUTE):
+        if not (c.is_added_mass or c.inputs) and (c.left == ONE or c.left >= ABSOLUTE):
             terms.append((c, value))
     if all(c.is_diagonal or c.is_one_sided for c, _ in terms):
         return True

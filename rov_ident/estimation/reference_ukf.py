@@ -57,7 +57,7 @@ class ReferenceUkf:
         """nu_dot (6,) with the coefficients theta (m,), under the wrench tau."""
         mass = self.model.with_theta(theta).mass_matrix
         mass = mass + raised(mass, self.task.lightest)
-        force = force_of_one(self.model.structure, mass, theta, nu)
+        force = force_of_one(self.model.structure, mass, theta, nu, self._row["inputs"][0])
         nu_dot: Array = np.linalg.solve(mass, tau - force - self.model.restoring_force(down))
         return nu_dot
 

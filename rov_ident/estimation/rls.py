@@ -63,6 +63,7 @@ from rov_ident.estimation.observer import (
     drive_of,
     force_of,
     linearised_step,
+    take_inputs,
 )
 from rov_ident.estimation.physical import Estimate, calibrated
 from rov_ident.estimation.process_noise import wrench_noise
@@ -398,6 +399,7 @@ def _predict(task, state, work, sample, side):
     noise, inverse = s.noise, s.inverse
     n, free = len(work.scale), state.scalars[0].free
     force_of(sample, s.wrench, task.restoring, s.force, s.slope)
+    take_inputs(task.structure, sample.inputs[0], s)
     doubtful = wrench_noise(task.process[0], sample, s.middle)
     for i in range(6):
         for j in range(i + 1):

@@ -91,6 +91,8 @@ def begin(info, sample):
         total += sample.nu[i] + sample.wrench[i] + sample.wrench_slope[i]
     for i in range(3):
         total += sample.down[i] + sample.down_slope[i]
+    for i in range(sample.inputs.shape[1]):
+        total += sample.inputs[0, i] + sample.inputs[1, i]
     return np.isfinite(total)
 
 

@@ -66,6 +66,7 @@ from rov_ident.estimation.wrench_residual import filtered_residual
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import (
     add_added_mass,
+    extend_inputs,
     generalized_force,
     in_motion,
     symmetric_product,
@@ -301,6 +302,7 @@ def _move(task, x, work, sample, side):
     """Move the sigma points to the sample's time: work.moved, and the centre's inverse mass."""
     s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
     force_of(sample, sample.wrench, task.restoring, s.force, s.slope)
+    extend_inputs(LANES, task.structure, sample.inputs[0], s.extended)
     steps = steps_of(sample.dt)
     dt = sample.dt / steps
     for sign in range(2):

@@ -8,7 +8,7 @@ the momentum P is exact: ``s w/(s + w) P = w (P - x)`` where x is the filtered P
 import numpy as np
 
 from rov_ident.core.jit import inlined, inner
-from rov_ident.model.equations import generalized_force, six, symmetric_product
+from rov_ident.model.equations import extend_inputs, generalized_force, six, symmetric_product
 
 
 @inlined
@@ -24,6 +24,7 @@ def filtered_residual(task, theta, s, filters, sample, restarted, out):
     w, dt = task.settings[0].corner, sample.dt
     for i in range(6):
         s.one_nu[i, 0] = sample.nu[i]
+    extend_inputs(1, task.structure, sample.inputs[1], s.one_extended)
     generalized_force(1, task.structure, s.one_mass, theta, s.one_nu, s.one_h, s.one_extended)
     momentum = symmetric_product(s.one_mass, six(s.one_nu, 0), 0)
     a, b0, b1 = first_order(w, dt)

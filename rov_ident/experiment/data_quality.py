@@ -17,7 +17,7 @@ from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
-from rov_ident.core.linalg import scaled_inverse, scaled_solve
+from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.states import CONVERGED, State, of_fit
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -32,7 +32,7 @@ from rov_ident.offline.least_squares import PERIOD
 from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Shown
 from rov_ident.reports.table import PLUS_MINUS, Table, Tables
-from rov_ident.sampling.raw_streams import Streams, gather, integral, interpolated
+from rov_ident.sampling.raw_streams import Streams, gather, integral
 from rov_ident.sampling.records import Record, read_record
 
 if TYPE_CHECKING:
@@ -199,7 +199,10 @@ def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
 
 def _rates(streams: Streams) -> list[Remark]:
     remarks = []
-    for name, t in (("odometry", streams.t), ("imu", streams.imu_t), ("wrench", streams.demand_t)):
+    topics = {"odometry": streams.t, "imu": streams.imu_t, "wrench": streams.demand_t}
+    if len(streams.inputs_t):
+        topics["inputs"] = streams.inputs_t
+    for name, t in topics.items():
         if len(t) < 2:
             text = "there is none: attitude and velocity between two odometry messages are guessed"
             remarks.append(Remark(name, WARNING, text))
@@ -362,11 +365,14 @@ def _wrench_lag(driven: Array, phi: Array, wrench: Array) -> tuple[float, float]
 
 
 def _excitation(streams: Streams, config: Config, found: Sequence[Prospect]) -> list[Remark]:
-    remarks, limits = [], authority(config.dynamics)
+    remarks, limits, steered = [], authority(config.dynamics), np.zeros((1, 6))
+    if len(streams.inputs_t):  # fins and propeller drive, too
+        now = interpolated(streams.inputs_t, streams.inputs, streams.t)
+        steered = config.dynamics.input_wrench(streams.nu, now)
     for i, axis in enumerate(MOTIONS):
         unit, force = UNITS[i]
         low, high = np.quantile(streams.nu[:, i], [0.02, 0.98])
-        driven = float(np.sqrt(np.mean(streams.demand[:, i] ** 2)))
+        driven = float(np.sqrt(np.mean(streams.demand[:, i] ** 2) + np.mean(steered[:, i] ** 2)))
         text = f"from {low:.2f} to {high:.2f} {unit}, wrench {driven:.2g} {force} rms"
         level = GOOD
         if driven < _DRIVEN * limits[i]:

@@ -39,7 +39,12 @@ from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.cdr import DECODERS, ROLE_TYPES
 from rov_ident.io.other_bags import OtherFile, Ros1File, SqliteFile
 
-ROLE_NAMES = {"odom": "odom", "imu": "imu/data", "wrench": "thruster_wrench"}
+ROLE_NAMES = {
+    "odom": "odom",
+    "imu": "imu/data",
+    "wrench": "thruster_wrench",
+    "inputs": "joint_states",
+}
 """As the nodes call them."""
 
 _USUAL = {

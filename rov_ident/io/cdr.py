@@ -12,11 +12,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.core.messages import Array, Commands, Imu, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.core.messages import (
+    Array,
+    Commands,
+    Imu,
+    Joints,
+    Message,
+    Odometry,
+    Pose,
+    Twist,
+    Wrench,
+)
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
+JOINTS_TYPE = "sensor_msgs/msg/JointState"
 ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian, no options
@@ -142,12 +153,22 @@ def decode_pose(data: bytes, layout: _Layout = _POSE) -> Pose:
 
 def decode_joint_state(data: bytes) -> Commands:
     """The efforts of a sensor_msgs/msg/JointState."""
+    joints, fields = _joints(data)
+    return Commands(joints.stamp, fields.sequence("<f8"))
+
+
+def decode_joints(data: bytes) -> Joints:
+    """Positions and velocities of a sensor_msgs/msg/JointState."""
+    return _joints(data)[0]
+
+
+def _joints(data: bytes) -> tuple[Joints, _Fields]:
+    """A sensor_msgs/msg/JointState, and its fields from the efforts on."""
     fields = _Fields(data)
-    stamp, _ = fields.stamp(), fields.string()
-    for _ in range(fields.length()):
-        fields.string()  # the name of a joint
-    _, _, effort = (fields.sequence("<f8") for _ in range(3))  # position, velocity, effort
-    return Commands(stamp, effort)
+    stamp, frame_id = fields.stamp(), fields.string()
+    names = tuple(fields.string() for _ in range(fields.length()))
+    position, velocity = fields.sequence("<f8"), fields.sequence("<f8")
+    return Joints(stamp, frame_id, names, position, velocity), fields
 
 
 def decode_channels(data: bytes) -> Commands:
@@ -189,6 +210,8 @@ def encode(message: Message) -> bytes:
 
     Raises ValueError: a stamp outside the range of builtin_interfaces/Time.
     """
+    if isinstance(message, Joints):
+        return _encode_joints(message)
     strings, layout = [message.frame_id], _IMU if isinstance(message, Imu) else _WRENCH
     if isinstance(message, Odometry):
         strings, layout = [message.frame_id, message.child_frame_id], _ODOMETRY
@@ -197,12 +220,33 @@ def encode(message: Message) -> bytes:
     if isinstance(message, Imu) and not message.orientation.any():
         numbers[_IMU_ORIENTATION_COVARIANCE] = -1.0
 
-    try:
-        body = bytearray(_STAMP.pack(*divmod(message.stamp, _SECOND)))
-    except struct.error as error:
-        raise ValueError(f"the stamp {message.stamp} ns does not fit a ROS time") from error
+    body = _stamped(message.stamp)
     for text in strings:
-        raw = text.encode() + b"\0"
-        body += bytes(-len(body) % 4) + _LENGTH.pack(len(raw)) + raw
+        _append(body, text)
     body += bytes(-len(body) % 8) + numbers.tobytes()
     return _ENCAPSULATION + bytes(body)
+
+
+def _encode_joints(message: Joints) -> bytes:
+    body = _stamped(message.stamp)
+    _append(body, message.frame_id)
+    body += bytes(-len(body) % 4) + _LENGTH.pack(len(message.names))
+    for name in message.names:
+        _append(body, name)
+    for numbers in (message.position, message.velocity, np.zeros(0)):
+        body += bytes(-len(body) % 4) + _LENGTH.pack(len(numbers))
+        if len(numbers):
+            body += bytes(-len(body) % 8) + np.asarray(numbers, dtype="<f8").tobytes()
+    return _ENCAPSULATION + bytes(body)
+
+
+def _stamped(stamp: int) -> bytearray:
+    try:
+        return bytearray(_STAMP.pack(*divmod(stamp, _SECOND)))
+    except struct.error as error:
+        raise ValueError(f"the stamp {stamp} ns does not fit a ROS time") from error
+
+
+def _append(body: bytearray, text: str) -> None:
+    raw = text.encode() + b"\0"
+    body += bytes(-len(body) % 4) + _LENGTH.pack(len(raw)) + raw

@@ -1,4 +1,4 @@
-"""A plain log (CSV) into a bag of the topics `odom` and `thruster_wrench`.
+"""A plain log (CSV) into a bag of the topics `odom`, `thruster_wrench` and `joint_states`.
 
 Nothing is resampled or filtered. What the log does not tell (an attitude, a position) is filled in
 so that it agrees with the velocities, and said in the report.
@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 
 from rov_ident.core import frames
 from rov_ident.core.errors import UserError
-from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Message, Odometry, Wrench, fault
+from rov_ident.core.messages import (
+    DRIVE,
+    ODOMETRY,
+    WRENCH,
+    Array,
+    Joints,
+    Message,
+    Odometry,
+    Wrench,
+    fault,
+)
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.csv_table import read_csv
 from rov_ident.io.write_messages import write_messages
@@ -25,11 +35,14 @@ _POSITIONS = ("x", "y", "z")
 _ANGLES = ("roll", "pitch", "yaw")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _REQUIRED = ("t_s", *_VELOCITIES, *_WRENCH)
-NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION)
+_FINS = ("delta_s", "delta_r", "delta_a")
+_DRIVEN = (*_FINS, "rpm")
+NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION, *_DRIVEN)
 
 _FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
 _SECOND = 1_000_000_000  # ns
 _LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
+_LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
 _WRAP_JUMP = 1.0  # rad within one row, and back in the next: no vehicle does that
 
 
@@ -64,7 +77,9 @@ def import_csv(
     begin at 1 s. A wrench message holds from its stamp until the next.
 
     Args:
-        paths: files with the columns `NAMES`; the position, angles and quaternion may be absent.
+        paths: files with the columns `NAMES`; the position, angles and quaternion may be absent;
+            with fin angles (rad) or the propeller's `rpm` also the wrench. These become joints of
+            the names `delta_s`, `delta_r`, `delta_a` and `n`.
         out: the bag, see `BagWriter`.
         columns: our name -> heading in the files; or a number, for what was not logged (`w=0`).
         body_frame: `frd` (the world is then NED) or `flu` (ENU).
@@ -92,6 +107,10 @@ def import_csv(
     log.check_time()
     log.check_angles()
     notes = log.prepare(prepare) if prepare else []
+    if given := [
+        name for name in _WRENCH if log.headings[name] == "0" != (columns or {}).get(name)
+    ]:
+        notes.append(f"no {' '.join(given)} given: fins and propeller drive alone")
 
     time = log.data["t_s"]
     start = min(0.0, float(time[0]))
@@ -118,6 +137,7 @@ def import_csv(
         wrench_stamps[1:] = stamps[:-1] + np.diff(stamps) // 2
     elif wrench_timing == "bin":
         stamps = stamps + _bin_widths(stamps) // 2
+    joints = log.joints()
     world, body = _FRAME_IDS[body_frame]
     force, torque = log.matrix(_WRENCH[:3]), log.matrix(_WRENCH[3:])
 
@@ -125,6 +145,9 @@ def import_csv(
         for k, (at, acts) in enumerate(zip(stamps.tolist(), wrench_stamps.tolist(), strict=True)):
             # The wrench first: at equal stamps it already acts on the velocity that follows.
             yield k, acts, WRENCH, Wrench(acts, body, force[k], torque[k])
+            if joints is not None:
+                names, angle, turning = joints
+                yield k, at, DRIVE, Joints(at, body, names, angle[k], turning[k])
             if kept[k]:
                 motion = position[k], orientation[k], linear[k], angular[k], np.zeros(6)
                 yield k, at, ODOMETRY, Odometry(at, world, body, *motion)
@@ -293,6 +316,17 @@ class _Log:
         """Columns side by side, (n, len(names))."""
         return np.column_stack([self.data[name] for name in names])
 
+    def joints(self) -> tuple[tuple[str, ...], Array, Array] | None:
+        """Names (k,), positions (n, k) and velocities (n, k) of fins and shaft, if any is given."""
+        names = tuple(name for name in _DRIVEN if name in self.data)
+        if not names:
+            return None
+        velocity = np.array([name == "rpm" for name in names])
+        x = self.matrix(names)
+        x[:, velocity] *= 2.0 * np.pi / 60.0
+        shown = tuple("n" if name == "rpm" else name for name in names)
+        return shown, np.where(velocity, 0.0, x), np.where(velocity, x, 0.0)
+
     def place(self, row: int) -> str:
         path, line = self.places[row]
         return f"{path}, line {line}"
@@ -314,6 +348,13 @@ class _Log:
 
     def check_angles(self) -> None:
         """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates."""
+        for name in _FINS:
+            angle = self.data.get(name, np.zeros(1))
+            if (large := np.flatnonzero(np.abs(angle) > _LARGEST_FIN)).size:
+                raise UserError(
+                    f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
+                    "looks like degrees: convert it to rad."
+                )
         for name in _ANGLES:
             angle = self.data.get(name, np.zeros(1))
             large = np.flatnonzero(np.abs(angle) > 2.0 * np.pi)
@@ -331,8 +372,11 @@ class _Log:
 def _headings(path: Path, header: Collection[str], columns: Mapping[str, str]) -> dict[str, str]:
     """The heading of each of our names that the file (or a constant) provides."""
     headings = {}
+    is_driven = any(columns.get(name, name) in header for name in _DRIVEN)
     for name in NAMES:
         heading = columns.get(name, name)
+        if is_driven and name in _WRENCH and heading == name and name not in header:
+            heading = "0"
         if heading in header or _constant(heading):
             headings[name] = heading
         elif name in columns or name in _REQUIRED:

@@ -28,12 +28,13 @@ from rov_ident.core.frames import (
     quaternion_to_euler,
     quaternion_to_matrix,
 )
-from rov_ident.core.messages import Array, Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
 from rov_ident.io import cdr
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
 
 ODOMETRY, IMU, WRENCH, POSE, BATTERY = "odom", "imu", "wrench", "pose", "battery"
+_JOINTS = "sensor_msgs/JointState"
 
 _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
@@ -78,7 +79,7 @@ class Source(NamedTuple):
 
 def sources(inputs: Inputs) -> dict[str, Source]:
     """The topics by role: `odom`, `imu`, `wrench`; `pose` where the motion is a twist; `battery`
-    where there is one."""
+    and `inputs` where there are such."""
     thrust = ROLE_NAMES[WRENCH]
     if inputs.is_allocated:
         thrust = "thruster_forces" if inputs.wrench in schema.FORCE_TYPES else "thruster_pwm"
@@ -91,6 +92,8 @@ def sources(inputs: Inputs) -> dict[str, Source]:
         found[POSE] = Source("pose", inputs.pose)
     if inputs.battery != "none":
         found[BATTERY] = Source("battery", inputs.battery)
+    if inputs.joints:
+        found[DRIVE] = Source(ROLE_NAMES[DRIVE], _JOINTS)
     return found
 
 
@@ -119,6 +122,8 @@ class Reader:
         """What the sampler is to take, (role, message); ``arrival`` [ns] stamps what has none."""
         type_name = self._types[role]
         try:
+            if role == DRIVE:
+                return [(DRIVE, cdr.decode_joints(data))]
             message = _DECODERS[type_name](data)
         except ValueError:
             self.counts[f"{role}: bytes that are no {_full(type_name)}"] += 1
@@ -252,17 +257,19 @@ def messages(
 def as_played(
     bag: Bag, topics: Mapping[str, str], config: Config
 ) -> Iterator[tuple[str, RawMessage]]:
-    """(role, message as bytes) of the three types that the estimators know, whatever the bag's.
+    """(role, message as bytes) of the types that the estimators know, whatever the bag's.
 
     A message without a stamp could not be stamped on arrival when it is played at another speed.
     """
-    if config.inputs == Inputs():
+    if config.inputs == config.inputs.standard:
         roles = {topic: role for role, topic in topics.items()}
         for raw in bag.iter_raw(roles):
             yield roles[raw.topic], raw
         return
     for role, message, raw in _read(bag, topics, config, None):
-        yield role, raw._replace(type_name=cdr.ROLE_TYPES[role], data=cdr.encode(message))
+        if role != DRIVE:
+            raw = raw._replace(type_name=cdr.ROLE_TYPES[role], data=cdr.encode(message))
+        yield role, raw
 
 
 def _read(
@@ -329,7 +336,11 @@ def survey(bag: Bag) -> Survey:
                 return
 
     def named(role: str) -> Callable[[str], str]:
-        return lambda kind: sources(Inputs(**{role: kind}))[role].topic
+        def of_kind(kind: str) -> str:
+            chosen: dict[str, Any] = {role: kind}
+            return sources(Inputs(**chosen))[role].topic
+
+        return of_kind
 
     look(ODOMETRY, schema.ODOMETRY_TYPES, named(ODOMETRY))
     look(IMU, ("sensor_msgs/Imu",), lambda kind: ROLE_NAMES[IMU])

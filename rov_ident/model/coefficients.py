@@ -16,14 +16,21 @@ name           term on the hydrodynamic side of the axis    example
 ``A_bb_neg``   ``|b| min(b, 0)``, added to ``A_bb |b| b``   ``Z_ww_neg``
 ``A_uudr``     fin ``u^2 dr``; with ``ds``, ``da`` alike;   ``N_uudr``, ``X_uudsds``
                ``A_uudrdr``: ``u^2 |dr| dr``, or plain
-               square where even; ``A_udr``, ``A_dr``:
-               behind a propeller, where not u^2 decides
+               square where even; ``A_udr``, ``A_dr``,
+               ``A_nndr``: behind a propeller, where not
+               u^2 decides
+``A_nn``       propeller ``|n| n``; ``A_n``: ``n``;         ``X_nn``, ``K_nn``, ``X_un``
+               ``A_un``: ``u n``, of the inflow
 =============  ==========================================  ============================
 
-A *term* is the product of two entries of the extended velocity ``[1, nu, |nu|, min(nu, 0)]``, so
-that every velocity coefficient is a row and two indices: simulator, regressor and Kalman filter
-loop over one table, and a new name in the grammar needs no new equation. Fin angles are an input,
-not a state: their coefficients (:class:`FinCoefficient`) make a wrench outside of that table.
+A *term* is the product of two entries of the extended state: ``[1, nu, |nu|, min(nu, 0), u^2]``,
+and behind these for each input x (fin angles, the propeller's speed of rotation) ``x, |x| x, x^2``.
+So every coefficient but added mass is a row and two indices: simulator, regressor and Kalman filter
+loop over one table, and a new name in the grammar needs no new equation.
+
+A fin meets the flow at its own angle and at that of the motion there, ``delta + (v + x_f r) / u``:
+its lift ``u^2 (delta + ...)`` has further terms ``u v`` and ``u r``. Hull and fins share these
+(``Y_uv Y_ur N_uv N_ur``, ``Z_uw Z_uq M_uw M_uq``): no motion tells them apart.
 """
 
 import re
@@ -39,46 +46,32 @@ MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 # Even under port-starboard or up-down mirror symmetry, hence a plain square.
 EVEN = frozenset("X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split())
 
-# Places in the extended velocity [1, nu, |nu|, min(nu, 0)] of model.extend.
+INPUTS = ("delta_s", "delta_r", "delta_a", "n")
+"""What drives a vehicle beside the thrusters' wrench: equivalent cross-tail angles [rad] of stern
+planes, rudder and aileron (:mod:`rov_ident.model.fins`), the propeller's revolutions a second."""
+INPUT_LETTERS = "sran"
+"""The inputs in the names of coefficients."""
+
+# Places in the extended state [1, nu, |nu|, min(nu, 0), u^2, inputs] of equations.extend.
 ONE = 0
 PLAIN = 1
 ABSOLUTE = 7
 NEGATIVE = 13
-EXTENDED_SIZE = 19
+SQUARE = 19
+INPUT = 20  # x, |x| x, x^2 of the first input, and so on
+EXTENDED_SIZE = INPUT + 3 * len(INPUTS)
 
 _GRAMMAR = re.compile(
     r"(?P<axis>[XYZKMN])_(?P<first>[uvwpqr])"
     r"(?:(?P<dot>dot)|_abs_(?P<abs>[uvwpqr])|(?P<second>[uvwpqr])?(?P<neg>_neg)?)"
 )
 
-FINS = "sra"
-"""Equivalent cross-tail angles: stern plane, rudder, aileron (:mod:`rov_ident.model.fins`)."""
-
-_FIN_GRAMMAR = re.compile(
-    r"(?P<axis>[XYZKMN])_(?P<speed>u{0,2})d(?P<fin>[sra])(?P<square>d(?P=fin))?"
+_INPUT_GRAMMAR = re.compile(
+    r"(?P<axis>[XYZKMN])_(?:"
+    r"(?P<speed>u{0,2}|nn)d(?P<fin>[sra])(?P<square>d(?P=fin))?|(?P<propeller>n|nn|un|nu))"
 )
 _FIN_EVEN = {"X": "sra", "Z": "ra", "M": "ra"}  # by the same symmetries as EVEN
 _FIN_NAMES = {"s": "stern plane", "r": "rudder", "a": "aileron"}
-
-
-@dataclass(frozen=True)
-class FinCoefficient:
-    """A force per fin angle: ``u^power delta``, with ``square`` ``u^power |delta| delta``, or
-    ``u^power delta^2`` where it is ``even``. ``row`` is the axis (0..5), ``fin`` one of FINS."""
-
-    name: str
-    row: int
-    power: int
-    fin: str
-    square: bool
-    even: bool
-    unit: str
-    meaning: str
-
-    def factor(self, u: float, delta: float) -> float:
-        """What the coefficient multiplies, at surge speed u [m/s] and angle delta [rad]."""
-        angle = delta if not self.square else delta * (delta if self.even else abs(delta))
-        return u**self.power * angle
 
 
 @dataclass(frozen=True)
@@ -86,7 +79,8 @@ class Coefficient:
     """One coefficient: its place in the model, unit and meaning.
 
     ``row`` is the axis (0..5). For added mass ``column`` is the velocity it multiplies and
-    ``left = right = -1``; otherwise the term is ``extended[left] * extended[right]``.
+    ``left = right = -1``; otherwise the term is ``extended[left] * extended[right]``. ``right`` is
+    a velocity, or an input.
     """
 
     name: str
@@ -102,6 +96,12 @@ class Coefficient:
         return self.left < 0
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """Those of INPUTS that the term depends on."""
+        places = {(i - INPUT) // 3: None for i in (self.left, self.right) if i >= INPUT}
+        return tuple(INPUTS[place] for place in places)
+
+    @property
     def is_diagonal(self) -> bool:
         """Of an axis's own motion (``X_udot``, ``X_u``, ``X_uu``): never positive for a hull."""
         if self.is_added_mass:
@@ -111,13 +111,13 @@ class Coefficient:
 
     @property
     def velocity(self) -> int:
-        """The component of nu (0..5) in the second factor; every term has one."""
-        return (self.right - PLAIN) % 6
+        """The component of nu (0..5) in the second factor; of an input's term that of its axis."""
+        return self.row if self.right >= INPUT else (self.right - PLAIN) % 6
 
     @property
     def is_one_sided(self) -> bool:
         """Acts only where the axis's own velocity is negative (``Z_ww_neg``)."""
-        return self.right >= NEGATIVE
+        return NEGATIVE <= self.right < SQUARE
 
     @property
     def symmetric(self) -> str:
@@ -138,6 +138,13 @@ def parse(name: str) -> Coefficient:
 
     Raises UserError if the name is not in the grammar.
     """
+    if (driven := parse_input(name)) is not None:
+        return driven
+    if name in ("T_n", "T_nn", "T_nu", "T_un"):
+        raise UserError(
+            f"'{name}' is written X_{name[2:]}: the propeller's thrust on the vehicle, less what "
+            "the hull loses by its suction"
+        )
     match = _GRAMMAR.fullmatch(name)
     if match is None:
         raise UserError(
@@ -186,34 +193,49 @@ def parse(name: str) -> Coefficient:
 
 
 @cache
-def parse_fin(name: str) -> FinCoefficient | None:
-    """The fin coefficient called ``name``; None for any other name."""
-    match = _FIN_GRAMMAR.fullmatch(name)
+def parse_input(name: str) -> Coefficient | None:
+    """The coefficient of an input called ``name``; None for any other name."""
+    match = _INPUT_GRAMMAR.fullmatch(name)
     if match is None:
         return None
-    axis, fin, power = match["axis"], match["fin"], len(match["speed"])
-    row, square = AXES.index(axis), match["square"] is not None
+    row, axis = AXES.index(match["axis"]), match["axis"]
+    force, side = ("N", "force") if row < 3 else ("N m", "moment")
+    n = INPUT + 3 * INPUT_LETTERS.index("n")
+    if match["propeller"]:
+        left, right, formula, unit = {
+            "n": (ONE, n, "n", f"{force} s"),
+            "nn": (ONE, n + 1, "|n| n", f"{force} s2"),
+        }.get(match["propeller"], (PLAIN, n, "u n", f"{force} s2/m"))
+        meaning = f"propeller: {side} {axis} = {name} {formula}, n in revolutions a second"
+        return Coefficient(name, row, -1, left, right, unit, meaning)
+    fin, square = match["fin"], match["square"] is not None
     even = square and fin in _FIN_EVEN.get(axis, "")
-    speed = ("", "u ", "u^2 ")[power]
+    own = INPUT + 3 * INPUT_LETTERS.index(fin)
+    left, factor, above, below = {
+        "": (ONE, "", "", ""),
+        "u": (PLAIN, "u ", "s", "m"),
+        "uu": (SQUARE, "u^2 ", "s2", "m2"),
+        "nn": (n + 1, "|n| n ", "s2", ""),
+    }[match["speed"]]
+    right = own + (0 if not square else 2 if even else 1)
     angle = f"d{fin}" if not square else f"d{fin}^2" if even else f"|d{fin}| d{fin}"
-    force = "N" if row < 3 else "N m"
     radians = "rad2" if square else "rad"
-    unit = (f"{force}/{radians}", f"{force} s/(m {radians})", f"{force} s2/(m2 {radians})")[power]
-    side = "force" if row < 3 else "moment"
-    meaning = f"fin ({_FIN_NAMES[fin]}): {side} {axis} = {name} {speed}{angle}"
-    return FinCoefficient(name, row, power, fin, square, even, unit, meaning)
+    unit = f"{force} {above}".strip() + (f"/({below} {radians})" if below else f"/{radians}")
+    meaning = f"fin ({_FIN_NAMES[fin]}): {side} {axis} = {name} {factor}{angle}"
+    return Coefficient(name, row, -1, left, right, unit, meaning)
 
 
-def fin_catalogue() -> list[FinCoefficient]:
-    """Every fin coefficient of the grammar."""
+def input_catalogue() -> list[Coefficient]:
+    """Every coefficient of an input, one name a term."""
     names = [
         f"{axis}_{speed}d{fin}{square}"
-        for speed in ("uu", "u", "")
+        for speed in ("uu", "u", "", "nn")
         for axis in AXES
-        for fin in FINS
+        for fin in "sra"
         for square in ("", f"d{fin}")
     ]
-    return [c for name in names if (c := parse_fin(name))]
+    names += [f"{axis}_{factor}" for factor in ("n", "nn", "un") for axis in AXES]
+    return [c for name in names if (c := parse_input(name))]
 
 
 def _unit(force: str, velocities: list[int]) -> str:
@@ -230,7 +252,7 @@ def _unit(force: str, velocities: list[int]) -> str:
 
 
 def catalogue() -> list[Coefficient]:
-    """Every coefficient of the grammar, one name a term, by axis within kind."""
+    """Every coefficient of the vehicle's own motion, one name a term, by axis within kind."""
     names = [f"{a}_{b}dot" for a in AXES for b in VELOCITIES]
     names += [f"{a}_{b}" for a in AXES for b in VELOCITIES]
     names += [f"{a}_{b}{b}" for a in AXES for b in VELOCITIES]

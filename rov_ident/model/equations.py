@@ -7,8 +7,11 @@ In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 
     C(nu) nu = [omega x p1; omega x p2 + v x p1]
     M   = M_RB - sym(added-mass coefficients)
     d   = sum of  coefficient * extended[left] * extended[right]
-    extended = [1, nu, |nu|, min(nu, 0)]
+    extended = [1, nu, |nu|, min(nu, 0), u^2, inputs]
     g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
+
+The inputs are fin angles and the propeller's speed: what they make is part of d, so that their
+coefficients are parameters like any other. A vehicle without such coefficients has none.
 
 ``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, with
 the centre of gravity anywhere, off-diagonal terms included, and does no work by construction.
@@ -21,7 +24,7 @@ ones.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,12 +35,14 @@ from rov_ident.core.jit import inlined, kernel, lean, record
 from rov_ident.model.coefficients import (
     ABSOLUTE,
     EXTENDED_SIZE,
+    INPUT,
+    INPUTS,
     NEGATIVE,
     ONE,
     PLAIN,
+    SQUARE,
     Coefficient,
     parse,
-    parse_fin,
 )
 
 Array = NDArray[np.float64]
@@ -51,7 +56,8 @@ class Structure(NamedTuple):
     """Which coefficients a model has, as tables the kernels loop over.
 
     The parameter vector theta holds the ``len(mass_row)`` added-mass coefficients first, then one
-    for each term ``extended[left] * extended[right]`` on axis ``row``.
+    for each term ``extended[left] * extended[right]`` on axis ``row``. ``inputs`` are the places in
+    INPUTS of those that any term depends on.
     """
 
     mass_row: Indices
@@ -59,6 +65,7 @@ class Structure(NamedTuple):
     row: Indices
     left: Indices
     right: Indices
+    inputs: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +100,13 @@ class RigidBody:
 class Model:
     """A rigid body and its hydrodynamic coefficients: all that the equations of motion need.
 
-    ``coefficients`` are in the order of the parameter vector ``theta`` (added mass first).
-    ``fins`` are coefficients of fin angles: these are an input, so that what they make is part of
-    the wrench on the vehicle (:meth:`fin_wrench`) and the estimators do not see them.
+    ``coefficients`` are in the order of the parameter vector ``theta`` (added mass first). Inputs
+    (4,), where a method takes them, are in the order of INPUTS; left out, they are zero.
     """
 
     body: RigidBody
     coefficients: tuple[Coefficient, ...]
     theta: Array
-    fins: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,10 +118,23 @@ class Model:
         return dict(zip(self.names, self.theta.tolist(), strict=True))
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """Those of INPUTS that a coefficient depends on."""
+        found = {name for c in self.coefficients for name in c.inputs}
+        return tuple(name for name in INPUTS if name in found)
+
+    @property
+    def fins(self) -> dict[str, float]:
+        """The coefficients of inputs by name."""
+        return {c.name: self.values[c.name] for c in self.coefficients if c.inputs}
+
+    @property
     def structure(self) -> Structure:
         mass = [(c.row, c.column) for c in self.coefficients if c.is_added_mass]
         terms = [(c.row, c.left, c.right) for c in self.coefficients if not c.is_added_mass]
-        tables = np.array(mass).reshape(-1, 2).T, np.array(terms).reshape(-1, 3).T
+        inputs = [[INPUTS.index(name) for name in self.inputs]]
+        tables = [np.array(mass).reshape(-1, 2).T, np.array(terms).reshape(-1, 3).T]
+        tables.append(np.array(inputs))
         return Structure(*(column.astype(np.int64) for table in tables for column in table))
 
     def with_theta(self, theta: Array) -> "Model":
@@ -142,14 +160,23 @@ class Model:
             theta[self.names.index(name)] = value
         return self.with_theta(theta)
 
-    def fin_wrench(self, u: float, angles: Mapping[str, float]) -> Array:
-        """The wrench (6,) of the fins at surge speed u [m/s]; ``angles`` [rad] by letter."""
-        wrench = np.zeros(6)
-        for name, value in self.fins.items():
-            c = parse_fin(name)
-            if c is not None:
-                wrench[c.row] += value * c.factor(u, angles.get(c.fin, 0.0))
-        return wrench
+    def input_wrench(self, nu: Array, inputs: Array) -> Array:
+        """The wrench (..., 6) of fins and propeller at nu (..., 6) for inputs (..., 4)."""
+        states = extended_states(
+            _vector(nu).reshape(-1, 6), _vector(inputs).reshape(-1, len(INPUTS))
+        )
+        out = np.zeros((len(states), 6))
+        for c, value in zip(self.coefficients, self.theta, strict=True):
+            if c.inputs:
+                out[:, c.row] += value * states[:, c.left] * states[:, c.right]
+        return out.reshape(np.shape(nu))
+
+    def _force(self, nu: Array, inputs: Array | None) -> Array:
+        given = np.zeros(len(INPUTS)) if inputs is None else _vector(inputs)
+        force: Array = force_of_one(
+            self.structure, self.mass_matrix, self.theta, _vector(nu), given
+        )
+        return force
 
     @property
     def mass_matrix(self) -> Array:
@@ -168,11 +195,14 @@ class Model:
         return coriolis(self.mass_matrix @ nu, _vector(nu))
 
     def damping_matrix(self, nu: Array) -> Array:
-        """D(nu) (6, 6) with ``d(nu) = -D(nu) nu``: each term's second factor is its velocity."""
-        extended = _extended(_vector(nu))
+        """D(nu) (6, 6) with ``d(nu) = -D(nu) nu`` without inputs: each term's second factor is its
+        velocity."""
+        extended = extended_states(_vector(nu)[None], np.zeros((1, len(INPUTS))))[0]
         matrix = np.zeros((6, 6))
         for c, value in zip(self.coefficients, self.theta, strict=True):
-            if not c.is_added_mass and not (c.is_one_sided and nu[c.velocity] >= 0.0):
+            if c.is_added_mass or c.inputs:
+                continue
+            if not (c.is_one_sided and nu[c.velocity] >= 0.0):
                 matrix[c.row, c.velocity] -= value * extended[c.left]
         return matrix
 
@@ -186,22 +216,26 @@ class Model:
         """g (6,), on the left-hand side of the equations; ``down`` is k in body axes."""
         return -self.body.restoring @ down
 
-    def wrench(self, nu: Array, nu_dot: Array, down: Array) -> Array:
+    def wrench(self, nu: Array, nu_dot: Array, down: Array, inputs: Array | None = None) -> Array:
         """The thruster wrench (6,) that this motion takes: the inverse dynamics."""
-        h = force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
+        h = self._force(nu, inputs)
         return self.mass_matrix @ nu_dot + h + self.restoring_force(down)
 
-    def acceleration(self, nu: Array, tau: Array, down: Array) -> Array:
+    def acceleration(
+        self, nu: Array, tau: Array, down: Array, inputs: Array | None = None
+    ) -> Array:
         """nu_dot (6,) under the thruster wrench tau: the forward dynamics."""
-        h = force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu))
-        return np.linalg.solve(self.mass_matrix, tau - h - self.restoring_force(down))
+        h = self._force(nu, inputs)
+        wrench = tau - h - self.restoring_force(down)
+        return np.asarray(np.linalg.solve(self.mass_matrix, wrench), dtype=np.float64)
 
-    def regressor(self, nu: Array, nu_dot: Array) -> Array:
+    def regressor(self, nu: Array, nu_dot: Array, inputs: Array | None = None) -> Array:
         """Y (6, n): ``wrench = M_RB nu_dot + C_RB nu + g + Y theta``."""
         structure, n = self.structure, len(self.theta)
         momentum, force, of_rate = np.zeros((6, n)), np.zeros((6, n)), np.zeros((6, n))
         momentum_columns(structure, _vector(nu_dot), of_rate)
-        columns(structure, _vector(nu), momentum, force, np.empty((EXTENDED_SIZE, 1)))
+        extended = extended_by(structure, np.zeros(len(INPUTS)) if inputs is None else inputs)
+        columns(structure, _vector(nu), momentum, force, extended)
         return of_rate + force
 
 
@@ -215,11 +249,7 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
     hull has.
     """
     by_place: dict[tuple[int, ...], Coefficient] = {}
-    fins: dict[str, float] = {}
     for name, value in values.items():
-        if parse_fin(name) is not None and np.isfinite(value):
-            fins[name] = float(value)
-            continue
         coefficient = parse(name)
         if not np.isfinite(value):
             raise UserError(f"coefficients.{name} is {value}, but must be a finite number")
@@ -240,7 +270,7 @@ def build(body: RigidBody, values: Mapping[str, float]) -> Model:
             )
     coefficients = sorted(by_place.values(), key=lambda c: not c.is_added_mass)
     theta = np.array([float(values[c.name]) for c in coefficients])
-    model = Model(body, tuple(coefficients), theta, fins)
+    model = Model(body, tuple(coefficients), theta)
     if np.linalg.eigvalsh(model.mass_matrix)[0] <= 0:
         raise UserError(
             "the mass matrix (rigid body plus added mass) is not positive definite: "
@@ -267,14 +297,37 @@ def skew(a: Sequence[float] | Array) -> Array:
 
 @inlined
 def extend(lanes, nu, extended):
-    """[1, nu, |nu|, min(nu, 0)] (EXTENDED_SIZE, lanes) from nu (6, lanes)."""
+    """[1, nu, |nu|, min(nu, 0), u^2], the first rows of extended, from nu (6, lanes).
+
+    The others are those of the inputs, which change more slowly: :func:`extend_inputs`.
+    """
     for k in range(lanes):
         extended[ONE, k] = 1.0
+        extended[SQUARE, k] = nu[0, k] * nu[0, k]
     for i in range(6):
         for k in range(lanes):
             extended[PLAIN + i, k] = nu[i, k]
             extended[ABSOLUTE + i, k] = abs(nu[i, k])
             extended[NEGATIVE + i, k] = min(nu[i, k], 0.0)
+
+
+@inlined
+def _extend_input(lanes, which, x, extended):
+    row = INPUT + 3 * which
+    for k in range(lanes):
+        extended[row, k] = x
+        extended[row + 1, k] = abs(x) * x
+        extended[row + 2, k] = x * x
+
+
+@inlined
+def extend_inputs(lanes, structure, inputs, extended):
+    """The rows of the inputs (4,) in extended (EXTENDED_SIZE, lanes), of those that terms use.
+
+    They stay there while velocities change.
+    """
+    for i in range(len(structure.inputs)):
+        _extend_input(lanes, structure.inputs[i], inputs[structure.inputs[i]], extended)
 
 
 @inlined
@@ -322,7 +375,8 @@ def generalized_force(lanes, structure, mass, theta, nu, h, extended):
     """h = C(nu) nu - d(nu) (6, lanes).
 
     mass (6, 6, lanes), theta (n, lanes), nu (6, lanes); extended (EXTENDED_SIZE, lanes) is work
-    space. Of the mass matrices the lower half is read.
+    space that holds the inputs (:func:`extend_inputs`). Of the mass matrices the lower half is
+    read.
     """
     for k in range(lanes):
         x = six(nu, k)
@@ -366,7 +420,8 @@ def columns(structure, nu, momentum, force, extended):
 
     ``wrench = d/dt(momentum @ theta) + force @ theta + known``: the derivative is left to the
     caller, who may differentiate (:func:`momentum_columns` of nu_dot), filter or integrate by
-    parts. Both arrays are overwritten; extended (EXTENDED_SIZE, 1) is work space.
+    parts. Both arrays are overwritten; extended (EXTENDED_SIZE, 1) is work space that holds the
+    inputs (:func:`extend_inputs`).
     """
     momentum_columns(structure, nu, momentum)
     first = len(structure.mass_row)
@@ -385,14 +440,19 @@ def columns(structure, nu, momentum, force, extended):
 
 @lean
 def in_motion(structure, moving, out):
-    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,)."""
+    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,).
+
+    An input has no noise to speak of: where it is zero, its columns are.
+    """
     first = len(structure.mass_row)
     for c in range(first):
         out[c] = moving[structure.mass_row[c]] != 0 and moving[structure.mass_column[c]] != 0
     for term in range(len(structure.row)):
         moves = True
         for index in (structure.left[term], structure.right[term]):
-            if index != ONE:
+            if index == SQUARE:
+                moves = moves and moving[0] != 0
+            elif index != ONE and index < INPUT:
                 moves = moves and moving[(index - PLAIN) % 6] != 0
         out[first + term] = moves
 
@@ -450,18 +510,34 @@ def add_current(structure, added_mass, theta, nu, water, s, out):
 
 
 @kernel
-def force_of_one(structure, mass, theta, nu):
-    """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,) -> (6,)."""
+def force_of_one(structure, mass, theta, nu, inputs):
+    """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,), inputs (4,).
+
+    The result is (6,).
+    """
     h = np.empty((6, 1))
     extended = np.empty((EXTENDED_SIZE, 1))
+    extend_inputs(1, structure, inputs, extended)
     one_mass = np.ascontiguousarray(mass).reshape(6, 6, 1)
     generalized_force(1, structure, one_mass, theta.reshape(-1, 1), nu.reshape(6, 1), h, extended)
     return h[:, 0]
 
 
 @kernel
-def _extended(nu):
-    """:func:`extend` for a single state (6,)."""
-    extended = np.empty((EXTENDED_SIZE, 1))
-    extend(1, nu.reshape(6, 1), extended)
-    return extended[:, 0]
+def extended_by(structure, inputs):
+    """Work space extended (EXTENDED_SIZE, 1) that holds the inputs (4,)."""
+    extended = np.zeros((EXTENDED_SIZE, 1))
+    extend_inputs(1, structure, inputs, extended)
+    return extended
+
+
+@kernel
+def extended_states(nu, inputs):
+    """The extended states (N, EXTENDED_SIZE) of nu (N, 6) and inputs (N, 4)."""
+    out, extended = np.empty((len(nu), EXTENDED_SIZE)), np.empty((EXTENDED_SIZE, 1))
+    for k in range(len(nu)):
+        extend(1, nu[k].reshape(6, 1), extended)
+        for i in range(inputs.shape[1]):
+            _extend_input(1, i, inputs[k, i], extended)
+        out[k] = extended[:, 0]
+    return out

@@ -10,7 +10,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from numpy.typing import NDArray
 
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
+from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH
 from rov_ident.core.states import Level, State
 from rov_ident.estimation.checkpoint import Keeper
 from rov_ident.estimation.online import OnlineEstimator
@@ -46,7 +46,8 @@ class Inputs:
 
     def have_stopped(self, timeout: float) -> bool:
         """Whether one is silent without which there are no samples."""
-        return self.is_missing(ODOMETRY, timeout) or self.is_missing(WRENCH, timeout)
+        needed = self.sources.keys() & {ODOMETRY, WRENCH, DRIVE}
+        return any(self.is_missing(role, timeout) for role in needed)
 
 
 class Diagnostics:

@@ -147,7 +147,7 @@ def _open_description(key: str) -> str:
     """What a key of an open section means; empty where it is one of ROS's own."""
     section, _, name = key.partition(".")
     if section == "coefficients":
-        coefficient = coefficients.parse_fin(name) or coefficients.parse(name)
+        coefficient = coefficients.parse(name)
         return f"{coefficient.meaning} [{coefficient.unit}]"
     if section == "prior":
         return f"prior standard deviation of {key.rpartition('.')[2]}"

@@ -1,7 +1,7 @@
 """Plays a bag into estimator nodes, in lockstep with them, and records what they publish."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -61,6 +61,7 @@ class Player(Node):  # type: ignore[misc]
         writer: BagWriter | None,
         on_report: OnReport | None,
         check: Callable[[], None],
+        listened: Mapping[str, tuple[str, type]] = INPUTS,
     ) -> None:
         super().__init__("rov_ident_player", context=context, cli_args=apart(namespace))
         self.reports: dict[str, Report] = {}
@@ -76,10 +77,10 @@ class Player(Node):  # type: ignore[misc]
         self._executor.add_node(self)
 
         self._clock = self.create_publisher(Clock, "/clock", STREAM)
-        # All three, even where the bag has no IMU: the nodes wait for a publisher on each.
+        # All of them, even where the bag has no IMU: the nodes wait for a publisher on each.
         self._inputs = {
             role: self.create_publisher(type_, name, STREAM)
-            for role, (name, type_) in INPUTS.items()
+            for role, (name, type_) in listened.items()
         }
         self._outputs = [self._record("/diagnostics", DiagnosticArray, STREAM)]
         self._flushes = {}

@@ -18,7 +18,7 @@ from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
 from rov_ident import config as configuration
-from rov_ident.config import Inputs, Qos
+from rov_ident.config import Qos
 from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output
@@ -26,6 +26,7 @@ from rov_ident.estimation.online import ESTIMATORS, Report
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
+from rov_ident.nodes.common import subscribed
 from rov_ident.nodes.player import OnReport, Player, apart
 
 _LOOPBACK = Path(__file__).with_name("loopback.xml")
@@ -83,7 +84,7 @@ def replay(
             settings = replace(
                 configuration.load(config_path, name),
                 qos=Qos(reliability="reliable"),
-                inputs=Inputs(),  # the player converts: see inputs.as_played
+                inputs=config.inputs.standard,  # the player converts: see inputs.as_played
             )
             configuration.dump(settings, parameters)
             nodes.append(stack.enter_context(_Process(name, parameters, namespace)))
@@ -98,7 +99,15 @@ def replay(
         context = Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stack.callback(rclpy.try_shutdown, context=context)
-        player = Player(context, namespace, estimators, writer, on_report, check)
+        player = Player(
+            context,
+            namespace,
+            estimators,
+            writer,
+            on_report,
+            check,
+            subscribed(config.inputs.standard),
+        )
         stack.callback(player.destroy_node)
         player.wait_for_nodes(next(recorded.iter_raw(topics.values())).log_time)
         if writer is not None:

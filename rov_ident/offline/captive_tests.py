@@ -30,8 +30,8 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.linalg import sandwich, scaled_inverse
 from rov_ident.core.messages import Array
 from rov_ident.io.csv_table import CsvTable, read_csv
-from rov_ident.model.coefficients import AXES, VELOCITIES, parse, parse_fin
-from rov_ident.model.equations import Model, build, coriolis
+from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, parse
+from rov_ident.model.equations import Model, build, coriolis, extended_states
 from rov_ident.model.fins import CROSS, X
 from rov_ident.reports.result import Result, provenance
 
@@ -356,20 +356,17 @@ def column(name: str, nu: Array, fins: Mapping[str, Array]) -> Array:
     """What a term multiplies, (n,): the force is ``value * column``."""
     if name.endswith("_0"):
         return np.ones(len(nu))
-    fin = parse_fin(name)
-    if fin is not None:
-        delta = fins.get(fin.fin, np.zeros(len(nu)))
-        return np.array([fin.factor(u, d) for u, d in zip(nu[:, 0], delta)])
-    c = parse(name)
-    extended = np.hstack([np.ones((len(nu), 1)), nu, np.abs(nu), np.minimum(nu, 0.0)])
-    return extended[:, c.left] * extended[:, c.right]
+    c, inputs = parse(name), [fins.get(x, np.zeros(len(nu))) for x in INPUT_LETTERS]
+    extended = extended_states(np.ascontiguousarray(nu), np.ascontiguousarray(np.array(inputs).T))
+    column: Array = extended[:, c.left] * extended[:, c.right]
+    return column
 
 
 def unit(name: str) -> str:
     """The unit of a term."""
     if name.endswith("_0"):
         return "N" if name[0] in "XYZ" else "N m"
-    return (parse_fin(name) or parse(name)).unit
+    return parse(name).unit
 
 
 def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit]:
@@ -581,7 +578,7 @@ def with_hull(config: Config, hull: Mapping[str, float]) -> Config:
         return config
     model = config.model
     values = {n: x for n, x in model.values.items() if not parse(n).is_added_mass}
-    return config.with_model(build(model.body, {**hull, **values, **model.fins}))
+    return config.with_model(build(model.body, {**hull, **values}))
 
 
 def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
@@ -590,7 +587,7 @@ def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
 
     Raises UserError if the values make no passive hull.
     """
-    values = {**config.model.values, **config.model.fins}
+    values = dict(config.model.values)
     for f in fits.values():
         for name in (*f.pool, *f.aliases):
             values.pop(name, None)

@@ -18,7 +18,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.jit import inlined, kernel
 from rov_ident.estimation.wrench_residual import first_order
 from rov_ident.model.coefficients import EXTENDED_SIZE
-from rov_ident.model.equations import Array, Structure, columns, coriolis_of
+from rov_ident.model.equations import Array, Structure, columns, coriolis_of, extend_inputs
 
 
 class Regression(NamedTuple):
@@ -104,6 +104,7 @@ def _rows(task, samples, period, out):
 def _regress(task, sample, momentum, force, extended, p, now, rate):
     """now: momenta, rate: corner * momentum - force; the last column is what is known."""
     n, w, nu = len(task.scale), task.corner, sample.nu
+    extend_inputs(1, task.structure, sample.inputs[1], extended)
     columns(task.structure, nu, momentum, force, extended)
     for i in range(6):
         p[i] = 0.0

@@ -44,6 +44,7 @@ from rov_ident.estimation.observer import (
     drive_of,
     force_of,
     linearised_step,
+    take_inputs,
 )
 from rov_ident.estimation.shared import drive_sides, measure, steps_of, wrench_of
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
@@ -442,6 +443,7 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
     s, n = work.scratch[0], len(eq.estimated)
     wrench_of(eq.one_theta, sample, side, s.wrench)
     force_of(sample, s.wrench, eq.restoring, s.force, s.slope)
+    take_inputs(eq.structure, sample.inputs[0], s)
     for i in range(6):
         for j in range(6):
             s.force[i] -= eq.mass[i, j] * s.guide[j]

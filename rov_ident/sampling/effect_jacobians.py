@@ -217,7 +217,7 @@ def _surround(variants, t, nu, rotation, thrust, out):
 @inlined
 def _acceleration(motion, sample, nu):
     """nu_dot (6,) of the configured model at velocities nu (6,)."""
-    h = force_of_one(motion.structure, motion.mass, motion.theta, nu)
+    h = force_of_one(motion.structure, motion.mass, motion.theta, nu, sample.inputs[1])
     return motion.inverse @ (sample.wrench + motion.restoring @ sample.down - h)
 
 

@@ -5,9 +5,10 @@ Topics come at their own rates and phases. Only stamps decide, never the time of
 
 import math
 from collections import deque
+from collections.abc import Collection
 from typing import NamedTuple
 
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Message
+from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message
 
 MERGE = 0.05  # s; an odometry message is carried to the IMU message that follows this closely: one
 # interval of the slowest odometry beside which an IMU is of use, 20 Hz
@@ -39,6 +40,7 @@ class Queues:
     def __init__(self) -> None:
         self.grace = 0.0  # s; how long a silent topic is waited for
         self._lateness = 0.0  # s; the same, after a topic was that late
+        self._drives: tuple[str, ...] = ()
         self.clear()
 
     def clear(self) -> None:
@@ -51,19 +53,30 @@ class Queues:
         self._latest = -math.inf  # s; of all topics
         # s; no topic will bring anything before this. Of commands one more is waited for: it tells,
         # with the others, whether one is an outlier.
-        self._reach = dict.fromkeys(self._by_role, -math.inf)
+        self._reach = dict.fromkeys((*self._by_role, *self._drives), -math.inf)
         self._newest_command = -math.inf  # s
 
     def __getitem__(self, role: str) -> deque[Waiting]:
         return self._by_role[role]
 
-    def add(self, role: str, waiting: Waiting) -> None:
-        """Append a message to those of its topic."""
-        t, queue = waiting.t, self._by_role[role]
+    def await_drive(self, used: Collection[str]) -> None:
+        """Whether there is a topic of fins and shafts, whose messages are kept elsewhere."""
+        self._drives = (DRIVE,) if used else ()
+        self._reach = {
+            role: self._reach.get(role, -math.inf) for role in (*self._by_role, *self._drives)
+        }
+
+    def reached(self, role: str, t: float) -> None:
+        """A topic has come to t [s]."""
         if math.isnan(self._first):
             self._first = t
         self._latest = max(self._latest, t)
         self._reach[role] = t
+
+    def add(self, role: str, waiting: Waiting) -> None:
+        """Append a message to those of its topic."""
+        t, queue = waiting.t, self._by_role[role]
+        self.reached(role, t)
         queue.append(waiting)
         if role == WRENCH:
             self._reach[role] = self._newest_command if self._newest_command > -math.inf else t

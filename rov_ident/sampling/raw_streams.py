@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_multiply, to_core
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Message, Odometry
+from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
+from rov_ident.model.coefficients import INPUTS
 from rov_ident.sampling.despiking import largest_usual, measured_values
+from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
 from rov_ident.sampling.validation import REPEATED, RESTARTS, Validation, describe
 
@@ -31,6 +33,7 @@ class Streams:
     odometry: ``t`` (N,), position (N, 3), orientation (N, 4) w x y z, nu (N, 6) as measured.
     IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
     wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; dropped ones are estimated.
+    fins and shafts: ``inputs_t`` (I,), inputs (I, 4) of INPUTS, straight from each to the next.
     ``has_pose`` tells whether the positions mean anything; ``notes`` say what was left out.
     """
 
@@ -43,6 +46,8 @@ class Streams:
     specific_force: Array
     demand_t: Array
     demand: Array
+    inputs_t: Array
+    inputs: Array
     notes: tuple[str, ...] = ()
 
     @property
@@ -88,6 +93,7 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
         *completed(
             np.array([t for t, _ in wrench]), np.array([measured_values(m) for _, m in wrench])
         ),
+        *_driven_by(taken[DRIVE], config),
         tuple(f"left out: {reason}" for reason in describe(counts)),
     )
 
@@ -103,7 +109,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
 
     both: dict[str, Any] = {"notes": tuple(note for bag in bags for note in bag.notes)}
     for name in (f.name for f in fields(Streams) if f.name != "notes"):
-        shifts = begins if name in ("t", "imu_t", "demand_t") else [0.0] * len(bags)
+        shifts = begins if name.endswith("_t") or name == "t" else [0.0] * len(bags)
         both[name] = np.concatenate([getattr(b, name) + s for b, s in zip(bags, shifts)])
     return Streams(**both), begins
 
@@ -123,6 +129,25 @@ def _driven(
     return [message for message, drop in zip(odometry, silent, strict=True) if not drop]
 
 
+def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, Array]:
+    """Times (I,) and inputs (I, 4); one that a message lacks goes on as before.
+
+    Raises UserError if one never comes.
+    """
+    t, x = np.array([t for t, _ in taken]), np.zeros((len(taken), len(INPUTS)))
+    for name, given in config.inputs.joints.items():
+        values = [value_of(given, message) for _, message in taken]
+        known = np.array([np.nan if v is None else v for v in values])
+        have = np.isfinite(known)
+        if not have.any():
+            raise UserError(
+                f"the bag has no joint {given.joint}, which inputs.{name}.joint names: it has "
+                + (", ".join(sorted({n for _, m in taken for n in m.names})) or "none")
+            )
+        x[:, INPUTS.index(name)] = np.interp(t, t[have], known[have])
+    return t, x
+
+
 def _taken(
     messages: Iterable[tuple[str, Message]], config: Config
 ) -> tuple[dict[str, list[tuple[float, Any]]], Counter[str]]:
@@ -131,7 +156,7 @@ def _taken(
     Velocities that have not been measured again are refused here.
     """
     validation, origin = Validation(), None
-    taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: []}
+    taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: [], DRIVE: []}
     for role, message in messages:
         reason = validation.judge(role, message)
         if reason in RESTARTS:
@@ -199,11 +224,6 @@ def _rate(q: Array, omega: Array) -> Array:
     """q_dot (k, 4) = q (0, omega) / 2."""
     rates = np.insert(omega, 0, 0.0, axis=1)
     return 0.5 * quaternion_multiply(q, rates)
-
-
-def interpolated(t: Array, y: Array, at: Array) -> Array:
-    """Columns y (N, n) at times t (N,), between which they are linear, at the times ``at``."""
-    return np.stack([np.interp(at, t, column) for column in y.T], axis=1)
 
 
 def integral(t: Array, y: Array) -> Array:

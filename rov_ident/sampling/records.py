@@ -14,6 +14,7 @@ from rov_ident.core.messages import Array
 from rov_ident.effects import Acting
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
+from rov_ident.model.coefficients import INPUTS
 from rov_ident.model.equations import Model
 from rov_ident.sampling.sample import believed, joined, stretches
 from rov_ident.sampling.sampler import Sampler
@@ -75,12 +76,29 @@ def read_record(
     counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
+    notes += _said_of_inputs(config, samples)
     if len(samples) < 2:
         raise UserError(
             f"{path}: its messages make no samples"
             + (f": {'; '.join(notes)}" if notes else ", it is too short")
         )
     return Record(Path(path), samples, counts, tuple(notes), bag.sha256)
+
+
+def _said_of_inputs(config: Config, samples: NDArray[np.void]) -> list[str]:
+    """Which inputs are not heard, or never change: their coefficients cannot be told."""
+    said = [
+        f"{', '.join(names)}: held, as {name} counts as zero: name its joint in inputs.{name}.joint"
+        for name, names in config.unheard.items()
+    ]
+    for name, given in config.inputs.joints.items():
+        x = samples["inputs"][:, 1, INPUTS.index(name)] if len(samples) else np.zeros(0)
+        if len(x) and np.ptp(x) == 0.0:
+            said.append(
+                f"{name} (joint {given.joint}) stays at {x[0]:.3g} throughout: it is stuck, or "
+                "never moved, and nothing tells its coefficients"
+            )
+    return said
 
 
 def predicted(
@@ -105,9 +123,10 @@ def predicted(
         slope = part["wrench_slope"] - part["surroundings_slope"]
         # a sample's wrench belongs to the interval that ends there
         thrust, slope = (np.vstack([values[1:], values[-1:]]) for values in (thrust, slope))
+        inputs = np.vstack([part["inputs"][1:, 0], part["inputs"][-1:, 0]])
         out[first:end] = open_loop(
             model, part["t"], thrust, over_ground(part), part["orientation"], horizon, slope, free,
-            effects,
+            effects, inputs,
         )  # fmt: skip
     return out
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core.jit import record
 from rov_ident.core.messages import Array
+from rov_ident.model.coefficients import INPUTS
 
 NO_SIDES = np.zeros((1, 13, 0))
 
@@ -28,6 +29,11 @@ SAMPLE = record(
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
         ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
+        (
+            "inputs",
+            "f8",
+            (2, len(INPUTS)),
+        ),  # mean over dt, and at t; zeros where none is configured
         ("hold", "f8"),  # s: how long a command acts, of late; 0: not known yet
         ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
         ("surroundings_slope", "f8", (6,)),

@@ -22,10 +22,21 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.frames import to_core
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry
+from rov_ident.core.messages import (
+    DRIVE,
+    IMU,
+    ODOMETRY,
+    WRENCH,
+    Array,
+    Imu,
+    Joints,
+    Message,
+    Odometry,
+)
 from rov_ident.effects import velocity_delay
 from rov_ident.sampling.acting_wrench import ActingWrench
 from rov_ident.sampling.despiking import Despiker, measured_values
+from rov_ident.sampling.driven import Driven
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.kinematic_filter import KinematicFilter
 from rov_ident.sampling.late_velocities import LateVelocities
@@ -39,7 +50,7 @@ _NO_WRENCH = (_NO_VALUES, _NO_VALUES, _NO_VALUES)
 
 
 class Sampler:
-    """Merges the three topics into samples; the only part of the estimation that waits.
+    """Merges the topics into samples; the only part of the estimation that waits.
 
     ``counts`` holds how many messages of each kind were taken or, by reason, refused; bad data
     never raises. ``origin`` is the stamp [ns] of t = 0. Who wants the single commands (t [s],
@@ -56,6 +67,7 @@ class Sampler:
         self._despiker = Despiker(config, self.counts)
         self.kinematic_filter = KinematicFilter(config)
         self._acting = ActingWrench(config)
+        self._driven = Driven(config, self.counts)
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
         self.configure(config)
@@ -70,10 +82,12 @@ class Sampler:
         self._despiker.configure(config)
         self.kinematic_filter.configure(config)
         self._acting.configure(config, self._jacobians)
+        self._driven.configure(config)
 
     def _take_delay(self, config: Config) -> None:
         self._late.delay = velocity_delay(config.effects)
         self._queues.grace = config.grace + self._late.delay
+        self._queues.await_drive(config.inputs.joints)
 
     def recentre(self, config: Config) -> None:
         """Go on with other values of the effects' parameters; their memory stays."""
@@ -91,6 +105,7 @@ class Sampler:
         self._despiker.clear()
         self.kinematic_filter.clear()
         self._acting.clear()
+        self._driven.clear()
         self._previous = math.nan
         if self._jacobians is not None:
             self._jacobians.forget()
@@ -111,7 +126,7 @@ class Sampler:
         if t < self._previous:
             self.counts[f"{role}: too late"] += 1
             self._queues.wait_longer(t)
-            if role != WRENCH:
+            if role not in (WRENCH, DRIVE):
                 return self._none
         self._enqueue(role, message)
         return self._emit(final=False)
@@ -128,6 +143,10 @@ class Sampler:
         if isinstance(message, Odometry):
             message = self.validation.marked(message)
         message = to_core(message, self._frames)
+        if isinstance(message, Joints):
+            self._driven.push(t, message)
+            self._queues.reached(DRIVE, t)
+            return
         if isinstance(message, Odometry):
             timed, waiting = self._late.push(t, message), self._queues.odometry
             if timed is None:
@@ -163,6 +182,9 @@ class Sampler:
         self._previous = t
         wrench = self._acting.over(begin, t, self._queues[WRENCH], self._despiker, self.commands)
         whole, sample, sides = one_sample(self._size)
+        missing = ""
+        if self._driven.used:
+            sample["inputs"][0], missing = self._driven.over(begin, t)
         imu = self._queues[IMU].popleft().message if instant.has_imu else None
         odometry, age = None, 0.0
         if instant.has_odometry:
@@ -187,8 +209,9 @@ class Sampler:
             self.counts[f"odom: {why}"] += 1
         if anew:
             self.counts["odom: contradicts the first, begun anew"] += 1
-        if wrench is None or not known:
-            self.counts[f"sample: no {'wrench' if wrench is None else 'odometry yet'}"] += 1
+        if wrench is None or not known or missing:
+            why = "wrench" if wrench is None else "odometry yet" if not known else missing
+            self.counts[f"sample: no {why}"] += 1
             self._previous = math.nan
             return None
         self._acting.surround(sample)

@@ -6,7 +6,7 @@ Bad data never raises. Whatever is refused leaves everything as it was.
 from collections import Counter
 from collections.abc import Mapping
 
-from rov_ident.core.messages import Message, Odometry, fault
+from rov_ident.core.messages import Joints, Message, Odometry, fault
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
 """Counted where stamps begin anew: a bag that starts over, another computer."""
@@ -77,6 +77,8 @@ class Validation:
         """What is wrong with the fields or the frame, or an empty string."""
         if wrong := fault(message):
             return wrong
+        if isinstance(message, Joints):
+            return ""
         frames: tuple[str, ...] = (message.frame_id,)
         if isinstance(message, Odometry):
             frames = (message.frame_id, message.child_frame_id)

@@ -12,11 +12,12 @@ from rov_ident.core.jit import inner, lean, record
 from rov_ident.core.quaternions import rotate, rotation_of
 from rov_ident.core.runge_kutta import NODES, runge_kutta
 from rov_ident.effects import Acting, add_surroundings, surroundings
-from rov_ident.model.coefficients import EXTENDED_SIZE
+from rov_ident.model.coefficients import EXTENDED_SIZE, INPUTS
 from rov_ident.model.equations import (
     CURRENT,
     Array,
     Model,
+    extend_inputs,
     generalized_force,
     six,
     symmetric_product,
@@ -52,13 +53,14 @@ class Guide(NamedTuple):
 def simulate(
     model: Model, t: Array, wrench: Array, nu: Array | None = None, position: Array | None = None,
     orientation: Array | None = None, wrench_slope: Array | None = None,
-    guide: Guide | None = None, effects: Acting | None = None,
+    guide: Guide | None = None, effects: Acting | None = None, inputs: Array | None = None,
 ) -> Trajectory:  # fmt: skip
     """Integrate from the first instant of ``t`` (N,), the wrench (N, 6) held from each to the next.
 
     nu (6,), position (3,) and orientation (4,) are the state at ``t[0]``: at rest, at the origin
     and level by default. ``wrench_slope`` (N, 6) lets the wrench change linearly in each interval
-    about its mean. With a ``guide`` only some components are simulated, the others follow it.
+    about its mean. ``inputs`` (N, 4), of INPUTS, are held like the wrench. With a
+    ``guide`` only some components are simulated, the others follow it.
 
     Of ``effects`` wrenches and current act along the simulated motion, at the instants ``t`` since
     the first message; effects on the input are the caller's (:func:`rov_ident.effects.acted`).
@@ -89,6 +91,7 @@ def simulate(
         np.ascontiguousarray(t, dtype=float),
         np.ascontiguousarray(wrench, dtype=float),
         np.empty((0, 6)) if wrench_slope is None else np.ascontiguousarray(wrench_slope),
+        np.zeros((n, len(INPUTS))) if inputs is None else np.ascontiguousarray(inputs),
         guide.free,
         np.ascontiguousarray(guide.nu),
         np.ascontiguousarray(guide.orientation),
@@ -108,13 +111,14 @@ def simulate(
 def open_loop(
     model: Model, t: Array, wrench: Array, nu: Array, orientation: Array, horizon: float,
     wrench_slope: Array | None = None, free: NDArray[np.bool_] | None = None,
-    effects: Acting | None = None,
+    effects: Acting | None = None, inputs: Array | None = None,
 ) -> Array:  # fmt: skip
     """Velocities (N, 6) predicted open loop over windows of ``horizon`` seconds.
 
     Each window starts from the measured ``nu`` (N, 6) and ``orientation`` (N, 4) at its first
     sample; rows whose prediction has left all reason (a diverging model) hold infinity. Components
-    not marked in ``free`` (6,) follow the measurement. ``effects`` as for :func:`simulate`.
+    not marked in ``free`` (6,) follow the measurement. ``effects`` and ``inputs`` as for
+    :func:`simulate`.
     """
     free = np.ones(6, dtype=bool) if free is None else free
     slope = np.zeros_like(wrench) if wrench_slope is None else wrench_slope
@@ -126,7 +130,7 @@ def open_loop(
             guide = Guide(free, nu[window], orientation[window])
             predicted[window] = simulate(
                 model, t[window], wrench[window], nu[first], None, orientation[first],
-                slope[window], guide, effects,
+                slope[window], guide, effects, None if inputs is None else inputs[window],
             ).nu  # fmt: skip
         except UserError:
             predicted[window] = np.inf
@@ -187,7 +191,7 @@ def _derivative(structure, theta, restoring, guided, s, rate):
 @lean
 def _simulate(
     around, current, structure, added_mass, mass, inverse, theta, restoring, t, wrench,
-    wrench_slope, free, guide, attitude, start, max_step, scratch, out,
+    wrench_slope, inputs, free, guide, attitude, start, max_step, scratch, out,
 ):  # fmt: skip
     """Classical Runge-Kutta; out (N, 19): position, quaternion, nu, nu_dot.
 
@@ -215,6 +219,8 @@ def _simulate(
                 if j >= 3:
                     for k in range(4):
                         state[3 + k] = attitude[i, k]
+        extend_inputs(1, structure, inputs[i], s.extended)
+        extend_inputs(1, structure, inputs[i], s.current.extended)
         steps = max(1, int(np.ceil(span / max_step - 1e-9)))
         dt = span / steps
         for n in range(steps):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rov_ident.config import Config
+from rov_ident.config import Config, Shaft
 from rov_ident.core.frames import (
     acceleration_of_arm,
     quaternion_from_euler,
@@ -14,7 +14,19 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
     velocity_of_arm,
 )
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Array, Imu, Message, Odometry, Wrench
+from rov_ident.core.linalg import interpolated
+from rov_ident.core.messages import (
+    DRIVE,
+    IMU,
+    ODOMETRY,
+    WRENCH,
+    Array,
+    Imu,
+    Joints,
+    Message,
+    Odometry,
+    Wrench,
+)
 from rov_ident.effects import (
     acted,
     compiled,
@@ -25,6 +37,7 @@ from rov_ident.effects import (
     velocity_delay,
 )
 from rov_ident.effects.base import Reading
+from rov_ident.model.coefficients import INPUTS
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.open_loop import Trajectory, simulate
 
@@ -53,6 +66,8 @@ class Suite:
     accelerometer_bias_std: float = 0.0
     gyro_bias_std: float = 0.0
     wrench_std: float = 0.01
+    joint_rate: float = 20.0
+    joint_std: float = 0.001  # rad; of a fin, and relative of a shaft's speed
     delay: float = 0.0
     jitter: float = 0.0
     drop: float = 0.0
@@ -92,16 +107,25 @@ def dive(
 
 def measure(
     config: Config, demand_t: Array, demand: Array, duration: float, suite: Suite,
-    rng: np.random.Generator,
+    rng: np.random.Generator, inputs: Array | None = None, start: Array | None = None,
 ) -> Dive:  # fmt: skip
-    """Simulate under a wrench demanded from each of ``demand_t`` (K,) to the next, and measure."""
+    """Simulate under a wrench demanded from each of ``demand_t`` (K,) to the next, and measure.
+
+    ``inputs`` (K, 4) at these instants change in straight lines; left out, fins and propeller are
+    at zero. ``start`` (6,) is the velocity at first, at rest by default.
+    """
+    inputs = np.zeros((len(demand_t), len(INPUTS))) if inputs is None else inputs
     # Every topic starts at a phase of its own, as real drivers do.
     odometry_t = _clock(suite.odometry_rate, duration, rng)
     imu_t = _clock(suite.imu_rate, duration, rng)
     t = np.unique(np.concatenate([demand_t, odometry_t, imu_t, np.arange(0.0, duration, 0.005)]))
     held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
     effects = compiled(of_the_vehicle(config.effects))
-    truth = simulate(config.dynamics, t, acted(effects, t, held), effects=effects)
+    driven = interpolated(demand_t, inputs, t)
+    truth = simulate(
+        config.dynamics, t, acted(effects, t, held), start, effects=effects,
+        inputs=0.5 * (driven + np.vstack([driven[1:], driven[-1:]])),
+    )  # fmt: skip
     sensed = sense(_reading(truth, config), config.effects)
     late = t - velocity_delay(config.effects)
     delayed = np.stack([np.interp(late, t, column) for column in sensed.linear.T], axis=1)
@@ -137,6 +161,13 @@ def measure(
         noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
         messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
 
+    if config.inputs.joints:
+        own = rng.spawn(1)[0]
+        joint_t = _clock(suite.joint_rate, duration, own)
+        driven = interpolated(demand_t, inputs, joint_t)
+        for at, x in zip(joint_t, driven, strict=True):
+            messages.append(_stamped(at, DRIVE, _joints(config, x, suite.joint_std, own)))
+
     keep = rng.random(len(messages)) >= suite.drop
     late = suite.delay + suite.jitter * np.abs(rng.standard_normal(len(messages)))
     arrived = [
@@ -152,6 +183,20 @@ def measure(
         ordered.append((newest[role], role, message))
     ordered.sort(key=lambda m: m[0])
     return Dive(truth, held, ordered)
+
+
+def _joints(config: Config, inputs: Array, std: float, rng: np.random.Generator) -> Joints:
+    """The state of the configured joints for inputs (4,), with noise."""
+    given = config.inputs.joints
+    position, velocity = np.zeros(len(given)), np.zeros(len(given))
+    for k, (name, joint) in enumerate(given.items()):
+        x, noise = inputs[INPUTS.index(name)] / joint.scale, std * rng.standard_normal()
+        if isinstance(joint, Shaft):
+            velocity[k] = x * (1.0 + noise)
+        else:
+            position[k] = x + noise
+    names = tuple(joint.joint for joint in given.values())
+    return Joints(0, "", names, _coarse(position), _coarse(velocity))
 
 
 def _reading(truth: Trajectory, config: Config) -> Reading:

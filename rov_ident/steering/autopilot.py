@@ -1,11 +1,11 @@
 """Closed-loop simulation of a vehicle with fins: zigzag, turn, heading change, dive to depth.
 
-A law looks at the motion and orders fin angles; servos follow at a limited rate; the fins' wrench
-``u^2 delta`` acts beside the propeller's. The equations of motion are those of
-:mod:`rov_ident.simulation.open_loop`, run from control step to control step.
+A law looks at the motion and orders fin angles; servos follow at a limited rate. The equations of
+motion are those of :mod:`rov_ident.simulation.open_loop`, run from control step to control step.
 """
 
 import io
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -15,6 +15,7 @@ import numpy as np
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, wrap_angle
 from rov_ident.core.messages import Array
+from rov_ident.model.coefficients import INPUT_LETTERS, INPUTS
 from rov_ident.model.equations import Model
 from rov_ident.simulation.open_loop import simulate
 from rov_ident.steering.zigzag import Zigzag
@@ -44,13 +45,24 @@ class Servo:
 
 @dataclass(frozen=True)
 class Run:
-    """t (n,), position (n, 3), angles (n, 3) roll pitch yaw, nu (n, 6), fins {letter: (n,)}."""
+    """t (n,), position (n, 3), angles (n, 3) roll pitch yaw, nu (n, 6), fins {letter: (n,)}.
+
+    ``thrust`` (n,) [N] acts from each instant to the next, or the propeller turns at
+    ``revolutions`` (n,) [1/s].
+    """
 
     t: Array
     position: Array
     angles: Array
     nu: Array
     fins: Mapping[str, Array]
+    thrust: Array
+    revolutions: Array
+
+    @property
+    def inputs(self) -> Array:
+        """(n, 4), of INPUTS."""
+        return np.column_stack([*(self.fins[x] for x in "sra"), self.revolutions])
 
     def zigzag(self, name: str = "simulated") -> Zigzag:
         """Heading and rudder."""
@@ -65,15 +77,17 @@ def steer(
     servo: Servo = Servo(),
     step: float = 0.02,
     depth: float = 0.0,
+    speeds: Callable[[float], float] | None = None,
 ) -> Run:
     """Run a law for ``duration`` [s] from straight level motion at ``speed`` [m/s].
 
-    The propeller keeps the thrust of that speed. Fin angles are linear within a step, of which
-    their wrench takes the middle.
+    The propeller keeps the thrust of that speed, or of that which ``speeds`` gives for the time
+    [s]; where the model knows what the propeller does, by its revolutions. Fin
+    angles are linear within a step, of which the middle acts.
 
     Raises UserError if the vehicle has no fins in its coefficients, or the motion diverges.
     """
-    if not model.fins:
+    if not model.inputs:
         raise UserError(
             "the vehicle has no fin coefficients: add N_uudr, Y_uudr (rudder) and M_uuds, Z_uuds "
             "(stern planes) to coefficients"
@@ -81,27 +95,40 @@ def steer(
     n = round(duration / step) + 1
     position, orientation = np.array([0.0, 0.0, depth]), np.array([1.0, 0.0, 0.0, 0.0])
     nu, surge = np.eye(6)[0] * speed, np.eye(6)[0]
-    thrust = surge * model.wrench(nu, np.zeros(6), np.array([0.0, 0.0, 1.0]))
     angles = np.zeros(3)
     fins = dict.fromkeys("sra", 0.0)
-    out = np.empty((n, 15))
+    out = np.empty((n, 17))
     for i in range(n):
-        out[i] = np.concatenate([position, angles, nu, [fins["s"], fins["r"], fins["a"]]])
+        thrust, turning = _propulsion(model, speed if speeds is None else speeds(i * step))
+        driven = [fins["s"], fins["r"], fins["a"], thrust, turning]
+        out[i] = np.concatenate([position, angles, nu, driven])
         ordered = law(Now(i * step, position, angles, nu))
-        middle = {}
+        middle = np.zeros((2, len(INPUTS)))
+        middle[:, INPUTS.index("n")] = turning
         for letter, now in fins.items():
             wanted = np.clip(ordered.get(letter, 0.0), -servo.limit, servo.limit)
             fins[letter] = now + float(np.clip(wanted - now, -servo.rate * step, servo.rate * step))
-            middle[letter] = 0.5 * (now + fins[letter])
-        push = thrust + model.fin_wrench(nu[0], middle)
-        both = np.array([0.0, step]), np.tile(push, (2, 1))
-        run = simulate(model, *both, nu, position, orientation)
+            middle[:, INPUT_LETTERS.index(letter)] = 0.5 * (now + fins[letter])
+        both = np.array([0.0, step]), np.tile(thrust * surge, (2, 1))
+        run = simulate(model, *both, nu, position, orientation, inputs=middle)
         position, orientation, nu = run.position[1], run.orientation[1], run.nu[1]
         yaw = angles[2]
         angles = np.array(quaternion_to_euler(orientation))
         angles[2] = yaw + wrap_angle(angles[2] - yaw)
     t: Array = step * np.arange(n, dtype=np.float64)
-    return Run(t, out[:, :3], out[:, 3:6], out[:, 6:12], dict(zip("sra", out[:, 12:].T)))
+    found = dict(zip("sra", out[:, 12:15].T))
+    return Run(t, out[:, :3], out[:, 3:6], out[:, 6:12], found, out[:, 15], out[:, 16])
+
+
+def _propulsion(model: Model, speed: float) -> tuple[float, float]:
+    """Thrust [N], or revolutions [1/s] of a propeller in the model, for straight motion."""
+    nu, known = np.eye(6)[0] * speed, model.values
+    thrust = float(model.wrench(nu, np.zeros(6), np.array([0.0, 0.0, 1.0]))[0])
+    square, linear = known.get("X_nn", 0.0), known.get("X_n", 0.0)
+    linear += speed * known.get("X_un", known.get("X_nu", 0.0))
+    if square > 0.0:
+        return 0.0, float((np.sqrt(linear**2 + 4.0 * square * thrust) - linear) / (2.0 * square))
+    return (0.0, thrust / linear) if linear > 0.0 else (thrust, 0.0)
 
 
 _STEEPEST = float(np.radians(25.0))  # pitch on the way to a depth
@@ -155,7 +182,23 @@ class Kempf:
         return {"r": self._side * self.rudder}
 
 
-MANOEUVRES = ("zigzag", "turn", "heading", "dive")
+def alternating(
+    values: tuple[float, ...], shortest: float, longest: float, rng: np.random.Generator
+) -> Callable[[float], float]:
+    """One of the values after the other, each held for a random time [s] within the limits."""
+    ends = [0.0]
+
+    def at(t: float) -> float:
+        while ends[-1] <= t:
+            ends.append(ends[-1] + rng.uniform(shortest, longest))
+        return values[(bisect_right(ends, t) - 1) % len(values)]
+
+    return at
+
+
+MANOEUVRES = ("zigzag", "turn", "heading", "dive", "waypoints")
+"""Of vehicles with fins. `waypoints`: the autopilot is given other headings, depths and speeds in
+turn, so that fins swing between their limits by themselves (Zhao, Xie and Qiao 2018)."""
 
 
 def manoeuvre(
@@ -167,11 +210,14 @@ def manoeuvre(
     duration: float = 100.0,
     speed: float = 1.5,
     servo: Servo = Servo(),
+    step: float = 0.02,
+    seed: int = 0,
 ) -> Run:
     """A manoeuvre by name, the depth held where the vehicle has stern planes.
 
     ``angle`` [rad] is the rudder's for `zigzag` (reversed at ``switch``, the same by default) and
-    `turn`, the course for `heading`; `dive` goes to ``depth`` [m].
+    `turn`, the course for `heading`; `dive` goes to ``depth`` [m]. `waypoints` go to either side
+    by ``angle``, down to ``depth`` and up, at times drawn by ``seed``.
 
     Raises UserError for an unknown name, or fins that the vehicle lacks for it.
     """
@@ -179,6 +225,17 @@ def manoeuvre(
     if not (pitch if name == "dive" else yaw):
         lacking = "M_uuds" if name == "dive" else "N_uudr"
         raise UserError(f"the vehicle has no {lacking}: add it to coefficients for a {name}")
+    if name == "waypoints":
+        rng = np.random.default_rng(seed)
+        course = alternating((angle, -angle), 6.0, 15.0, rng)
+        level = alternating((depth, 0.0), 10.0, 25.0, rng)
+        speeds = alternating((speed, 0.7 * speed, 1.2 * speed), 8.0, 20.0, rng)
+
+        def waypoints(now: Now) -> Mapping[str, float]:
+            there = to_heading(course(now.t), yaw)(now)
+            return {**there, **to_depth(level(now.t), pitch)(now)} if pitch else there
+
+        return steer(model, waypoints, duration, speed, servo, step, speeds=speeds)
     laws: dict[str, Law] = {
         "zigzag": Kempf(angle, angle if switch is None else switch),
         "turn": turn(angle),
@@ -190,7 +247,7 @@ def manoeuvre(
     law = laws[name]
     if name != "dive" and pitch:
         law = both(law, to_depth(0.0, pitch))
-    return steer(model, law, duration, speed, servo)
+    return steer(model, law, duration, speed, servo, step)
 
 
 def to_csv(run: Run, step: float, heading_noise: float = 0.0, seed: int = 0) -> str:

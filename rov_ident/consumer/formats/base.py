@@ -50,13 +50,13 @@ def diagonal(values: Mapping[str, float], kind: str) -> list[float]:
 
 def lost_terms(coefficients: Iterable[Coefficient], held: Collection[str]) -> list[str]:
     """One sentence naming the coefficients outside ``held``, if any."""
-    names = [c.name for c in coefficients if c.name not in held]
+    names = [c.name for c in coefficients if c.name not in held and not c.inputs]
     return [f"the coefficients {', '.join(names)} have no place in it"] if names else []
 
 
 def lost_besides(config: Config, held: Collection[str] = ()) -> list[str]:
-    """What else no format has a place for: the coefficients of fins; the effects that act outside
-    the rigid body and are not in ``held``; where sensors and thrusters sit."""
+    """What else no format has a place for: the coefficients of fins and propeller; the effects
+    that act outside the rigid body and are not in ``held``; where sensors and thrusters sit."""
     mounted = {
         "odometry.position": np.any(config.odometry.position),
         "imu.position": np.any(config.imu.position),
@@ -65,7 +65,7 @@ def lost_besides(config: Config, held: Collection[str] = ()) -> list[str]:
     }
     outside = [name for name in config.effects if EFFECTS[name].body is None and name not in held]
     kinds = {
-        "coefficients of fins": config.model.fins,
+        "coefficients of fins and propeller": config.model.fins,
         "effects": outside,
         "settings": [name for name, there in mounted.items() if there],
     }

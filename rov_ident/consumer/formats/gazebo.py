@@ -95,7 +95,7 @@ def write(config: Config) -> Written:
     for c in model.coefficients:
         if c.is_one_sided:
             one_sided.append(c.name)
-        elif not c.is_added_mass:
+        elif not (c.is_added_mass or c.inputs):
             tag, sign = _damping_tag(c)
             _text(plugin, tag, sign * values[c.name])
     if one_sided:

@@ -17,7 +17,7 @@ def write(config: Config) -> Written:
     """``vehicle = NAME()`` with the fields above."""
     model, body = config.dynamics, config.dynamics.body
     values = config.model.values
-    linear = [c for c in model.coefficients if c.left == ONE and not c.is_one_sided]
+    linear = [c for c in model.coefficients if c.left == ONE and not (c.is_one_sided or c.inputs)]
     damping = np.zeros((6, 6))
     for c in linear:
         damping[c.row, c.velocity] = -values[c.name]

@@ -1,0 +1,249 @@
+"""Fin angles and shaft speeds as inputs: equations, joints, samples, and coefficients from them."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rov_ident import config as configuration
+from rov_ident.api.simulation import simulate
+from rov_ident.config.prior import prior_of
+from rov_ident.core.errors import UserError
+from rov_ident.core.messages import DRIVE, Joints
+from rov_ident.io import cdr
+from rov_ident.io.csv_log import import_csv
+from rov_ident.io.write_messages import write_messages
+from rov_ident.model.coefficients import AXES, INPUT_LETTERS, INPUTS, input_catalogue
+from rov_ident.model.equations import build
+from rov_ident.sampling.records import predicted, read_record
+from rov_ident.simulation.open_loop import simulate as integrate
+from rov_ident.simulation.virtual_sensors import Suite
+
+ROOT = Path(__file__).resolve().parents[1]
+REMUS = ROOT / "config" / "remus100.yaml"
+HEAVY = ROOT / "config" / "bluerov2_heavy.yaml"
+DOWN = np.array([0.0, 0.0, 1.0])
+PROPELLED = {"X_nn": 0.02, "K_nn": -0.0008, "X_un": -0.01}
+
+
+@pytest.fixture(scope="module")
+def remus():
+    return configuration.load(REMUS)
+
+
+def with_inputs(config, **joints):
+    """The configuration with these joints for its inputs, and all coefficients estimated."""
+    plain = configuration.to_parameters(config)
+    plain.pop("estimate", None)
+    plain["inputs"] = {name: {"joint": joint} for name, joint in joints.items()}
+    return configuration.from_parameters(plain)
+
+
+# ------------------------------------------------------------------ equations
+
+
+def by_its_name(name, u, inputs):
+    """What a coefficient of an input multiplies, read off its name letter by letter."""
+    x = dict(zip(INPUT_LETTERS, inputs, strict=True))
+    term = name.split("_")[1]
+    if "d" not in term:
+        n = x["n"]
+        return {"n": n, "nn": abs(n) * n, "un": u * n}[term]
+    speed, _, fin = term.partition("d")
+    angle = x[fin[0]]
+    if len(fin) > 1:  # mirror symmetry: port-starboard for r and a, up-down for s
+        even = name[0] == "X" or (name[0] in "ZM" and fin[0] in "ra")
+        angle = angle**2 if even else abs(angle) * angle
+    n = x["n"]
+    return {"": 1.0, "u": u, "uu": u * u, "nn": abs(n) * n}[speed] * angle
+
+
+def test_each_coefficient_of_an_input_is_its_formula(remus):
+    rng = np.random.default_rng(3)
+    for c in input_catalogue():
+        nu, inputs = rng.normal(size=6), rng.normal(size=4)
+        model = build(remus.model.body, {**remus.model.values, "X_udot": -1.0, c.name: 0.7})
+        if c.name in remus.model.values:
+            model = model.with_values({c.name: 0.7})
+        other = {name: 0.0 for name in model.fins if name != c.name}
+        wrench = model.with_values(other).input_wrench(nu, inputs)
+        expected = np.zeros(6)
+        expected[AXES.index(c.name[0])] = 0.7 * by_its_name(c.name, nu[0], inputs)
+        np.testing.assert_allclose(wrench, expected, atol=1e-11)
+
+
+def test_regressor_and_both_dynamics_agree_with_inputs(remus):
+    model = build(remus.model.body, {**remus.model.values, **PROPELLED})
+    rng = np.random.default_rng(4)
+    nu, nu_dot, inputs = rng.normal(size=6), rng.normal(size=6), rng.normal(size=4)
+    tau = model.wrench(nu, nu_dot, DOWN, inputs)
+    np.testing.assert_allclose(model.acceleration(nu, tau, DOWN, inputs), nu_dot, atol=1e-9)
+    none = model.with_theta(np.zeros_like(model.theta)).wrench(nu, nu_dot, DOWN, inputs)
+    rows = model.regressor(nu, nu_dot, inputs)
+    np.testing.assert_allclose(none + rows @ model.theta, tau, atol=1e-9)
+    still = model.wrench(nu, nu_dot, DOWN)
+    np.testing.assert_allclose(still - tau, model.input_wrench(nu, inputs), atol=1e-9)
+
+
+def test_constant_propeller_reaches_its_terminal_speed(remus):
+    """X_nn n^2 + X_uu u^2 = 0: u = n sqrt(X_nn / -X_uu)."""
+    model = build(remus.model.body, {"X_udot": -0.93, "X_uu": -1.62, "X_nn": 0.02})
+    t = np.linspace(0.0, 300.0, 301)
+    inputs = np.tile([0.0, 0.0, 0.0, 12.0], (len(t), 1))
+    run = integrate(model, t, np.zeros((len(t), 6)), inputs=inputs)
+    assert run.nu[-1, 0] == pytest.approx(12.0 * math.sqrt(0.02 / 1.62), rel=1e-6)
+
+
+def test_vehicle_without_such_coefficients_has_no_inputs():
+    config = configuration.load(HEAVY)
+    assert config.model.inputs == () and len(config.model.structure.inputs) == 0
+    assert config.inputs.joints == {}
+
+
+# ------------------------------------------------------------------ configuration
+
+
+def test_coefficients_wait_for_their_input(remus):
+    deaf = with_inputs(remus, delta_r="rudder")
+    assert deaf.unheard == {"delta_s": ("Z_uuds", "M_uuds")}
+    assert not {"Z_uuds", "M_uuds"} & set(deaf.estimate)
+    assert {"Y_uudr", "N_uudr"} < set(deaf.estimate) == set(prior_of(deaf).names)
+    plain = configuration.to_parameters(deaf)
+    plain["estimate"] = ["X_uu", "M_uuds"]
+    with pytest.raises(UserError, match=r"M_uuds depends on delta_s.*inputs\.delta_s\.joint"):
+        configuration.from_parameters(plain)
+
+
+def test_joints_survive_the_file(remus, tmp_path):
+    given = with_inputs(remus, delta_r="rudder", delta_s="planes", n="shaft")
+    configuration.dump(given, tmp_path / "again.yaml")
+    again = configuration.load(tmp_path / "again.yaml")
+    assert again.inputs == given.inputs and again.estimate == given.estimate
+
+
+# ------------------------------------------------------------------ joints
+
+
+def test_joint_states_are_those_of_another_implementation():
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    message = Joints(
+        1_500_000_007, "base", ("a", "rudder"), np.array([0.1, -0.2]), np.array([3.0, 4.0])
+    )
+    other = store.deserialize_cdr(cdr.encode(message), cdr.JOINTS_TYPE)
+    assert other.name == ["a", "rudder"] and other.header.frame_id == "base"
+    np.testing.assert_array_equal(other.position, message.position)
+    np.testing.assert_array_equal(other.velocity, message.velocity)
+    assert len(other.effort) == 0
+    again = cdr.decode_joints(bytes(store.serialize_cdr(other, cdr.JOINTS_TYPE)))
+    assert again[:3] == message[:3]
+    np.testing.assert_array_equal(again.velocity, message.velocity)
+
+
+def run_of(config, seed, duration=20.0, **sensors):
+    return simulate(
+        config, manoeuvre="waypoints", duration=duration, seed=seed, sensors=Suite(**sensors)
+    )
+
+
+def record_of(config, messages, path):
+    write_messages(path, messages)
+    return read_record(path, config)
+
+
+def test_samples_hold_the_inputs_mean_and_end(remus, tmp_path):
+    """Between the joints' messages in straight lines: as those of the messages, integrated."""
+    run = run_of(remus, 3, joint_std=0.0)
+    record = record_of(remus, run.messages, tmp_path / "run.mcap")
+    joints = [m for _, role, m in run.messages if role == DRIVE]
+    origin = record.counts and min(m.stamp for _, _, m in run.messages)
+    t = np.array([(m.stamp - origin) * 1e-9 for m in joints])
+    rudder = np.array([m.position[m.names.index("rudder")] for m in joints])
+    samples = record.samples[5:]
+    at = INPUTS.index("delta_r")
+    np.testing.assert_allclose(
+        samples["inputs"][:, 1, at], np.interp(samples["t"], t, rudder), atol=1e-9
+    )
+    fine = np.linspace(0.0, 1.0, 2001)
+    for sample in samples[::97]:
+        along = np.interp(sample["t"] - sample["dt"] * fine, t, rudder)
+        assert sample["inputs"][0, at] == pytest.approx(np.trapezoid(along, fine), abs=1e-7)
+    assert not samples["inputs"][:, :, [INPUTS.index("delta_a"), INPUTS.index("n")]].any()
+
+
+def test_own_simulation_is_followed_without_error(remus, tmp_path):
+    """With the fins in the samples the truth predicts itself; with fins at zero it does not."""
+    run = run_of(remus, 5, linear_std=1e-6, angular_std=1e-6, wrench_std=0.0, joint_std=0.0,
+                 gyro_std=1e-6, accelerometer_std=1e-5, attitude_std=1e-7)  # fmt: skip
+    record = record_of(remus, run.messages, tmp_path / "run.mcap")
+    error = predicted(remus.dynamics, record.samples, 5.0) - record.samples["nu"]
+    deaf = record.samples.copy()
+    deaf["inputs"] = 0.0
+    worse = predicted(remus.dynamics, deaf, 5.0) - record.samples["nu"]
+    rms, without = (np.sqrt(np.mean(e**2, axis=0)) for e in (error, worse))
+    assert (rms[[1, 2, 4, 5]] < 0.02 * without[[1, 2, 4, 5]]).all()
+
+
+def test_missing_input_is_counted_and_said(remus, tmp_path):
+    messages = run_of(remus, 3).messages
+    begin = messages[0][0]
+    silent = [m for m in messages if m[1] != DRIVE or m[0] < begin + 8e9]
+    record = record_of(remus, silent, tmp_path / "silent.mcap")
+    assert 6.0 < record.samples["t"][-1] < 10.0
+    assert any(re.search(r"sample: no delta_s \(\d+\)", note) for note in record.notes)
+    without = [m for m in messages if m[1] != DRIVE]
+    with pytest.raises(UserError, match="no joint_states topic"):
+        record_of(remus, without, tmp_path / "without.mcap")
+    other = with_inputs(remus, delta_r="rudder_joint", delta_s="stern_planes")
+    with pytest.raises(UserError, match="no delta_r"):
+        record_of(other, messages, tmp_path / "other.mcap")
+
+
+def test_stuck_input_is_said(remus, tmp_path):
+    def stuck(message):
+        return message._replace(position=np.where([False, True], 0.1, message.position))
+
+    messages = [
+        (at, role, stuck(m) if role == DRIVE else m) for at, role, m in run_of(remus, 3).messages
+    ]
+    notes = record_of(remus, messages, tmp_path / "stuck.mcap").notes
+    assert any("delta_r (joint rudder) stays at 0.1 throughout" in note for note in notes)
+    assert not any("delta_s (joint" in note for note in notes)
+
+
+def test_unnamed_joints_are_said(remus, tmp_path):
+    deaf = with_inputs(remus, delta_s="stern_planes")
+    notes = record_of(deaf, run_of(remus, 3).messages, tmp_path / "deaf.mcap").notes
+    assert any("Y_uudr, N_uudr: held" in n and "inputs.delta_r.joint" in n for n in notes)
+
+
+# ------------------------------------------------------------------ from a plain log
+
+
+def test_import_of_angles_and_revolutions(remus, tmp_path):
+    t = np.arange(0.0, 10.0, 0.05)
+    columns = {"t_s": t, **{name: np.zeros_like(t) for name in "vwpqr"}, "u": 1.5 + 0.0 * t}
+    columns |= {"delta_r": 0.2 * np.sin(t), "delta_s": 0.1 * np.cos(t), "rpm": 600.0 + 60.0 * t}
+    rows = np.column_stack(list(columns.values()))
+    log = tmp_path / "log.csv"
+    np.savetxt(log, rows, delimiter=",", header=",".join(columns), comments="")
+    report = import_csv([log], tmp_path / "log.mcap")
+    assert any("no X Y Z K M N given" in note for note in report.notes)
+    config = with_inputs(remus, delta_s="delta_s", delta_r="delta_r", n="n")
+    samples = read_record(tmp_path / "log.mcap", config).samples
+    at = samples["t"]
+    expected = np.column_stack([0.1 * np.cos(at), 0.2 * np.sin(at), 0.0 * at, 10.0 + at])
+    np.testing.assert_allclose(samples["inputs"][:, 1], expected, atol=1e-6)
+
+
+def test_angles_in_degrees_are_refused(tmp_path):
+    t = np.arange(0.0, 1.0, 0.05)
+    columns = {"t_s": t, **{name: np.zeros_like(t) for name in "uvwpqr"}, "delta_r": 20.0 + 0 * t}
+    log = tmp_path / "log.csv"
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(log, rows, delimiter=",", header=",".join(columns), comments="")
+    with pytest.raises(UserError, match="delta_r is 20, which looks like degrees"):
+        import_csv([log], tmp_path / "log.mcap")
