@@ -15,7 +15,7 @@ from rov_ident.cli import program as cli
 from rov_ident.config import schema
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
-from rov_ident.model.coefficients import catalogue, fin_catalogue
+from rov_ident.model.coefficients import catalogue, input_catalogue
 
 _HOOKS = {
     "coefficients": "adds coefficients to the equations of motion",
@@ -238,7 +238,7 @@ def _range(p: schema.Parameter) -> str:
 
 
 def coefficients() -> str:
-    rows = [[f"`{c.name}`", c.unit, c.meaning] for c in (*catalogue(), *fin_catalogue())]
+    rows = [[f"`{c.name}`", c.unit, c.meaning] for c in (*catalogue(), *input_catalogue())]
     return (
         "# Coefficients\n\nSNAME derivatives with their usual signs: `M = M_RB - diag(X_udot, "
         "...)`, damping force `X_u u + X_uu |u|u`, negative for a hull that dissipates. A name is "

@@ -1,5 +1,6 @@
 """Fin angles and shaft speeds as inputs: equations, joints, samples, and coefficients from them."""
 
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -89,7 +90,8 @@ def test_regressor_and_both_dynamics_agree_with_inputs(remus):
 
 def test_constant_propeller_reaches_its_terminal_speed(remus):
     """X_nn n^2 + X_uu u^2 = 0: u = n sqrt(X_nn / -X_uu)."""
-    model = build(remus.model.body, {"X_udot": -0.93, "X_uu": -1.62, "X_nn": 0.02})
+    neutral = dataclasses.replace(remus.model.body, weight=300.0, buoyancy=300.0)
+    model = build(neutral, {"X_udot": -0.93, "X_uu": -1.62, "X_nn": 0.02})
     t = np.linspace(0.0, 300.0, 301)
     inputs = np.tile([0.0, 0.0, 0.0, 12.0], (len(t), 1))
     run = integrate(model, t, np.zeros((len(t), 6)), inputs=inputs)

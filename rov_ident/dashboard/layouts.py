@@ -50,7 +50,8 @@ def _tabs(
     for name in config.estimate:
         linear = own[name].left == 0 or own[name].right == 0
         damping = "Linear damping" if linear else "Other damping"
-        kinds.setdefault("Added mass" if own[name].is_added_mass else damping, []).append(name)
+        kind = "Fins and propeller" if own[name].inputs else damping
+        kinds.setdefault("Added mass" if own[name].is_added_mass else kind, []).append(name)
     if config.estimate_effects:
         kinds["Effects"] = [
             f"{effect}.{parameter}" for effect, parameter in config.estimate_effects

@@ -208,7 +208,8 @@ def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
     nu[:, :3] += water
     unknown, none = np.zeros((len(t), 3)), np.zeros((0, 3))
     held = demands[:, 0].copy(), demands[:, 1:].copy()
-    inputs = samples["inputs"][:, 1]
+    driven = samples["inputs"][:, 1]
+    times = samples["t"].copy() if driven.any() else np.zeros(0)
     return Streams(
-        t, unknown, orientation, nu, np.zeros(0), none, none, *held, samples["t"].copy(), inputs
+        t, unknown, orientation, nu, np.zeros(0), none, none, *held, times, driven[: len(times)]
     )
