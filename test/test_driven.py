@@ -255,7 +255,7 @@ def test_angles_in_degrees_are_refused(tmp_path):
 # ------------------------------------------------------------------ coefficients from dives
 
 SPREAD = 0.3  # of the coefficients, relative: uniform within
-SEEDS = range(1, 4)
+SEEDS = (1, 2)
 
 
 @pytest.fixture(scope="module")
@@ -277,9 +277,9 @@ def dives(remus, tmp_path_factory):
     return found
 
 
-@pytest.mark.parametrize("estimator", ["rls", "ukf", "ls", "ml"])
+@pytest.mark.parametrize("estimator", ["rls", "ukf"])
 def test_fin_coefficients_are_found_again(estimator, dives):
-    """Of 12 intervals of 95 % at most 2 miss (three or more: 2 % of such tests), and the error that
+    """Of 8 intervals of 95 % at most 2 miss (three or more: 0.6 % of such tests), and the error that
     the prior had, 17 %, falls to less than half in the median."""
     missed, errors = 0, []
     for given, truth, path in dives:
