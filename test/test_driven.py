@@ -279,8 +279,8 @@ def dives(remus, tmp_path_factory):
 
 @pytest.mark.parametrize("estimator", ["rls", "ukf"])
 def test_fin_coefficients_are_found_again(estimator, dives):
-    """Of 8 intervals of 95 % at most 2 miss (three or more: 0.6 % of such tests), and the error that
-    the prior had, 17 %, falls to less than half in the median."""
+    """Of 8 intervals of 95 % at most 2 miss (three or more: 0.6 % of such tests), and the error
+    that the prior had, 17 %, falls to less than half in the median."""
     missed, errors = 0, []
     for given, truth, path in dives:
         fit = ri.fit(path, given, estimator=estimator)
