@@ -390,6 +390,8 @@ def values_of(parameter: Any) -> st.SearchStrategy[Any]:
     lower, upper = max(parameter.lower, -1e6), min(parameter.upper, 1e6)
     if parameter.choices:
         return st.sampled_from(parameter.choices)
+    if parameter.type is bool:
+        return st.booleans()
     if parameter.type is str:
         return NAMES
     if parameter.type is int:

@@ -364,8 +364,45 @@ def test_what_is_left_unused_is_named(tmp_path):
     path = tmp_path / "table.csv"
     rows = [f"{u},{-3.0 * u**2},{8.0 + u},x" for u in np.linspace(0.2, 2.0, 12)]
     path.write_text("\n".join(["u,X,lift force,remark", *rows]))
-    (note,) = force_tables.read_table(path).notes
-    assert note.endswith(": lift force, remark")
+    found = force_tables.read_table(path)
+    (note,) = found.notes
+    assert note.startswith("headings not understood") and note.endswith(": lift force, remark")
+    assert found.not_understood == ("lift force", "remark")
+    result = tmp_path / "f.json"
+    assert main(["forces", str(path), "--json", str(result)]) == 0
+    assert json.loads(result.read_text())["not_understood"] == ["lift force", "remark"]
+
+
+@pytest.mark.parametrize(
+    "heading, likely",
+    [("beta(deg)", "beta_deg"), ("Drift angle [deg]", "beta_deg"), ("delta (rad)", "rudder_rad"),
+     ("yaw rate (rad/s)", "r"), ("v [m/s]", "v"), ("elevator_deg", None), ("r", None)],
+)  # fmt: skip
+def test_a_heading_that_is_likely_a_state_is_not_passed_over(tmp_path, heading, likely):
+    """Left out, its forces would be laid to the other states."""
+    path = tmp_path / "table.csv"
+    rows = [f"{u},{-3.0 * u**2},{2.0 + u}" for u in np.linspace(0.2, 2.0, 12)]
+    path.write_text("\n".join([f"U_mps,X,{heading}", *rows]))
+    if likely is None:
+        assert force_tables.read_table(path).not_understood == ()
+        return
+    with pytest.raises(UserError, match=f"looks like {likely}: say so with --map"):
+        force_tables.read_table(path)
+
+
+def test_headline_of_the_report(tmp_path, capsys):
+    """What was found comes first, with interval and unit, on the page and in the terminal."""
+    u = np.linspace(0.2, 2.0, 12)
+    noise = 0.01 * np.cos(9.0 * u)
+    path = write(tmp_path / "t.csv", {"u": u, "X": -3.0 * u**2 + noise})
+    page = tmp_path / "f.html"
+    assert main(["forces", str(path), "--report", str(page)]) == 0
+    fit = force_tables.fit(force_tables.read_table(path))["X"]
+    low, high = f"{fit.lower[0]:.5g}", f"{fit.upper[0]:.5g}"
+    out, text = capsys.readouterr().out, page.read_text()
+    assert all(word in out for word in ("X_uu", low, high, "N s2/m2"))
+    first = text[text.index("<h1") : text.index("<h2")]
+    assert "X_uu = -3.00" in first and low in first and high in first and "N s2/m2" in first
 
 
 def test_hull_in_words():

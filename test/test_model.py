@@ -511,53 +511,6 @@ def test_rows_of_the_regressor_are_those_derived(nu, nu_dot):
         same(model.regressor(nu, nu_dot)[:, column], alone, np.full(6, scale))
 
 
-def moving() -> tuple[Array, Array]:
-    """A motion with nothing small or equal in it."""
-    return np.array([0.9, -0.5, 0.4, 0.7, -0.6, 0.8]), np.array([0.3, 0.5, -0.7, 0.2, 0.9, -0.4])
-
-
-def test_notes_sign_of_the_acceleration_columns_is_wrong():
-    """M = diag(m - X_udot, ...): the column of X_udot holds -udot, not +udot."""
-    _, nu_dot = moving()
-    Y = build(NOTES_BODY, NOTES_VALUES).regressor(np.zeros(6), nu_dot)
-    np.testing.assert_array_equal(Y[:, :6], -np.diag(nu_dot))
-
-
-def test_notes_sign_of_the_rigid_body_terms_is_wrong():
-    """m (v r - w q) in surge: it works against m (q w - r v), and the forces do work."""
-    nu, _ = moving()
-    u, v, w, _, q, r = nu
-    force = build(NOTES_BODY, {}).coriolis_force(nu)
-    notes = force.copy()
-    notes[0] = NOTES_BODY.mass * (v * r - w * q)
-    assert notes[0] == pytest.approx(-force[0], rel=1e-14)
-    assert abs(nu @ force) < 1e-14
-    assert nu @ notes == pytest.approx(2.0 * NOTES_BODY.mass * u * (v * r - w * q), rel=1e-12)
-
-
-@pytest.mark.parametrize("column", range(6))
-def test_notes_angular_momentum_in_the_sway_row_is_wrong(column):
-    """r (J_z - N_rdot) belongs to the moments: anywhere in the sway row it does work."""
-    nu, _ = moving()
-    model = build(NOTES_BODY, NOTES_VALUES)
-    C = model.coriolis_matrix(nu)
-    C[1, column] += nu[5] * (NOTES_BODY.inertia[2, 2] - NOTES_VALUES["N_rdot"])
-    assert abs(nu @ C @ nu) > 1e-2
-    assert not np.allclose(C, -C.T)
-    assert not np.allclose(C @ nu, model.coriolis_force(nu))
-
-
-@pytest.mark.parametrize("axis", range(3, 6))
-def test_notes_linear_momentum_twice_in_a_moment_row_is_wrong(axis):
-    """v x p1 enters each moment once: counted twice, the moment does work."""
-    nu, _ = moving()
-    model = build(NOTES_BODY, NOTES_VALUES)
-    C = model.coriolis_matrix(nu)
-    C[axis, :3] *= 2.0
-    assert abs(nu @ C @ nu) > 1e-2
-    assert not np.allclose(C, -C.T)
-
-
 # ------------------------------------------------------------------ momentum and force
 
 

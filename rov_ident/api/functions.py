@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident import config as configuration
 from rov_ident.config import Config
+from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
@@ -27,6 +28,7 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
 from rov_ident.offline import archive, batch_fit
 from rov_ident.offline.batch_fit import CHANNELS, KINDS, Settings
+from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
@@ -122,6 +124,7 @@ def fit(
     jobs: int = 1,
     dask: str = "",
     reference: float = 0.0,
+    prior_from: File | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Identify the coefficients of a vehicle from its bags.
@@ -155,6 +158,9 @@ def fit(
     reference
         ukf: seconds of the first bag over which filterpy's own filter runs beside ours on the same
         model and samples; ``more["reference"]`` has both.
+    prior_from
+        Path of a JSON of ``forces``: its coefficients and their standard deviations are the prior,
+        in the place of those of ``config``.
     progress
         As in :func:`read`.
 
@@ -183,9 +189,14 @@ def fit(
         "dask (--dask)": live and bool(dask),
         "reference (--reference)": estimator != "ukf" and bool(reference),
     }
+    if prior_from is not None and not prior:
+        raise UserError("--prior-from and --no-prior exclude each other: leave one out")
     if wrong := [name for name, is_ignored in ignored.items() if is_ignored]:
         raise UserError(f"{wrong[0]} has no meaning with the estimator {estimator}")
     given = load(config, f"{estimator}_node" if live else "")
+    table: dict[str, Any] = {}
+    if prior_from is not None:
+        given, table = with_prior(given, Path(prior_from))
     paths, say = _several(bags), progress or _silent
     settings = Settings(_stages(channels), prior, weighted, process)
     with contextlib.ExitStack() as stack:
@@ -201,6 +212,8 @@ def fit(
             many = stack.enter_context(_opened(paths, given, say, jobs, dask))
             _check_enough(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
+        if table:
+            found = _beside_the_table(found, given, table)
         say("simulating in open loop")
         found = dataclasses.replace(
             found, curves=tuple(batch_fit.curves(many, given, found.fitted))
@@ -211,6 +224,20 @@ def fit(
         more = {"validation": batch_fit.validation(judge, given, found.fitted)}
         judged = tuple(batch_fit.curves(judge, given, found.fitted))
         return dataclasses.replace(found, more=found.more | more, judged=judged)
+
+
+def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:
+    """The fit, saying where its prior is from, and where table and dives exclude each other."""
+    prior = prior_of(given)
+    of_table = {
+        name: (mean, std)
+        for name, mean, std in zip(prior.names, prior.mean.tolist(), prior.std.tolist())
+        if name in table["coefficients"]
+    }
+    notes = disagreements(of_table, found.names, found.values, found.std)
+    return dataclasses.replace(
+        found, notes=(*found.notes, *notes), more={**found.more, "prior_from": dict(table)}
+    )
 
 
 def _check_enough(many: archive.Archive, config: Config) -> None:

@@ -23,6 +23,10 @@ def add(commands: common.Commands) -> None:
         "--reference", type=common.positive, nargs="?", const=60.0, metavar="S",
         help="ukf: run filterpy's filter, too, over the first S seconds (60), and show both",
     )  # fmt: skip
+    fit.add_argument(
+        "--prior-from", type=Path, metavar="FORCES.json",
+        help="what a force table tells (rov-ident forces --json) is the prior of its coefficients",
+    )  # fmt: skip
     batch = fit.add_argument_group("ls, iv and ml")
     batch.add_argument(
         "--channels", action="append", metavar="surge,sway,...",
@@ -47,7 +51,9 @@ def _fit(options: argparse.Namespace) -> None:
     from rov_ident.offline.archive import default_jobs
 
     outputs = [options.json, options.save, options.report]
-    common.check_outputs(outputs, [*options.bags, options.config, options.validate])
+    common.check_outputs(
+        outputs, [*options.bags, options.config, options.validate, options.prior_from]
+    )
     live = options.estimator in common.LIVE
     with common.progress(options) as tell:
         found = fit(
@@ -62,6 +68,7 @@ def _fit(options: argparse.Namespace) -> None:
             jobs=options.jobs or (1 if live else default_jobs()),
             dask=options.dask,
             reference=options.reference or 0.0,
+            prior_from=options.prior_from,
             progress=tell,
         )
         common.write_result(found, options, tell)

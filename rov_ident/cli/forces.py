@@ -63,7 +63,10 @@ def _forces(options: argparse.Namespace) -> None:
     notes = (*table.notes, *force_tables.remarks(fits, config is not None))
     new = force_tables.configured(config, fits) if config and options.out else None
     if options.json:
-        write_file(options.json, force_tables.to_json(fits, notes))
+        write_file(
+            options.json,
+            force_tables.to_json(fits, notes, table.not_understood, config is not None),
+        )
     if options.report:
         from rov_ident.offline import captive_report
 
@@ -72,7 +75,7 @@ def _forces(options: argparse.Namespace) -> None:
         configuration.dump(
             new, options.out, f"Coefficients from {options.table.name} by rov-ident forces."
         )
+    common.OUT.print(force_tables.headline(fits))
     for axis, f in fits.items():
-        common.OUT.print(f.numbers(f"{axis}: R2 {f.r2:.4f}"))
-        common.OUT.print(f"{axis}: {f.why}\n")
+        common.OUT.print(f"{axis}: R2 {f.r2:.4f}, {f.why}")
     common.say(*notes)

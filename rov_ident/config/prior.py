@@ -99,8 +99,13 @@ def drift_of(config: Config, names: tuple[str, ...]) -> Array:
     return np.array([1.0 / _CURRENT_TIME if name in drifting else 0.0 for name in names])
 
 
-def rigid_body_covariance(config: Config, names: tuple[str, ...], values: Array) -> Array:
+def rigid_body_covariance(
+    config: Config, names: tuple[str, ...], values: Array, gain: Array | None = None
+) -> Array:
     """What an uncertain rigid body adds to the covariance (n, n) of the estimates ``values`` (n,).
+
+    ``gain`` (n, n) is how far estimates follow what the data alone would say, None: all the way. A
+    narrow prior holds them where the data, with a wrong mass, say something else.
 
     An error of a moment of inertia is one of K_pdot, M_qdot or N_rdot, as a motion shows their sum.
     So is an error of the mass one of X_udot, Y_vdot and Z_wdot, where the thrust is known. Where
@@ -119,8 +124,17 @@ def rigid_body_covariance(config: Config, names: tuple[str, ...], values: Array)
     sources = [{n: known.mass_std * v for n, v in of_mass.items()}]
     sources += [{n: known.inertia_std * moment} for n, moment in moments.items()]
     rows = np.array([[source.get(name, 0.0) for name in names] for source in sources])
+    if gain is not None:
+        rows = rows @ gain.T
     covariance: Array = rows.T @ rows
     return covariance
+
+
+def gain_of(covariance: Array, std: Array) -> Array:
+    """The share (n, n) of the data in an estimate: I - P P0^-1, P (n, n) after them and P0 the
+    prior's, diagonal with ``std`` (n,)."""
+    share: Array = np.eye(len(std)) - covariance / std**2
+    return share
 
 
 _SCALED = ("thrust_scale.scale", "buoyancy.delta")

@@ -446,6 +446,16 @@ class Config:
         0.3, "of the velocity of the water north and east; zero: it is still", "m/s", lower=0.0
     )
     vehicle_uncertainty: VehicleUncertainty = field(default_factory=VehicleUncertainty)
+    nomoto: bool = option(
+        False,
+        "whether the nodes also identify K and T of Nomoto's model, from the heading of the "
+        "odometry and the rudder",
+    )
+    rudder_joint: str = option(
+        "",
+        "the rudder's name in joint_states (sensor_msgs/JointState, position in rad); empty: the "
+        "rudder is on the topic rudder (std_msgs/Float64, rad), stamped on arrival",
+    )
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     estimate_effects: tuple[tuple[str, str], ...] = ()
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config, load
-from rov_ident.config.prior import first_centre, prior_of, rigid_body_covariance
+from rov_ident.config.prior import first_centre, gain_of, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
@@ -352,7 +352,10 @@ class OnlineEstimator:
             self.config, self.prior, raw.values, self._unexplained(),
             self.sampler.kinematic_filter.test_ratios,
         )  # fmt: skip
-        covariance = raw.covariance + rigid_body_covariance(self.config, raw.names, raw.values)
+        gain = gain_of(raw.covariance, self.prior.std)
+        covariance = raw.covariance + rigid_body_covariance(
+            self.config, raw.names, raw.values, gain
+        )
         raw = replace(raw, covariance=consistency.widened(covariance, self.prior.std))
         values = physical(self.config.dynamics, self.prior, raw)
         diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())

@@ -26,7 +26,7 @@ from rov_ident import config as configuration
 from rov_ident.config import Config, Parameter
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import from_core
-from rov_ident.core.messages import WRENCH, Wrench
+from rov_ident.core.messages import ODOMETRY, WRENCH, Wrench
 from rov_ident.core.states import State
 from rov_ident.estimation import checkpoint
 from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Report
@@ -38,6 +38,7 @@ from rov_ident.nodes.compile_state import CompileState, settle
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix
 from rov_ident.nodes.diagnostics import Diagnostics, Inputs
 from rov_ident.nodes.model_monitor import ModelMonitor
+from rov_ident.nodes.nomoto_input import NomotoInput
 
 _OWN = (
     Parameter("save_path", str, "",
@@ -133,6 +134,7 @@ class EstimatorNode(GuardedNode):
         qos = QoSProfile(
             depth=config.qos.depth, reliability=ReliabilityPolicy[config.qos.reliability.upper()]
         )
+        self._nomoto = NomotoInput(self, config, kind, qos) if config.nomoto else None
         # Raw: our decoder is fifty times as fast, and the one that reads bags.
         for role, (name, type_) in self._inputs.sources.items():
             self._inputs.subscriptions[role] = self.create_subscription(
@@ -175,6 +177,8 @@ class EstimatorNode(GuardedNode):
 
     def _take(self, source: str, data: bytes, arrival: int) -> None:
         for role, message in self._reader.read(source, data, arrival):
+            if self._nomoto and role == ODOMETRY and self._online.enabled:
+                self._nomoto.heading(message)
             info = self._online.push(role, message)
             if len(info):
                 self._idle = 0.0
@@ -218,6 +222,8 @@ class EstimatorNode(GuardedNode):
         elif not self._online.enabled:
             messages = tuple(f"disabled: {text}" for text in messages)
         shown = replace(report, messages=messages, states=states)
+        if self._nomoto:
+            shown = report = self._nomoto.beside(shown)
         pairs = np.stack([report.values, report.std], axis=1)
         columns = " ".join(report.names)
         self._covariance.publish(to_matrix(report.names, columns, report.covariance))
@@ -300,6 +306,8 @@ class EstimatorNode(GuardedNode):
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._waiting.clear()  # those from before the reset
         self._online.reset()
+        if self._nomoto:
+            self._nomoto.reset()
         self._publish()
         self.get_logger().info("reset to the prior")
         response.success, response.message = True, "back to the prior"

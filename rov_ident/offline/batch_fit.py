@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import Prior, first_centre, prior_of, rigid_body_covariance
+from rov_ident.config.prior import Prior, first_centre, gain_of, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
@@ -265,7 +265,8 @@ def _stage(
         more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
         if not likelihood.converged:
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
-    covariance = covariance + rigid_body_covariance(config, names, found)
+    gain = gain_of(covariance, prior.std) if settings.prior else None
+    covariance = covariance + rigid_body_covariance(config, names, found, gain)
     removed = 1.0 - np.diag(covariance) / prior.std**2
     estimate = Estimate(names, found, covariance, 0.0)
     values = physical(config.dynamics, prior, estimate)

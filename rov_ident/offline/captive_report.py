@@ -5,14 +5,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rov_ident.core.messages import Array
-from rov_ident.offline.captive_tests import AxisFit
+from rov_ident.offline.captive_tests import AxisFit, headline
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
+from rov_ident.reports.table import estimate
 
 
 def page(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
     """The page of a force table."""
-    sections = [report.bullets(notes)] if notes else []
+    sections = [headline(fits).html()]
+    sections += [report.bullets(notes)] if notes else []
     for axis, f in fits.items():
         unit = "N" if axis in "XYZ" else "N m"
         tried = [[" ".join(c.terms), f"{c.cv_rmse:.4g}"] for c in f.candidates[:8]]
@@ -31,10 +33,13 @@ def page(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> s
                 ],
                 "Left: every row of the table. Right: the best structures that were tried.",
             ),
-            report.numbers(f),
             report.paragraph(f"Chosen because: {f.why}."),
             report.table(["structure", f"cross-validated error [{unit}]"], tried),
         ]
-    lead = ", ".join(f"{axis}: {' '.join(f.names)}" for axis, f in fits.items())
+    lead = "; ".join(
+        f"{name} = {' ± '.join(estimate(value, half))} {unit}"
+        for f in fits.values()
+        for name, unit, value, half in zip(f.names, f.units, f.values, f.quantile * f.std)
+    )
     origin = report.origin(next(iter(fits.values())))
     return report.page(f"Coefficients from {name}", lead, sections, origin)

@@ -18,6 +18,7 @@ before the fit.
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -34,6 +35,7 @@ from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, parse
 from rov_ident.model.equations import Model, build, coriolis, extended_states
 from rov_ident.model.fins import CROSS, X
 from rov_ident.reports.result import Result, provenance
+from rov_ident.reports.table import PLUS_MINUS, Table
 
 _FIN_COLUMNS = {
     "r": ("rudder", "delta_r", "dr", "deltar", "delta"),
@@ -54,7 +56,8 @@ _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of 
 
 @dataclass(frozen=True)
 class ForceTable:
-    """States nu (n, 6), fin angles {letter: (n,)} [rad], forces {axis letter: (n,)} [N, N m]."""
+    """States nu (n, 6), fin angles {letter: (n,)} [rad], forces {axis letter: (n,)} [N, N m]; and
+    the headings of the file that say nothing to us."""
 
     name: str
     nu: Array
@@ -62,6 +65,7 @@ class ForceTable:
     forces: Mapping[str, Array]
     notes: tuple[str, ...] = ()
     sha256: str = ""
+    not_understood: tuple[str, ...] = ()  # headings
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,9 @@ class AxisFit(Result):
     candidates: tuple[Candidate, ...]
     why: str
     pool: tuple[str, ...]
+    left_out: Mapping[str, Array] = field(default_factory=dict)
+    """By term that the table moves and the structure lacks: by how much each value (n,) would be
+    less per unit of it (the regression of its column on those of the structure)."""
     aliases: Mapping[str, str] = field(default_factory=dict)
     measured: Array = field(default_factory=lambda: np.zeros(0))
     fitted: Array = field(default_factory=lambda: np.zeros(0))
@@ -136,18 +143,21 @@ def read_table(
     reader = _Reader(table, dict(columns or {}), nondimensional is not None)
     notes: list[str] = []
     nu, speed = _states(reader, drift, notes)
-    forces = _forces(reader, speed, nondimensional)
     fins = _fins(reader)
+    reader.refuse_likely()
+    forces = _forces(reader, speed, nondimensional)
     if np.ptp(np.column_stack([nu, *fins.values()]), axis=0).max() < 1e-12:
         raise UserError(
             f"{path}: every row is the same condition: vary speed, drift, turning or fin angles"
         )
     if drift == "auto" and reader.has_flow:
         nu = _as_a_hull_resists(nu, forces, notes)
-    reader.refuse_unknown_angles()
-    if unused := [heading for heading in table.cells if heading not in reader.used]:
-        notes.append(f"columns that are not used (name them with --map): {', '.join(unused)}")
-    return ForceTable(path.name, nu, fins, forces, tuple(notes), table.sha256)
+    unused = tuple(heading for heading in table.cells if heading not in reader.used)
+    if unused:
+        notes.insert(
+            0, f"headings not understood, columns left out (--map names them): {', '.join(unused)}"
+        )
+    return ForceTable(path.name, nu, fins, forces, tuple(notes), table.sha256, unused)
 
 
 class _Reader:
@@ -199,16 +209,73 @@ class _Reader:
             )
         return values if unit == "rad" else np.radians(values)
 
-    def refuse_unknown_angles(self) -> None:
+    def refuse_likely(self) -> None:
+        """Once states and fins are read.
+
+        Raises UserError if a heading that was not used looks like a speed or an angle that varies
+        and is not given otherwise: without it the forces would be laid to something else.
+        """
         for heading in self.table.cells:
-            if heading in self.used or not heading.endswith(("_deg", "_rad")):
+            if heading in self.used or self._is_constant(heading):
                 continue
-            if np.ptp(self.table.numbers(heading)) > 0.0:
+            name = _likely(heading)
+            if (
+                name
+                and not {self.columns.get(n, n) for n in (name, *_SAME.get(name, ()))} & self.used
+            ):
+                raise UserError(
+                    f"{self.table.path}: the heading `{heading}` is not understood, and looks like "
+                    f'{name}: say so with --map {name}="{heading}", or remove the column'
+                )
+            if heading.endswith(("_deg", "_rad")) and not name:
                 raise UserError(
                     f"{self.table.path}: the angle `{heading}` is not known here: name it with "
                     f"--map rudder_{heading[-3:]}={heading} (or stern, aileron, alpha, beta), or "
                     "remove the column"
                 )
+
+    def _is_constant(self, heading: str) -> bool:
+        """Also where a cell is no number: then it is a remark."""
+        try:
+            return float(np.ptp(self.table.numbers(heading))) == 0.0
+        except UserError:
+            return True
+
+
+# By our name, other names of ours that say the same.
+_SAME = {
+    "U_mps": ("u",),
+    **{f"beta_{unit}": ("v", "beta_deg", "beta_rad") for unit in ("deg", "rad")},
+    **{f"alpha_{unit}": ("w", "alpha_deg", "alpha_rad") for unit in ("deg", "rad")},
+    "r": ("R_m", "radius_m"),
+    **{
+        f"{names[0]}_{unit}": tuple(f"{name}_{u}" for name in names for u in ("deg", "rad"))
+        for names in _FIN_COLUMNS.values()
+        for unit in ("deg", "rad")
+    },
+}
+_WORDS = {
+    **dict.fromkeys(("speed", "velocity", "vel", "towing speed"), "U_mps"),
+    **dict.fromkeys(("beta", "drift", "drift angle", "sideslip"), "beta"),
+    **dict.fromkeys(("alpha", "angle of attack", "aoa"), "alpha"),
+    **dict.fromkeys(("yaw rate", "r"), "r"),
+    **{name: name for name in "uvwpq"},
+    **{name.replace("_", " "): names[0] for names in _FIN_COLUMNS.values() for name in names},
+}
+
+
+def _likely(heading: str) -> str:
+    """What a heading such as `beta(deg)` or `Speed [m/s]` may be in our names, if anything."""
+    bare, _, unit = re.sub(r"[(\[\]),/ _-]+", " ", heading.lower()).strip().partition(" ")
+    words = f"{bare} {unit}".split()
+    known = "deg" if {"deg", "degrees", "degree"} & set(words) else "rad"
+    while words and words[-1] in ("deg", "degrees", "degree", "rad", "m", "s", "mps", "angle"):
+        words.pop()
+    name = _WORDS.get(" ".join(words), "")
+    angular = name in ("alpha", "beta") or name in {names[0] for names in _FIN_COLUMNS.values()}
+    if name in ("p", "q", "r") and known == "deg":
+        return ""  # degrees a second, which are not read
+    return f"{name}_{known}" if angular else name
 
 
 def _states(reader: _Reader, drift: str, notes: list[str]) -> tuple[Array, Array]:
@@ -410,6 +477,8 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     values = np.asarray(np.linalg.lstsq(x, force, rcond=None)[0], dtype=np.float64)
     covariance = sandwich(scaled_inverse(x.T @ x), (x.T * errors[chosen] ** 2) @ x)  # HC3
     fitted = x @ values
+    every = {name: matrix[:, i] for i, name in enumerate(names)}
+    every |= {name: column(name, nu, fins) for name in aliases}
     spread = float(np.sum((force - force.mean()) ** 2))
     shown = {*sorted(rms, key=lambda s: rms[s])[:_SHOWN], chosen}
     return AxisFit(
@@ -426,6 +495,11 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
         candidates=tuple(Candidate(words[s], rms[s]) for s in sorted(shown, key=lambda s: rms[s])),
         why=why,
         pool=tuple(names),
+        left_out={
+            name: np.linalg.lstsq(x, z, rcond=None)[0] / scale
+            for name, z in every.items()
+            if name not in terms
+        },
         aliases={a: b for a, b in aliases.items() if b in terms},
         measured=force,
         fitted=fitted,
@@ -535,21 +609,46 @@ def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def to_json(fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
-    """The result as JSON."""
+def to_json(
+    fits: Mapping[str, AxisFit],
+    notes: Sequence[str] = (),
+    not_understood: Sequence[str] = (),
+    coriolis_taken_off: bool = False,
+) -> str:
+    """The result as JSON; ``covariance`` and ``left_out`` of an axis are in the order of its terms.
+
+    ``coriolis_taken_off``: whether the terms are free of the Coriolis forces of the added mass.
+    """
     axes = {
         axis: {
             "terms": f.entries(),
             "cv_rmse": f.cv_rmse,
             "rmse": f.rmse,
             "r2": f.r2,
+            "covariance": f.covariance.tolist(),
+            "left_out": {name: slope.tolist() for name, slope in f.left_out.items()},
             "candidates": [asdict(c) for c in f.candidates],
             "why": f.why,
             "indistinguishable": dict(f.aliases),
         }
         for axis, f in fits.items()
     }
-    return json.dumps({"axes": axes, "notes": list(notes)}, indent=2, allow_nan=False) + "\n"
+    document = {
+        "axes": axes,
+        "not_understood": list(not_understood),
+        "coriolis_taken_off": coriolis_taken_off,
+        "notes": list(notes),
+    }
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def headline(fits: Mapping[str, AxisFit]) -> Table:
+    """Every coefficient of the table: value, half of its 95 % interval, the interval, unit."""
+    rows = []
+    for f in fits.values():
+        for row, low, high in zip(f.numbers("").rows, f.lower, f.upper, strict=True):
+            rows.append([*row, f"{low:.5g}", f"{high:.5g}"])
+    return Table("Coefficients", ["", "value", PLUS_MINUS, "unit", "lower", "upper"], rows, (3,))
 
 
 def remarks(fits: Mapping[str, AxisFit], with_config: bool) -> list[str]:

@@ -1,0 +1,125 @@
+"""Nomoto's K and T beside the coefficients of a node, from the heading and a rudder's topic."""
+
+from collections import deque
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+
+from rov_ident.config import Config
+from rov_ident.core.frames import quaternion_to_euler, to_core
+from rov_ident.core.messages import Message, Odometry
+from rov_ident.core.states import State, is_known
+from rov_ident.estimation.online import Report
+from rov_ident.nodes.common import GuardedNode
+from rov_ident.nodes.conversions import from_time
+from rov_ident.reports.result import NORMAL
+from rov_ident.steering.nomoto_recursive import GAP, RecursiveNomoto
+
+NAMES, UNITS = ("nomoto.K", "nomoto.T"), ("1/s", "s")
+_UNKNOWN = np.array([10.0, 1000.0])  # std of K [1/s] and T [s] before any data: a choice, very wide
+_MOST = 20_000  # messages that wait for the rudder: some minutes
+
+
+class NomotoInput:
+    """Brings heading and rudder together by their stamps.
+
+    A heading waits until a rudder angle as late as it has come; the rudder is linear in between.
+    """
+
+    def __init__(self, node: GuardedNode, config: Config, kind: str, qos: QoSProfile) -> None:
+        self._node, self._config, self._kind = node, config, kind
+        self.reset()
+        joint = config.rudder_joint
+        self._topic = "joint_states" if joint else "rudder"
+        if joint:
+            node.create_subscription(JointState, self._topic, self._joints, qos)
+        else:
+            node.create_subscription(Float64, self._topic, self._angle, qos)
+
+    def reset(self) -> None:
+        self._estimator = RecursiveNomoto(self._kind)
+        self._headings: deque[tuple[int, float]] = deque(maxlen=_MOST)  # stamp [ns], angle [rad]
+        self._rudder: deque[tuple[int, float]] = deque(maxlen=_MOST)
+        self._origin = self._stamp = self._heard = 0  # ns
+
+    def heading(self, message: Message) -> None:
+        """A message of the odometry, in the axes of its topic."""
+        if isinstance(message, Odometry):
+            core: Any = to_core(message, self._config.frames)
+            self._headings.append((core.stamp, float(quaternion_to_euler(core.orientation)[2])))
+            self._heard = max(self._heard, core.stamp)
+            self._use()
+
+    def _joints(self, message: JointState) -> None:
+        names = list(message.name)
+        if self._config.rudder_joint in names:  # other joints may have messages of their own
+            angle = float(message.position[names.index(self._config.rudder_joint)])
+            stamp = from_time(message.header.stamp)
+            self._turned(stamp or self._node.get_clock().now().nanoseconds, angle)
+
+    def _angle(self, message: Float64) -> None:
+        self._turned(self._node.get_clock().now().nanoseconds, float(message.data))
+
+    def _turned(self, stamp: int, angle: float) -> None:
+        if not self._rudder or stamp > self._rudder[-1][0]:
+            self._rudder.append((stamp, angle))
+            self._use()
+
+    def _use(self) -> None:
+        """The headings up to the last rudder angle."""
+        while self._headings and self._rudder and self._headings[0][0] <= self._rudder[-1][0]:
+            at, heading = self._headings.popleft()
+            while len(self._rudder) > 1 and self._rudder[1][0] < at:
+                self._rudder.popleft()
+            (begin, angle), (end, after) = (
+                self._rudder[0],
+                self._rudder[min(len(self._rudder), 2) - 1],
+            )
+            if at < begin or end - begin > GAP * 1e9:
+                continue  # nothing is known of the rudder then
+            share = (at - begin) / (end - begin) if end > begin else 0.0
+            self._origin = self._origin or at
+            self._estimator.push(
+                1e-9 * (at - self._origin), heading, angle + share * (after - angle)
+            )
+            self._stamp = at
+
+    def beside(self, report: Report) -> Report:
+        """The report with K and T behind the coefficients."""
+        found = self._estimator.result
+        values = np.zeros(2) if found is None else found.values
+        covariance = np.diag(_UNKNOWN**2) if found is None else found.covariance
+        std = np.sqrt(np.diag(covariance))
+        text, state = "converging", State.CONVERGING
+        if not self._rudder:
+            text, state = (
+                f"held: no rudder on {self._node.resolve_topic_name(self._topic)}",
+                State.HELD,
+            )
+        elif found is None:
+            text, state = "held: the rudder has not yet turned the vehicle enough", State.HELD
+        elif self._heard - self._stamp > GAP * 1e9:
+            text, state = "stale: no rudder to the latest headings", State.STALE
+        elif all(map(is_known, values, std, (0.0, 0.0))):
+            text, state = "converged", State.CONVERGED
+        n = len(report.names)
+        whole = np.zeros((n + 2, n + 2))
+        whole[:n, :n], whole[n:, n:] = report.covariance, covariance
+        return replace(
+            report,
+            stamp=max(report.stamp, self._stamp),
+            names=(*report.names, *NAMES),
+            units=(*report.units, *UNITS),
+            values=np.append(report.values, values),
+            std=np.append(report.std, std),
+            lower=np.append(report.lower, values - NORMAL * std),
+            upper=np.append(report.upper, values + NORMAL * std),
+            covariance=whole,
+            excitation=np.append(report.excitation, [np.nan, np.nan]),
+            states=(*report.states, state, state),
+            messages=(*report.messages, text, text),
+        )
