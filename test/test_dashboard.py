@@ -506,7 +506,7 @@ def test_two_vehicles(command):
         expected[node] = online.report()
         options = ["--ros-args", "--params-file", str(configs[vehicle]), "-r", f"__ns:=/{vehicle}"]
         options += ["-p", "qos.reliability:=reliable", "-p", "timeout:=3.0"]
-        command(f"rov_ident.nodes.{kind}_node", *options)
+        command("rov_ident.nodes", f"{kind}_node", *options)
     table = command("rov_ident", "watch")
     dashboard = command("rov_ident", "dashboard", "--port", "0", "--json")
     page = json.loads(dashboard.stdout.readline())["page"]
@@ -616,11 +616,11 @@ def test_watch_hears_nobody(domain):
     [
         (["rov_ident", "dashboard", "--port", "{taken}"], "cannot be used (Address already in"),
         (
-            ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=99999"],
+            ["rov_ident.nodes", "dashboard_node", "--ros-args", "-p", "port:=99999"],
             "dashboard_node: port is 99999, but must be between 0 and 65535",
         ),
         (
-            ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=auto"],
+            ["rov_ident.nodes", "dashboard_node", "--ros-args", "-p", "port:=auto"],
             "dashboard_node: port is 'auto' (text), but must be a whole number",
         ),
     ],

@@ -307,7 +307,7 @@ def test_bad_configuration(domain, heavy_path, tmp_path, old, new, sentence):
 
 
 def test_started_without_a_configuration(domain):
-    command = [sys.executable, "-m", "rov_ident.nodes.rls_node"]
+    command = [sys.executable, "-m", "rov_ident.nodes", "rls_node"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert done.returncode == 2
     assert "--ros-args --params-file" in done.stderr and "Traceback" not in done.stderr
@@ -317,7 +317,7 @@ def test_vehicles_of_a_fleet_save_to_files_of_their_own(domain, heavy_path, tmp_
     """And whoever saves what has learnt nothing is told so."""
     caller = Vehicle()
     for name in ("one", "two"):
-        command = [sys.executable, "-m", "rov_ident.nodes.rls_node", "--ros-args"]
+        command = [sys.executable, "-m", "rov_ident.nodes", "rls_node", "--ros-args"]
         command += ["-r", f"__ns:=/{name}", "--params-file", heavy_path]
         process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
         try:
@@ -358,7 +358,7 @@ def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
     for name, number in (
         ("controller_bridge", signal.SIGTERM), ("example_controller", signal.SIGINT),
     ):  # fmt: skip
-        command = [sys.executable, "-m", f"rov_ident.nodes.{name}", "--ros-args"]
+        command = [sys.executable, "-m", "rov_ident.nodes", name, "--ros-args"]
         command += ["-p", "controller:=/nobody"] * (name == "controller_bridge")
         command.append("--params-file")
         done = subprocess.run([*command, wrong], capture_output=True, text=True, timeout=240)

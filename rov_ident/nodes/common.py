@@ -22,9 +22,9 @@ from sensor_msgs.msg import Imu
 from rov_ident import config as configuration
 from rov_ident.config import Inputs
 from rov_ident.core.errors import UserError
+from rov_ident.core.interrupts import INTERRUPTS, end_at_once
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.io.topics import sources
-from rov_ident.nodes.programs import INTERRUPTS, end_at_once
 
 try:  # costs half as much, and keeps the order of arrival across topics
     from rclpy.experimental import EventsExecutor as Executor
@@ -138,7 +138,7 @@ def live(
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # open, so that the last messages can be published.
-    end_at_once()
+    end_at_once(0)
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy gives its RCLError no public name

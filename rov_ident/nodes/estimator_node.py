@@ -360,7 +360,7 @@ class EstimatorNode(GuardedNode):
         )
 
 
-def run(kind: Kind) -> int:
+def main(kind: Kind) -> int:
     """Run a node; its exit status is 0 after an interrupt, 2 for a bad configuration."""
     compiling = CompileState(kind)
     return live(
