@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from functools import wraps
 from importlib import import_module
 from itertools import pairwise
@@ -47,6 +47,16 @@ class GuardedNode(Node):  # type: ignore[misc]
         self.faults: Counter[str] = Counter()
         self.outlives = True
         super().__init__(*arguments, **options)  # which listens to /clock
+
+    def declare_parameters(
+        self, namespace: str, parameters: Iterable[Any], ignore_override: bool = False
+    ) -> Any:
+        """As rclpy; raises UserError for what a user has set to nothing."""
+        given = list(parameters)
+        for name, value, *described in given:
+            if value is None and not any(d.dynamic_typing for d in described):
+                raise UserError(f"{name} is [], which says nothing: give a value, or leave it out")
+        return super().declare_parameters(namespace, given, ignore_override)
 
     def create_subscription(
         self, type_: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
