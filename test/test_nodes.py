@@ -91,6 +91,26 @@ def test_publishing_leaves_time_for_the_inputs(domain, heavy_path):
     process.wait()
 
 
+def test_what_never_reaches_the_node_is_counted(domain, heavy_path, short_dive):
+    """A node that is not scheduled for a while: DDS keeps a thousand messages of a topic for it."""
+    process, vehicle = start_connected("rls", parameters=heavy_path)
+    imu = next(cdr.encode(message) for _, role, message in short_dive if role == "imu")
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    try:
+        vehicle.diagnostics.clear()
+        process.send_signal(signal.SIGSTOP)
+        for _ in range(3000):
+            vehicle.publish("imu", imu)
+        process.send_signal(signal.SIGCONT)
+        vehicle.until(lambda: "imu: lost before it reached the node=" in vehicle.words())
+        warned = [s for m in vehicle.diagnostics for s in m.status if "lost before" in s.message]
+        assert warned and all(int.from_bytes(s.level, "little") >= 1 for s in warned)
+    finally:
+        process.kill()
+        process.wait()
+        vehicle.close()
+
+
 def processor_time(pid):
     """Of a process so far, in s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

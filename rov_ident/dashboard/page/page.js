@@ -308,11 +308,11 @@ function buildCoefficients(main, names, coefficients) {
 
 // What the residual of one axis says in words, from [least, most, rms] of every half second. Noise has both signs in
 // nearly every bin, and of two halves of it neither is twice as large.
-function meaning(bins) {
+function meaning(bins, what) {
   if (bins.length <= RECENT_BINS) return "";
   const recent = bins.slice(-RECENT_BINS);
   for (const [side, beyond] of [["above", ([least]) => least > 0], ["below", ([, most]) => most < 0]])
-    if (recent.filter(beyond).length > 0.5 * RECENT_BINS) return `${side} zero: a steady force is missing`;
+    if (recent.filter(beyond).length > 0.5 * RECENT_BINS) return `${side} zero: a steady ${what} is missing`;
   const size = (some) => Math.sqrt(some.reduce((sum, [, , rms]) => sum + rms * rms, 0) / some.length);
   return size(recent) > 2 * size(bins.slice(0, -RECENT_BINS)) ? "larger than before" : "around zero";
 }
@@ -341,7 +341,7 @@ function buildResiduals(main, names) {
         const { rms, words } = rows[index];
         rms.textContent = bins.length
           ? `rms ${Number(bins.at(-1)[3][k]).toPrecision(2)} ${k < 3 ? "N" : "N m"}` : "no samples yet";
-        words.textContent = meaning(bins.map((bin) => [bin[1][k], bin[2][k], bin[3][k]]));
+        words.textContent = meaning(bins.map((bin) => [bin[1][k], bin[2][k], bin[3][k]]), k < 3 ? "force" : "moment");
         for (const [t, least, most] of bins) {
           low = Math.min(low, least[k]); high = Math.max(high, most[k]);
           start = Math.min(start, t); end = Math.max(end, t);
