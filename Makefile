@@ -65,6 +65,7 @@ sdf: .venv/drake.stamp
 torture: .venv/test.stamp
 	$(BIN)/python -m bench.studies.torture
 	$(BIN)/python -m bench.studies.torture_live
+	$(BIN)/python -m bench.studies.endurance
 	$(BIN)/python -m bench.studies.fuzz
 	$(BIN)/python -m bench.studies.fuzz_guided
 

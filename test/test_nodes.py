@@ -393,28 +393,6 @@ def test_the_other_nodes_live_the_same_life(domain, heavy_path, tmp_path):
         assert "Traceback" not in said
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_while_loading(domain, heavy_path, number):
-    """A launch file that is stopped at once does not show where in which module each node was."""
-    program = "from rov_ident.nodes import programs; import sys; print(flush=True); "
-    parameters = {
-        "rls_node": ["--params-file", str(heavy_path)],
-        "dashboard_node": ["-p", "port:=0"],
-    }
-    for name, given in parameters.items():
-        for delay in (0.2, 0.6):  # s; a node that is quick is up then
-            command = [sys.executable, "-c", f"{program} sys.exit(programs.{name}())"]
-            command += ["--ros-args", *given]
-            process = subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            )
-            assert process.stdout.readline()
-            time.sleep(delay)
-            status, said = end_node(process, number)
-            assert status == 0, said
-            assert "Traceback" not in said
-
-
 @pytest.fixture
 def nothing_compiled(tmp_path, monkeypatch):
     monkeypatch.setenv("ROV_IDENT_CACHE", str(tmp_path))
@@ -473,17 +451,21 @@ def test_interrupt_while_compiling(domain, heavy_path, nothing_compiled):
     assert "compiled after" not in said and "Traceback" not in said
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.002, 0.004, 0.5])
-def test_nothing_compiles_for_a_node_that_is_gone(domain, heavy_path, nothing_compiled, delay):
+@pytest.mark.parametrize(
+    "delay, number",
+    [(0.0, signal.SIGKILL), (0.002, signal.SIGINT), (0.004, signal.SIGKILL), (0.5, signal.SIGINT)],
+)
+def test_nothing_compiles_for_a_node_that_is_gone(
+    domain, heavy_path, nothing_compiled, delay, number
+):
     """Also where it ends while it starts the compiler; who compiles has the same stderr."""
-    for number in (signal.SIGKILL, signal.SIGINT):
-        process = start_node("rls", heavy_path)
-        until_said(process, "compiling")
-        time.sleep(delay)
-        began = time.monotonic()
-        _, said = end_node(process, number)
-        assert time.monotonic() - began < 10.0 * slowness()  # of some thirty
-        assert "Traceback" not in said
+    process = start_node("rls", heavy_path)
+    until_said(process, "compiling")
+    time.sleep(delay)
+    began = time.monotonic()
+    _, said = end_node(process, number)
+    assert time.monotonic() - began < 10.0 * slowness()  # of some thirty
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -505,10 +487,9 @@ def test_interrupt_while_an_object_of_a_start_is_finalised(number):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path, number):
+def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path):
     """It starts a thread then; one that was half started kept the process for ever."""
-    for delay in (0.0, 0.0003, 0.001, 0.003):
+    for delay, number in zip((0.0, 0.0003, 0.001, 0.003), (signal.SIGINT, signal.SIGTERM) * 2):
         process = start_node("rls", heavy_path)
         until_said(process, "]: active")
         time.sleep(delay)
