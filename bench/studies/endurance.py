@@ -96,7 +96,7 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
         both = [f"{role} publishers" for role in INPUTS]
         _until(executor, lambda: len(heard) == 10 and all(
             values[key] == "1" for values in heard.values() for key in both
-        ))  # fmt: skip
+        ), 400.0)  # fmt: skip
         cpu = sum(_cpu(p.pid) for p in processes.values())
         begun = time.monotonic()
         for arrival, role, message in messages:
@@ -137,32 +137,30 @@ def _until(executor, ready, seconds=120.0, fails=True):
         executor.spin_once(timeout_sec=0.1)
 
 
-_STEPS = (3600.0, -3600.0, 0.3, -0.3, 86400.0, -1.0)  # s
+_STEPS = {"of hours": (3600.0, -3600.0, 86400.0), "of 0.3 s": (0.3, -0.3)}  # s
 
 
-def clock(options: argparse.Namespace) -> Iterator[Row]:
-    """Every ten seconds of a dive the clock of all stamps steps, forward and backward."""
+def clock(_: argparse.Namespace) -> Iterator[Row]:
+    """Twelve times in a dive, every ten seconds, the clock of all stamps steps."""
     config = configuration.load(HEAVY)
-    messages = dive(config, "steps", 20.0 + 10.0 * 3 * len(_STEPS), seed=4).messages
+    messages = dive(config, "steps", 140.0, seed=4).messages
     for kind in ESTIMATORS:
-        disturbed, undisturbed = OnlineEstimator(config, kind), OnlineEstimator(config, kind)
-        offset, steps, used, waited = 0, itertools.cycle(_STEPS), 0, []
-        last, next_step = messages[0][0], messages[0][0] + 20 * SECOND
-        for arrival, role, message in messages:
+        undisturbed = OnlineEstimator(config, kind)
+        for _, role, message in messages:
             undisturbed.push(role, message)
-            if arrival >= next_step:
-                offset += int(next(steps) * SECOND)
-                next_step += 10 * SECOND
-            got = disturbed.push(role, message._replace(stamp=message.stamp + offset))
-            if len(got):
-                waited.append((arrival - last) / SECOND)
-                last, used = arrival, used + len(got)
-        one, two = disturbed.report(), undisturbed.report()
-        off = np.abs(one.values - two.values) / np.maximum(two.std, 1e-300)
-        yield Row(
-            f"{3 * len(_STEPS)} clock steps: longest without samples", kind, max(waited), "s", 10
-        )
-        yield Row("  largest change of a coefficient", kind, off.max(), "std", 3.0)
+        two = undisturbed.report()
+        for name, sizes in _STEPS.items():
+            disturbed, steps, offset, waited = OnlineEstimator(config, kind), 0, 0, 0.0
+            last, first = messages[0][0], messages[0][0]
+            for arrival, role, message in messages:
+                if arrival >= first + (20 + 10 * steps) * SECOND:
+                    offset += int(sizes[steps % len(sizes)] * SECOND)
+                    steps += 1
+                if len(disturbed.push(role, message._replace(stamp=message.stamp + offset))):
+                    waited, last = max(waited, (arrival - last) / SECOND), arrival
+            off = np.abs(disturbed.report().values - two.values) / two.std
+            yield Row(f"{steps} clock steps {name}: longest without samples", kind, waited, "s", 10)
+            yield Row("  largest change of a coefficient", kind, off.max(), "std", 3.0)
 
 
 def disk(_: argparse.Namespace) -> Iterator[Row]:
