@@ -65,7 +65,9 @@ sdf: .venv/drake.stamp
 torture: .venv/test.stamp
 	$(BIN)/python -m bench.studies.torture
 	$(BIN)/python -m bench.studies.torture_live
+	$(BIN)/python -m bench.studies.endurance
 	$(BIN)/python -m bench.studies.fuzz
+	$(BIN)/python -m bench.studies.fuzz_guided
 
 ## known faults of the dependencies, suspicious places in the source, and the list of what `make demo`
 ## installs (out/sbom.json, CycloneDX); needs the network

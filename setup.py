@@ -63,6 +63,8 @@ setup(
             "types-PyYAML",
         ],
         "bench": ["padasip>=1.2"],
+        # fuzzing by coverage, in `make torture` where it is installed
+        "fuzz": ["atheris>=3"],
         # `make docs`
         "docs": ["mkdocs>=1.6", "mkdocs-material>=9.5"],
         # `rov-ident import` of ArduSub's logs

@@ -29,7 +29,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Imu, Odometry, Wrench
-from rov_ident.io import bag_reader, cdr
+from rov_ident.io import bag_reader, cdr, topics
 from rov_ident.io.bag_reader import Bag, _records, read_messages, select_topics
 from rov_ident.io.bag_writer import BagWriter
 
@@ -74,11 +74,12 @@ def write_mcap(path, rows, **options):
     with path.open("wb") as stream:
         writer = McapWriter(stream, **options)
         writer.start(profile="ros2")
-        channels = {}
+        channels, schemas = {}, {}
         for topic, type_name, stamp, data in rows:
+            if type_name not in schemas:
+                schemas[type_name] = writer.register_schema(type_name, "ros2msg", b"")
             if topic not in channels:
-                schema = writer.register_schema(type_name, "ros2msg", b"")
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
+                channels[topic] = writer.register_channel(topic, "cdr", schemas[type_name])
             writer.add_message(channels[topic], stamp, data, stamp)
         writer.finish()
     return path
@@ -578,3 +579,13 @@ def test_a_bag_of_many_topics_is_refused_in_a_sentence(tmp_path):
         with pytest.raises(UserError) as refusal:
             select_topics(Bag(path), overrides, ["wrench", "odom"])
         assert len(str(refusal.value)) <= 2_000
+
+
+def test_sixty_thousand_topics(tmp_path, heavy):
+    """Listed in one go, and not all named in the sentence that refuses them."""
+    rows = ((f"/t{k}", "std_msgs/msg/String", k, b"\0\1\0\0\1\0\0\0\0") for k in range(60_000))
+    bag = Bag(write_mcap(tmp_path / "many.mcap", rows))
+    assert len(bag.topics) == 60_000
+    with pytest.raises(UserError, match="has no odom topic") as refused:
+        topics.select(bag, heavy)
+    assert len(str(refused.value)) <= 2000

@@ -418,6 +418,12 @@ async def _in_a_browser(report):
             "document.querySelector('[data-coefficient=X_u] .state').innerText.endsWith('s ago')"
         )
         await page.send("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+        # Noise around zero; then a steady force.
+        words = "document.querySelector('.grid.six .state').innerText"
+        await page.until(f"{words} == 'around zero'")
+        for k in range(240):
+            store.take_residual("/rov1/rls_node", 10**18 + (400 + k) * 50_000_000, np.full(6, 9.0))
+        await page.until(f"{words}.startsWith('above zero')")
         bridge = Status(1, "stale", {"controller": "/c", "pending": "X_u"})
         store.take_status("/rov1/controller_bridge", "bridge", bridge)
         bridge_note = "[...document.querySelectorAll('.note')].map((n) => n.innerText)"
@@ -442,6 +448,12 @@ async def _in_a_browser(report):
                     ".map((e) => parseFloat(getComputedStyle(e).fontSize)))"
                 )
                 assert smallest >= 11.0
+        # A link leads to its part, on a phone below the head that stays.
+        await page.evaluate("document.querySelectorAll('#parts a')[2].click()")
+        assert await page.evaluate("document.querySelectorAll('h2')[2].innerText") == "Excitation"
+        top = "document.querySelectorAll('h2')[2].getBoundingClientRect().top"
+        head = "document.querySelector('header').getBoundingClientRect().bottom"
+        await page.until(f"{head} <= {top} && {top} < 0.5 * innerHeight")
         # The other vehicle, on a click.
         await page.evaluate("document.querySelectorAll('nav button')[1].click()")
         await page.until("document.querySelectorAll('.tile').length == 1")
@@ -506,7 +518,7 @@ def test_two_vehicles(command):
         expected[node] = online.report()
         options = ["--ros-args", "--params-file", str(configs[vehicle]), "-r", f"__ns:=/{vehicle}"]
         options += ["-p", "qos.reliability:=reliable", "-p", "timeout:=3.0"]
-        command(f"rov_ident.nodes.{kind}_node", *options)
+        command("rov_ident.nodes", f"{kind}_node", *options)
     table = command("rov_ident", "watch")
     dashboard = command("rov_ident", "dashboard", "--port", "0", "--json")
     page = json.loads(dashboard.stdout.readline())["page"]
@@ -616,11 +628,11 @@ def test_watch_hears_nobody(domain):
     [
         (["rov_ident", "dashboard", "--port", "{taken}"], "cannot be used (Address already in"),
         (
-            ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=99999"],
+            ["rov_ident.nodes", "dashboard_node", "--ros-args", "-p", "port:=99999"],
             "dashboard_node: port is 99999, but must be between 0 and 65535",
         ),
         (
-            ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=auto"],
+            ["rov_ident.nodes", "dashboard_node", "--ros-args", "-p", "port:=auto"],
             "dashboard_node: port is 'auto' (text), but must be a whole number",
         ),
     ],

@@ -1,5 +1,6 @@
 """`rov-ident identify`: from dives to a judged model, or a reason why not and what to fly."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -8,6 +9,10 @@ import pytest
 
 import rov_ident as ri
 from bench import ROOT
+from rov_ident.api import identification
+from rov_ident.discrepancy.explain import Explanation
+from rov_ident.discrepancy.extension import Kept
+from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import validation
 
@@ -66,3 +71,19 @@ def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
     assert "no dive is fit" in done.stderr and "fly instead: " in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not out.exists()
+
+
+@dataclasses.dataclass(frozen=True)
+class Findings:
+    notes: tuple
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_one_configuration_is_called_extended(used):
+    """That of the fit, which is written; explain's own is at most where the fit starts."""
+    notes = ("another", Kept((), None).note, Kept(("Y",), Hypothesis(None, {})).note)
+    found = Explanation(Findings(notes), None, None, None, None, {}, ())
+    said = identification._as_a_start(found, used).findings.notes
+    assert said[0] == "another" and "extended" not in " ".join(said)
+    assert len(said) == (3 if used else 1)
+    assert all("the configuration that the fit starts from" in note for note in said[1:])

@@ -170,3 +170,12 @@ def test_a_compiler_that_is_stopped_ends_and_starts_no_more(cache):
     assert results == [False]
     job.start()
     assert job.poll() is not None
+
+
+def test_a_relative_cache_home_is_ignored(tmp_path, monkeypatch):
+    """As the XDG standard wants it: else each folder in which one works would get a cache."""
+    for name in ("ROV_IDENT_CACHE", "NUMBA_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "cache")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert jit._cache_folder().parent == tmp_path / ".cache" / "rov_ident"

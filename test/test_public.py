@@ -317,6 +317,12 @@ def test_every_kind_of_result_can_be_compared(tmp_path, fit, results):
     path = tmp_path / "findings.json"
     path.write_text(json.dumps(findings))
     assert ri.compare(path, path).names == ("X_u", "thruster_lag.time_constant")
+    (tmp_path / "identified").mkdir()  # as `identify` leaves it
+    result = json.dumps({"fit": json.loads(fit.to_json()), "explain": findings})
+    (tmp_path / "identified" / "result.json").write_text(result)
+    found = ri.compare(fit, tmp_path / "identified")
+    assert found.names == fit.names and found.changed == () and "same data" in found.notes[0]
+    assert found.labels[1] == "identified"
     path.write_text(json.dumps({"order": 1, "K": {"value": 1.0, "std": 0.1, "unit": "1/s"}}))
     assert ri.compare(path, path).names == ("K",)
     path.write_text(json.dumps({"axes": {"X": {"terms": {"X_uu": findings["effects"][0]["parameters"]["time_constant"]}}}}))  # fmt: skip  # noqa: E501

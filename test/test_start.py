@@ -97,7 +97,9 @@ def test_a_bag_of_mavros_by_its_usual_names(tmp_path, mavros, capsys):
     # forward-left-up in the tree, forward-starboard-down in the file
     np.testing.assert_allclose(made.imu.position, [0.1, 0.0, -0.2], atol=1e-9)
     np.testing.assert_allclose(made.imu.rotation, [0.0, 0.0, -np.pi / 2], atol=1e-6)
-    assert "nothing that can be wrench" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "nothing that can be wrench" in said and "as it is" not in said
+    assert f"It can be used, with other records than {mavros.name};" in said
 
 
 def test_a_urdf_gives_the_body_and_leaves_the_rest_open(tmp_path, capsys):

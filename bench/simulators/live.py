@@ -155,7 +155,7 @@ class Vehicle:
 
 def start_node(estimator, parameters, *options):
     """The process of a node with a parameter file."""
-    command = [sys.executable, "-m", f"rov_ident.nodes.{estimator}_node", "--ros-args"]
+    command = [sys.executable, "-m", "rov_ident.nodes", f"{estimator}_node", "--ros-args"]
     command += ["--params-file", str(parameters)]
     for option in options:
         command += ["-p", option]

@@ -7,6 +7,7 @@ there. A damaged file differs from a seed by some bytes, numbers or pieces.
 import argparse
 import contextlib
 import io
+import math
 import random
 import resource
 import signal
@@ -187,14 +188,24 @@ def search(
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument(
+        "--files",
+        type=int,
+        nargs=2,
+        metavar=("READERS", "COMMANDS"),
+        help="so many in place of a time",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, help="folder for the files that led to faults")
     options = parser.parse_args()
     share = options.seconds / (len(READERS) + len(COMMANDS))
     bad = 0
-    for of, names, give in (("reader", READERS, read), ("command", COMMANDS, run)):
+    most = options.files or (sys.maxsize, sys.maxsize)
+    share = math.inf if options.files else share
+    kinds = ("reader", READERS, read, most[0]), ("command", COMMANDS, run, most[1])
+    for of, names, give, files in kinds:
         for name in names:
-            count, faults = search(name, give, share, sys.maxsize, options.seed)
+            count, faults = search(name, give, share, -(-files // len(names)), options.seed)
             print(f"{of} {name}: {count} files, {len(faults)} faults", flush=True)
             for k, (what, data) in enumerate(faults.items()):
                 print(f"  {what}")

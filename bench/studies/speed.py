@@ -467,7 +467,7 @@ def process(command: list[str], **variables: str) -> Iterator["subprocess.Popen[
 
 def rls_node(*arguments: str) -> list[str]:
     path = str(HEAVY)
-    command = [sys.executable, "-m", "rov_ident.nodes.rls_node"]
+    command = [sys.executable, "-m", "rov_ident.nodes", "rls_node"]
     return [*command, *(arguments or ["--ros-args"]), "--params-file", path]
 
 

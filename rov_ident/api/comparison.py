@@ -21,6 +21,7 @@ from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from rov_ident.api.identification import Identification
     from rov_ident.discrepancy.explain import Explanation
 
 _LARGEST_FILE = 100 << 20  # bytes; more than any result has
@@ -142,17 +143,18 @@ def _written(value: float, std: float) -> tuple[str, str]:
 
 
 def compare(
-    a: "Result | Explanation | Config | str | os.PathLike[str]",
-    b: "Result | Explanation | Config | str | os.PathLike[str]",
+    a: "Result | Explanation | Identification | Config | str | os.PathLike[str]",
+    b: "Result | Explanation | Identification | Config | str | os.PathLike[str]",
 ) -> Comparison:
     """Compare two results: which coefficients changed, and by how many standard deviations.
 
     Parameters
     ----------
     a, b
-        A Fit, an Explanation, a Config, or the path of the JSON of ``fit``, ``explain``, ``nomoto``
-        or ``forces`` or of a parameter file (YAML). Values of a configuration have no uncertainty:
-        they are compared as they are.
+        A Fit, an Explanation, an Identification, a Config, or the path of the JSON of ``fit``,
+        ``explain``, ``nomoto`` or ``forces``, of the folder that ``identify`` wrote, or of a
+        parameter file (YAML). Values of a configuration have no uncertainty: they are compared as
+        they are.
 
     Returns
     -------
@@ -191,13 +193,15 @@ def _estimates(source: Any) -> Estimates:
     if isinstance(source, Config):
         return _of_config(source, source.name)
     if isinstance(source, Shown):
-        label = source.estimator if isinstance(source, Result) else "explain"
+        label = source.estimator if isinstance(source, Result) else type(source).__name__.lower()
         return _of_document(json.loads(source.to_json()), label)
-    path = Path(source)
+    path, label = Path(source), Path(source).name
+    if path.is_dir():  # of identify
+        path /= "result.json"
     if path.suffix in (".yaml", ".yml"):
         return _of_config(configuration.load(path), path.name)
     try:
-        return _of_document(json.loads(read_input(path, _LARGEST_FILE), parse_int=float), path.name)
+        return _of_document(json.loads(read_input(path, _LARGEST_FILE), parse_int=float), label)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
@@ -215,6 +219,8 @@ def _of_document(document: Any, label: str) -> Estimates:
 
     Raises UserError if there are none.
     """
+    if isinstance(document, Mapping) and isinstance(document.get("fit"), Mapping):
+        document = document["fit"]  # of identify
     found: dict[str, tuple[str, float, float]] = {}
     entry: Any
     for name, entry in _entries(document):
@@ -225,7 +231,7 @@ def _of_document(document: Any, label: str) -> Estimates:
         found[name] = (unit, float(value), float(std))
     if not found:
         raise UserError(
-            f"{label} holds no estimates: give the JSON of fit, explain, nomoto or forces"
+            f"{label} holds no estimates: give the JSON of fit, explain, identify, nomoto or forces"
         )
     units, values, std = zip(*found.values(), strict=True)
     bags = _mappings(_mapping(document.get("provenance")).get("bags"))

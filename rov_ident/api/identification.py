@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
+from rov_ident.discrepancy.extension import EXTENDED
 from rov_ident.experiment.data_quality import BAD, GOOD, Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.offline.batch_fit import validation
@@ -236,6 +237,7 @@ def identify(
     explanation = explain(used, config, judge, progress=say)
     extended = explanation.findings.verdict in ("explained", "unexplained")
     start = explanation.extended if extended else given
+    explanation = _as_a_start(explanation, extended)
     fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
     judged: dict[str, Any] = {}
     if judge is not None:
@@ -250,6 +252,17 @@ def identify(
     name = judge.name if judge else ""
     notes = (*why, *explanation.findings.notes)
     return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
+
+
+def _as_a_start(explanation: Explanation, used: bool) -> Explanation:
+    """With notes on its configuration that say what that is here: the fit's start, if ``used``."""
+    findings = explanation.findings
+    notes = tuple(
+        note.replace(EXTENDED, "the configuration that the fit starts from")
+        for note in findings.notes
+        if used or EXTENDED not in note
+    )
+    return replace(explanation, findings=replace(findings, notes=notes))
 
 
 def _why(found: Check) -> str:

@@ -36,13 +36,15 @@ class Draft:
     text: str
     unknown: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    unfit: str = ""  # the record to which nothing can be fitted
 
     @property
     def sentence(self) -> str:
         """What is left to do."""
         if self.unknown:
             return f"To be given before it can be used: {', '.join(self.unknown)}."
-        return "It can be used as it is; check what is marked as assumed."
+        other = f", with other records than {self.unfit}" if self.unfit else " as it is"
+        return f"It can be used{other}; check what is marked as assumed."
 
     def save(self, path: File) -> None:
         """Write the file. Raises UserError if it cannot be written."""
@@ -56,6 +58,7 @@ class _Found:
     parameters: dict[str, Any] = field(default_factory=dict)
     remarks: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    unfit: str = ""
 
     def put(self, key: str, value: Any, source: str) -> None:
         section = self.parameters
@@ -123,7 +126,7 @@ def _written(found: _Found) -> Draft:
     unknown = tuple(re.findall(r"^ *(\w+): *# UNKNOWN", text, re.MULTILINE))
     if not unknown:  # what is drafted can be read
         configuration.from_parameters(found.parameters)
-    return Draft(text, unknown, tuple(found.notes))
+    return Draft(text, unknown, tuple(found.notes), found.unfit)
 
 
 def _of_model(path: Path, found: _Found, vehicle: str) -> None:
@@ -174,7 +177,8 @@ def _of_log(path: Path, found: _Found, vehicle: str) -> None:
         if len(track) < 2
     ]
     if lacks:
-        found.notes.append(f"{path.name} has no {', no '.join(lacks)}: nothing can be fitted")
+        found.notes.append(f"{path.name} has no {', no '.join(lacks)}: nothing can be fitted to it")
+        found.unfit = path.name
         return
     armed = [log.is_armed(t) for t in log.outputs.t]
     if armed and len(log.armed):
@@ -200,6 +204,7 @@ def _of_bag(path: Path, found: _Found) -> None:
             found.notes.append(
                 f"{path.name} has nothing that can be {role}: record it too (docs/inputs.md)"
             )
+            found.unfit = path.name
     if topics.IMU not in seen.sources:
         found.notes.append(f"{path.name} has no IMU: angular rates come from the odometry alone")
     for note in seen.notes:

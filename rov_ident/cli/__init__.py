@@ -8,10 +8,17 @@ from collections.abc import Sequence
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command in this process, which is the program's own; the exit status."""
+    """Run a command; the exit status. Without ``arguments`` the process is the program's own."""
+    from rov_ident.core.interrupts import end_at_once
+
+    if arguments is None:
+        end_at_once()  # before anything else is loaded
     from rov_ident.core.threads import limit_process
 
     limit_process()  # before numpy is loaded
     from rov_ident.cli.program import main as run
 
-    return run(arguments)
+    status = run(arguments)
+    if arguments is None:
+        end_at_once(status)
+    return status

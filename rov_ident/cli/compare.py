@@ -8,7 +8,10 @@ from rov_ident.cli.common import OUT, Commands, check_outputs, command, show, wr
 
 def add(commands: Commands) -> None:
     text = "two results: what changed, by how much against its uncertainty"
-    kinds = "JSON of fit, explain, nomoto or forces, or a parameter file, whose values are exact"
+    kinds = (
+        "JSON of fit, explain, nomoto or forces, the folder of identify, or a parameter file, "
+        "whose values are exact"
+    )
     compare = command(commands, "compare", text, _compare, "--json --report")
     compare.add_argument("a", type=Path, metavar="A", help=kinds)
     compare.add_argument("b", type=Path, metavar="B", help="the same")

@@ -1,6 +1,6 @@
 """The command ``rov-ident``: standard output carries results, standard error everything else.
 
-Exit status: 0 done, 2 the user can mend it, 1 a fault of ours.
+Exit status: 0 done, 2 the user can mend it, 1 a fault of ours, 130 and 143 interrupted.
 """
 
 import argparse
@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rov_ident.cli.common import command, say
 from rov_ident.core.errors import UserError
+from rov_ident.core.interrupts import raise_interrupts
 
 # The files of this room that hold commands, in the order of --help.
 COMMANDS = (
@@ -27,6 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     try:
+        if arguments is None:
+            raise_interrupts()
         options.run(options)
         sys.stdout.flush()
         written = (getattr(options, name, None) for name in ("json", "save", "report", "out"))
@@ -40,9 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # still holds of it goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         say("interrupted")
-        return 130
+        return getattr(interrupt, "status", 130)
     return 0
 
 

@@ -102,7 +102,7 @@ def replace_file(path: Place, content: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(place)
-    except OSError:
+    except BaseException:  # an interrupt, too
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise

@@ -15,6 +15,8 @@ from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
 from rov_ident.model.coefficients import AXES, parse
 from rov_ident.model.equations import Array
 
+EXTENDED = "the extended configuration"
+
 
 @dataclass(frozen=True)
 class Kept:
@@ -29,13 +31,13 @@ class Kept:
         """What stays as it was, in words; empty where nothing does."""
         if self.model is None:
             return (
-                "the extended configuration is the one given: on held-out data no part of what was "
+                f"{EXTENDED} is the one given: on held-out data no part of what was "
                 "found predicts every velocity as well"
             )
         if not self.axes:
             return ""
         return (
-            f"the extended configuration keeps the coefficients of {', '.join(self.axes)} as they "
+            f"{EXTENDED} keeps the coefficients of {', '.join(self.axes)} as they "
             "were: on held-out data those found do not predict every velocity as well"
         )
 

@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from functools import wraps
 from importlib import import_module
 from itertools import pairwise
@@ -22,9 +22,9 @@ from sensor_msgs.msg import Imu
 from rov_ident import config as configuration
 from rov_ident.config import Inputs
 from rov_ident.core.errors import UserError
+from rov_ident.core.interrupts import INTERRUPTS, end_at_once
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.io.topics import sources
-from rov_ident.nodes.programs import INTERRUPTS, end_at_once
 
 try:  # costs half as much, and keeps the order of arrival across topics
     from rclpy.experimental import EventsExecutor as Executor
@@ -47,6 +47,16 @@ class GuardedNode(Node):  # type: ignore[misc]
         self.faults: Counter[str] = Counter()
         self.outlives = True
         super().__init__(*arguments, **options)  # which listens to /clock
+
+    def declare_parameters(
+        self, namespace: str, parameters: Iterable[Any], ignore_override: bool = False
+    ) -> Any:
+        """As rclpy; raises UserError for what a user has set to nothing."""
+        given = list(parameters)
+        for name, value, *described in given:
+            if value is None and not any(d.dynamic_typing for d in described):
+                raise UserError(f"{name} is [], which says nothing: give a value, or leave it out")
+        return super().declare_parameters(namespace, given, ignore_override)
 
     def create_subscription(
         self, type_: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
@@ -138,7 +148,7 @@ def live(
     """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # open, so that the last messages can be published.
-    end_at_once()
+    end_at_once(0)
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy gives its RCLError no public name

@@ -5,7 +5,6 @@ approval mode not before somebody said so. A set is sent as a whole or not at al
 controller that took a part of it gets back what it had.
 """
 
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -405,7 +404,3 @@ def main() -> int:
         executor=lambda: _Executor(_THREADS),
         leave=ControllerBridge.leave,
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,10 +11,10 @@ from rclpy.executors import ExternalShutdownException
 
 from rov_ident.config import Parameter as Own
 from rov_ident.core.errors import UserError
+from rov_ident.core.interrupts import INTERRUPTS, end_at_once
 from rov_ident.dashboard.server import serving
 from rov_ident.dashboard.store import Store
 from rov_ident.nodes import parameters
-from rov_ident.nodes.programs import INTERRUPTS
 from rov_ident.nodes.watch_node import WatchNode, watching
 
 _OWN = (
@@ -52,9 +52,11 @@ def _live(
     arguments: list[str] | None, port: Callable[[WatchNode], int], announce: Announce
 ) -> None:
     """Run node and server until the end; ``arguments`` None: those of the program."""
+    end_at_once(0)  # a server may be ended at any time
     store = Store(time.monotonic)
     with watching(store, "dashboard", arguments) as (node, executor):
         asyncio.run(_serve(store, executor, port(node), announce))
+        end_at_once(0)  # again: the server had handlers of its own
 
 
 async def _serve(store: Store, executor: Any, port: int, announce: Announce) -> None:
@@ -72,7 +74,3 @@ async def _serve(store: Store, executor: Any, port: int, announce: Announce) -> 
         announce(address)
         await ended.wait()
         await hearing
-
-
-if __name__ == "__main__":
-    sys.exit(main())

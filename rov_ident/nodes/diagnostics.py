@@ -35,6 +35,7 @@ class Inputs:
 
     sources: Mapping[str, tuple[str, type]]
     received: Counter[str] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)  # that DDS says it has dropped, by reason
     silence: dict[str, float] = field(default_factory=dict)  # s since the last message
     subscriptions: dict[str, Any] = field(default_factory=dict)
 
@@ -48,6 +49,10 @@ class Inputs:
         """Whether one is silent without which there are no samples."""
         needed = self.sources.keys() & {ODOMETRY, WRENCH, DRIVE}
         return any(self.is_missing(role, timeout) for role in needed)
+
+    def count_lost(self, role: str, event: Any) -> None:
+        """Take DDS's own count of what was published and never reached the subscription."""
+        self.lost[f"{role}: lost before it reached the node"] = event.total_count
 
 
 class Diagnostics:
@@ -122,7 +127,7 @@ class Diagnostics:
                 )
             else:
                 complaints.append(f"no message received on {topic}: remap it or start the driver")
-        counts = self._online.counts + self._reader.counts + self._node.faults
+        counts = self._online.counts + self._reader.counts + self._node.faults + self._inputs.lost
         refused = counts - self._counts
         complaints += describe(
             {k: n for k, n in refused.items() if k not in _NO_WARNING and n > _CHANCE.get(k, 0)}

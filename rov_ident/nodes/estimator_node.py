@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
@@ -138,8 +139,11 @@ class EstimatorNode(GuardedNode):
         # Raw: our decoder is fifty times as fast, and the one that reads bags.
         for role, (name, type_) in self._inputs.sources.items():
             self._inputs.subscriptions[role] = self.create_subscription(
-                type_, name, partial(self._receive, role), qos, raw=True
-            )
+                type_, name, partial(self._receive, role), qos, raw=True,
+                event_callbacks=SubscriptionEventCallbacks(
+                    message_lost=partial(self._inputs.count_lost, role)
+                ),
+            )  # fmt: skip
         self._publish()
         self.get_logger().info(
             f"active after {time.monotonic() - self._started:.1f} s: estimating "
@@ -368,7 +372,7 @@ class EstimatorNode(GuardedNode):
         )
 
 
-def run(kind: Kind) -> int:
+def main(kind: Kind) -> int:
     """Run a node; its exit status is 0 after an interrupt, 2 for a bad configuration."""
     compiling = CompileState(kind)
     return live(

@@ -6,7 +6,6 @@ keeping is how it treats coefficients, silence and numbers that are none.
 """
 
 import math
-import sys
 import time
 
 import numpy as np
@@ -141,7 +140,3 @@ class ExampleController(GuardedNode):
 
 def main() -> int:
     return live("example_controller", ExampleController, own=_OWN_PARAMETERS)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -22,6 +22,7 @@ from rov_ident.config import Qos
 from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output
+from rov_ident.core.interrupts import INTERRUPTS, Interrupted
 from rov_ident.estimation.online import ESTIMATORS, Report
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -121,22 +122,26 @@ def replay(
 
 @contextmanager
 def _noted_interrupts() -> Iterator[Callable[[], None]]:
-    """A function that raises KeyboardInterrupt if there was one: within a callback of rclpy's it
+    """A function that raises Interrupted if there was an interrupt: within a callback of rclpy's it
     would be lost."""
-    noted = threading.Event()
+    noted: list[int] = []
 
     def raise_interrupt() -> None:
-        if noted.is_set():
-            raise KeyboardInterrupt
+        if noted:
+            raise Interrupted(noted[0])
 
     if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
         yield raise_interrupt
         return
-    before = signal.signal(signal.SIGINT, lambda *_: noted.set())
+    before = {
+        number: signal.signal(number, lambda number, _: noted.append(number))
+        for number in INTERRUPTS
+    }
     try:
         yield raise_interrupt
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -160,7 +165,7 @@ class _Process:
 
     def __init__(self, name: str, parameters: Path, namespace: str) -> None:
         self.name = name
-        command = ["-m", f"rov_ident.nodes.{name}", *apart(namespace)]
+        command = ["-m", "rov_ident.nodes", name, *apart(namespace)]
         command += ["--params-file", str(parameters), "--log-level", "warn"]
         command += ["-p", "use_sim_time:=true", "-p", "lockstep:=true"]
         # Ctrl-C interrupts this process only, which then interrupts the node.

@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.interrupts import INTERRUPTS
 from rov_ident.core.states import Level
 from rov_ident.dashboard.store import GONE, Estimator, Store, plain
 from rov_ident.estimation.online import Report
 from rov_ident.nodes.conversions import entries, for_json
-from rov_ident.nodes.programs import INTERRUPTS
 from rov_ident.nodes.watch_node import watching
 
 Heard = Mapping[str, tuple[Estimator, float]]

@@ -1,6 +1,7 @@
 // Draws what the server sends twice a second; asks for nothing and changes nothing.
 "use strict";
 
+const RECENT_BINS = 20;                // the last ten seconds of them
 const BINS = 240;                      // of residuals, as the server keeps them
 const POINTS = 300;                    // of a curve
 const CELL = 12;                       // px; the least in which a name can stand
@@ -101,6 +102,7 @@ class Picture {
     widths.observe(this.svg);          // asking for it while drawing would lay out the page each time
     this.svg.picture = this;
     this.grid = drawing(this.svg, "path", { class: "axis" });
+    this.zero = drawing(this.svg, "path", { class: "zero" });
     this.bands = names.map((_, i) => drawing(this.svg, "path", { class: "band", fill: colour(i) }));
     this.curves = names.map((_, i) => drawing(this.svg, "path",
       { class: `curve ${dashed(i)}`, stroke: colour(i) }));
@@ -130,6 +132,7 @@ class Picture {
     const y = (v) => 6 + (high - Math.min(high, Math.max(low, v))) / (high - low) * (bottom - 10);
     this.svg.setAttribute("viewBox", `0 0 ${width} ${this.height}`);
     this.grid.setAttribute("d", found.map((v) => `M${this.left},${y(v).toFixed(1)}H${width - 4}`).join(""));
+    this.zero.setAttribute("d", low <= 0 && high >= 0 ? `M${this.left},${y(0).toFixed(1)}H${width - 4}` : "");
     this.labels.replaceChildren();
     const write = (text, px, py, anchor) => {
       drawing(this.labels, "text", { x: px, y: py, "text-anchor": anchor }).textContent = text;
@@ -162,6 +165,16 @@ function keyOf(parent, index, name) {
   const key = element(parent, "span", `key ${dashed(index)}`);
   key.style.background = colour(index);
   parent.append(name);
+}
+
+// A part's heading, with a link to it in the page's head: on a phone the last part is ten screens below.
+function heading(parent, text) {
+  const title = element(parent, "h2", "", text), link = element(document.getElementById("parts"), "a", "", text);
+  link.href = "#";  // what follows it names the vehicle
+  link.addEventListener("click", (event) => {
+    event.preventDefault();
+    title.scrollIntoView();
+  });
 }
 
 function stateCounts(state) {
@@ -239,9 +252,9 @@ function buildBridges(main) {
 }
 
 function buildCoefficients(main, names, coefficients) {
-  const heading = element(main, "div", "heading");
-  element(heading, "h2", "", "Coefficients");
-  const choice = element(heading, "div", "choice");
+  const top = element(main, "div", "heading");
+  heading(top, "Coefficients");
+  const choice = element(top, "div", "choice");
   for (const [seconds, label] of [[0, "whole run"], [60, "last minute"], [10, "last 10 s"]]) {
     const button = element(choice, "button", "", label);
     button.addEventListener("click", () => { recent = seconds; refresh(); });
@@ -293,10 +306,23 @@ function buildCoefficients(main, names, coefficients) {
   }
 }
 
+// What the residual of one axis says in words, from [least, most, rms] of every half second. Noise has both signs in
+// nearly every bin, and of two halves of it neither is twice as large.
+function meaning(bins, what) {
+  if (bins.length <= RECENT_BINS) return "";
+  const recent = bins.slice(-RECENT_BINS);
+  for (const [side, beyond] of [["above", ([least]) => least > 0], ["below", ([, most]) => most < 0]])
+    if (recent.filter(beyond).length > 0.5 * RECENT_BINS) return `${side} zero: a steady ${what} is missing`;
+  const size = (some) => Math.sqrt(some.reduce((sum, [, , rms]) => sum + rms * rms, 0) / some.length);
+  return size(recent) > 2 * size(bins.slice(0, -RECENT_BINS)) ? "larger than before" : "around zero";
+}
+
 function buildResiduals(main, names) {
-  element(main, "h2", "", "Residual of the wrench");
-  element(main, "p", "soft", "Measured minus model, the last two minutes: the extremes of half a second, " +
-    "and its root mean square.");
+  heading(main, "Residual of the wrench");
+  element(main, "p", "soft", "The force that acts and that the model does not know: measured minus model, the last " +
+    "two minutes. Band: the extremes of half a second; curve: its root mean square. A good model leaves a narrow band " +
+    "around zero, the noise of the sensors. A band beside zero is a steady force that is missing (a current, weight, a " +
+    "tether); one that widens when the vehicle moves is wrong damping, added mass or thrust.");
   const grid = element(main, "div", "grid six");
   AXES.forEach((axis, k) => {
     const card = element(grid, "div", "card");
@@ -306,27 +332,29 @@ function buildResiduals(main, names) {
     const rows = names.map((_, index) => {
       const row = element(card, "div", "row");
       keyOf(element(row, "span"), index, "");
-      return element(row, "span");
+      return { rms: element(row, "span"), words: element(row, "span", "state soft") };
     });
     updates.push(() => {
       let low = Infinity, high = -Infinity, start = Infinity, end = -Infinity;
       const curves = names.map((name, index) => {
         const bins = estimators.get(name).residuals;
-        rows[index].textContent = bins.length
+        const { rms, words } = rows[index];
+        rms.textContent = bins.length
           ? `rms ${Number(bins.at(-1)[3][k]).toPrecision(2)} ${k < 3 ? "N" : "N m"}` : "no samples yet";
+        words.textContent = meaning(bins.map((bin) => [bin[1][k], bin[2][k], bin[3][k]]), k < 3 ? "force" : "moment");
         for (const [t, least, most] of bins) {
           low = Math.min(low, least[k]); high = Math.max(high, most[k]);
           start = Math.min(start, t); end = Math.max(end, t);
         }
         return bins.map(([t, least, most, rms]) => [t, rms[k], least[k], most[k]]);
       });
-      if (low <= high) picture.draw(curves, start, end, low, high);
+      if (low <= high) picture.draw(curves, start, end, Math.min(low, 0), Math.max(high, 0));
     });
   });
 }
 
 function buildExcitation(main, names, coefficients) {
-  element(main, "h2", "", "Excitation");
+  heading(main, "Excitation");
   element(main, "p", "soft", "How much of what was not known beforehand the motion of the last 20 to 40 s " +
     `would tell by itself; below ${100 * EXCITED} % (the line) a coefficient is held.`);
   const bars = element(main, "div", "bars");
@@ -354,7 +382,7 @@ function buildExcitation(main, names, coefficients) {
 }
 
 function buildCorrelations(main, names) {
-  element(main, "h2", "", "What is not told apart");
+  heading(main, "What is not told apart");
   element(main, "p", "soft", "Correlation of the estimates: near −1 or 1 the data know a sum of two " +
     "coefficients better than either.");
   const maps = element(main, "div", "maps");
@@ -456,6 +484,7 @@ function build(namespaces, names, coefficients) {
   widths.disconnect();
   const nav = document.getElementById("vehicles"), main = document.getElementById("main");
   nav.replaceChildren();
+  document.getElementById("parts").replaceChildren();
   main.replaceChildren();
   if (namespaces.length > 1) for (const namespace of namespaces) {
     const button = element(nav, "button", "", namespace === "/" ? "no namespace" : namespace);
