@@ -24,16 +24,17 @@ COMMANDS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    name = "rov-ident"
     try:
+        options = _parser().parse_args(arguments)
+        name += f" {options.command}"
         options.run(options)
         sys.stdout.flush()
         written = (getattr(options, name, None) for name in ("json", "save", "report", "out"))
         if paths := [str(path) for path in written if isinstance(path, Path) and path.exists()]:
             say(f"written: {', '.join(paths)}")
     except UserError as error:
-        say(f"rov-ident {options.command}: {error}")
+        say(f"{name}: {error}")
         return 2
     except BrokenPipeError:
         # Whoever read our output has seen enough (`rov-ident coefficients | head`); what Python
