@@ -6,10 +6,10 @@ import pytest
 from bench import HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition
-from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import blocks, windows
 from rov_ident.discrepancy.output_error import fit
-from rov_ident.discrepancy.results import Finding, Gain
+from rov_ident.discrepancy.report import _card
+from rov_ident.discrepancy.results import Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import gather, joined
@@ -68,20 +68,17 @@ def test_headings_are_compared_between_records():
     assert none == [0.0, 0.0] and same[0] is bags[0]
 
 
-def test_a_lag_is_shared_and_a_heading_is_each_dives_own():
-    """A yaw that was set to zero at each start is no property of the vehicle."""
-    lag = {"time_constant": 0.3}
-    bags = [
-        record(seed, 60.0, thruster_lag=lag, heading_offset={"yaw": yaw})
-        for seed, yaw in ((11, 0.1), (12, 0.6))
-    ]
-    explanation = explain(bags, TODAY)
-    found = {f.effect: f for f in explanation.findings.effects}
-    assert set(found) == {"thruster_lag", "heading_offset"}
-    shared, own = (found[n].repetition for n in ("thruster_lag", "heading_offset"))
-    assert shared.same and shared.repeats and found["thruster_lag"].separable
-    assert not own.same
-    for of, true in zip(own.records, (0.1, 0.6)):
+def test_a_heading_is_each_dives_own():
+    """With the values that were taken off before the records were compared."""
+    bags = [record(seed, heading_offset={"yaw": yaw}) for seed, yaw in ((11, 0.1), (12, 0.6))]
+    turned, headings = repetition.turned(bags, TODAY)
+    gain = Gain("kinematic", 2.0, 1.0, 50.0, 40.0, 60.0)
+    value = {"yaw": Value(0.1, 0.01, "rad")}
+    found = Finding("heading_offset", (), value, None, gain, True, None, (), "")
+    (own,) = repetition.of_sensors(turned, TODAY, [found], headings)
+    assert not own.repetition.same and own.separable
+    for of, true in zip(own.repetition.records, (0.1, 0.6)):
         assert abs(of["yaw"].value - true) < 0.02
-    assert set(explanation.extended.effects) == {"thruster_lag"}
-    assert '"repetition"' in explanation.to_json() and "record 2" in explanation.page()
+    assert "The records differ: yaw" in own.sentence
+    page = _card(own)
+    assert "record 2" in page and "The records differ in it." in page
