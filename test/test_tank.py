@@ -46,9 +46,6 @@ def test_nodes_identify_the_measured_vehicle(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not TANK.is_dir(), reason="the measured tank record is not here")
-@pytest.mark.xfail(
-    strict=True, reason="names linear damping, a mounting and a heading instead: not yet understood"
-)
 @pytest.mark.parametrize("y_v", [None, 0.0, -20.0])
 def test_what_a_linear_model_lacks_is_named(y_v: float | None, tmp_path: Path) -> None:
     """Whatever linear drag it begins with: quadratic drag, and a lag of the thrusters."""

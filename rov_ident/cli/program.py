@@ -25,9 +25,10 @@ COMMANDS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    name = "rov-ident"
     try:
+        options = _parser().parse_args(arguments)
+        name += f" {options.command}"
         if arguments is None:
             raise_interrupts()
         options.run(options)
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if paths := [str(path) for path in written if isinstance(path, Path) and path.exists()]:
             say(f"written: {', '.join(paths)}")
     except UserError as error:
-        say(f"rov-ident {options.command}: {error}")
+        say(f"{name}: {error}")
         return 2
     except BrokenPipeError:
         # Whoever read our output has seen enough (`rov-ident coefficients | head`); what Python

@@ -20,8 +20,9 @@ function with a single caller: numba optimises whatever a kernel calls once more
 
 numba compiles a cached function again when its own file changes, but not when a function it calls
 or a constant of another module changes. The cache therefore lies in a folder that is named after
-the source of the whole package and the versions of all that makes the machine code: a kernel of
-another version is never run, and a new version does not disturb one that is running.
+the source of the whole package and of installed effects, and the versions of all that makes the
+machine code: a kernel of another version is never run, and a new version does not disturb one that
+is running.
 """
 
 import contextlib
@@ -41,7 +42,7 @@ import numpy as np
 from llvmlite import binding
 from numba.core.registry import CPUDispatcher, cpu_target
 
-from rov_ident.core import children
+from rov_ident.core import children, plugins
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -53,6 +54,8 @@ def _cache_folder() -> Path:
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
+    for source in plugins.sources():
+        digest.update(source)
     for version in (sys.version, np.__version__, numba.__version__, binding.get_host_cpu_name()):
         digest.update(version.encode())
     caches = Path(os.environ.get("XDG_CACHE_HOME") or "")

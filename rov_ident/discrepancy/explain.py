@@ -14,7 +14,7 @@ import numpy as np
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.discrepancy import extension, sensor_choice, sensor_consistency
+from rov_ident.discrepancy import extension, repetition, sensor_choice, sensor_consistency
 from rov_ident.discrepancy.findings import (
     changes,
     finding,
@@ -30,6 +30,7 @@ from rov_ident.discrepancy.held_out import (
     Judge,
     blocks,
     is_practical,
+    is_sure,
     split,
     thinned,
     windows,
@@ -40,9 +41,9 @@ from rov_ident.discrepancy.results import Finding, Findings, Residual, Verdict
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import Search, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
-from rov_ident.discrepancy.sensor_choice import NOISE
+from rov_ident.discrepancy.sensor_choice import HEADING, NOISE
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.model.coefficients import VELOCITIES
+from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Shown
 from rov_ident.reports.table import Tables
@@ -62,6 +63,9 @@ CUT_SHORT = (
 _NO_TORQUE = (
     "the wrench of these bags never holds a moment: how the vehicle turns is taken from the "
     "measurement, not simulated, and nothing is said about it"
+)
+_OWN_HEADINGS = (
+    "each record has a heading of its own against the world: the extended configuration has none"
 )
 _ONLY_FITTED = (
     "the extended model cannot be simulated through all of the data: its values are those of the "
@@ -141,15 +145,27 @@ def explain(
     with the share that is done. UserError if the bags are too short, or the model cannot be
     simulated at all."""
     say = progress or (lambda what, share: None)
+    total = sum(bag.duration for bag in bags)
+    if total < _SHORTEST:
+        raise UserError(
+            f"the bags hold {total:.0f} s of data: at least {_SHORTEST:.0f} s are needed to find "
+            "anything"
+        )
+    say("comparing the sensors", 0.05)
+    with_others = [*bags, *([] if validate is None else [validate])]
+    as_headed = joined(bags)[0] if validate is None else validate
+    turned, headings = repetition.turned(with_others, config)
+    bags = turned[: len(bags)]
+    validate = None if validate is None else turned[-1]
     streams, to_fit, held = _divided(bags, validate)
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
-
-    say("comparing the sensors", 0.05)
-    choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config)
+    choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config, any(headings))
     of_sensors = sensor_findings(
         streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
-        choice.alternatives, choice.fixed,
+        choice.alternatives, choice.fixed, as_headed,
     )  # fmt: skip
+    if len(bags) > 1:
+        of_sensors = repetition.of_sensors(bags, config, of_sensors, headings[: len(bags)])
     sensors = {f.effect: choice.sensors[f.effect] for f in of_sensors if is_practical(f.gain)}
     recorded = judged, streams
     streams = sensor_consistency.corrected(streams, sensors)
@@ -170,7 +186,12 @@ def explain(
     written = extension.kept(judge, baseline, model.final.hypothesis)
     last, notes = _with_all_data(search, streams, model)
     found = [f for f in of_sensors if is_practical(f.gain)]
-    found += [with_parameters(search, last, f) for f in model.found]
+    of_dynamics = [with_parameters(search, last, f) for f in model.found]
+    if len(bags) > 1:
+        say("leaving records out", 0.95)
+        records = repetition.Records(streams, bags, joined(bags)[1])
+        of_dynamics = repetition.in_each(search, records, last, of_dynamics)
+    found += of_dynamics
     minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
     verdict: Verdict = "unexplained" if residual else "explained" if found else "agrees"
     if verdict == "agrees" and is_practical(judge.gain(search.given, retuned.hypothesis)):
@@ -188,9 +209,11 @@ def explain(
         reads = any(f.effect == NOISE and is_practical(f.gain) for f in of_sensors)
         if not reads:
             values = sensor_choice.with_noise(values, config.effects.get(NOISE, {}))
-        extended = _extended(values, sensors)
+        lasting = {n: v for n, v in sensors.items() if not (n == HEADING and any(headings))}
+        extended = _extended(values, lasting)
     everything = WindowedProblem(streams, blocks(streams))
     notes = [*choice.notes, *notes, *filter(None, [written.note, far])]
+    notes += [_OWN_HEADINGS] if any(headings) else []
     notes += [_NO_TORQUE] if streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
@@ -200,7 +223,7 @@ def explain(
         rmse[2],
         changes(config, retuned),
         tuple(sorted(found, key=lambda f: -f.gain.percent)),
-        tuple(f for f in minor if f.gain.low > 0.0 or f.gain.percent >= 100.0 * PRACTICAL),
+        tuple(f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL),
         tuple(residual),
         verdict,
         (*streams.notes, *notes),
@@ -217,13 +240,8 @@ def explain(
 
 
 def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams, Spans, Spans]:
-    """The bags joined, the spans to fit, and those to judge on. UserError if they are too short."""
-    total, (streams, begins) = sum(bag.duration for bag in bags), joined(bags)
-    if total < _SHORTEST:
-        raise UserError(
-            f"the bags hold {total:.0f} s of data: at least {_SHORTEST:.0f} s are needed to find "
-            "anything"
-        )
+    """The bags joined, the spans to fit, and those to judge on."""
+    streams, begins = joined(bags)
     of_all: tuple[Spans, Spans] = [], []  # to fit, and held out
     for bag, begin in zip(bags, begins, strict=True):
         own = split(bag.duration) if validate is None else (windows(0.0, bag.duration), [])
@@ -319,7 +337,7 @@ def _supports_another(search: Search, judge: Judge, model: _Model, name: str) ->
         neither = refit(final.hypothesis.without(keys), final.linearisation)
         if neither is None or search.improvement(neither, rest, final) >= VERY_STRONG:
             continue
-        if is_practical(judge.gain(neither.hypothesis, final.hypothesis)):
+        if is_practical(judge.gain(neither.hypothesis, final.hypothesis, axes=AXES)):
             return True
     return False
 

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from rov_ident.discrepancy.held_out import Judge, surely_less
+from rov_ident.discrepancy.held_out import Judge, log_ratio, surely_less
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
 from rov_ident.model.coefficients import AXES, parse
 from rov_ident.model.equations import Array
@@ -55,7 +55,7 @@ def kept(judge: Judge, given: Array, h: Hypothesis) -> Kept:
         for axes in combinations(rows, count):
             there = without_rows(h, axes)
             after = judge.summed(there)
-            growth = np.log(np.maximum(after.sum(axis=0), 1e-300) / given.sum(axis=0))
+            growth = log_ratio(after.sum(axis=0), given.sum(axis=0))  # guided axes have no errors
             own = np.array([a in rows and a not in axes for a in AXES])
             worse = own & (growth > 0.0)
             for i in np.flatnonzero(~own & judge.free):

@@ -22,7 +22,7 @@ from rov_ident.discrepancy.results import Alternative, Change, Finding, Gain, Re
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
-from rov_ident.discrepancy.sensor_choice import NOISE, with_noise
+from rov_ident.discrepancy.sensor_choice import HEADING, NOISE, with_noise
 from rov_ident.discrepancy.windowed_problem import Spans, within
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -234,16 +234,19 @@ def sensor_findings(
     held: Spans,
     alternatives: Mapping[str, Sequence[str]] | None = None,
     fixed: Container[Key] = (),
+    as_headed: Streams | None = None,
 ) -> list[Finding]:
     """Findings of the sensor effects ``found`` in the spans ``fit`` of the streams, by how much
     better the sensors agree in the spans ``held`` of the streams ``judged``. Each cannot be told
-    from its ``alternatives``; the parameters ``fixed`` are at their null."""
+    from its ``alternatives``; the parameters ``fixed`` are at their null. ``as_headed``: the
+    streams judged with the headings of their records as they were."""
     findings = []
     after = sensor_consistency.comparisons(judged, config, found)
     for name in found:
         others = [n for n in found if n != name]
         rest, _ = sensor_consistency.search(streams, config, fit, others, fixed)
-        before = sensor_consistency.comparisons(judged, config, rest)
+        given = as_headed if name == HEADING and as_headed is not None else judged
+        before = sensor_consistency.comparisons(given, config, rest)
         sums = [_common(*pair, held) for pair in zip(before, after, strict=True)]
         last = max(map(len, sums))
         of = np.stack([np.pad(s, ((0, last - len(s)), (0, 0))) for s in sums], axis=2)

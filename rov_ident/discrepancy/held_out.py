@@ -3,12 +3,13 @@ with it and without."""
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.discrepancy.hypothesis import Hypothesis
-from rov_ident.discrepancy.results import Gain
+from rov_ident.discrepancy.results import Gain, Together
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import sense
 from rov_ident.effects.base import Reading
@@ -120,14 +121,18 @@ class Judge:
     ) -> Gain:
         """Of the component that gains most, of those that surely gain if any do. Windows that reach
         into the time ``except_for`` do not count. Where none surely gains, those of the ``axes`` on
-        which an effect acts are looked at alone: an interval for six components is wide."""
+        which an effect acts are looked at alone, as an interval for six components is wide, and
+        then all of these together: a lag moves each a little."""
         free, use = np.flatnonzero(~self._guided), self._used(except_for)
         a, b = (self.summed(h)[use] for h in (before, after))
         count = int(use[self._chunk].sum())
         own = np.array([i for i in free if AXES[i] in axes], dtype=int)
         sets = [of for of in (free, own) if len(of)]
         gains = [gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count) for of in sets]
-        return next((g for g in gains if g.low > 0.0), gains[0])
+        found = next((g for g in gains if g.low > 0.0), gains[0])
+        if found.low <= 0.0 and len(own) > 1:
+            found = replace(found, together=together(a[:, own], b[:, own]))
+        return found
 
     def _used(self, except_for: tuple[float, float] | None) -> NDArray[np.bool_]:
         """Which chunks count."""
@@ -144,7 +149,7 @@ class Judge:
         """Whether a rival predicts better, all velocities taken together."""
         free, use = ~self._guided, self._used(except_for)
         a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
-        return bool(_log_ratio(a, b).sum() < 0.0)
+        return bool(log_ratio(a, b).sum() < 0.0)
 
     def summed(self, h: Hypothesis) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
@@ -165,7 +170,17 @@ def improved(gain: Gain) -> str:
 
 def is_practical(gain: Gain) -> bool:
     """Whether a gain is sure, and large enough to matter."""
-    return gain.percent >= 100.0 * PRACTICAL and gain.low > 0.0
+    judged = _judged(gain)
+    return judged.percent >= 100.0 * PRACTICAL and judged.low > 0.0
+
+
+def is_sure(gain: Gain) -> bool:
+    """Whether predictions improve, be it by little."""
+    return _judged(gain).low > 0.0
+
+
+def _judged(gain: Gain) -> Gain | Together:
+    return gain if gain.low > 0.0 or gain.together is None else gain.together
 
 
 def gain_of(components: Sequence[str], before: Array, after: Array, count: float | Array) -> Gain:
@@ -178,8 +193,8 @@ def gain_of(components: Sequence[str], before: Array, after: Array, count: float
     """
     chunks = len(before)
     draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
-    change = _log_ratio(after.sum(axis=0), before.sum(axis=0))
-    drawn = _log_ratio(draws @ after, draws @ before)
+    change = log_ratio(after.sum(axis=0), before.sum(axis=0))
+    drawn = log_ratio(draws @ after, draws @ before)
     std = drawn.std(axis=0) + 1e-12
     widest = np.quantile(np.abs((drawn - change) / std).max(axis=1), 0.95) * std
     percent, low, high = (
@@ -187,7 +202,19 @@ def gain_of(components: Sequence[str], before: Array, after: Array, count: float
     )
     rmse = (np.sqrt(x.sum(axis=0) / count) for x in (before, after))
     best = int(np.argmax(np.where(low > 0.0, percent, -np.inf if (low > 0.0).any() else percent)))
-    return Gain(components[best], *(float(x[best]) for x in (*rmse, percent, low, high)))
+    of = [float(x[best]) for x in (*rmse, percent, low, high)]
+    return Gain(components[best], of[0], of[1], of[2], of[3], of[4])
+
+
+def together(before: Array, after: Array) -> Together:
+    """The gain of all components (C, K) together: one number, so nothing has been picked."""
+    chunks = len(before)
+    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    change = log_ratio(after.sum(axis=0), before.sum(axis=0)).mean()
+    drawn = log_ratio(draws @ after, draws @ before).mean(axis=1)
+    widest = np.quantile(np.abs(drawn - change), 0.95)
+    ends = change, change + widest, change - widest
+    return Together(*(float(100.0 * (1.0 - np.exp(0.5 * x))) for x in ends))
 
 
 def surely_less(a: Array, b: Array) -> bool:
@@ -195,9 +222,10 @@ def surely_less(a: Array, b: Array) -> bool:
     components taken together: in 97.5 % of resampled chunks, one end of a 95 % interval."""
     chunks = len(a)
     draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
-    return bool(np.quantile(_log_ratio(draws @ a, draws @ b).sum(axis=1), 0.975) < 0.0)
+    return bool(np.quantile(log_ratio(draws @ a, draws @ b).sum(axis=1), 0.975) < 0.0)
 
 
-def _log_ratio(a: Array, b: Array) -> Array:
+def log_ratio(a: Array, b: Array) -> Array:
+    """The logarithm of a / b, of squared errors that may be zero."""
     ratio: Array = np.log(np.maximum(a, 1e-300)) - np.log(np.maximum(b, 1e-300))
     return ratio

@@ -21,6 +21,9 @@ from rov_ident.model.equations import Array, Model
 Key = tuple[str, str]
 COEFFICIENTS = "coefficients"
 
+_WIDE = 10.0  # times the size of a coefficient: one that is configured as zero, on an axis without
+# other damping, has a size of 2 N s/m where drag is 80, and would be held near zero
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -137,7 +140,7 @@ def coefficient_sizes(model: Model) -> dict[Key, float]:
 
 def precision(h: Hypothesis) -> Array:
     """Prior precision (P,): wide, so that it decides only where the data say nothing."""
-    width = coefficient_sizes(h.config.model)
+    width = {key: _WIDE * size for key, size in coefficient_sizes(h.config.model).items()}
     width |= {key: 1e3 * parameter(key).typical for key in h.keys if key[0] in EFFECTS}
     return np.array([width.get(key, np.inf) for key in h.keys]) ** -2.0
 

@@ -12,7 +12,7 @@ from rov_ident.config import Config
 from rov_ident.core.files import write_file
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, predicted
-from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Value
+from rov_ident.discrepancy.results import Finding, Findings, Gain, Repetition, Residual, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
@@ -27,6 +27,7 @@ _SENSES = (("astern", "forward"), _SIDES, ("up", "down"), _SIDES, ("bow down", "
 SENSES = dict(zip(VELOCITIES, _SENSES))
 """What a negative and a positive velocity mean."""
 
+_TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
 _TOLD = 3  # parameters of an effect in the verdict
 _SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
 _STRETCH = 30.0  # s of motion that is shown
@@ -120,6 +121,7 @@ def dependence(r: Residual) -> str:
 
 def interval(gain: Gain) -> str:
     """A gain with its interval, on what it was measured, from what to what."""
+    all_of = gain.together
     if gain.component == "kinematic":
         what, unit = "disagreement of the sensors", "times their noise"
     else:
@@ -127,6 +129,7 @@ def interval(gain: Gain) -> str:
     return (
         f"{gain.percent:.1f} % (95 %: {gain.low:.1f} to {gain.high:.1f} %) on the {what}: RMSE "
         f"{number(gain.rmse_before)} without it, {number(gain.rmse_after)} {unit} with it"
+        + ("" if all_of is None else _TOGETHER.format(all_of.percent, all_of.low, all_of.high))
     )
 
 
@@ -411,6 +414,8 @@ def _card(finding: Finding) -> str:
         report.table(["", "value", "std", "unit", "meaning"], rows, text=(3, 4)),
         report.paragraph(f"Gain on data that no fit has seen: {interval(finding.gain)}."),
     ]
+    if finding.repetition is not None:
+        parts += _in_each_record(finding.repetition)
     if finding.axes:
         parts.append(report.paragraph(f"It acts on {listed(finding.axes)}."))
     why = "What else might do the same has no name, or was not all tried (see the notes)."
@@ -423,6 +428,21 @@ def _card(finding: Finding) -> str:
         run = finding.manoeuvre or effect.manoeuvre
         parts.append(report.paragraph(f"{why} The run that would tell: {run}."))
     return report.card(name[0].upper() + name[1:], parts)
+
+
+def _in_each_record(r: Repetition) -> list[str]:
+    """Whether an effect is the same in each of several records, and what it is in each."""
+    words = "It is the same in each record." if r.same else "The records differ in it."
+    if r.repeats is not None:
+        does = "does" if r.repeats else "does not"
+        words += f" Fitted to the others, it {does} predict a record that was left out better."
+    names = list(r.records[0])
+    rows = [
+        [f"record {i}", *(x for n in names for x in estimate(of[n].value, of[n].std))]
+        for i, of in enumerate(r.records, 1)
+    ]
+    heads = ["", *(x for n in names for x in (n, "std"))]
+    return [report.paragraph(words), report.table(heads, rows)]
 
 
 def _retuned(f: Findings) -> list[str]:

@@ -19,10 +19,20 @@ class Value:
 
 
 @dataclass(frozen=True)
+class Together:
+    """A gain [%] of several velocities, the mean of its logarithms, with its 95 % interval."""
+
+    percent: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class Gain:
     """What an effect gains on data that no fit has seen: ``component`` is a velocity component or
     "kinematic"; rmse in its unit (kinematic: in units of the noise); ``percent`` with its 95 %
-    interval."""
+    interval. Where no velocity surely gains by itself, those of the axes on which the effect acts
+    ``together``."""
 
     component: str
     rmse_before: float
@@ -30,6 +40,7 @@ class Gain:
     percent: float
     low: float
     high: float
+    together: Together | None = None
 
 
 @dataclass(frozen=True)
@@ -38,6 +49,17 @@ class Alternative:
 
     effect: str
     why_not: str
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """What several records say of an effect: whether it is the ``same`` in each, whether a record
+    is predicted better with it by fits to the others (``repeats``; None: not asked, as sensors are
+    compared in each record, and an onset belongs to one), and its parameters in each."""
+
+    same: bool
+    repeats: bool | None
+    records: tuple[dict[str, Value], ...]
 
 
 @dataclass(frozen=True)
@@ -55,6 +77,7 @@ class Finding:
     manoeuvre: str | None
     alternatives: tuple[Alternative, ...]
     sentence: str
+    repetition: Repetition | None = None
 
 
 @dataclass(frozen=True)

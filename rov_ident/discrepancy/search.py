@@ -134,7 +134,9 @@ class Search:
         if progress is not None:
             progress(", ".join(f"{c.name} {c.score:.0f}" for c in candidates[:5]))
         fits = self.fit_best(now, candidates) + self._with_late_thrust(now)
-        best = self._best(now, fits) or self._damping_and_another(now, candidates)
+        best = self._best(now, fits)
+        if best is None or added_effect(now, best) not in HULL_DAMPING:
+            best = self._cheapest([best, self._damping_and_another(now, candidates)])
         if best is None:
             damping = [f for f in fits if added_effect(now, f) in HULL_DAMPING]
             best = self._best(now, damping, HULL_DAMPING_ASKED)
@@ -157,9 +159,17 @@ class Search:
         damping = [f for f in good if added_effect(now, f) in HULL_DAMPING]
         return min(damping or good, key=lambda f: self.cost(f, closest), default=None)
 
+    def _cheapest(self, fits: Sequence[Fitted | None]) -> Fitted | None:
+        """The fit with the best penalised score of those that there are."""
+        there = [f for f in fits if f is not None]
+        closest = min(there, key=lambda f: f.squares, default=None)
+        return closest and min(there, key=lambda f: self.cost(f, closest))
+
     def _damping_and_another(self, now: Fitted, candidates: Sequence[Candidate]) -> Fitted | None:
         """Hull damping with one effect more, where neither shows without the other; late thrust
-        whatever its score: the linearisation of a model without drag does not show it."""
+        whatever its score: the linearisation of a model without drag does not show it. What shows
+        by itself in such a model may only imitate the two: a limit of the thrust, or products of
+        velocities, on the measured record of docs/tank.md."""
         for candidate in candidates:
             if candidate.name not in HULL_DAMPING:
                 continue

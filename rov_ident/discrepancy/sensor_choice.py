@@ -81,18 +81,25 @@ class _Data:
         return sensor_consistency.common_squares(all_found, self.held)
 
 
-def chosen(streams: Streams, spans: Spans, judged: Streams, held: Spans, config: Config) -> Choice:
+def chosen(
+    streams: Streams,
+    spans: Spans,
+    judged: Streams,
+    held: Spans,
+    config: Config,
+    turned: bool = False,
+) -> Choice:
     """The effects that the streams support in the ``spans``, by what they do in the spans ``held``
-    of the streams ``judged``."""
+    of the streams ``judged``. ``turned``: the heading is off, by what several records say."""
     data = _Data(streams, spans, judged, held, config)
     found, std = sensor_consistency.search(streams, config, spans)
     choice = Choice(found, std)
-    if {HEADING, MOUNTING} & found.keys():
-        choice = _heading_or_mounting(data, choice)
+    if turned or {HEADING, MOUNTING} & found.keys():
+        choice = _heading_or_mounting(data, choice, turned)
     return _without_refuted(data, choice)
 
 
-def _heading_or_mounting(data: _Data, found: Choice) -> Choice:
+def _heading_or_mounting(data: _Data, found: Choice, turned: bool) -> Choice:
     """The heading of the pose, the mounting of the velocity sensor, or its tilt and the heading:
     those that the sensors refute are dropped, then those that the dynamics refute, and of the rest
     that is taken which changes the velocities least."""
@@ -104,7 +111,8 @@ def _heading_or_mounting(data: _Data, found: Choice) -> Choice:
         data.fitted([*others, HEADING, MOUNTING], frozenset({_YAW})),
     ]
     sums = data.agreement([v.sensors for v in variants])
-    order = sorted(range(len(variants)), key=lambda i: float(np.log(sums[i].sum(axis=0)).sum()))
+    possible = (0, 2) if turned else (0, 1, 2)
+    order = sorted(possible, key=lambda i: float(np.log(sums[i].sum(axis=0)).sum()))
     best = order[0]
     left = [i for i in order if not surely_less(sums[best], sums[i])]
     if len(left) > 1:

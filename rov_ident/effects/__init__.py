@@ -1,11 +1,13 @@
-"""What a simulation may lack: one file for each effect, found because it is in this folder.
+"""What a simulation may lack: one file for each effect, found because it is in this folder, and
+those of installed packages (docs/own-effects.md).
 
 Knows equations and no data: effects on the input, the motion, the wrench and the rigid body. The
 kernels below run all effects of one place; :func:`compiled` makes their arguments from the section
 ``effects`` of a configuration.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
 from pkgutil import iter_modules
@@ -14,15 +16,43 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.core import plugins
+from rov_ident.core.errors import UserError
 from rov_ident.core.jit import inlined, kernel, lean
-from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading
+from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading, faults
 from rov_ident.model.equations import RigidBody, add_current
 
-EFFECTS: dict[str, Effect] = {
-    module.name: replace(import_module(f"{__name__}.{module.name}").EFFECT, name=module.name)
-    for module in iter_modules(__path__)
-    if module.name != "base"
-}
+
+def _of_others(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
+    """Effects that installed packages bring, by the names of their entry points. UserError if one
+    is none, or has a name that is taken."""
+    names: dict[str, str] = dict.fromkeys(taken, "rov_ident")
+    for package, point in plugins.installed():
+        effect, name = plugins.loaded(package, point), point.name
+        fault = faults(effect)
+        if name in names:
+            fault = f"has the name of one that {names[name]} has"
+        elif not re.fullmatch("[a-z][a-z0-9_]*", name):
+            fault = "needs a name of small letters, digits and underscores"
+        if fault:
+            raise UserError(
+                f"the effect {name} of the installed package {package} {fault}: mend or uninstall "
+                "that package"
+            )
+        names[name] = package
+        yield name, replace(effect, name=name)
+
+
+def _library() -> dict[str, Effect]:
+    ours = {
+        module.name: replace(import_module(f"{__name__}.{module.name}").EFFECT, name=module.name)
+        for module in iter_modules(__path__)
+        if module.name != "base"
+    }
+    return {**dict(_of_others(ours)), **ours}
+
+
+EFFECTS: dict[str, Effect] = _library()
 """Every effect by the name users give it."""
 
 _INPUT = sorted((e for e in EFFECTS.values() if e.act), key=lambda e: (e.order, e.name))

@@ -41,6 +41,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.core.errors import UserError
+from rov_ident.model.coefficients import parse
+
 Array = NDArray[np.float64]
 
 SIZE = 8
@@ -157,3 +160,29 @@ class Effect:
     def of_sensors(self) -> bool:
         """Whether it changes what is measured, and no motion."""
         return bool(self.sense or self.late or self.heading or self.noise)
+
+
+_HOOKS = ("coefficients", "body", "wrench", "water", "act", "sense", "late", "heading")
+
+
+def faults(effect: Any) -> str:
+    """What is wrong with an effect that was written elsewhere, in words; empty if nothing is."""
+    if not isinstance(effect, Effect):
+        return "is no rov_ident.effects.base.Effect"
+    if sum(bool(getattr(effect, hook)) for hook in _HOOKS) != 1:
+        return f"must have exactly one of {', '.join(_HOOKS)}"
+    if bool(effect.sense) != bool(effect.correct):
+        return "must have sense and correct, or neither"
+    if len(effect.parameters) > SIZE:
+        return f"has {len(effect.parameters)} parameters, but may have {SIZE} at most"
+    if bool(effect.parameters) == bool(effect.coefficients):
+        return "must have parameters, or coefficients"
+    for p in effect.parameters:
+        if not (p.lower <= p.null <= p.upper and p.typical > 0.0):
+            return f"needs lower <= null <= upper and typical > 0 of its parameter {p.name}"
+    try:
+        for name in effect.coefficients:
+            parse(name)
+    except UserError as error:
+        return f"has a coefficient that is none: {error}"
+    return ""

@@ -1,0 +1,183 @@
+"""Whether a cause is the same in each of several records, and whether it repeats.
+
+The model that was found is fitted to each record alone: where an effect's parameters differ by more
+than chance, the records differ in it, as in a current or in what a vehicle carries. Then each
+record is left out as a whole: it is predicted by fits to the others, with the effect and without
+(cross-validation in groups; Stone 1974).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.discrepancy import sensor_consistency
+from rov_ident.discrepancy.findings import parameters_of
+from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
+from rov_ident.discrepancy.hypothesis import role_of
+from rov_ident.discrepancy.output_error import Fitted, fit, refit
+from rov_ident.discrepancy.results import Finding, Repetition, Value
+from rov_ident.discrepancy.search import Search
+from rov_ident.discrepancy.selection import PENALTY
+from rov_ident.discrepancy.sensor_choice import HEADING
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.effects import EFFECTS
+from rov_ident.model.equations import Array
+from rov_ident.sampling.raw_streams import Streams
+
+_LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
+
+
+class Records:
+    """Several bags joined (`raw_streams.joined`): which part of the time is which."""
+
+    def __init__(self, streams: Streams, bags: Sequence[Streams], begins: Sequence[float]) -> None:
+        self.streams = streams
+        self.spans = [(b, b + bag.duration) for bag, b in zip(bags, begins, strict=True)]
+
+    def __len__(self) -> int:
+        return len(self.spans)
+
+    def blocks(self, which: Sequence[int]) -> Spans:
+        """Some of the records, in blocks."""
+        out: Spans = []
+        for begin, end in (self.spans[i] for i in which):
+            edges = np.linspace(begin, end, max(1, int((end - begin) // BLOCK)) + 1)
+            out += itertools.pairwise(edges.tolist())
+        return out
+
+
+def in_each(
+    search: Search, records: Records, last: Fitted, found: Sequence[Finding]
+) -> list[Finding]:
+    """Findings of the dynamics with what each record says of them; ``last`` is the model fitted to
+    all. One that does not repeat cannot be told for sure."""
+    alone = [_fitted(records, [b], last) for b in range(len(records))]
+    repeats = _left_out(search, records, last, [f.effect for f in found], alone)
+    out = []
+    for f in found:
+        keys = search.keys_of(last, f.effect)
+        names = [k for k in keys if role_of(k) in _LINEAR]
+        each = tuple(parameters_of(there or last, names) for there in alone)
+        same = all(_agree([of[n] for of in each]) for n in each[0])
+        out.append(_with(f, Repetition(same, repeats.get(f.effect), each)))
+    return out
+
+
+def _fitted(records: Records, which: Sequence[int], last: Fitted) -> Fitted | None:
+    """The model ``last`` fitted to some of the records."""
+    halves = [s for a, b in records.blocks(which) for s in windows(a, b)]
+    try:
+        return fit(WindowedProblem(records.streams, thinned(halves)), last.hypothesis)
+    except UserError:  # too little odometry
+        return None
+
+
+def of_sensors(
+    bags: Sequence[Streams], config: Config, found: Sequence[Finding], headings: Sequence[float]
+) -> list[Finding]:
+    """The same of findings of the sensors; ``headings`` have been taken off the records before."""
+    names = [f.effect for f in found]
+    each = []
+    for bag in bags:
+        spans = windows(0.0, bag.duration)
+        each.append(sensor_consistency.search(bag, config, spans, names))
+    out = []
+    for f in found:
+        values = [
+            {
+                name: Value(at[f.effect][name], std.get((f.effect, name), 0.0), v.unit)
+                for name, v in f.parameters.items()
+            }
+            for at, std in each
+        ]
+        if f.effect == HEADING and any(headings):
+            values = [
+                {n: dataclasses.replace(v, value=v.value + yaw) for n, v in of.items()}
+                for of, yaw in zip(values, headings, strict=True)
+            ]
+        same = all(_agree([of[name] for of in values]) for name in f.parameters)
+        out.append(_with(f, Repetition(same, None, tuple(values))))
+    return out
+
+
+def turned(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list[float]]:
+    """Records with the heading of the first, and the headings that were taken off [rad], where the
+    odometry of each shows that they differ: no sensor is mounted anew between two dives of a
+    morning, but a heading is set to zero at each start."""
+    none = [0.0] * len(bags)
+    if len(bags) < 2 or not all(bag.has_pose for bag in bags):
+        return list(bags), none
+    yaw = []
+    for bag in bags:
+        found, std = sensor_consistency.search(bag, config, windows(0.0, bag.duration), [HEADING])
+        yaw.append(Value(found[HEADING]["yaw"], std[HEADING, "yaw"], "rad"))
+    apart = [float(np.angle(np.exp(1j * (v.value - yaw[0].value)))) for v in yaw]
+    if _agree([dataclasses.replace(v, value=a) for v, a in zip(yaw, apart, strict=True)]):
+        return list(bags), none
+    return [
+        sensor_consistency.corrected(bag, {HEADING: {"yaw": y}}) for bag, y in zip(bags, apart)
+    ], apart
+
+
+def _agree(of: Sequence[Value]) -> bool:
+    """Whether estimates differ by no more than chance: squares of their distances from the mean."""
+    x, weight = np.array([v.value for v in of]), np.array([max(v.std, 1e-12) for v in of]) ** -2.0
+    apart = x - weight @ x / weight.sum()
+    return bool(weight @ apart**2 <= PENALTY * (len(x) - 1))
+
+
+def _with(f: Finding, repetition: Repetition) -> Finding:
+    """A finding that says what each record says."""
+    several = [", ".join(f"{of[n].value:.3g}" for of in repetition.records) for n in f.parameters]
+    if repetition.same:
+        words = " It is the same in each record."
+    else:
+        told = "; ".join(f"{n} {v}" for n, v in zip(f.parameters, several))
+        words = f" The records differ: {told}."
+    if repetition.repeats is False:
+        words += " Fitted to the others, it does not predict a record that was left out."
+    separable = f.separable and repetition.repeats is not False
+    manoeuvre = None if separable else f.manoeuvre or EFFECTS[f.effect].manoeuvre
+    return dataclasses.replace(
+        f, repetition=repetition, separable=separable, manoeuvre=manoeuvre,
+        sentence=f.sentence + words,
+    )  # fmt: skip
+
+
+def _left_out(
+    search: Search,
+    records: Records,
+    last: Fitted,
+    names: Sequence[str],
+    alone: Sequence[Fitted | None],
+) -> dict[str, bool]:
+    """Of each effect that has no onset, which no other record can tell, whether a record is
+    predicted better with it by fits to the others: surely all together, and none surely worse."""
+    names = [n for n in names if not any(role_of(k) == "onset" for k in search.keys_of(last, n))]
+    before: dict[str, list[Array]] = {n: [] for n in names}
+    after: list[Array] = []
+    for b in range(len(records)):
+        others = [i for i in range(len(records)) if i != b]
+        there = alone[others[0]] if len(others) == 1 else _fitted(records, others, last)
+        try:
+            judge = Judge(WindowedProblem(records.streams, records.blocks([b])))
+        except UserError:  # too little odometry
+            return {}
+        if there is None:
+            return {}
+        after.append(judge.summed(there.hypothesis)[:, judge.free])
+        for name in names:
+            without = there.hypothesis.without(search.keys_of(last, name))
+            rest = refit(without, there.linearisation)
+            h = without if rest is None else rest.hypothesis
+            before[name].append(judge.summed(h)[:, judge.free])
+    out = {}
+    for name in names:
+        pairs = list(zip(before[name], after, strict=True))
+        x, y = (np.concatenate(of) for of in zip(*pairs, strict=True))
+        out[name] = surely_less(y, x) and not any(surely_less(*pair) for pair in pairs)
+    return out

@@ -1,0 +1,84 @@
+"""Several records: what they share, what each has for itself, and whether a cause repeats."""
+
+import numpy as np
+import pytest
+
+from bench import HEAVY
+from rov_ident import config as configuration
+from rov_ident.discrepancy import repetition
+from rov_ident.discrepancy.held_out import blocks, windows
+from rov_ident.discrepancy.output_error import fit
+from rov_ident.discrepancy.report import _card
+from rov_ident.discrepancy.results import Finding, Gain, Value
+from rov_ident.discrepancy.search import Search
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.sampling.raw_streams import gather, joined
+from rov_ident.simulation.virtual_sensors import Suite, dive
+
+TODAY = configuration.load(HEAVY)
+LEAN = Suite(odometry_rate=10.0, imu_rate=0.0)
+
+
+def record(seed, duration=40.0, **effects):
+    """A dive of the vehicle with effects that its configuration does not have."""
+    document = configuration.to_parameters(TODAY) | {"effects": effects}
+    true = configuration.from_parameters(document)
+    messages = dive(true, "steps", duration, LEAN, seed).messages
+    return gather(((role, message) for _, role, message in messages), TODAY)
+
+
+def told_in_each(bags, effect, **parameters):
+    """What the records say of an effect that a fit to all of them has from the start."""
+    streams, begins = joined(bags)
+    halves = [s for a, b in blocks(streams) for s in windows(a, b)]
+    search = Search(streams, TODAY, halves)
+    values = {(effect, name): value for name, value in parameters.items()}
+    last = fit(WindowedProblem(streams, halves), search.given.having(values))
+    gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
+    found = Finding(effect, ("X",), dict.fromkeys(parameters), None, gain, True, None, (), "")
+    records = repetition.Records(streams, bags, begins)
+    return repetition.in_each(search, records, last, [found])[0]
+
+
+def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
+    bags = [record(1, ocean_current={"north": 0.3}), record(2)]
+    found = told_in_each(bags, "ocean_current", north=0.1, east=0.01, down=0.01)
+    assert not found.repetition.same and not found.repetition.repeats
+    assert not found.separable and found.manoeuvre
+    for of, true in zip(found.repetition.records, (0.3, 0.0)):
+        assert abs(of["north"].value - true) < 4.0 * of["north"].std < 0.2
+    assert "The records differ" in found.sentence
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_current_that_is_always_there_is_the_same_and_repeats(seed):
+    current = {"north": 0.2, "east": -0.1}
+    bags = [record(seed, ocean_current=current), record(seed + 1, ocean_current=current)]
+    found = told_in_each(bags, "ocean_current", north=0.1, east=0.01, down=0.01)
+    assert found.repetition.same and found.repetition.repeats and found.separable
+    assert "It is the same in each record." in found.sentence
+
+
+def test_headings_are_compared_between_records():
+    bags = [record(7, heading_offset={"yaw": yaw}) for yaw in (0.1, 0.1, -0.5)]
+    turned, headings = repetition.turned(bags, TODAY)
+    assert np.abs(np.array(headings) - [0.0, 0.0, -0.6]).max() < 0.05
+    assert np.abs(turned[2].orientation - turned[0].orientation).max() < 0.05
+    same, none = repetition.turned(bags[:2], TODAY)
+    assert none == [0.0, 0.0] and same[0] is bags[0]
+
+
+def test_a_heading_is_each_dives_own():
+    """With the values that were taken off before the records were compared."""
+    bags = [record(seed, heading_offset={"yaw": yaw}) for seed, yaw in ((11, 0.1), (12, 0.6))]
+    turned, headings = repetition.turned(bags, TODAY)
+    gain = Gain("kinematic", 2.0, 1.0, 50.0, 40.0, 60.0)
+    value = {"yaw": Value(0.1, 0.01, "rad")}
+    found = Finding("heading_offset", (), value, None, gain, True, None, (), "")
+    (own,) = repetition.of_sensors(turned, TODAY, [found], headings)
+    assert not own.repetition.same and own.separable
+    for of, true in zip(own.repetition.records, (0.1, 0.6)):
+        assert abs(of["yaw"].value - true) < 0.02
+    assert "The records differ: yaw" in own.sentence
+    page = _card(own)
+    assert "record 2" in page and "The records differ in it." in page
