@@ -121,6 +121,8 @@ def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):
 def test_a_fit_that_predicts_worse_than_its_file_is_said_to(heavy):
     before = np.array([0.1, 0.1, np.nan, 0.1, 0.1, 0.1])
     after = np.array([0.05, 0.2, 0.3, 0.1, 0.1, 0.1])
-    found = Consistency(()).with_open_loop(before, after)
+    found = Consistency(()).with_open_loop(before, after, np.zeros(6))
     assert [test.name for test in found.tests if not test.passed] == ["open loop: v"]
     assert not found.consistent and "predicts v worse" in found.sentence
+    uncertain = Consistency(()).with_open_loop(before, after, np.full(6, 0.05))
+    assert uncertain.consistent  # 0.2 is within 0.1 and twice 0.05

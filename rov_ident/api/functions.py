@@ -20,7 +20,7 @@ from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.explain import explain as explain_streams
 from rov_ident.estimation.online import ESTIMATORS
-from rov_ident.experiment import data_quality, design
+from rov_ident.experiment import data_quality, design, messages_alone
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Limits, Proposal
 from rov_ident.io import topics
@@ -203,14 +203,14 @@ def fit(
         if live:
             records = [read(path, given, progress) for path in paths]
             many = archive.of_records(records)
-            _check_enough(many, given)
+            _check(many, given)
             say("estimating")
             found = fit_online(records, given, estimator)  # type: ignore[arg-type]
             if reference:
                 found.more["reference"] = _reference(paths[0], given, reference, say)
         else:
             many = stack.enter_context(_opened(paths, given, say, jobs, dask))
-            _check_enough(many, given)
+            _check(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         if table:
             found = _beside_the_table(found, given, table)
@@ -240,8 +240,11 @@ def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fi
     )
 
 
-def _check_enough(many: archive.Archive, config: Config) -> None:
-    """k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed."""
+def _check(many: archive.Archive, config: Config) -> None:
+    """UserError where the data are too few, or so wrong that no fit makes sense of them.
+
+    k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed.
+    """
     chosen = (c.row for c in config.model.coefficients if c.name in config.estimate)
     unknowns = max(Counter(chosen).values(), default=0)
     if many.samples - 1 <= unknowns:
@@ -249,6 +252,8 @@ def _check_enough(many: archive.Archive, config: Config) -> None:
             f"{many.samples} samples are too few for {unknowns} coefficients of one axis: record "
             "for longer (rov-ident plan says what)"
         )
+    for remarks in many.each(messages_alone.of_dynamics, config):
+        messages_alone.refuse_reversed(remarks)
 
 
 def _reference(path: Path, config: Config, duration: float, say: Progress) -> dict[str, Any]:
@@ -325,6 +330,9 @@ def explain(
     given, say = load(config), progress or _silent
     read_bags = [_streams(path, given, say) for path in _several(bags)]
     judge = None if validate is None else _streams(_existing(validate), given, say)
+    for streams, _ in read_bags:
+        seen = messages_alone.samples_of(streams)
+        messages_alone.refuse_reversed(messages_alone.of_dynamics(seen, given))
     found = explain_streams(
         [streams for streams, _ in read_bags], given, judge[0] if judge else None, say
     )
@@ -365,8 +373,8 @@ def check(bag: File, config: File | Config, *, progress: Progress | None = None)
     Returns
     -------
     Check
-        ``fit``, whether a fit makes sense; ``remarks``; ``prospects``, each with the standard
-        deviation that a fit would give, in the coefficient's unit.
+        ``fit``, whether a fit can be trusted; ``remarks``; ``quick``, a quick fit; ``prospects``,
+        what it makes of each coefficient.
 
     Raises
     ------

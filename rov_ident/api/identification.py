@@ -28,8 +28,9 @@ from rov_ident.core.files import write_file
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import EXTENDED
-from rov_ident.experiment.data_quality import BAD, GOOD, Check
+from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
+from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
 from rov_ident.reports.result import Shown
@@ -223,10 +224,10 @@ def identify(
     left_out: dict[str, str] = {}
     for path in paths:
         found = check(path, given, progress=say)
-        if found.fit:
+        if found.usable:
             checked.append((path, found))
         else:
-            left_out[path.name] = _why(found)
+            left_out[path.name] = found.why
     if not checked:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
         raise UserError(f"no dive is fit for identification: {reasons}{_instead(given, say)}")
@@ -263,11 +264,6 @@ def _as_a_start(explanation: Explanation, used: bool) -> Explanation:
         if used or EXTENDED not in note
     )
     return replace(explanation, findings=replace(findings, notes=notes))
-
-
-def _why(found: Check) -> str:
-    bad = [f"{r.subject}: {r.text}" for r in found.remarks if r.level == BAD]
-    return "; ".join(bad) or "its motion would tell no coefficient"
 
 
 def _instead(config: Any, say: Progress) -> str:

@@ -25,6 +25,7 @@ _SUPPOSED = (
 )
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
 _WORSE = 1.05  # what the scatter of a second dive allows
+_CHANCE = 2.0  # standard deviations: what 5 % of fits exceed if one direction decides
 
 
 @dataclass(frozen=True)
@@ -75,17 +76,20 @@ class Consistency:
         doubted = {} if self.consistent else {State.CONVERGED: State.CONVERGING}
         return tuple(doubted.get(state, state) for state in states)
 
-    def with_open_loop(self, before: Array, after: Array) -> "Consistency":
+    def with_open_loop(self, before: Array, after: Array, chance: Array) -> "Consistency":
         """The same, asked also whether a fit predicts worse than what it began with.
 
-        ``before`` and ``after`` (6,) are errors of the open-loop simulation, NaN where not known.
+        ``before`` and ``after`` (6,) are errors of the open-loop simulation, NaN where not known;
+        ``chance`` (6,) is the part of the latter that the uncertainty of the fit explains. Without
+        it, no fit could stand beside a configuration that is right already.
         """
-        tests = list(self.tests)
-        for component, old, new in zip(VELOCITIES, before.tolist(), after.tolist(), strict=True):
+        tests, allowed = list(self.tests), before + _CHANCE * chance  # the triangle inequality
+        columns = before.tolist(), after.tolist(), allowed.tolist()
+        for component, old, new, most in zip(VELOCITIES, *columns, strict=True):
             if np.isfinite([old, new]).all() and old > 0.0:
                 tests.append(
                     Test(
-                        f"open loop: {component}", new / old, _WORSE,
+                        f"open loop: {component}", new / most, _WORSE,
                         f"the fit predicts {component} worse than the configuration does (error "
                         f"{new:.3g} instead of {old:.3g}): rov-ident explain looks for the cause",
                     )

@@ -1,4 +1,4 @@
 """Is a bag good enough, and which manoeuvre should come next?
 
-Uses all identification above; identifies nothing itself.
+Uses the identification above, and has no estimator of its own.
 """

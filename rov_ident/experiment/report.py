@@ -8,8 +8,9 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONVERGED
-from rov_ident.experiment.data_quality import BAD, GOOD, UNITS, WARNING, Check, Prospect
+from rov_ident.experiment.data_quality import UNITS, Check, Prospect
 from rov_ident.experiment.design import Proposal
+from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.scales import authority
 from rov_ident.reports import html as report
@@ -28,8 +29,10 @@ def of_check(found: Check) -> str:
     )
     sections = [
         *([report.bullets(bad + doubtful)] if bad or doubtful else []),
-        report.heading("What a fit of it would tell"),
-        report.beside([_precision(check_picture(found))], [found.table().parts[1].html()]),
+        report.heading("What a quick fit tells"),
+        report.beside(
+            [_precision(check_picture(found))], [p.html() for p in found.table().parts[1:]]
+        ),
         report.heading("Excitation"),
         _excitation(found, config),
         report.heading("Measured, and the simulation as configured"),
@@ -90,7 +93,7 @@ def plan_picture(found: Proposal) -> plots.Figure:
 
 def _precision(figure: plots.Figure) -> str:
     caption = (
-        "Predicted standard deviation relative to the value; left of the dashed line a coefficient "
+        "Standard deviation relative to the value; left of the dashed line a coefficient "
         "counts as known well."
     )
     return report.figure(plots.zoomable(figure, "precision"), caption)

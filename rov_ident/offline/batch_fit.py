@@ -26,6 +26,7 @@ from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Samples, total
 from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
+from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers, over_ground, predicted
 
@@ -116,9 +117,14 @@ def fit_batch(
         now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
-    after = open_loop_rmse(_as_read_by(archive, config, now), now)
+    judged = _as_read_by(archive, config, now)
+    after = open_loop_rmse(judged, now)
+    learnt = [i for i, state in enumerate(states.values()) if state is not State.HELD]
+    chance = by_chance(
+        judged, now, [prior.names[i] for i in learnt], covariance[np.ix_(learnt, learnt)]
+    )
     consistency = consistency_of(config, prior, values, unexplained)
-    consistency = consistency.with_open_loop(before, after)
+    consistency = consistency.with_open_loop(before, after, chance)
     motion = archive.each(_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
@@ -364,25 +370,6 @@ def predicted_information(
 
 
 # ------------------------------------------------------------------ open loop
-
-
-def open_loop_rmse(
-    archive: Archive, config: Config, free: NDArray[np.bool_] | None = None
-) -> Array:
-    """RMSE (6,) of the open-loop simulation in windows of HORIZON seconds over all bags."""
-    parts = archive.each(_squares, config.dynamics, compiled(config.effects), free)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rmse: Array = np.sqrt(sum(p[0] for p in parts) / sum(p[1] for p in parts))
-    return rmse
-
-
-def _squares(
-    samples: Samples, model: Model, effects: Acting, free: NDArray[np.bool_] | None
-) -> tuple[Array, int]:
-    measured = samples["measured"]
-    with np.errstate(invalid="ignore"):
-        error = predicted(model, samples, HORIZON, free, effects) - over_ground(samples)
-    return np.sum(error[measured] ** 2, axis=0), int(measured.sum())
 
 
 def _range(samples: Samples) -> tuple[Array, Array]:

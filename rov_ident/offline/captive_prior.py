@@ -15,7 +15,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
-from rov_ident.model.coefficients import AXES, Coefficient, parse, parse_fin
+from rov_ident.model.coefficients import AXES, Coefficient, parse, parse_input
 from rov_ident.model.equations import build, coriolis
 from rov_ident.reports.result import NORMAL
 
@@ -54,7 +54,7 @@ def with_prior(config: Config, path: Path) -> tuple[Config, dict[str, Any]]:
     try:
         axes, coriolis_taken_off = _axes(json.loads(data, parse_int=float))
         told = _checked(config, axes, coriolis_taken_off)
-        values, std = {**config.model.values, **config.model.fins}, dict(config.prior.std)
+        values, std = dict(config.model.values), dict(config.prior.std)
         for axis in axes.values():
             means, widths = _beside(config, axis)
             values |= means
@@ -138,7 +138,11 @@ def _checked(config: Config, axes: Mapping[str, _Axis], coriolis_taken_off: bool
                 raise UserError(f"{name} stands on the axis {axis}, where it cannot be")
             if name.endswith("_0"):
                 continue
-            if parse_fin(name) is None and not coriolis_taken_off and _holds_coriolis(config, name):
+            if (
+                parse_input(name) is None
+                and not coriolis_taken_off
+                and _holds_coriolis(config, name)
+            ):
                 raise UserError(
                     f"{name} holds a Coriolis force of the added mass, which the model has "
                     "already: write the file with rov-ident forces --config"
@@ -158,7 +162,7 @@ def _beside(config: Config, axis: _Axis) -> tuple[dict[str, float], dict[str, fl
 
     def own_name(name: str) -> str:
         """Of the configuration, which may have Y_vu for Y_uv; empty where it has none."""
-        fin = name.endswith("_0") or parse_fin(name) is not None
+        fin = name.endswith("_0") or parse_input(name) is not None
         return "" if fin else places.get(parse(name).place, "")
 
     beside = {own: s for name, s in axis.left_out.items() if (own := own_name(name))}

@@ -12,16 +12,17 @@ from rov_ident.config import Config, dump
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
-from rov_ident.effects import compiled
 from rov_ident.estimation.compilation import ensure_compiled
 from rov_ident.estimation.consistency import Consistency
 from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
+from rov_ident.offline import archive
+from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
 from rov_ident.reports.result import Result, Shown, provenance
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON, Record, numbers, read_record, score
+from rov_ident.sampling.records import HORIZON, Record, numbers, read_record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -233,13 +234,17 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     ]
     config = estimator.config
     found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
-    given = records
+    before = open_loop_rmse(archive.of_records(records), config)
     if found.effects != config.effects:  # what acts is no longer what was read
         records = [read_record(record.path, found) for record in records]
-    samples = sum(len(record.samples) for record in records)
-    before, after = _open_loop(given, config), _open_loop(records, found)
+    judged = archive.of_records(records)
+    after = open_loop_rmse(judged, found)
+    learnt = [i for i, state in enumerate(states) if state is not State.HELD]
+    chance = by_chance(
+        judged, found, [report.names[i] for i in learnt], report.covariance[np.ix_(learnt, learnt)]
+    )
     assert report.consistency is not None
-    predicts = Consistency(()).with_open_loop(before, after)
+    predicts = Consistency(()).with_open_loop(before, after, chance)
     consistency = Consistency(report.consistency.tests + predicts.tests)
     return Fit(
         estimator=kind,
@@ -250,19 +255,10 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         states=consistency.of_states(states),
         given=config,
         fitted=found,
-        samples=samples,
-        duration=sum(record.duration for record in records),
+        samples=judged.samples,
+        duration=judged.duration,
         rmse=after,
         consistency=consistency,
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
     )
-
-
-def _open_loop(records: Sequence[Record], config: Config) -> Array:
-    """RMSE (6,) of the open-loop simulation in windows over all records."""
-    effects = compiled(config.effects)
-    scores = [score(config.dynamics, record.samples, effects=effects) for record in records]
-    squares = [s.rmse**2 * len(r.samples) for s, r in zip(scores, records, strict=True)]
-    rmse: Array = np.sqrt(np.sum(squares, axis=0) / sum(len(r.samples) for r in records))
-    return rmse

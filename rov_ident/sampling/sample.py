@@ -29,11 +29,8 @@ SAMPLE = record(
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
         ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
-        (
-            "inputs",
-            "f8",
-            (2, len(INPUTS)),
-        ),  # mean over dt, and at t; zeros where none is configured
+        # fins and shafts: mean over dt, and at t; zeros where none is configured
+        ("inputs", "f8", (2, len(INPUTS))),
         ("hold", "f8"),  # s: how long a command acts, of late; 0: not known yet
         ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
         ("surroundings_slope", "f8", (6,)),

@@ -1,0 +1,257 @@
+"""What the messages of a bag alone say: rates, pauses, axes, signs, delays.
+
+Axes, and signs of the wrench against the motion, can be so wrong that no fit makes sense of them.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
+from rov_ident.core.messages import Array
+from rov_ident.model.coefficients import MOTIONS
+from rov_ident.model.scales import authority
+from rov_ident.offline.filtered_regression import filtered_rows, regression
+from rov_ident.offline.least_squares import PERIOD
+from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.raw_streams import Streams, integral
+from rov_ident.sampling.sample import SAMPLE
+
+GOOD, WARNING, BAD = "good", "warning", "bad"
+_GAP = 0.5  # s without a message, from which the sampler gives up the time between
+_SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
+DRIVEN = 0.05  # of the axis's authority: an RMS wrench below it is that of keeping station
+_DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
+_CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
+_FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes, ...
+_FEWEST_TIMED = 100  # ... and fewer than these nothing of delays
+_FEWEST_ROWS = 20  # of filtered wrench and motion; about as many as there are coefficients
+_UPWARD = 0.9  # g; mean specific force upward; a sign or an axis that is wrong gives 0.7 or less
+_SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
+_REVERSED = -0.3  # correlation of two measurements of one thing; below it the sign is wrong
+_ANGULAR_LEAST, _LINEAR_LEAST, _MOTION_LEAST = 0.7, 0.5, 0.5  # correlation that good sensors reach:
+# half of the variance is common; of position and motion, which are noisier, a quarter
+_UNMOVED = 0.1  # of the wrench; neither a guess nor a thrust scale is ten times off
+_STILL = 1e-4  # m or rad/s; nothing moves
+_MOVES = 0.05  # m or rad/s RMS, from which a poor correlation is worth a word
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One thing looked at: ``level`` GOOD, WARNING or BAD, ``text`` a sentence."""
+
+    subject: str
+    level: str
+    text: str
+    hopeless: bool = False
+    """No model explains such data: a fit is refused."""
+
+
+def of_messages(streams: Streams, config: Config) -> list[Remark]:
+    """On the rates, pauses, axes, signs and delays of the sensors."""
+    return [*_rates(streams), *_frames(streams, config)]
+
+
+def refuse_reversed(remarks: Iterable[Remark]) -> None:
+    """UserError where remarks of :func:`of_dynamics` say that no fit can make sense of the data."""
+    for remark in remarks:
+        if remark.hopeless:
+            raise UserError(f"{remark.text} (rov-ident check says more)")
+
+
+def _rates(streams: Streams) -> list[Remark]:
+    remarks = []
+    topics = {"odometry": streams.t, "imu": streams.imu_t, "wrench": streams.demand_t}
+    if len(streams.inputs_t):
+        topics["inputs"] = streams.inputs_t
+    for name, t in topics.items():
+        if len(t) < 2:
+            text = "there is none: attitude and velocity between two odometry messages are guessed"
+            remarks.append(Remark(name, WARNING, text))
+            continue
+        steps = np.diff(t)
+        rate, gap = 1.0 / float(np.median(steps)), float(steps.max())
+        text = f"{rate:.1f} Hz, longest pause {gap:.2f} s"
+        level = GOOD
+        if gap > _GAP and name != "wrench":
+            lost = float(steps[steps > _GAP].sum())
+            level, text = WARNING, f"{text}; {lost:.1f} s in all are lost to pauses"
+        if rate < _SLOW:
+            level = WARNING
+            text += f"; {_SLOW:g} Hz is the least that shows how the vehicle accelerates"
+        remarks.append(Remark(name, level, text))
+    return remarks
+
+
+def _frames(streams: Streams, config: Config) -> list[Remark]:
+    remarks = []
+    body = config.model.body
+    # What rights the hull for each radian of roll or pitch, the axis z down.
+    righting = body.weight * body.cog[2] - body.buoyancy * body.cob[2]
+    if righting < 0.0:
+        text = f"by its cob and cog the configured hull would capsize ({righting:.2g} N m/rad): "
+        text += "check vehicle.frame (frd: z down, flu: z up), vehicle.cob and vehicle.cog"
+        remarks.append(Remark("vehicle.frame", BAD, text))
+    r = quaternion_to_matrix(streams.orientation)
+    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    if len(streams.imu_t) > _FEWEST_IMU:
+        attitude = r[np.clip(np.searchsorted(streams.t, streams.imu_t), 0, len(r) - 1)]
+        force = np.einsum("kij,jl,kl->ki", attitude, mounting, streams.specific_force)
+        mean = np.median(force, axis=0)
+        upward = -float(mean[2]) / config.gravity
+        level, text = GOOD, f"gravity is where it should be ({upward:.2f} g upward at rest)"
+        if upward <= _UPWARD or np.hypot(*mean[:2]) >= _SIDEWAYS * config.gravity:
+            level, text = BAD, "specific force in the world is "
+            text += f"{mean[0]:.1f} {mean[1]:.1f} {mean[2]:.1f} m/s2 north east down, not 0 0 "
+            text += f"{-config.gravity:.1f}: check the frame id of the IMU, frames.body and "
+            text += "imu.rotation"
+        remarks.append(Remark("imu axes", level, text))
+        gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
+        rate = streams.nu[:, 3:]
+        remarks.append(_signs("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
+    if streams.has_pose:
+        step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
+        moved = streams.position[step:] - streams.position[:-step]
+        way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
+        told, axes = way[step:] - way[:-step], ("north", "east", "down")
+        remarks.append(_signs("pose against velocity", told, moved, axes, _LINEAR_LEAST))
+    if len(streams.imu_t) > _FEWEST_TIMED:
+        known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
+        lag = _lag(streams.t[known], gyro[known], rate[known])
+        remarks.append(_late("odometry behind the IMU", *lag))
+    return remarks
+
+
+def _signs(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
+    """Whether two measurements of the same agree in sign."""
+    power, common = np.mean(a**2, axis=0), np.mean(a * b, axis=0)
+    size = np.sqrt(power * np.mean(b**2, axis=0))
+    c = np.where(size < _STILL, 1.0, common / np.maximum(size, 1e-300))
+    moves = np.sqrt(power) > _MOVES
+    return _correlated(
+        subject, dict(zip(names, c.tolist(), strict=True)), np.where(moves, least, _REVERSED),
+        "the sign of {} is reversed: check frame ids and mounting",
+        "hardly correlated in {}: check frames, or the sensor's noise", "signs and axes agree",
+    )  # fmt: skip
+
+
+def _correlated(
+    subject: str, by_name: dict[str, float], least: Array, bad: str, weak: str, good: str
+) -> Remark:
+    """The sentence for correlations of which some are reversed, or less than the least (n,)."""
+    reverse = [name for name, c in by_name.items() if c < _REVERSED]
+    low = [f"{n} ({c:.2f})" for (n, c), x in zip(by_name.items(), least, strict=True) if c < x]
+    if reverse:
+        text = bad.format(", ".join(reverse))
+        return Remark(subject, BAD, text, hopeless=2 * len(reverse) >= len(by_name))
+    return (
+        Remark(subject, WARNING, weak.format(", ".join(low)))
+        if low
+        else Remark(subject, GOOD, good)
+    )
+
+
+def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
+    """What wrench and motion, samples (k,) of SAMPLE, filtered alike, say of each other.
+
+    A controller that holds a place in waves pushes against the motion, too, but hardly on most of
+    the axes that are driven: that is a wrong sign, and hopeless.
+    """
+    if samples["inputs"].any():
+        return []  # fins and propellers drive it, too: the wrench alone does not say where it goes
+    task = regression(config, _CORNER)
+    still = samples.copy()
+    for name in ("nu", "down", "down_slope"):
+        still[name] = 0.0
+    phi = filtered_rows(task, samples, PERIOD)
+    wrench = filtered_rows(task, still, PERIOD)[:, :, -1]
+    if len(phi) < _FEWEST_ROWS or len(phi) != len(wrench):
+        return []
+    size = np.sqrt(np.mean(wrench**2, axis=0))
+    driven = size > DRIVEN * authority(config.dynamics)
+    subject, moved = "wrench against motion", wrench - phi[:, :, -1]
+    if not driven.any():
+        return [Remark(subject, BAD, "no axis is driven: nothing can be identified")]
+    if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
+        text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
+        return [Remark(subject, BAD, text, hopeless=True)]
+    by_name = {
+        MOTIONS[i]: float(np.corrcoef(wrench[:, i], moved[:, i])[0, 1])
+        for i in np.flatnonzero(driven)
+    }
+    push = _correlated(
+        subject, by_name, np.full(len(by_name), _MOTION_LEAST),
+        "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
+        "frames.body)",
+        "motion and wrench hardly go together in {}: check axes and units",
+        "the vehicle goes where it is pushed",
+    )  # fmt: skip
+    return [push, _late("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
+
+
+def samples_of(streams: Streams) -> NDArray[np.void]:
+    """Samples (N,) of SAMPLE at the odometry messages, as far as :func:`of_dynamics` needs them."""
+    samples = np.zeros(len(streams.t), dtype=SAMPLE)
+    dt = np.diff(streams.t, prepend=streams.t[0])
+    impulse = np.concatenate(
+        [np.zeros((1, 6)), np.cumsum(np.diff(streams.demand_t)[:, None] * streams.demand[:-1], 0)]
+    )
+    at = interpolated(streams.demand_t, impulse, streams.t)
+    samples["t"], samples["dt"], samples["nu"] = streams.t, dt, streams.nu
+    samples["restart"] = (dt <= 0.0) | (dt > _GAP)
+    samples["wrench"][1:] = np.diff(at, axis=0) / np.maximum(dt[1:, None], 1e-9)
+    if len(streams.inputs_t):
+        samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, streams.t)
+    samples["down"] = quaternion_to_matrix(streams.orientation)[:, 2]
+    samples["down_slope"][1:] = np.diff(samples["down"], axis=0) / np.maximum(dt[1:, None], 1e-9)
+    return samples
+
+
+def _late(subject: str, lag: float, std: float) -> Remark:
+    text = f"{1e3 * lag:.1f} ± {1e3 * NORMAL * std:.1f} ms (95 %)"
+    if not np.isfinite(lag):
+        return Remark(subject, WARNING, "cannot be told: nothing moves")
+    if abs(lag) > max(_DELAY, 3.0 * std):
+        more = ", or let explain look for thruster lag and delay" if "wrench" in subject else ""
+        return Remark(subject, WARNING, f"{text}: check the time stamps{more}")
+    return Remark(subject, GOOD, text)
+
+
+def _lag(t: Array, early: Array, late: Array) -> tuple[float, float]:
+    """By how much ``late`` (k, n) follows ``early`` [s], to first order, and its error."""
+    slope = np.gradient(early, t, axis=0)
+    power = float(np.sum(slope**2))
+    if power < 1e-6 * len(t):
+        return np.nan, np.nan
+    off = late - early
+    off = off - off.mean(axis=0)
+    lag = -float(np.sum(off * slope)) / power
+    left = off + lag * slope
+    return lag, float(np.sqrt(np.mean(left**2) / power))
+
+
+def _wrench_lag(driven: Array, phi: Array, wrench: Array) -> tuple[float, float]:
+    """Delay between wrench and motion, the coefficients refitted along with it; rows phi (K, 6, n +
+    1) = [Phi y], filtered wrench (K, 6). tau(t - d) is tau - d tau': the wrench's derivative is one
+    more column, and the delay its factor."""
+    slope = np.gradient(wrench, PERIOD, axis=0)
+    table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)[1:-1]
+    n = table.shape[2] - 1
+    if not driven.any() or len(table) < 5 * n:
+        return np.nan, np.nan
+    weight = np.where(driven, 1.0 / np.maximum(np.mean(wrench**2, axis=0), 1e-12), 0.0)
+    prior = np.append(np.ones(n - 1), 0.0)
+    for _ in range(3):
+        a = np.einsum("kai,a,kaj->ij", table, weight, table)
+        normal = a[:n, :n] + np.diag(prior)
+        x = scaled_solve(normal, a[:n, n])
+        left = table[:, :, n] - table[:, :, :n] @ x
+        weight = np.where(driven, 1.0 / np.maximum(np.mean(left**2, axis=0), 1e-12), 0.0)
+    # rows closer than the filter's memory repeat each other
+    variance = scaled_inverse(normal)[-1, -1] * 2.0 / (_CORNER * PERIOD)
+    return float(x[-1]), float(np.sqrt(variance))
