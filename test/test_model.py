@@ -235,7 +235,8 @@ def test_wrench_of_random_vehicles_is_the_textbooks(seed):
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_wrench_of_the_shipped_vehicles_is_the_textbooks(path):
     model = config.load(path).model
-    values = dict(zip(model.names, model.theta))
+    fins = set(model.fins)  # at zero: test_driven.py has their formulas
+    values = {name: value for name, value in model.values.items() if name not in fins}
     rng = np.random.default_rng(4)
     for _ in range(20):
         nu, nu_dot = rng.normal(size=(2, 6))
