@@ -14,12 +14,11 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, quaternion_to_matrix, to_core
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench, fault
 from rov_ident.io.ardupilot_log import import_log
-from rov_ident.io.bag_reader import ROLE_NAMES, Bag, read_messages
+from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model import thruster_allocation as thrusters
 
 VOLTAGE = 15.2
-TOPICS = {role: f"/{name}" for role, name in ROLE_NAMES.items()}
 FORMATS = {  # type: (name, format, columns), as ArduPilot's LogStructure.h has them
     128: ("FMT", "BBnNZ", "Type,Length,Name,Format,Columns"),
     1: ("XKF1", "QBccCfffffffccce", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD,GX,GY,GZ,OH"),
@@ -298,7 +297,8 @@ def test_what_no_vehicle_does_is_left_out(tmp_path, dive, kind, column, value):
     assert "left out" in report.notes[-1]
     whole = [role for _, role, _ in dive]
     assert report.odometry >= whole.count(ODOMETRY) - 3 and report.imu >= whole.count(IMU) - 1
-    for role, message in read_messages(Bag(tmp_path / "log.mcap"), TOPICS):
+    bag = Bag(tmp_path / "log.mcap")
+    for role, message in read_messages(bag, select_topics(bag)):
         assert not fault(message), role
 
 

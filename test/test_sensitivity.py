@@ -131,8 +131,8 @@ def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
     """Configured 20 to 40 % off, the coefficients 8 %; three standard deviations at most.
 
     A tether's drag and the arm of it multiply each other: what is learnt in the first seconds,
-    about wrong values of both, is kept, and the error of k reaches five standard deviations in one
-    dive of six. It must come nearer, the arm stay within five centimetres (docs/live.md).
+    about wrong values of both, is kept. Where that leaves an error the fit is said to disagree with
+    the data, and its intervals are wide (docs/live.md).
     """
     world = having(heavy, {effect: TRUTH[effect]})
     config = having(heavy, {effect: GIVEN[effect]})
@@ -143,17 +143,17 @@ def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
         online.push(role, message)
     online.flush()
     report = online.report()
+    consistent = report.consistency.consistent
+    assert consistent or effect == "tether_drag"
     for name, value, std in zip(report.names, report.values, report.std, strict=True):
         if "." in name:
             effect_, parameter = name.split(".")
             given = GIVEN[effect_][parameter]
             off = abs(value - TRUTH[effect_][parameter])
-            if effect == "tether_drag":
-                assert off < max(0.9 * abs(given - TRUTH[effect_][parameter]), 0.05), name
-            else:
-                assert off < 3.0 * std, name
+            assert off < 3.0 * std, name
             if given != TRUTH[effect_][parameter]:
-                assert std < 0.2 * abs(TRUTH[effect_][parameter] - given), name
+                assert off < 0.9 * abs(TRUTH[effect_][parameter] - given), name
+                assert not consistent or std < 0.2 * abs(TRUTH[effect_][parameter] - given), name
 
 
 def test_which_parameters_are_estimated_unless_told(heavy):
