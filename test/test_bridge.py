@@ -117,7 +117,7 @@ class Bridge:
         self.controller = subprocess.Popen(
             [*python, Path(__file__).with_name("controller.py"), mode]
         )
-        command = [*python, "-m", "rov_ident.nodes.controller_bridge", "--ros-args"]
+        command = [*python, "-m", "rov_ident.nodes", "controller_bridge", "--ros-args"]
         command += ["--params-file", str(HEAVY), "-p", "controller:=/controller"]
         for option in ("dead_band.percent:=0.5", *options):
             command += ["-p", option]
@@ -343,7 +343,7 @@ def test_half_a_set(start, mode, words):
     ],
 )
 def test_bad_parameters(domain, options, sentence):
-    command = [sys.executable, "-m", "rov_ident.nodes.controller_bridge", "--ros-args"]
+    command = [sys.executable, "-m", "rov_ident.nodes", "controller_bridge", "--ros-args"]
     command += ["--params-file", str(HEAVY), *(part for o in options for part in ("-p", o))]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert ended.returncode == 2

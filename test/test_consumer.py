@@ -352,7 +352,7 @@ class Plant:
 
 
 def start_controller(*options, path=HEAVY):
-    command = [sys.executable, "-m", "rov_ident.nodes.example_controller", "--ros-args"]
+    command = [sys.executable, "-m", "rov_ident.nodes", "example_controller", "--ros-args"]
     command += ["--params-file", str(path), "-r", "coefficients:=/rls_node/coefficients"]
     for option in options:
         command += ["-p", option]

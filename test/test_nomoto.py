@@ -331,7 +331,8 @@ def linearised(model, speed):
             nu[row] = side
             ends.append(-inverse @ model.wrench(nu, still, down)[rows])
         f[:, i] = (ends[1] - ends[0]) / 2e-6
-    g = inverse @ (model.fin_wrench(speed, {"r": 1e-6})[rows] / 1e-6)
+    rudder = np.array([0.0, 1.0, 0.0, 0.0])
+    g = inverse @ model.input_wrench(np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), rudder)[rows]
     b0 = f[1, 0] * g[0] - f[0, 0] * g[1]
     theta = np.array([np.linalg.det(f), -np.trace(f), b0, g[1], 0.0])
     return nomoto_model.model_of(2, False, "linearised", theta, np.zeros((5, 5)), "rad", 0.0)

@@ -266,13 +266,13 @@ def done_by(graph, name):
 
 
 OTHERS = {
-    "controller_bridge": ["rov_ident.nodes.controller_bridge", "--ros-args", "--params-file",
+    "controller_bridge": ["rov_ident.nodes", "controller_bridge", "--ros-args", "--params-file",
                           str(ROOT / "config" / "bluerov2_heavy.yaml"), "-p",
                           "controller:=/controller", "-r", "coefficients:=/ukf_node/coefficients"],
-    "example_controller": ["rov_ident.nodes.example_controller", "--ros-args", "--params-file",
+    "example_controller": ["rov_ident.nodes", "example_controller", "--ros-args", "--params-file",
                            str(ROOT / "config" / "bluerov2_heavy.yaml"),
                            "-r", "coefficients:=/ukf_node/coefficients"],
-    "dashboard": ["rov_ident.nodes.dashboard_node", "--ros-args", "-p", "port:=0"],
+    "dashboard": ["rov_ident.nodes", "dashboard_node", "--ros-args", "-p", "port:=0"],
     "rov_ident_watch": ["rov_ident", "watch"],
 }  # fmt: skip
 
