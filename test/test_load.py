@@ -7,6 +7,6 @@ from bench.studies import torture_live
 
 @pytest.mark.parametrize("kind", ["rls", "ukf"])
 def test_five_minutes(kind, domain):
-    rows = list(torture_live.loaded(kind, 305.0, warm=3))  # buffers take four minutes to fill
+    rows = list(torture_live.loaded(kind, 365.0, warm=4))  # buffers fill for four minutes
     lost, grown, _ = rows
     assert lost.met and grown.met, rows
