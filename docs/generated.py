@@ -206,7 +206,10 @@ def _kind(p: schema.Parameter) -> str:
         return "text"
     if p.type is schema.Vector:
         return "numbers" if p.size == schema.ANY else f"{p.size} numbers"
-    return {float: "number", int: "whole number", str: "text", schema.Names: "names"}[p.type]
+    kinds = {
+        bool: "true, false", float: "number", int: "whole number", str: "text", schema.Names: "names"
+    }  # fmt: skip
+    return kinds[p.type]
 
 
 def _default(p: schema.Parameter) -> str:
@@ -216,6 +219,8 @@ def _default(p: schema.Parameter) -> str:
         return "computed"
     if isinstance(p.default, tuple):
         return str(list(p.default)) if p.default else "empty"
+    if isinstance(p.default, bool):
+        return f"`{p.default}`".lower()
     return f"`{p.default}`" if p.default != "" else "empty"
 
 

@@ -97,13 +97,19 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
         sections.setdefault(section, {})[key] = _line(name, value, "", remarks.get(key, ""))
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), "/**:", "  ros__parameters:"]
     opened: tuple[str, ...] = ()
+    active = {
+        tuple(section.split("."))[:depth]
+        for section, rows in sections.items()
+        if any(not row.startswith("#") for row in rows.values())
+        for depth in range(1, section.count(".") + 2)
+    }
     for section in sorted(sections, key=lambda name: name != "" and list(sections).index(name)):
         rows = sorted(sections[section].values(), key=lambda row: row.startswith("#"))
         path = tuple(section.split(".")) if section else ()
-        active = any(not row.startswith("#") for row in rows)
         for depth, name in enumerate(path):
-            if path[: depth + 1] != opened[: depth + 1]:
-                lines.append(f"    {'  ' * depth}{'' if active else '# '}{name}:")
+            above = path[: depth + 1]
+            if above != opened[: depth + 1]:
+                lines.append(f"    {'  ' * depth}{'' if above in active else '# '}{name}:")
         lines += [f"    {'  ' * len(path)}{row}" for row in rows]
         opened = path
     return "\n".join(lines) + "\n"
