@@ -207,7 +207,8 @@ def _kind(p: schema.Parameter) -> str:
     if p.type is schema.Vector:
         return "numbers" if p.size == schema.ANY else f"{p.size} numbers"
     kinds = {
-        bool: "true, false", float: "number", int: "whole number", str: "text", schema.Names: "names"
+        bool: "true or false", float: "number", int: "whole number",
+        str: "text", schema.Names: "names",
     }  # fmt: skip
     return kinds[p.type]
 

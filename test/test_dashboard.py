@@ -548,7 +548,7 @@ def publishing(dives):
     from rclpy.signals import SignalHandlerOptions
 
     from rov_ident.io import cdr
-    from rov_ident.nodes.common import INPUTS, STREAM, Executor
+    from rov_ident.nodes.common import STREAM, Executor, subscribed
     from rov_ident.nodes.conversions import from_time
 
     context = rclpy.Context()
@@ -559,7 +559,7 @@ def publishing(dives):
     publishers = {
         (vehicle, role): node.create_publisher(type_, f"/{vehicle}/{topic}", STREAM)
         for vehicle in dives
-        for role, (topic, type_) in INPUTS.items()
+        for role, (topic, type_) in subscribed(config.load(VEHICLES[vehicle][0]).inputs).items()
     }
     used = dict.fromkeys(NODES, -math.inf)
     for name in NODES:

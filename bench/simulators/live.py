@@ -26,7 +26,9 @@ def compile_all():
             assert job.ensure()
 
 
-ROUNDING = 1e-8  # standard deviations, for same_to_rounding
+ROUNDING = 1e-7
+"""Standard deviations, for same_to_rounding. Measured: 1e-8 for the lag of remus100, about whose
+estimate samples are made again and again; 1e-10 for what is linear."""
 
 
 def same_to_rounding(values, std, expected):
@@ -34,7 +36,7 @@ def same_to_rounding(values, std, expected):
 
     To rounding: sums are added in the order that suits the machine code of a process, which is not
     the same after compiling as after reading the cache (core/jit.py). A message
-    that is used by one of them alone makes a difference a hundred thousand times as large.
+    that is used by one of them alone makes a difference ten thousand times as large.
     """
     np.testing.assert_array_less(np.abs(values - expected.values), ROUNDING * expected.std)
     np.testing.assert_array_less(np.abs(std - expected.std), ROUNDING * expected.std)
