@@ -28,7 +28,7 @@ def compile_all():
 
 ROUNDING = 1e-7
 """Standard deviations, for same_to_rounding. Measured: 1e-8 for the lag of remus100, about whose
-estimate samples are made again and again; 1e-10 for what is linear."""
+estimate samples are made again and again."""
 
 
 def same_to_rounding(values, std, expected):
