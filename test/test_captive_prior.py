@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from rov_ident import api
+from rov_ident.api.functions import fit
 from rov_ident.cli.program import main
 from rov_ident.config import load
 from rov_ident.config.prior import prior_of
@@ -61,8 +61,8 @@ def test_table_and_dive_are_better_than_either_and_honest(tmp_path):
         for name in (n for f in fits.values() for n in f.names if n in heavy.model.names):
             i = both.names.index(name)
             inside.append(both.lower[i] <= heavy.value(name) <= both.upper[i])
-            fit = fits[name[0]]
-            of_table = (fit.quantile * fit.std / 1.96)[fit.names.index(name)]
+            own = fits[name[0]]
+            of_table = (own.quantile * own.std / 1.96)[own.names.index(name)]
             ratios.append((both.std[i] / of_table, both.std[i] / dive.std[i]))
     assert np.mean(inside) >= 0.85  # some 30 of 95 %: by chance fewer one time in sixty
     assert (np.median(ratios, axis=0) < 0.9).all()
@@ -80,7 +80,7 @@ def dive_and_table(heavy, tmp_path_factory):
 @pytest.mark.parametrize("estimator", ["ls", "iv", "ml", "rls", "ukf"])
 def test_every_estimator_takes_it(heavy, dive_and_table, estimator):
     bag, table = dive_and_table
-    found = api.functions.fit(bag, off(heavy, 3), estimator, prior_from=table)
+    found = fit(bag, off(heavy, 3), estimator, prior_from=table)
     assert found.more["prior_from"]["file"] == "forces.json"
     assert "Y_vv" in found.more["prior_from"]["coefficients"]
     assert found.value("Y_vv") == pytest.approx(heavy.value("Y_vv"), rel=0.02)
@@ -177,4 +177,4 @@ def test_no_file_and_no_prior_are_refused(heavy, tmp_path):
     with pytest.raises(UserError, match="cannot be read"):
         with_prior(heavy, tmp_path / "none.json")
     with pytest.raises(UserError, match="exclude each other"):
-        api.functions.fit("dive.mcap", heavy, prior_from=tmp_path / "f.json", prior=False)
+        fit("dive.mcap", heavy, prior_from=tmp_path / "f.json", prior=False)
