@@ -1,8 +1,11 @@
 """`rov-ident init`: from what a bag, a log or a model tells, a configuration with every option."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+from test_bags import write_mcap
 
 import rov_ident as ri
 from bench import DATA, ROOT
@@ -11,6 +14,8 @@ from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS
 from rov_ident.config.writing import annotated
 from rov_ident.core.messages import Imu, Odometry
 from rov_ident.core.yaml_file import parse
+from rov_ident.io import topics
+from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.cdr import encode
 
@@ -100,6 +105,48 @@ def test_a_bag_of_mavros_by_its_usual_names(tmp_path, mavros, capsys):
     said = capsys.readouterr().err
     assert "nothing that can be wrench" in said and "as it is" not in said
     assert f"It can be used, with other records than {mavros.name};" in said
+
+
+def test_two_twists_of_mavros_are_told_apart_by_their_usual_names(tmp_path):
+    twist, pose = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/PoseStamped"
+    kinds = {
+        "local_position/velocity_body": twist,
+        "local_position/velocity_local": twist,
+        "local_position/pose": pose,
+        "vision_pose/pose": pose,
+        "imu/data": "sensor_msgs/msg/Imu",
+        "imu/data_raw": "sensor_msgs/msg/Imu",
+        "rc/out": "mavros_msgs/msg/RCOut",
+    }
+    rows = [(f"/mavros/{name}", kind, 1, bytes(8)) for name, kind in kinds.items()]
+    path = write_mcap(tmp_path / "mavros.mcap", rows)
+    config = ri.load(SHIPPED)
+    types = {"odom": "geometry_msgs/TwistStamped", "wrench": "mavros_msgs/RCOut"}
+    config = dataclasses.replace(config, inputs=dataclasses.replace(config.inputs, **types))
+    assert topics.select(Bag(path), config) == {
+        "odom": "/mavros/local_position/velocity_body",
+        "pose": "/mavros/local_position/pose",
+        "imu": "/mavros/imu/data",
+        "wrench": "/mavros/rc/out",
+    }
+
+
+def test_types_that_only_a_laboratory_has_are_named(tmp_path):
+    """The topics of SOLAQUA's vehicle: none is of a type that is known."""
+    kinds = {
+        "/sensor/dvl_velocity": "sensors/msg/DVLVelocity",
+        "/sensor/attitude": "messages/msg/Attitude",
+        "/commanded_thrust": "rospy_tutorials/msg/Floats",
+    }
+    rows = [(topic, kind, 1, bytes(8)) for topic, kind in kinds.items()]
+    bag = Bag(write_mcap(tmp_path / "data.mcap", rows))
+    with pytest.raises(ri.UserError) as refusal:
+        topics.select(bag, ri.load(SHIPPED))
+    said = str(refusal.value)
+    assert "/sensor/dvl_velocity may be meant, but only the package sensors knows" in said
+    assert "republish it as geometry_msgs/TwistStamped" in said
+    with pytest.raises(ri.UserError, match="/commanded_thrust may be meant.*JointState"):
+        topics.select(bag, ri.load(SHIPPED), ["wrench"])
 
 
 def test_a_urdf_gives_the_body_and_leaves_the_rest_open(tmp_path, capsys):

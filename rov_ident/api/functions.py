@@ -32,6 +32,7 @@ from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
+from rov_ident.sampling.without_velocity import refuse_without_velocity
 
 File = str | os.PathLike[str]
 Files = File | Sequence[File]
@@ -348,6 +349,7 @@ def _streams(path: Path, config: Config, say: Progress) -> tuple[Streams, dict[s
     bag = Bag(path)
     chosen = topics.select(bag, config)
     total = topics.total(bag, chosen)
+    refuse_without_velocity(bag, chosen, config)
 
     def counted() -> Iterator[Any]:
         for done, message in enumerate(topics.messages(bag, chosen, config)):

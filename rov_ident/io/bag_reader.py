@@ -263,8 +263,11 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
     named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
     typed = [topic for topic in filled if filled[topic] == type_name]
     usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
-    tiers = ([topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual)
+    tiers = [[topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual]
     candidates = next(filter(None, tiers), typed)
+    if len(candidates) > 1:  # mavros has vision_pose/pose beside local_position/pose
+        closer = ([topic for topic in tier if topic in candidates] for tier in tiers)
+        candidates = next((found for found in closer if len(found) == 1), candidates)
     if len(candidates) == 1:
         return candidates[0]
     if candidates:

@@ -70,6 +70,19 @@ _CHOICES = {
 }
 
 
+_FOREIGN = {  # what such topics and types are called, and what they could be
+    ODOMETRY: (
+        ("dvl", "bottomtrack", "odom", "velocity", "twist"),
+        "geometry_msgs/TwistStamped (velocity in body axes) beside a geometry_msgs/PoseStamped",
+    ),
+    POSE: (("pose", "attitude", "ahrs"), "geometry_msgs/PoseStamped"),
+    WRENCH: (
+        ("thrust", "wrench", "pwm", "servo", "actuator"),
+        "sensor_msgs/JointState (a force for each thruster) or geometry_msgs/WrenchStamped",
+    ),
+}
+
+
 class Source(NamedTuple):
     """A topic that is listened to: its relative name and its type, as `geometry_msgs/Wrench`."""
 
@@ -238,9 +251,24 @@ def _hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
         if not wanted or topic == named
     ]
     if not others:
-        return ""
+        return _foreign(bag, role)
     topic, other = others[0]
     return f" Or is it {topic}? Then set inputs.{role} to {other}."
+
+
+def _foreign(bag: Bag, role: str) -> str:
+    """Which topic of a type that is not known may be meant, and what to do with it."""
+    words, instead = _FOREIGN.get(role, ((), ""))
+    packages = {name.partition("/")[0] for name in _DECODERS}
+    for topic, info in bag.topics.items():
+        package, _, kind = info.type_name.partition("/msg/")
+        named = any(word in f"{topic} {kind}".lower() for word in words)
+        if named and info.message_count and package not in packages:
+            return (
+                f" {topic} may be meant, but only the package {package} knows what its type "
+                f"{kind} holds: republish it as {instead}."
+            )
+    return ""
 
 
 def messages(

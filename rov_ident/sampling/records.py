@@ -19,6 +19,7 @@ from rov_ident.model.equations import Model
 from rov_ident.sampling.sample import believed, joined, stretches
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import describe
+from rov_ident.sampling.without_velocity import refuse_without_velocity
 from rov_ident.simulation.open_loop import open_loop
 from rov_ident.simulation.virtual_sensors import Dive
 
@@ -60,6 +61,7 @@ def read_record(
     bag = Bag(Path(path))
     topics = inputs.select(bag, config)
     total = inputs.total(bag, topics)
+    refuse_without_velocity(bag, topics, config)
     sampler = Sampler(config if columns else config.with_effects_held)
     parts: list[NDArray[np.void]] = []
     unusable: Counter[str] = Counter()
