@@ -33,9 +33,10 @@ def refuse_without_velocity(bag: Bag, topics: Mapping[str, str], config: Config)
         return  # no messages, or a vehicle at rest: others say so
     raise UserError(
         f"{bag.path} has no linear velocity: {topics[ODOMETRY]} marks every one as not measured, "
-        "or is zero while the depth changes. Surge and sway, and all that multiplies u or v, are "
-        "impossible to identify so, and heave, roll, pitch and yaw are not identified from "
-        "attitude, rates and depth alone: record a velocity sensor (DVL), or an EKF aided by one"
+        "or all are not finite, or zero while the depth changes. Surge and sway, and all that "
+        "multiplies u or v, are impossible to identify so, and heave, roll, pitch and yaw are not "
+        "identified from attitude, rates and depth alone: record a velocity sensor (DVL), or an "
+        "EKF aided by one"
     )
 
 
