@@ -39,15 +39,15 @@ def read_only(parts):
 
 
 def arrays(parts):
-    """Copies of all arrays in a tuple, inner tuples included, records field by field."""
+    """Copies of all arrays and numbers in a tuple, inner tuples included, records field by field."""
     out = []
     for part in parts:
         if isinstance(part, tuple):
             out += arrays(part)
-        elif part.dtype.names:
-            out += [part[name].copy() for name in part.dtype.names]
+        elif (array := np.array(part)).dtype.names:
+            out += [array[name].copy() for name in array.dtype.names]
         else:
-            out.append(part.copy())
+            out.append(array)
     return out
 
 

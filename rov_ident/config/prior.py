@@ -115,8 +115,8 @@ def rigid_body_covariance(
     known, body = config.vehicle_uncertainty, config.model.body
     value = dict(zip(names, values.tolist(), strict=True))
     moments = dict(zip(("K_pdot", "M_qdot", "N_rdot"), np.diag(body.inertia).tolist()))
-    if "thrust_scale.scale" in names:
-        scaled = {n: v for n, v in value.items() if "." not in n or n in _SCALED}
+    if THRUST_SCALE in names:
+        scaled = {n: v for n, v in value.items() if n == THRUST_SCALE or moves_with_thrust(n)}
         # relative to the inertia that the file gives and that does not change with the mass
         of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
     else:
@@ -137,7 +137,13 @@ def gain_of(covariance: Array, std: Array) -> Array:
     return share
 
 
-_SCALED = ("thrust_scale.scale", "buoyancy.delta")
+THRUST_SCALE = "thrust_scale.scale"
+
+
+def moves_with_thrust(name: str) -> bool:
+    """Whether it must be k times as large where the thrust is, for the same motion: a force, or
+    the coefficient of one."""
+    return "." not in name or name == "buoyancy.delta"
 
 
 def theta_of(config: Config) -> Array:

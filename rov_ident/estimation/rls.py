@@ -24,7 +24,7 @@ standard deviation about their prior value: the prior is the unit matrix.
 *Coefficients whose motion is not well above its noise* are not learnt, or it would be from the
 noise; but their uncertainty is that of the others, too. With their columns behind the others', R
 holds the distribution of the others *given* them, and that alone takes new rows (consider
-parameters, Bierman 1977, ch. VIII). Nor do the others learn from products with such motion.
+parameters, Bierman 1977, ch. VIII).
 
 *Forgetting* waits for evidence: while the innovations of an axis are larger than they should be,
 the coefficients that would show there gain variance as on a random walk, up to the prior's.
@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import Prior
+from rov_ident.config.prior import Prior, prior_of
 from rov_ident.core.jit import copy, floats, inlined, inner, kernel, record, reordered
 from rov_ident.core.messages import Array
 from rov_ident.estimation.innovation_monitor import (
@@ -121,6 +121,7 @@ _SETTINGS = record(
 _SCALARS = record(
     [
         *floats((), "t since_update since_walk"),
+        ("rho", "f8"),  # thrust scale over its prior mean, of the observer
         ("peak", "f8", (6,)),  # squared velocities, their peaks of late
         ("free", "i8"),  # so many of the first columns take rows
         ("started", "?"),
@@ -132,7 +133,8 @@ class State(NamedTuple):
     """All that the next step needs. Columns of coefficients are in the order of ``order``."""
 
     order: NDArray[np.int64]  # (n,): indices into Problem.estimated
-    root: Array  # (n, n + 1): [R | z], R upper triangular, of the scaled deviation from the prior
+    # (n, n + 1): [R | z], R upper triangular, of the coordinates: scaled deviations from the prior
+    root: Array
     score: Array  # (n, n): covariance of the accumulated score, the prior's included
     lagged: Array  # (n,): recent scores under the lag window
     solution: Array  # (n,): of R x = z when the observer was told last
@@ -151,6 +153,9 @@ def problem(config: Config) -> Problem:
     factor, variable = own.forgetting_factor, own.forgetting == "variable"
     task = problem_of(config, _SETTINGS, gate=own.gate, forgetting_factor=factor, variable=variable)
     task.settings["walks"] = task.drift.any()
+    if (i := task.thrust) >= 0:
+        s0, upper = task.theta[task.estimated[i]], prior_of(config, True).upper[i]
+        task.highest[i] = min(task.highest[i], s0 / task.scale[i] * (1.0 - s0 / upper))
     return task
 
 
@@ -158,11 +163,13 @@ def init(task: Problem) -> State:
     """Nothing learnt: the prior; the velocity is taken from the first measurement."""
     n = len(task.scale)
     scalars = np.zeros(1, dtype=_SCALARS)
-    scalars["free"] = n
+    scalars["free"], scalars["rho"] = n, 1.0
+    root = np.eye(n, n + 1)
+    root[:, :n] = np.linalg.inv(_jacobian(task, np.zeros(n)))
     return State(
         np.arange(n),
-        np.eye(n, n + 1),
-        np.eye(n),
+        root,
+        root[:, :n].T @ root[:, :n],
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
@@ -194,19 +201,62 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     n, place = len(task.scale), np.argsort(state.order)
     inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
     information = inverse @ inverse.T
+    solution = (inverse @ state.root[:, n])[place]
+    unit = task.scale[:, None] * _jacobian(task, solution)
     covariance = calibrated(information, state.score)[np.ix_(place, place)]
     return Estimate(
         prior.names,
-        task.theta[task.estimated] + task.scale * (inverse @ state.root[:, n])[place],
-        covariance * np.outer(task.scale, task.scale),
+        _values(task, solution),
+        unit @ covariance @ unit.T,
         float(state.scalars["t"][0]),
     )
 
 
 def variance(task: Problem, state: State) -> Array:
     """Diagonal (n,) of the inverse information, in squared units: what excitation is judged by."""
-    variances: Array = (inverse_of(state.root) ** 2).sum(axis=1)[np.argsort(state.order)]
-    return task.scale**2 * variances
+    inverse = inverse_of(state.root)[np.argsort(state.order)]
+    root = _jacobian(task, inverse @ state.root[:, -1]) @ inverse
+    variances: Array = task.scale**2 * (root**2).sum(axis=1)
+    return variances
+
+
+# ------------------------------------------------------------------ coordinates
+#
+# With thrust, coefficients, rigid body and weight k times as large, the motion is the same. So rows
+# say little along the line through the origin of thrust scale and coefficients, and where that runs
+# depends on the coefficients: rows linear about some would claim, about others, to know the scale.
+# R is kept in coordinates in which all these lines are parallel. With rho the scale over its prior
+# mean, they are -1 / rho and coefficient / rho; where no scale is estimated, rho is 1.
+
+
+@inlined
+def _relative_thrust(task, deviation):
+    """rho, of the scaled deviation of the thrust scale."""
+    i = task.thrust
+    bounded = min(max(deviation, -REACH), task.highest[i])
+    return 1.0 / (1.0 - task.scale[i] / task.theta[task.estimated[i]] * bounded)
+
+
+def _values(task: Problem, solution: Array) -> Array:
+    """Coefficients (n,) in their units, of a solution (n,) in their order."""
+    values: Array = task.theta[task.estimated] + task.scale * solution
+    if task.thrust >= 0:
+        rho = _relative_thrust(task, solution[task.thrust])
+        values[task.per_thrust] *= rho
+        values[task.thrust] = rho * task.theta[task.estimated[task.thrust]]
+    return values
+
+
+def _jacobian(task: Problem, solution: Array) -> Array:
+    """Derivatives (n, n) of the coefficients, in prior deviations, with respect to coordinates."""
+    out, i, scaled = np.eye(len(task.scale)), task.thrust, task.per_thrust
+    if i >= 0:
+        values, rho = _values(task, solution), _relative_thrust(task, solution[i])
+        out[scaled] *= rho
+        step = rho * task.scale[i] / task.theta[task.estimated[i]]
+        out[scaled, i] = step * values[scaled] / task.scale[scaled]
+        out[i, i] = rho**2
+    return out
 
 
 def condition(task: Problem, state: State) -> float:
@@ -229,7 +279,7 @@ _SCRATCH = record(
         ("lower_inverse", "f8", (6, 6, 1)),
         ("noise", "f8", (6, 6)),  # variance density of the acceleration
         # that acts; nu as measured, its variance; covariance of nu with one component of it
-        *floats((6,), "wrench z r cross"),
+        *floats((6,), "wrench thrust z r cross"),
         # what uncertain coefficients add to the variance of innovations, in the order of the rows;
         # the part of it that those add which are held, in this order and by axis
         ("spread", "f8", (3, 6)),
@@ -337,7 +387,13 @@ def _steps(task, state, work, samples, sides, infos):
 def _take_sides(task, work, sample, side):
     """What acts, with the parameters of effects as they are; the columns of what they measure."""
     first = len(task.theta) - side.shape[1]
-    wrench_of(work.one_theta, sample, side, work.scratch[0].wrench)
+    s = work.scratch[0]
+    wrench_of(work.one_theta, sample, side, s.wrench)
+    for i in range(6):
+        s.thrust[i] = s.wrench[i] - sample.surroundings[i]
+        for j in range(side.shape[1]):
+            if task.absolute[j]:
+                s.thrust[i] -= side[i, j] * (work.one_theta[first + j, 0] - side[12, j])
     if side.shape[1] > 0:
         for a in range(len(work.estimated)):
             j = work.estimated[a] - first
@@ -374,8 +430,19 @@ def _take_over(task, state, work):
     s = work.scratch[0]
     for j in range(len(task.theta)):
         work.one_theta[j, 0] = task.theta[j]
+    rho = 1.0
     for a in range(len(work.estimated)):
-        work.one_theta[work.estimated[a], 0] += work.scale[a] * state.deviation[a]
+        if state.order[a] == task.thrust:
+            rho = _relative_thrust(task, state.deviation[a])
+    for a in range(len(work.estimated)):
+        e = work.estimated[a]
+        if state.order[a] == task.thrust:
+            work.one_theta[e, 0] *= rho
+        else:
+            work.one_theta[e, 0] += work.scale[a] * state.deviation[a]
+            if task.per_thrust[state.order[a]]:
+                work.one_theta[e, 0] *= rho
+    state.scalars[0].rho = rho
     for j in range(len(task.theta)):
         for k in range(LANES):
             work.theta[j, k] = work.one_theta[j, 0]
@@ -397,7 +464,7 @@ def _predict(task, state, work, sample, side):
     """Velocities, covariance, sensitivities to the sample's time; False if out of all reason."""
     s, nu, p, sensitivity = work.scratch[0], state.nu, state.p, work.sensitivity
     noise, inverse = s.noise, s.inverse
-    n, free = len(work.scale), state.scalars[0].free
+    n = len(work.scale)
     force_of(sample, s.wrench, task.restoring, s.force, s.slope)
     take_inputs(task.structure, sample.inputs[0], s)
     doubtful = wrench_noise(task.process[0], sample, s.middle)
@@ -418,14 +485,10 @@ def _predict(task, state, work, sample, side):
             task.structure, work.theta, work.one_theta, nu, step * dt - 0.5 * sample.dt, dt, s
         )
         momentum_columns(task.structure, s.middle_nu_dot, work.of_rate)
-        if free < n:
-            drive_of(
-                task.structure, s.middle, work.estimated, work.scale, free, n, work, work.drive
-            )
-            for i in range(6):
-                s.middle[i] *= work.moving[i]  # or products with mere noise would be learnt from
-        drive_of(task.structure, s.middle, work.estimated, work.scale, 0, free, work, work.drive)
+        drive_of(task.structure, s.middle, work.estimated, work.scale, 0, n, work, work.drive)
         drive_sides(len(task.theta) - side.shape[1], work.estimated, work.scale, side, work.drive)
+        if task.thrust >= 0:
+            _by_coordinates(task, state, work)
         advance(s.transition, sensitivity, s.into, work.drive, work.rows)
         advance_covariance(s.transition, noise, dt, p, s.product)
         for i in range(6):
@@ -434,6 +497,28 @@ def _predict(task, state, work, sample, side):
     for i in range(6):
         fastest += nu[i] * nu[i]
     return fastest < FASTEST**2  # not so with NaN
+
+
+@inlined
+def _by_coordinates(task, state, work):
+    """The columns of drive, of coefficients so far, become those of the coordinates.
+
+    What the thrust scale does is taken from the whole thrust, as the model has it now: a column
+    that lacked some of it (products with a lag, with motion near the noise) would not cancel with
+    those of the coefficients, and what is left would claim to know the scale.
+    """
+    rho, drive, at = state.scalars[0].rho, work.drive, 0
+    for a in range(len(work.estimated)):
+        if state.order[a] == task.thrust:
+            at = a
+    step = rho * work.scale[at] / task.theta[work.estimated[at]]
+    for i in range(6):
+        total = work.scratch[0].thrust[i]
+        for a in range(len(work.estimated)):
+            if task.per_thrust[state.order[a]]:
+                total += work.one_theta[work.estimated[a], 0] / work.scale[a] * drive[i, a]
+                drive[i, a] *= rho
+        drive[i, at] = step * total
 
 
 @inlined

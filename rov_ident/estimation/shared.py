@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import drift_of, prior_of, theta_of
+from rov_ident.config.prior import THRUST_SCALE, drift_of, moves_with_thrust, prior_of, theta_of
 from rov_ident.core.jit import inlined, inner, record
 from rov_ident.core.messages import Array
+from rov_ident.effects import EFFECTS
 from rov_ident.estimation.process_noise import process
 from rov_ident.model.equations import Structure
 
@@ -48,6 +49,9 @@ class Problem(NamedTuple):
     drift: Array  # (n,) variance density of the random walk of scaled parameters, 1/s
     rigid_body: Array  # (6, 6)
     restoring: Array  # (6, 3)
+    thrust: int  # index of thrust_scale.scale among the estimated; -1: it is not
+    per_thrust: NDArray[np.bool_]  # (n,) what is proportional to the thrust in the same motion
+    absolute: NDArray[np.bool_]  # (k,) parameters of effects that are none of the thrust
     lightest: Array  # (6,) least pivots of a mass matrix: no hull with added mass is touched
 
 
@@ -58,6 +62,10 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
     for name, value in {**settings, "corner": config.residual_corner}.items():
         values[name] = value
     start = prior.mean / prior.std
+    names, mean = prior.names, dict(zip(prior.names, prior.mean, strict=True))
+    thrust = names.index(THRUST_SCALE) if mean.get(THRUST_SCALE, 0.0) > 0.0 else -1
+    per_thrust = [thrust >= 0 and moves_with_thrust(name) for name in names]
+    absolute = [EFFECTS[effect].act is None for effect, _ in config.estimate_effects]
     return Problem(
         values,
         process(config),
@@ -70,6 +78,9 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         drift_of(config, prior.names),
         body.mass_matrix,
         body.restoring,
+        thrust,
+        np.array(per_thrust, dtype=bool),
+        np.array(absolute, dtype=bool),
         LIGHTEST * np.diag(np.linalg.cholesky(body.mass_matrix)) ** 2,
     )
 

@@ -266,8 +266,9 @@ def _fill(motion, samples, acts, impulse, time, scale, velocity, about, followed
                 sides[6 + i, j] += to_world[a, i] * motion.water[a, j]
     if len(motion.bodies) > 0:
         nu_dot = _acceleration(motion, sample, sample.nu)
+        down = sample.down - 0.5 * sample.dt * sample.down_slope  # as the estimators take it
         for b in range(len(motion.bodies)):
-            change = motion.of_restoring[b] @ sample.down - motion.of_mass[b] @ nu_dot
+            change = motion.of_restoring[b] @ down - motion.of_mass[b] @ nu_dot
             change -= coriolis(motion.of_mass[b] @ sample.nu, sample.nu)
             for i in range(6):
                 sides[i, motion.bodies[b]] = change[i]
