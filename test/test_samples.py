@@ -648,6 +648,36 @@ def test_a_bag_that_starts_over(heavy, jump):
     assert (np.diff(samples["t"][:k]) > 0).all() and (np.diff(samples["t"][k:]) > 0).all()
 
 
+@pytest.mark.parametrize("step", [0.3, 0.2, -0.15, -0.3, -0.8])
+def test_a_clock_that_is_stepped(heavy, step):
+    """The interval is not bridged, nor are messages refused until the old stamps are reached."""
+    later = [
+        (role, m._replace(stamp=m.stamp + round(step * SECOND)))
+        for role, m in steady(110.0, 120.0, 50.0)
+    ]
+    samples, sampler = taken(heavy, [*steady(100.0, 110.0, 50.0), *later])
+    what = "stepped ahead, or all topics silent, not bridged" if step > 0.0 else "jumps, buffers"
+    assert sum(n for name, n in sampler.counts.items() if what in name) == 1
+    k = np.flatnonzero(samples["restart"])
+    assert len(k) == 2 and samples["dt"][k[1]] == 0.0
+    assert samples["dt"].max() < 0.021
+    assert len(samples) == pytest.approx(1000, abs=6)
+
+
+def test_what_is_no_step_of_the_clock(heavy):
+    """Odometry and IMU that are silent for 0.4 s beside commands; messages out of order."""
+    messages = list(steady(100.0, 110.0, 50.0))
+    silent = [(r, m) for r, m in messages if r == WRENCH or not 105.0 < m.stamp / SECOND < 105.4]
+    samples, sampler = taken(heavy, silent)
+    assert samples["restart"].sum() == 1 and samples["dt"].max() == pytest.approx(0.4, abs=0.021)
+    reordered = list(messages)
+    for k in range(300, 1200, 97):  # one comes a quarter of a second after its time
+        reordered.insert(k + 39, reordered.pop(k))
+    samples, sampler = taken(heavy, reordered)
+    assert samples["restart"].sum() == 1
+    assert not [name for name in sampler.counts if name.startswith("clock: ")]
+
+
 def test_a_first_stamp_that_is_wild(heavy):
     """The very first message carries another clock: nothing after it suffers."""
     good = list(steady(100.0, 110.0))

@@ -6,7 +6,8 @@ from bench.studies import torture
 
 
 @pytest.mark.parametrize(
-    "what", ["IMU gone", "velocity frozen", "wrench 300 ms late", "hour back", "demands lost"]
+    "what",
+    ["IMU gone", "velocity frozen", "wrench 300 ms late", "hour back", "0.3 s", "demands lost"],
 )
 def test_faults_in_time(what):
     """Held, used again within seconds, and the coefficients end where they would have."""
