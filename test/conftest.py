@@ -125,7 +125,7 @@ def pytest_collection_finish(session):
     """Compile what nodes run before the workers start; core/jit.py says why."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
     if wanted and not session.config.option.collectonly:
-        compile_all()
+        compile_all(offline=True)
 
 
 # Workers begin far from each other: what one has just left, another should not take up.

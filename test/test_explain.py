@@ -7,6 +7,7 @@ from concurrent.futures import CancelledError
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from tiers import more
 
 from bench.simulators.hidden import EFFECTS, NESTED, UNKNOWN, Conditions, draw
 from bench.studies.explain import (
@@ -61,14 +62,16 @@ def found_in(name, number, place="a minute"):
 @pytest.mark.parametrize(
     "name",
     [
-        "quadratic_damping",
-        "added_mass_coupling",
-        "ocean_current",
         "payload",
-        "thruster_deadband",
         "thruster_lag",
-        "thruster_failure",
         "sensor_lever_arm",
+        *more(
+            "quadratic_damping",
+            "added_mass_coupling",
+            "ocean_current",
+            "thruster_deadband",
+            "thruster_failure",
+        ),
     ],
 )
 def test_a_hidden_effect_is_named_first(name):
