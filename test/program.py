@@ -52,7 +52,7 @@ def run(*arguments, cwd="."):
     return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
 
 
-def start(*arguments, cwd=None):
+def run_alone(*arguments, cwd=None):
     """The finished program, in a process of its own."""
     command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=cwd)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from program import run, start
+from program import run, run_alone
 
 from rov_ident.core.errors import UserError
 from rov_ident.io.write_messages import write_messages
@@ -102,7 +102,7 @@ def test_nothing_readable_is_refused(paths, off, jobs):
 
 def test_the_command(paths, tmp_path, heavy_path):
     out, report, saved = tmp_path / "fit.json", tmp_path / "fit.html", tmp_path / "fitted.yaml"
-    done = start(
+    done = run_alone(
         "fit", *paths, "--config", heavy_path, "--estimator", "ls", "--jobs", 2,
         "--json", out, "--report", report, "--save", saved, "--quiet",
     )  # fmt: skip

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from program import run, start
+from program import run, run_alone
 
 from bench import HEAVY, ROOT
 from rov_ident import config as configuration
@@ -46,7 +46,7 @@ def test_the_shipped_bag_is_reproduced_bit_for_bit(tmp_path, compiled):
     line = next(line for line in text.splitlines() if "simulate" in line)
     arguments = line.split("rov-ident", 1)[1].split()
     arguments[arguments.index("--out") + 1] = str(again)
-    done = start(*arguments, cwd=ROOT)
+    done = run_alone(*arguments, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert again.read_bytes() == (ROOT / "bags" / "demo.mcap").read_bytes()
 
@@ -113,7 +113,7 @@ def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator
 
 def test_live_estimators_replay_a_bag(tmp_path, bag, compiled):
     out = tmp_path / "replayed.mcap"
-    done = start("replay", bag, "--config", HEAVY, "--rate", 0, "--out", out)
+    done = run_alone("replay", bag, "--config", HEAVY, "--rate", 0, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "rls" in done.stdout and "ukf" in done.stdout
     topics = Bag(out).topics
@@ -153,7 +153,7 @@ def test_every_coefficient_is_listed():
 
 
 def test_help_of_every_command():
-    done = start("--help")
+    done = run_alone("--help")
     assert done.returncode == 0
     for command in ("demo", "replay", "fit", "simulate", "import", "coefficients"):
         assert command in done.stdout
@@ -168,7 +168,7 @@ def fit(bag, config=HEAVY):
 
 def test_bags_that_cannot_be_used(tmp_path, bag):
     refused(fit(tmp_path / "none.mcap"), "none.mcap")
-    alone = start("fit", tmp_path / "none.mcap", "--config", HEAVY, "--estimator", "rls")
+    alone = run_alone("fit", tmp_path / "none.mcap", "--config", HEAVY, "--estimator", "rls")
     refused(alone, "none.mcap")  # in a process of its own, too
     (tmp_path / "empty.mcap").write_bytes(b"")
     refused(fit(tmp_path / "empty.mcap"), "empty.mcap")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from program import run, start
+from program import run, run_alone
 
 from bench import HEAVY
 from rov_ident.cli.common import EXAMPLES
@@ -313,5 +313,5 @@ def test_out_is_a_file_that_is_no_bag(tmp_path):
 
 
 def test_no_empty_line_where_there_is_no_terminal(tmp_path):
-    done = start("fit", Path("none.mcap"), "--config", HEAVY, "--estimator", "rls")
+    done = run_alone("fit", Path("none.mcap"), "--config", HEAVY, "--estimator", "rls")
     assert done.stderr.count("\n") == 1
