@@ -85,10 +85,8 @@ def mixed(rows, every):
     "names, alpha, dt, kind",
     [
         (12, 0.1, 0.05, "odometry"),
-        (15, 0.5, 0.02, "mixed"),
-        (15, 1.0, 0.05, "odometry"),
         (30, 0.1, 0.05, "mixed"),
-        (12, 0.1, 0.2, "mixed"),
+        *more((15, 0.5, 0.02, "mixed"), (15, 1.0, 0.05, "odometry"), (12, 0.1, 0.2, "mixed")),
     ],
 )
 def test_equals_filterpy(heavy, names, alpha, dt, kind):
