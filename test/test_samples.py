@@ -13,6 +13,7 @@ from rov_ident.core.frames import from_core, quaternion_to_matrix
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
+from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.sample import SAMPLE, believed
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import NEW_FRAME, describe
@@ -662,6 +663,19 @@ def test_a_clock_that_is_stepped(heavy, step):
     assert len(k) == 2 and samples["dt"][k[1]] == 0.0
     assert samples["dt"].max() < 0.021
     assert len(samples) == pytest.approx(1000, abs=6)
+
+
+@pytest.mark.parametrize("step", [-0.3, -3600.0])
+def test_a_clock_that_is_set_back_gives_no_time_twice(heavy, step):
+    """In the raw messages that `explain` searches: there is a pause instead."""
+    later = [
+        (role, m._replace(stamp=m.stamp + round(step * SECOND)))
+        for role, m in steady(100_010.0, 100_020.0, 50.0)
+    ]
+    streams = gather([*steady(100_000.0, 100_010.0, 50.0), *later], heavy)
+    for t in (streams.t, streams.imu_t, streams.demand_t):
+        assert (np.diff(t) > 0.0).all()
+    assert streams.duration == pytest.approx(80.0, abs=0.1)
 
 
 def test_what_is_no_step_of_the_clock(heavy):
