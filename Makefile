@@ -6,25 +6,35 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pe
 # A shell that has sourced a ROS workspace, or runs inside another venv, must not leak into .venv.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH RMW_IMPLEMENTATION
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# Tests start hundreds of processes: without bytecode each would compile all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo quick tiers test check docs accuracy bench validate sdf explain-bench torture audit lock bag picture clean
+.PHONY: demo quick tiers test studies check docs accuracy bench validate sdf explain-bench torture audit lock bag picture clean
 
 ## the main job on the shipped bag, live
 demo: .venv/demo.stamp
 	@$(BIN)/rov-ident demo
 
-## style, types, then all tests (under 15 minutes on two cores)
+# Each worker takes a stretch of the tests, so that fixtures of modules are made once. Three, because
+# tests of live nodes wait for half of their time.
+PYTEST := $(BIN)/python -m pytest -n 3 --dist worksteal
+
+## style, types, then all tests but the studies (bar: 8 minutes on two idle cores, once all is compiled)
 test: check
-	$(BIN)/python -m pytest -n 2 --timeout 900
+	$(PYTEST) --timeout 900 -m "not study"
+
+## the same tests with more seeds and vehicles
+studies: .venv/test.stamp
+	$(PYTEST) --timeout 1800 -m study
 
 ## the tests without DDS, programs and long computations (under 90 s, once all is compiled)
 quick: .venv/test.stamp
-	$(BIN)/python -m pytest -n 2 --timeout 300 -m "not dds and not process and not slow" \
+	$(PYTEST) -n 2 --timeout 300 -m "not dds and not process and not slow and not study" \
 	  --hypothesis-profile quick
 
-## all tests, measured: which of them `make quick` has time for (test/slow.txt)
+## the tests of `make test`, measured: which of them `make quick` has time for (test/slow.txt)
 tiers: .venv/test.stamp
-	$(BIN)/python -m pytest -n 2 --timeout 900 --find-slow
+	$(PYTEST) --timeout 900 -m "not study" --find-slow
 
 ## style and types
 check: .venv/test.stamp

@@ -1,7 +1,8 @@
 """Fixtures, and the tiers of the tests.
 
-`make test` runs everything. `make quick` leaves out what is marked here: `dds` and `process` by
-what a test uses, `slow` by slow.txt, which `make tiers` measures anew.
+`make test` runs everything but `study`, which the tests themselves say of some parameters
+(tiers.py). `make quick` also leaves out what is marked here: `dds` and `process` by what a test
+uses, `slow` by slow.txt, which `make tiers` measures anew.
 """
 
 import contextlib
@@ -55,7 +56,7 @@ def pytest_collection_modifyitems(items):
         names = getattr(item.function, "__code__", None) and item.function.__code__.co_names
         if "domain" in item.fixturenames:
             item.add_marker("dds")
-        elif "compiled" in item.fixturenames or "subprocess" in (names or ()):
+        elif "compiled" in item.fixturenames or {"subprocess", "run_alone"} & set(names or ()):
             item.add_marker("process")
 
 
@@ -125,13 +126,13 @@ def pytest_collection_finish(session):
     """Compile what nodes run before the workers start; core/jit.py says why."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
     if wanted and not session.config.option.collectonly:
-        compile_all()
+        compile_all(offline=True)
 
 
 # Workers begin far from each other: what one has just left, another should not take up.
 _WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 _DOMAINS = itertools.cycle(range(10, 100))
-for _ in range((os.getppid() + 45 * _WORKER) % 90):
+for _ in range((os.getppid() + 30 * _WORKER) % 90):
     next(_DOMAINS)
 _LEFT = deque(maxlen=12)  # the locks of domains in which a participant may still seem to live
 

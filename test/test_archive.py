@@ -1,11 +1,10 @@
 """Many bags as one fit: in one process, in several, on Dask; and bags that cannot be read."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from program import run, run_alone
 
 from rov_ident.core.errors import UserError
 from rov_ident.io.write_messages import write_messages
@@ -103,12 +102,10 @@ def test_nothing_readable_is_refused(paths, off, jobs):
 
 def test_the_command(paths, tmp_path, heavy_path):
     out, report, saved = tmp_path / "fit.json", tmp_path / "fit.html", tmp_path / "fitted.yaml"
-    command = [
-        sys.executable, "-m", "rov_ident", "fit", *map(str, paths), "--config", heavy_path,
-        "--estimator", "ls", "--jobs", "2", "--json", out, "--report", report, "--save", saved,
-        "--quiet",
-    ]  # fmt: skip
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240)
+    done = run_alone(
+        "fit", *paths, "--config", heavy_path, "--estimator", "ls", "--jobs", 2,
+        "--json", out, "--report", report, "--save", saved, "--quiet",
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "broken.mcap" in done.stderr
     result = json.loads(out.read_text())
@@ -133,9 +130,7 @@ def test_the_command(paths, tmp_path, heavy_path):
     ],
 )
 def test_options_that_would_not_be_heeded_are_refused(paths, heavy_path, options, said):
-    command = [sys.executable, "-m", "rov_ident", "fit", paths[0], "--config", heavy_path]
-    command = list(map(str, [*command, *options]))
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    done = run("fit", paths[0], "--config", heavy_path, *options)
     assert done.returncode == 2
     assert said in done.stderr
 

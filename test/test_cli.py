@@ -1,11 +1,10 @@
-"""The command line as a user meets it: real processes, real files, real messages."""
+"""The command line as a user meets it: real files, real messages, some processes of their own."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from program import run, run_alone
 
 from bench import HEAVY, ROOT
 from rov_ident import config as configuration
@@ -14,13 +13,6 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.cdr import decode_odometry, encode
 from rov_ident.io.write_messages import write_messages
-
-pytestmark = pytest.mark.usefixtures("compiled")
-
-
-def run(*arguments, cwd=None):
-    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240, cwd=cwd)
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +40,13 @@ def refused(done, *parts):
 # ------------------------------------------------------------------ simulate
 
 
-def test_the_shipped_bag_is_reproduced_bit_for_bit(tmp_path):
+def test_the_shipped_bag_is_reproduced_bit_for_bit(tmp_path, compiled):
     again = tmp_path / "demo.mcap"
     text = (ROOT / "Makefile").read_text()
     line = next(line for line in text.splitlines() if "simulate" in line)
     arguments = line.split("rov-ident", 1)[1].split()
     arguments[arguments.index("--out") + 1] = str(again)
-    done = run(*arguments, cwd=ROOT)
+    done = run_alone(*arguments, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert again.read_bytes() == (ROOT / "bags" / "demo.mcap").read_bytes()
 
@@ -89,8 +81,8 @@ def test_simulation_of_a_bag_is_compared_with_it(tmp_path, bag):
 
 @pytest.mark.parametrize("estimator", ["rls", "ukf"])
 def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator):
-    start = configuration.load(HEAVY)
-    off = start.with_model(start.model.with_theta(1.3 * start.model.theta))
+    given = configuration.load(HEAVY)
+    off = given.with_model(given.model.with_theta(1.3 * given.model.theta))
     configuration.dump(off, tmp_path / "off.yaml")
     done = run(
         "fit", bag, bag, "--config", tmp_path / "off.yaml", "--estimator", estimator,
@@ -107,10 +99,10 @@ def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator
     assert result["samples"] > 3000 and result["duration_s"] == pytest.approx(40.0, abs=0.5)
     assert result["open_loop"]["horizon_s"] == 10.0
     assert set(result["open_loop"]["rmse"]) == set("uvwpqr")
-    assert set(result["coefficients"]) == set(start.model.names)
+    assert set(result["coefficients"]) == set(given.model.names)
     fitted = configuration.load(tmp_path / "fitted.yaml").model
     errors = []
-    for name, truth in zip(start.model.names, start.model.theta, strict=True):
+    for name, truth in zip(given.model.names, given.model.theta, strict=True):
         found = result["coefficients"][name]
         assert set(found) >= {"value", "std", "unit", "identifiable"}
         assert found["value"] == fitted.theta[fitted.names.index(name)]
@@ -119,9 +111,9 @@ def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator
     assert "X_udot" in done.stdout
 
 
-def test_live_estimators_replay_a_bag(tmp_path, bag):
+def test_live_estimators_replay_a_bag(tmp_path, bag, compiled):
     out = tmp_path / "replayed.mcap"
-    done = run("replay", bag, "--config", HEAVY, "--rate", 0, "--out", out)
+    done = run_alone("replay", bag, "--config", HEAVY, "--rate", 0, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "rls" in done.stdout and "ukf" in done.stdout
     topics = Bag(out).topics
@@ -161,7 +153,7 @@ def test_every_coefficient_is_listed():
 
 
 def test_help_of_every_command():
-    done = run("--help")
+    done = run_alone("--help")
     assert done.returncode == 0
     for command in ("demo", "replay", "fit", "simulate", "import", "coefficients"):
         assert command in done.stdout
@@ -176,6 +168,8 @@ def fit(bag, config=HEAVY):
 
 def test_bags_that_cannot_be_used(tmp_path, bag):
     refused(fit(tmp_path / "none.mcap"), "none.mcap")
+    alone = run_alone("fit", tmp_path / "none.mcap", "--config", HEAVY, "--estimator", "rls")
+    refused(alone, "none.mcap")  # in a process of its own, too
     (tmp_path / "empty.mcap").write_bytes(b"")
     refused(fit(tmp_path / "empty.mcap"), "empty.mcap")
     (tmp_path / "text.mcap").write_text("not a bag " * 100)

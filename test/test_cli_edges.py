@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from program import run, run_alone
 
 from bench import HEAVY
 from rov_ident.cli.common import EXAMPLES
@@ -17,19 +18,12 @@ from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.write_messages import write_messages
 from rov_ident.simulation import virtual_sensors as sensors
 
-pytestmark = pytest.mark.usefixtures("compiled")
-
 COMMANDS = (
     "demo", "init", "identify", "compare", "replay", "fit", "check", "plan", "explain",
     "simulate", "import", "export", "import-model", "nomoto", "forces", "coast-down", "steer",
     "coefficients",
 )  # fmt: skip
 DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
-
-
-def run(*arguments):
-    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240)
 
 
 def simulate(out, *options, source=("--manoeuvre", "steps", "--duration", 5)):
@@ -155,8 +149,7 @@ def test_a_bag_in_the_folder_one_is_in(tmp_path, bag):
     folder = tmp_path / "first dive"
     folder.mkdir()
     (folder / "first.mcap").write_bytes(bag.read_bytes())
-    command = [sys.executable, "-m", "rov_ident", "check", ".", "--config", HEAVY]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=240)
+    done = run("check", ".", "--config", HEAVY, cwd=folder)
     assert done.stdout.startswith("first dive, 12.0 s")
 
 
@@ -320,5 +313,5 @@ def test_out_is_a_file_that_is_no_bag(tmp_path):
 
 
 def test_no_empty_line_where_there_is_no_terminal(tmp_path):
-    done = fit(Path("none.mcap"))
+    done = run_alone("fit", Path("none.mcap"), "--config", HEAVY, "--estimator", "rls")
     assert done.stderr.count("\n") == 1

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tiers import more
 
 from bench.simulators.hidden import LINEAR_STD, Conditions, draw
 from bench.studies.explain import streams_of
@@ -50,7 +51,7 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
     return explain([gather(((r, m) for _, r, m in run.messages), config)], config).findings
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, *more(4)])
 @pytest.mark.parametrize(
     "name",
     [
@@ -78,7 +79,7 @@ def test_each_cause_is_named_alone_and_with_its_size(heavy, name, seed):
 # ------------------------------------------------------------------ by the other hand
 
 
-@pytest.mark.parametrize("seed", [2, 5])
+@pytest.mark.parametrize("seed", [2, *more(5)])
 def test_weaker_thrust_is_one_factor(seed):
     """15 % less on every axis than read: no payload, no six gains."""
     case = draw(seed, conditions=MINUTE)
@@ -91,7 +92,7 @@ def test_weaker_thrust_is_one_factor(seed):
     assert "thruster_gain" not in [a.effect for a in found.alternatives if "as well" in a.why_not]
 
 
-@pytest.mark.parametrize("seed", [2, 5])
+@pytest.mark.parametrize("seed", [2, *more(5)])
 def test_late_velocities_are_said_to_be_late(seed):
     case = draw(seed, conditions=MINUTE)
     streams, t = streams_of(case), case.truth.t
@@ -112,7 +113,7 @@ def test_late_velocities_are_said_to_be_late(seed):
 NO_IMU = dataclasses.replace(Suite(), imu_rate=0.0)
 
 
-@pytest.mark.parametrize("yaw", [0.3, -0.6])
+@pytest.mark.parametrize("yaw", [0.3, *more(-0.6)])
 def test_a_heading_set_to_zero_is_no_mounting(heavy, yaw):
     """Without an IMU only the thrust can tell, on a vehicle that is level."""
     rng = np.random.default_rng(7)
@@ -122,7 +123,7 @@ def test_a_heading_set_to_zero_is_no_mounting(heavy, yaw):
     assert findings.effects[0].parameters["yaw"].value == pytest.approx(yaw, abs=0.02)
 
 
-@pytest.mark.parametrize("yaw", [0.3, -0.15])
+@pytest.mark.parametrize("yaw", [0.3, *more(-0.15)])
 def test_a_mounting_is_no_heading(heavy, yaw):
     rng = np.random.default_rng(8)
     mounting = {"roll": 0.03, "pitch": -0.04, "yaw": yaw}
@@ -148,7 +149,7 @@ def test_a_correction_that_the_thrust_refutes_is_not_applied(heavy):
 # ------------------------------------------------------------------ noise of the reading
 
 
-@pytest.mark.parametrize("seed", [4, 8, 9, 11])
+@pytest.mark.parametrize("seed", [4, *more(8, 9, 11)])
 def test_noise_of_the_reading_is_not_taken_for_a_fault(seed):
     """Bags of which a dead band, a gain or a centre of gravity was named before."""
     case = draw(seed, conditions=NOISY)
@@ -165,7 +166,7 @@ def test_noise_of_the_reading_is_named_with_its_size():
     assert "wrench_noise" in explanation.extended.effects
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, *more(1)])
 def test_a_dead_band_is_found_beside_noise_of_the_reading(seed):
     conditions = dataclasses.replace(NOISY, excitation="steps")
     case = draw(seed, ("thruster_deadband",), 1.0, conditions=conditions)

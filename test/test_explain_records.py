@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tiers import more
 
 from bench import HEAVY
 from rov_ident import config as configuration
@@ -50,7 +51,7 @@ def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
     assert "The records differ" in found.sentence
 
 
-@pytest.mark.parametrize("seed", [3, 5])
+@pytest.mark.parametrize("seed", [3, *more(5)])
 def test_a_current_that_is_always_there_is_the_same_and_repeats(seed):
     current = {"north": 0.2, "east": -0.1}
     bags = [record(seed, ocean_current=current), record(seed + 1, ocean_current=current)]

@@ -122,15 +122,10 @@ def test_wild_messages_to_a_live_node(live, heavy, short_dive):
 
     def counted():
         """By role, of what /diagnostics counts by name."""
-        found = dict.fromkeys(sent, 0)
         status = vehicle.diagnostics[-1].status[0]
         assert status.name == "rls_node: inputs"
-        for value in status.values:
-            role, _, reason = value.key.partition(":")
-            if role in sent and reason not in torture.NOT_OF_A_MESSAGE:
-                late = role == WRENCH and reason == " too late"  # and taken all the same
-                found[role] += 0 if late else int(value.value)
-        return found
+        values = {value.key: value.value for value in status.values}
+        return {role: torture.accounted(role, values) for role in sent}
 
     vehicle.until(lambda: vehicle.diagnostics and sum(counted().values()) >= sum(sent.values()))
     assert counted() == sent

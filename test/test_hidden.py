@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from tiers import more
 
 from bench.simulators import fossen, hidden
 from bench.simulators.hidden import EFFECTS, EXCITATIONS, FAMILIES, TIERS, UNKNOWN, Conditions, draw
@@ -235,7 +236,7 @@ TOLERANCE = {"thruster_lag": 5e-4, "payload": 5e-3}
 
 
 @pytest.mark.parametrize("effects", [(), *((name,) for name in EFFECTS), INPUT])
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, *more(4)])
 def test_two_hands_agree(effects, seed):
     """The package, told the truth, moves as the independent vehicle does (m/s, rad/s)."""
     case = draw(seed, effects, conditions=QUIET)

@@ -2,10 +2,9 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 
 import pytest
+from program import run
 
 import rov_ident as ri
 from bench import ROOT
@@ -19,13 +18,8 @@ from rov_ident.offline.batch_fit import validation
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
 
 
-def run(*arguments):
-    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600)
-
-
 @pytest.fixture(scope="module")
-def dives(tmp_path_factory, compiled):
+def dives(tmp_path_factory):
     """Two dives, the second the shorter one, and one at rest."""
     folder = tmp_path_factory.mktemp("dives")
     for name, manoeuvre, duration in (

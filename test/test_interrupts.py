@@ -86,7 +86,7 @@ def test_what_would_be_lost_waits(number):
             except Interrupted as error:
                 print(error.status)
     """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=240)
     assert done.stdout.split() == [str(128 + number).encode()] * 2
     assert done.stderr == b""
 
@@ -102,6 +102,6 @@ def test_a_file_in_the_making_goes(tmp_path, number):
         os.fsync = lambda _: os.kill(os.getpid(), {number:d})
         write_file({str(tmp_path / "result")!r}, "content")
     """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=240)
     assert b"Interrupted" in done.stderr
     assert list(tmp_path.iterdir()) == []

@@ -238,7 +238,7 @@ def test_wrench_alone(live, heavy):
 
 def test_services_and_parameters(live, heavy, short_dive, tmp_path):
     saved = tmp_path / "saved.yaml"
-    vehicle = live(f"save_path:={saved}", "timeout:=5")
+    vehicle = live(f"save_path:={saved}", "timeout:=300")
     middle = len(short_dive) // 2
     vehicle.drive(short_dive[:middle])
     vehicle.until(lambda: any(m.header.stamp.sec >= 4 for m in vehicle.coefficients[-1:]))
@@ -279,9 +279,14 @@ def test_services_and_parameters(live, heavy, short_dive, tmp_path):
         result = vehicle.call(SetParameters, "set_parameters", request).results[0]
         assert result.successful == (refusal == ""), result.reason
         assert refusal in result.reason
-    vehicle.coefficients.clear()
-    vehicle.listen(1.0)
-    assert len(vehicle.coefficients) > 12
+
+    def of_a_second():
+        vehicle.coefficients.clear()
+        vehicle.listen(1.0)
+        return len(vehicle.coefficients)
+
+    # By default they come five times a second; twenty times at once only to an idle computer.
+    vehicle.until(lambda: of_a_second() > 8)
 
 
 def test_a_node_outlives_its_callbacks(live, short_dive, tmp_path):
@@ -345,7 +350,7 @@ def test_vehicles_of_a_fleet_save_to_files_of_their_own(domain, heavy_path, tmp_
             client = caller.node.create_client(Trigger, f"/{name}/rls_node/save")
             caller.until(client.service_is_ready, 120.0)
             future = client.call_async(Trigger.Request())
-            caller.until(future.done, 30.0)
+            caller.until(future.done, 120.0)
             assert future.result().success
             assert "no sample was used yet" in future.result().message
         finally:
@@ -428,7 +433,7 @@ def test_the_first_start_on_a_computer(domain, heavy, heavy_path, nothing_compil
     assert stale is False
     assert sum("compiling failed with status -9: trying again" in line for line in said) == 1
     assert "interpreted until compiled" in vehicle.words()
-    vehicle.until(lambda: any("compiled after" in line for line in said), 120.0)
+    vehicle.until(lambda: any("compiled after" in line for line in said), 600.0)
     vehicle.until(lambda: is_stale(vehicle))
     vehicle.close()
     process.send_signal(signal.SIGINT)
@@ -483,7 +488,7 @@ def test_interrupt_while_an_object_of_a_start_is_finalised(number):
             time.sleep(60.0)
         live("node", make, own=())
     """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=240)
     assert (done.returncode, done.stderr) == (0, b"")
 
 

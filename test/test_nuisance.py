@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import yaml
+from tiers import more
 
 import rov_ident as ri
 from bench.simulators import sea
@@ -69,7 +70,7 @@ def errors(case, seed, kind, known=None, driving="six-axis"):
 
 @pytest.mark.parametrize("kind", ["rls", "ukf"])
 @pytest.mark.parametrize("case", ["scale", "current", "late"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, *more(2)])
 def test_what_the_file_does_not_know_is_found(case, seed, kind):
     """And without it the coefficients are surely wrong: the estimate owes it to this."""
     sigmas, median, _ = errors(case, seed, kind)
@@ -209,7 +210,7 @@ def test_a_current_that_turns_is_followed(kind):
 
 
 @pytest.mark.parametrize("kind", ["rls", "ukf"])
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, *more(12)])
 def test_pilots_show_no_delay_where_there_is_none(seed, kind):
     """Noise of measured velocities in the column of the delay once drew it to its bound."""
     rng = np.random.default_rng(seed)

@@ -130,6 +130,16 @@ print("rclpy" in sys.modules)
 """
 
 
+def test_a_fit_does_not_load_what_takes_a_second():
+    """Every command and every worker would wait for it."""
+    code = "import sys, rov_ident.api.functions; print([m for m in sys.modules if m in sys.argv])"
+    slow = ["scipy.signal", "scipy.stats", "scipy.ndimage", "matplotlib", "rclpy"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *slow], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "[]\n"
+
+
 def test_nor_does_loading_every_name():
     done = subprocess.run(
         [sys.executable, "-c", USED], capture_output=True, text=True, check=True, cwd=ROOT

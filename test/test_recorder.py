@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
+from program import run
 
 from rov_ident.core.errors import UserError
 from rov_ident.io.bag_reader import Bag
@@ -84,9 +85,7 @@ def test_a_cut_bag_is_used_and_the_loss_told(heavy_path, tmp_path):
         ["check", cut, "--config", heavy_path],
         ["fit", cut, "--config", heavy_path, "--estimator", "rls", "--json", tmp_path / "fit.json"],
     ):
-        done = subprocess.run(
-            [*PROGRAM, *map(str, command)], capture_output=True, text=True, timeout=240
-        )
+        done = run(*command)
         said = " ".join((done.stdout + done.stderr).split())
         assert done.returncode == 0, said
         assert f"its writer was killed, the last {lost} bytes" in said

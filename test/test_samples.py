@@ -13,6 +13,7 @@ from rov_ident.core.frames import from_core, quaternion_to_matrix
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
+from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.sample import SAMPLE, believed
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import NEW_FRAME, describe
@@ -646,6 +647,49 @@ def test_a_bag_that_starts_over(heavy, jump):
     assert np.isfinite(samples["nu"]).all()
     k = np.flatnonzero(samples["restart"])[1]
     assert (np.diff(samples["t"][:k]) > 0).all() and (np.diff(samples["t"][k:]) > 0).all()
+
+
+@pytest.mark.parametrize("step", [0.3, 0.2, -0.15, -0.3, -0.8])
+def test_a_clock_that_is_stepped(heavy, step):
+    """The interval is not bridged, nor are messages refused until the old stamps are reached."""
+    later = [
+        (role, m._replace(stamp=m.stamp + round(step * SECOND)))
+        for role, m in steady(110.0, 120.0, 50.0)
+    ]
+    samples, sampler = taken(heavy, [*steady(100.0, 110.0, 50.0), *later])
+    what = "stepped ahead, or all topics silent, not bridged" if step > 0.0 else "jumps, buffers"
+    assert sum(n for name, n in sampler.counts.items() if what in name) == 1
+    k = np.flatnonzero(samples["restart"])
+    assert len(k) == 2 and samples["dt"][k[1]] == 0.0
+    assert samples["dt"].max() < 0.021
+    assert len(samples) == pytest.approx(1000, abs=6)
+
+
+@pytest.mark.parametrize("step", [-0.3, -3600.0])
+def test_a_clock_that_is_set_back_gives_no_time_twice(heavy, step):
+    """In the raw messages that `explain` searches: there is a pause instead."""
+    later = [
+        (role, m._replace(stamp=m.stamp + round(step * SECOND)))
+        for role, m in steady(100_010.0, 100_020.0, 50.0)
+    ]
+    streams = gather([*steady(100_000.0, 100_010.0, 50.0), *later], heavy)
+    for t in (streams.t, streams.imu_t, streams.demand_t):
+        assert (np.diff(t) > 0.0).all()
+    assert streams.duration == pytest.approx(80.0, abs=0.1)
+
+
+def test_what_is_no_step_of_the_clock(heavy):
+    """Odometry and IMU that are silent for 0.4 s beside commands; messages out of order."""
+    messages = list(steady(100.0, 110.0, 50.0))
+    silent = [(r, m) for r, m in messages if r == WRENCH or not 105.0 < m.stamp / SECOND < 105.4]
+    samples, sampler = taken(heavy, silent)
+    assert samples["restart"].sum() == 1 and samples["dt"].max() == pytest.approx(0.4, abs=0.021)
+    reordered = list(messages)
+    for k in range(300, 1200, 97):  # one comes a quarter of a second after its time
+        reordered.insert(k + 39, reordered.pop(k))
+    samples, sampler = taken(heavy, reordered)
+    assert samples["restart"].sum() == 1
+    assert not [name for name in sampler.counts if name.startswith("clock: ")]
 
 
 def test_a_first_stamp_that_is_wild(heavy):

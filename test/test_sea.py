@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiers import more
 
 import rov_ident as ri
 from bench.simulators import sea
@@ -179,7 +180,7 @@ def test_the_packages_equations_give_the_wrench_that_acted(driving):
         np.testing.assert_allclose(wrench, truth.wrench[k], atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [12, 20, 21])
+@pytest.mark.parametrize("seed", [12, *more(20, 21)])
 def test_a_clean_dive_is_predicted_to_its_noise(tmp_path, seed):
     """By the package's simulation with the true coefficients, a minute in one run, from the
     messages in their bag; what is measured there is odometry and gyro together."""

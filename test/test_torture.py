@@ -1,12 +1,20 @@
 """The short form of `make torture`: faults and outliers of a dive, to both estimators."""
 
 import pytest
+from tiers import more
 
 from bench.studies import torture
 
 
 @pytest.mark.parametrize(
-    "what", ["IMU gone", "velocity frozen", "wrench 300 ms late", "hour back", "demands lost"]
+    "what",
+    [
+        "IMU gone",
+        "hour back",
+        "0.3 s",
+        "demands lost",
+        *more("velocity frozen", "wrench 300 ms late"),
+    ],
 )
 def test_faults_in_time(what):
     """Held, used again within seconds, and the coefficients end where they would have."""
@@ -18,8 +26,10 @@ def test_faults_in_time(what):
 @pytest.mark.parametrize(
     "channel",
     [
-        "odom linear u", "odom angular r", "odom orientation y", "imu angular_velocity x",
-        "imu linear_acceleration z", "wrench force X", "wrench torque N",
+        "odom linear u", "imu angular_velocity x", "wrench force X",
+        *more(
+            "odom angular r", "odom orientation y", "imu linear_acceleration z", "wrench torque N",
+        ),
     ],
 )  # fmt: skip
 def test_outliers(channel):
@@ -29,7 +39,9 @@ def test_outliers(channel):
     assert [row for row in rows if not row.met] == []
 
 
-@pytest.mark.parametrize("what", ["linear of odometry 1 wrong", "orientation of odometry 1 and 3"])
+@pytest.mark.parametrize(
+    "what", ["linear of odometry 1 wrong", *more("orientation of odometry 1 and 3")]
+)
 def test_begun_wrong(what):
     """What a first odometry message taught is given up when the next ones contradict it."""
     rows = list(torture.firsts(1, what))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import textbook
 from textbook import with_section
+from tiers import more
 
 from rov_ident import config as configuration
 from rov_ident.config.prior import prior_of
@@ -84,10 +85,8 @@ def mixed(rows, every):
     "names, alpha, dt, kind",
     [
         (12, 0.1, 0.05, "odometry"),
-        (15, 0.5, 0.02, "mixed"),
-        (15, 1.0, 0.05, "odometry"),
         (30, 0.1, 0.05, "mixed"),
-        (12, 0.1, 0.2, "mixed"),
+        *more((15, 0.5, 0.02, "mixed"), (15, 1.0, 0.05, "odometry"), (12, 0.1, 0.2, "mixed")),
     ],
 )
 def test_equals_filterpy(heavy, names, alpha, dt, kind):
@@ -271,7 +270,7 @@ def test_what_is_published_is_physical(heavy):
     assert values[i] == pytest.approx(heavy.model.theta[i], rel=0.2)
 
 
-@pytest.mark.parametrize("seed", [21, 31, 41])
+@pytest.mark.parametrize("seed", [21, *more(31, 41)])
 @pytest.mark.parametrize("name", ["X_uu", "N_rdot"])
 def test_follows_a_change(heavy, name, seed):
     """+30 % in one coefficient, default settings; it shows on one axis of six only."""

@@ -8,6 +8,7 @@ A part of `make torture`. Exit status 1 where a bar is missed. docs/trust.md has
 import argparse
 import itertools
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -25,7 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 from bench import HEAVY
 from bench.harness import Bars, Row, announce, show
 from bench.simulators.live import compile_all, end_node, start_connected
-from bench.studies.torture import SECOND
+from bench.studies.torture import SECOND, accounted
 from bench.studies.torture_live import _cpu, _memory, _repeated
 from rov_ident import config as configuration
 from rov_ident.estimation import checkpoint
@@ -68,13 +69,18 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
     messages = dive(config, "steps", options.seconds, seed=3).messages
     context = rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
-    executor, heard, nodes, processes = Executor(context=context), {}, [], {}
+    executor, heard, waiting = Executor(context=context), {}, {}
+    nodes, processes = [], {}
 
     def hear(message: DiagnosticArray) -> None:
         for status in message.status:
             name, _, kind = status.name.partition(": ")
             if kind == "inputs":
                 heard[name] = {v.key: v.value for v in status.values}
+            elif kind == "estimation":
+                waiting[name] = int(
+                    "0" + "".join(re.findall(r"(\d+) messages wait", status.message))
+                )
 
     try:
         publishers = []
@@ -108,10 +114,15 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
         lasted = time.monotonic() - begun
         sent = len(messages)
 
-        def taken() -> list[int]:
-            return [sum(int(v.get(role, 0)) for role in INPUTS) for v in heard.values()]
+        def told() -> list[int]:
+            """How many messages each node has used or refused, or says were lost or wait."""
+            return [
+                waiting.get(name, 0) + sum(accounted(role, values) for role in INPUTS)
+                for name, values in heard.items()
+            ]
 
-        _until(executor, lambda: min(taken()) >= sent, 30.0, fails=False)
+        _until(executor, lambda: min(told()) >= sent and not any(waiting.values()), 60.0, False)
+        lost = sum(int(n) for v in heard.values() for key, n in v.items() if "lost before" in key)
         used = sum(_cpu(p.pid) for p in processes.values()) - cpu
         memory = [_memory(p.pid) for p in processes.values()]
     finally:
@@ -121,8 +132,10 @@ def fleet(options: argparse.Namespace) -> Iterator[Row]:
         for process in processes.values():
             process.send_signal(signal.SIGINT)
         statuses = [process.wait(60) for process in processes.values()]
-    yield Row(f"ten nodes, {sent} messages each in {lasted:.0f} s: not taken",
-              "", 10 * sent - sum(taken()), "", 0)  # fmt: skip
+    yield Row(f"ten nodes, {sent} messages each in {lasted:.0f} s: nobody has counted",
+              "", 10 * sent - sum(told()), "", 0)  # fmt: skip
+    yield Row("  counted as lost before they reached the node", "", lost, "", 10 * sent)
+    yield Row("  still wait after a minute", "", sum(waiting.values()), "", 10 * sent)
     yield Row("  processor, of one core", "", 100.0 * used / lasted, "%", 100.0)
     yield Row("  memory of the largest", "", max(memory), "MiB", 200.0)
     yield Row("  ended with another status than 0", "", sum(map(bool, statuses)), "", 0)
@@ -137,7 +150,10 @@ def _until(executor, ready, seconds=120.0, fails=True):
         executor.spin_once(timeout_sec=0.1)
 
 
-_STEPS = {"of hours": (3600.0, -3600.0, 86400.0), "of 0.3 s": (0.3, -0.3)}  # s
+_STEPS = {  # s
+    "of hours": (3600.0, -3600.0, 86400.0), "of 0.3 s": (0.3, -0.3), "of 0.15 s": (0.15, -0.15),
+    "back by 0.8 s": (-0.8,), "ahead by 5 s": (5.0,),
+}  # fmt: skip
 
 
 def clock(_: argparse.Namespace) -> Iterator[Row]:

@@ -177,6 +177,15 @@ def clock(jump: int) -> Callable[[Messages], Messages]:
     return jumped
 
 
+def stepped(messages: Messages) -> Messages:
+    """A clock that is set by tenths of a second, and set back."""
+    offset = round(0.3 * SECOND)
+    return [
+        (a, role, m._replace(stamp=m.stamp + offset * (FAULT[0] <= at(m) < FAULT[1])))
+        for a, role, m in messages
+    ]
+
+
 def loop(messages: Messages) -> Messages:
     """A bag that starts over after its first half."""
     half = [m for m in messages if at(m[2]) < FAULT[0]]
@@ -203,6 +212,7 @@ FAULTS: dict[str, Callable[[Messages], Messages]] = {
     "wrench gone for 5 s": wrench_gone,
     "clock an hour ahead": clock(3600),
     "clock an hour back": clock(-3600),
+    "clock 0.3 s ahead, and back 10 s later": stepped,
     "bag starts over": loop,
     "a fifth of the demands lost": lossy(WRENCH),
     "a fifth of the IMU lost": lossy(IMU),
@@ -382,14 +392,17 @@ def abused(config: Config, kind: Kind, good: Messages, count: int, seed: int) ->
 
 def is_counted(role: str, before: Mapping[str, int], after: Mapping[str, int]) -> bool:
     """Whether exactly one message of the role has been taken, or refused by a name."""
-    changed = {name: n - before.get(name, 0) for name, n in after.items()}
-    taken = changed.get(role, 0)
-    late = changed.get(f"{WRENCH}: too late", 0) if role == WRENCH else 0  # taken all the same
-    refused = sum(
-        n for name, n in changed.items()
-        if name.startswith(f"{role}:") and name.partition(":")[2] not in NOT_OF_A_MESSAGE
+    return accounted(role, after) - accounted(role, before) == 1
+
+
+def accounted(role: str, counts: Mapping[str, int | str]) -> int:
+    """How many messages of a role were used, refused by a name, or are said to be lost."""
+    return sum(
+        int(counts[name]) for name in counts
+        if name.partition(":")[0] == role
+        and name.partition(":")[2] not in NOT_OF_A_MESSAGE
+        and name != f"{WRENCH}: too late"  # taken all the same
     )  # fmt: skip
-    return taken + refused - late == 1
 
 
 def is_fit(report: Report) -> bool:

@@ -12,15 +12,12 @@ from rov_ident.api.functions import File, Progress
 from rov_ident.config.writing import annotated
 from rov_ident.consumer.formats import import_model
 from rov_ident.core.errors import UserError
-from rov_ident.core.files import shipped, write_file
+from rov_ident.core.files import VEHICLES, shipped, write_file
 from rov_ident.core.frames import FLIP_BODY
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io import topics
 from rov_ident.io.ardupilot_log import FRAMES, SUFFIXES, read_log
 from rov_ident.io.bag_reader import Bag
-
-VEHICLES = ("bluerov2", "bluerov2_heavy", "remus100")
-"""Those with a file in the folder `config`."""
 
 _MODELS = (".urdf", ".xml", ".sdf")
 _OF_FRAME = {1: "bluerov2", 2: "bluerov2_heavy"}  # FRAME_CONFIG of ArduSub

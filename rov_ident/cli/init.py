@@ -4,11 +4,10 @@ import argparse
 from pathlib import Path
 
 from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, say
+from rov_ident.core.files import VEHICLES
 
 
 def add(commands: Commands) -> None:
-    from rov_ident.api.start import VEHICLES
-
     text = "write a commented configuration from what a bag, a log or a model tells"
     init = command(commands, "init", text, _init)
     init.add_argument(

@@ -18,8 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from rov_ident.config import Config
 from rov_ident.core.frames import (
@@ -87,6 +85,8 @@ def comparisons(
     streams: Streams, config: Config, effects: Mapping[str, Mapping[str, float]]
 ) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
+    from scipy.ndimage import gaussian_filter1d  # here, as all of it: fits do not need 30 MB
+
     keys = sensor_parameters()
     streams = _in_place(streams, effects)
     here, there, rate = _corrected_readings(streams, config, effects)
@@ -211,6 +211,8 @@ class _DeadReckoning:
 def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | None) -> Array:
     """Velocity (N, 3) in the world: long term from the pose, short term from the IMU, ``inertial``
     (N, 3), whose integral drifts. The velocity sensor stands in for either where it is missing."""
+    from scipy.ndimage import gaussian_filter1d
+
     t = streams.t
     even = np.arange(t[0], t[-1], float(np.median(np.diff(t))))
     width = (_STEADY if inertial is None else _DRIFT) / (even[1] - even[0])
@@ -286,6 +288,8 @@ def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
     """Of the local-level filter with a gain, begun anew after each gap; x itself without."""
     if gain is None:
         return x
+    from scipy.signal import lfilter
+
     steps = np.diff(x, axis=0, prepend=x[:1])
     steps[gap] = 0.0
     out: Array = lfilter([1.0], [1.0, gain - 1.0], steps, axis=0)

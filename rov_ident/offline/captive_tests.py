@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
@@ -487,7 +487,7 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
         units=tuple(unit(name) for name in terms),
         values=values / scale,
         covariance=covariance / np.outer(scale, scale),
-        quantile=float(stats.t.ppf(0.975, max(len(force) - len(terms), 1))),
+        quantile=float(stdtrit(max(len(force) - len(terms), 1), 0.975)),
         axis=axis,
         cv_rmse=rms[chosen],
         rmse=_rms(force - fitted),

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from rov_ident.core.errors import UserError
 from rov_ident.model.equations import Array
@@ -98,6 +96,8 @@ def despiked(x: Array, width: int = 11, limit: float = 5.0) -> tuple[Array, NDAr
     An outlier is further from the median of ``width`` neighbours than ``limit`` robust standard
     deviations of that distance over the whole signal (Hampel 1974; Pearson 2002).
     """
+    from scipy.ndimage import median_filter  # here: a fit of dives does not need it
+
     middle = median_filter(x, width, mode="nearest")
     off = np.abs(x - middle)
     # many a value is the median itself, whatever the noise: those say nothing of the spread
@@ -112,6 +112,8 @@ def smoothed(x: Array, period: float, corner: float) -> Array:
     By local cubics (Savitzky and Golay 1964). For pictures and starting values, not for a
     maximum-likelihood fit, which has the noise in its model.
     """
+    from scipy.signal import savgol_coeffs, savgol_filter  # here: it takes its time to import
+
     if not corner < 0.5 / period:
         raise UserError(f"{corner:g} Hz is too high a corner at {1.0 / period:.3g} rows a second")
     half, gain = 1, 1.0

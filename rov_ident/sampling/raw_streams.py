@@ -20,10 +20,10 @@ from rov_ident.model.coefficients import INPUTS
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
-from rov_ident.sampling.validation import REPEATED, RESTARTS, Validation, describe
+from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
 _USUAL = 2.0  # times what 99 % of the messages keep to
-_PAUSE = 60.0  # s between two bags that are searched as one
+_PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _taken(
 
     Velocities that have not been measured again are refused here.
     """
-    validation, origin = Validation(), None
+    validation, origin, latest = Validation(), None, 0
     taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: [], DRIVE: []}
     for role, message in messages:
         reason = validation.judge(role, message)
@@ -164,6 +164,10 @@ def _taken(
         elif reason:
             continue
         origin = message.stamp if origin is None else origin
+        if reason == NEW_CLOCK and message.stamp < latest:
+            origin -= latest - message.stamp + round(_PAUSE * 1e9)
+            latest = 0
+        latest = max(latest, message.stamp)
         validation.counts[role] += 1
         if isinstance(message, Odometry):
             message = validation.marked(message)

@@ -42,9 +42,11 @@ from rov_ident.sampling.kinematic_filter import KinematicFilter
 from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.queues import Instant, Queues, Waiting
 from rov_ident.sampling.sample import joined, one_sample, sample_type
-from rov_ident.sampling.validation import REPEATED, RESTARTS, Validation
+from rov_ident.sampling.validation import CLOCK_STEP, REPEATED, RESTARTS, Validation
 
 _LONGEST_INTERVAL = 0.5  # s without a measurement: restart rather than bridge
+_SILENCE = 2.0  # usual intervals, and CLOCK_STEP, without any message: the clock may have stepped
+_SHORTEN, _LENGTHEN = 0.3, 0.05  # weights of an interval in the usual one: gaps only make it longer
 _NO_VALUES = np.zeros(6)
 _NO_WRENCH = (_NO_VALUES, _NO_VALUES, _NO_VALUES)
 
@@ -70,6 +72,7 @@ class Sampler:
         self._driven = Driven(config, self.counts)
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
+        self._usual = 0.0  # s between samples
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -174,10 +177,28 @@ class Sampler:
             return self._none
         return samples[0] if len(samples) == 1 else joined(samples)
 
+    def _is_unknown(self, t: float, dt: float) -> bool:
+        """Whether nobody knows how much time the interval dt [s] before t [s] took.
+
+        If no topic has said anything for long, either all messages were lost, or the clock of their
+        stamps was stepped. To bridge it would take the motion of one for that of the other.
+        """
+        usual = self._usual or dt
+        change = min(dt, _SILENCE * usual) - usual
+        self._usual = usual + (_SHORTEN if change < 0.0 else _LENGTHEN) * change
+        longest = CLOCK_STEP + _SILENCE * usual
+        if dt <= longest:
+            return False
+        heard = [w.t for w in self._queues[WRENCH] if self._previous < w.t < t]
+        if max(np.diff([self._previous, *heard, t])) <= longest:
+            return False
+        self.counts["clock: stepped ahead, or all topics silent, not bridged"] += 1
+        return True
+
     def _sample(self, instant: Instant) -> NDArray[np.void] | None:
         """The sample (1,) of an instant, of which the messages are taken; None if it has none."""
         t, dt = instant.t, instant.t - self._previous
-        restart = not 0.0 < dt <= _LONGEST_INTERVAL
+        restart = not 0.0 < dt <= _LONGEST_INTERVAL or self._is_unknown(t, dt)
         begin = t if restart else self._previous
         self._previous = t
         wrench = self._acting.over(begin, t, self._queues[WRENCH], self._despiker, self.commands)

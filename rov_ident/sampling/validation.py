@@ -3,6 +3,7 @@
 Bad data never raises. Whatever is refused leaves everything as it was.
 """
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 
@@ -19,6 +20,7 @@ REPEATED = 2e3
 _LARGEST_JUMP = 10.0  # s; a stamp this far ahead, or _LARGEST_STEP_BACK behind, is another clock:
 _LARGEST_STEP_BACK = 1.0  # s; topics that are reordered or lost for a while stay well within both
 _AGREEMENT = 1.0  # s; two stamps out of line that are so close to one another are of one new clock
+CLOCK_STEP = 0.1  # s; ntpd steps clocks by 0.128 s and more, systemd by 0.4 s, and slews by less
 _REASONS = 100  # so many names of refusals are kept, so that a log cannot be flooded with them
 _GRID = 1e-4  # m/s; drivers that round velocities round to no finer grid than this
 _OFF_GRID = 0.01  # of a grid step; single precision of 10 m/s is that near
@@ -103,15 +105,18 @@ class Validation:
         if last is None:
             return ""
         step = (stamp - last) * 1e-9
-        if -_LARGEST_STEP_BACK <= step <= _LARGEST_JUMP:
-            if step > 0.0:
-                return ""
-            return "duplicate stamp" if step == 0.0 else "backward stamp"
-        # A single wild stamp is an error; two in a row that agree are another clock.
+        if 0.0 < step <= _LARGEST_JUMP:
+            return ""
+        # A single wild stamp is an error; two in a row that agree are another clock, as are two a
+        # step behind of which the second goes on from the first: reordered ones are single.
         suspect = self._suspect.get(role)
         self._suspect[role] = stamp
-        agrees = suspect is not None and abs(stamp - suspect) * 1e-9 < _AGREEMENT
-        return NEW_CLOCK if agrees else "stamp jumps"
+        since = math.inf if suspect is None else (stamp - suspect) * 1e-9
+        if -_LARGEST_STEP_BACK <= step <= 0.0:
+            if step < -CLOCK_STEP and 0.0 < since < CLOCK_STEP:
+                return NEW_CLOCK
+            return "duplicate stamp" if step == 0.0 else "backward stamp"
+        return NEW_CLOCK if abs(since) < _AGREEMENT else "stamp jumps"
 
     def marked(self, message: Odometry) -> Odometry:
         """The message, its velocity marked by its variance if it has not been measured again.

@@ -1,0 +1,58 @@
+"""The program `rov-ident`, as tests run it: in this process, or as one of its own.
+
+In this process its modules and kernels are loaded once for all tests. What it does is the same: it
+gets its arguments, and what it says and its exit status come back. A process of its own shows what
+only that has: signals, closed pipes, a terminal, the environment, memory.
+"""
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+import warnings
+
+from rov_ident.cli import main
+
+_QUIET = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+
+
+def _show(message, category, filename, lineno, file=None, line=None):
+    sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
+
+
+@contextlib.contextmanager
+def _inside(folder):  # contextlib.chdir, which is of Python 3.11
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def run(*arguments, cwd="."):
+    """The finished program, by a call of its main function."""
+    words, out, err = list(map(str, arguments)), io.StringIO(), io.StringIO()
+    with (
+        _inside(cwd),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        warnings.catch_warnings(),
+    ):
+        # What Python would have said of them, on standard error.
+        warnings.resetwarnings()
+        for quiet in _QUIET:
+            warnings.simplefilter("ignore", quiet)
+        warnings.showwarning = _show
+        try:
+            status = main(words)
+        except SystemExit as end:  # argparse
+            status = end.code or 0
+    return subprocess.CompletedProcess(words, status, out.getvalue(), err.getvalue())
+
+
+def run_alone(*arguments, cwd=None):
+    """The finished program, in a process of its own."""
+    command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=cwd)
