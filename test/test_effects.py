@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from textbook import finned, steered_dive
 
 from rov_ident import config as configuration
 from rov_ident import effects
@@ -18,7 +19,7 @@ from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.effects import EFFECTS, compiled
 from rov_ident.effects.base import SIZE, Array, Effect, Reading
 from rov_ident.estimation import rls, ukf
-from rov_ident.model.coefficients import parse
+from rov_ident.model.coefficients import INPUTS, parse
 from rov_ident.model.equations import CURRENT, RigidBody, build
 from rov_ident.sampling import records
 from rov_ident.sampling.records import score
@@ -26,7 +27,7 @@ from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.open_loop import simulate
 
 AXES = "XYZKMN"
-HOOKS = ("coefficients", "body", "wrench", "water", "act", "sense", "late", "heading")
+HOOKS = ("coefficients", "body", "wrench", "water", "act", "steer", "sense", "late", "heading")
 CONTRACT = {
     "quadratic_damping": "", "linear_damping": "", "asymmetric_damping": "", "coupled_damping": "",
     "lift": "", "added_mass_coupling": "", "buoyancy": "delta", "cog_offset": "dx dy dz",
@@ -42,13 +43,16 @@ CONTRACT = {
     "sensor_misalignment": "roll pitch yaw", "velocity_scale": "scale",
     "imu_bias": "ax ay az gx gy gz", "velocity_latency": "delay", "heading_offset": "yaw",
     "wrench_noise": "std_X std_Y std_Z std_K std_M std_N",
-    "thrust_advance": "k", "coriolis": "", "crossflow": "",
+    "thrust_advance": "k", "coriolis": "", "crossflow": "", "fin_lift": "",
+    "fin_offset": "delta_s delta_r delta_a", "fin_lag": "time_constant",
+    "fin_saturation": "delta_s delta_r delta_a rate",
     "thruster_saturation": "limit_X limit_Y limit_Z limit_K limit_M limit_N",
 }  # fmt: skip
 
 CURRENT_ALONG = {"ocean_current": {"north": 0.3, "east": 0.0, "down": 0.0}}
 WITH_PARAMETERS = [e for e in EFFECTS.values() if not e.coefficients]
 INPUT = [e for e in EFFECTS.values() if e.act]
+STEER = [e for e in EFFECTS.values() if e.steer]
 WRENCH = [e for e in EFFECTS.values() if e.wrench]
 SENSOR = [e for e in EFFECTS.values() if e.sense]
 
@@ -56,6 +60,7 @@ every_effect = pytest.mark.parametrize("effect", EFFECTS.values(), ids=EFFECTS)
 every_parametric = pytest.mark.parametrize("effect", WITH_PARAMETERS, ids=lambda e: e.name)
 EXACT = [e for e in WITH_PARAMETERS if not e.noise]  # noise is lost
 every_input = pytest.mark.parametrize("effect", INPUT, ids=lambda e: e.name)
+every_steer = pytest.mark.parametrize("effect", STEER, ids=lambda e: e.name)
 every_wrench = pytest.mark.parametrize("effect", WRENCH, ids=lambda e: e.name)
 every_sensor = pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.name)
 
@@ -116,7 +121,8 @@ def test_the_name_is_that_of_the_file_and_everything_is_said(effect):
 def test_it_enters_by_exactly_one_hook_of_its_place(effect):
     used = [hook for hook in HOOKS if getattr(effect, hook)]
     assert len(used) == 1
-    places = dict.fromkeys(("sense", "water", "late", "heading"), "motion") | {"act": "input"}
+    places = dict.fromkeys(("sense", "water", "late", "heading"), "motion")
+    places |= dict.fromkeys(("act", "steer"), "input")
     assert effect.place == places.get(used[0], "wrench")
     assert (effect.sense is None) == (effect.correct is None)
 
@@ -135,7 +141,8 @@ def test_bounds_are_finite_and_contain_null_and_typical(effect):
         assert p.lower <= p.null <= p.upper
         assert p.typical > 0.0
         assert p.null + p.typical <= p.upper or p.null - p.typical >= p.lower
-        assert p.axis == (p.name[-1] if p.name[-2:-1] == "_" else "")
+        assert p.axis == (p.name[-1] if p.name[-2:-1] == "_" and p.name[-1] in AXES else "")
+        assert p.input == (p.name if p.name in INPUTS else "")
     assert any(p.role in ("amplitude", "limit") for p in effect.parameters)
 
 
@@ -152,9 +159,14 @@ def mounted(heavy):
     )
 
 
-def simulated(config, values, duration=16.0, noise=0.0, name="steps"):
+def with_fins(effect, config):
+    """The vehicle, with fins where the effect is on them."""
+    return finned(config) if effect.steer else config
+
+
+def simulated(config, values, duration=16.0, noise=0.0):
     config = dataclasses.replace(config, effects=values)
-    return sensors.dive(config, name, duration, sensors.Suite().scaled(noise), 5)
+    return steered_dive(config, duration, sensors.Suite().scaled(noise), 5)
 
 
 def samples_of(config, dive):
@@ -163,7 +175,8 @@ def samples_of(config, dive):
 
 @pytest.fixture(scope="module")
 def without(mounted):
-    return simulated(mounted, {})
+    """The dive without any effect, with fins or not."""
+    return {fins: simulated(finned(mounted) if fins else mounted, {}) for fins in (False, True)}
 
 
 def content(dive):
@@ -173,32 +186,41 @@ def content(dive):
             np.ravel(value)
             for _, _, message in dive.messages
             for value in message
-            if not isinstance(value, str)
+            if not isinstance(value, str | tuple)
         ]
     )
 
 
 @every_parametric
 def test_at_null_nothing_changes_to_the_last_bit(effect, mounted, without):
-    null = {effect.name: at_null(effect)}
-    dive = simulated(mounted, null)
-    np.testing.assert_array_equal(content(dive), content(without))
-    samples = samples_of(dataclasses.replace(mounted, effects=null), dive)
-    expected = samples_of(mounted, without)
+    null, vehicle = {effect.name: at_null(effect)}, with_fins(effect, mounted)
+    dive, plain = simulated(vehicle, null), without[bool(effect.steer)]
+    np.testing.assert_array_equal(content(dive), content(plain))
+    samples = samples_of(dataclasses.replace(vehicle, effects=null), dive)
+    expected = samples_of(vehicle, plain)
     for name in samples.dtype.names:
         np.testing.assert_array_equal(samples[name], expected[name], err_msg=name)
+
+
+def largest(p, dive):
+    """Of what is demanded where a parameter limits it; of a rate, for fins of 0.3 rad at 0.6 Hz."""
+    if p.axis:
+        return np.abs(dive.demand[:, AXES.index(p.axis)]).max()
+    return 0.3 if p.input else 0.3 * 2.0 * np.pi * 0.6
 
 
 @every_parametric
 def test_close_to_null_little_changes(effect, mounted, without):
     """No jump at the null: a search may pass through it."""
-    near = at_null(effect)
+    near, plain = at_null(effect), without[bool(effect.steer)]
+    little = 1e-3 if effect.steer else 1e-6  # of what fins do, 1e-6 is lost in single precision
     for p in effect.parameters:
         if p.role == "amplitude":
-            near[p.name] += 1e-6 * p.typical * (1 if p.null < p.upper else -1)
+            near[p.name] += little * p.typical * (1 if p.null < p.upper else -1)
         elif p.role == "limit":  # it has its null wherever no command reaches it
-            near[p.name] = (1.0 - 1e-6) * np.abs(without.demand[:, AXES.index(p.axis)]).max()
-    difference = np.abs(content(simulated(mounted, {effect.name: near})) - content(without))
+            near[p.name] = (1.0 - little) * largest(p, plain)
+    difference = content(simulated(with_fins(effect, mounted), {effect.name: near}))
+    difference = np.abs(difference - content(plain))
     assert 0.0 < difference.max() < 1e-2
 
 
@@ -207,10 +229,11 @@ def test_with_the_effect_samples_show_the_truth_and_without_they_do_not(effect, 
     """Out of the simulator, into the sampler: open-loop simulation of the samples agrees."""
     values = {effect.name: typical(effect, np.random.default_rng(1))}
     known = CURRENT_ALONG if effect.heading else {}  # else no motion depends on the heading
-    dive = simulated(mounted, values | known)
+    vehicle = with_fins(effect, mounted)
+    dive = simulated(vehicle, values | known)
     errors = []
     for told in (values | known, known):
-        config = dataclasses.replace(mounted, effects=told)
+        config = dataclasses.replace(vehicle, effects=told)
         rows = samples_of(config, dive)
         result = score(config.dynamics, rows, 5.0, effects=compiled(told))
         errors.append(result.rmse)
@@ -237,14 +260,15 @@ def test_a_configuration_with_the_effect_is_written_and_read_again(effect, heavy
 def test_coefficients_are_found_whatever_acts_besides(effect, estimator, mounted):
     """From a configuration off by up to 50 %, the effect known: as well as without it."""
     values = {effect.name: typical(effect, np.random.default_rng(1))}
-    dive = simulated(mounted, values, duration=60.0, noise=1.0)
-    config = dataclasses.replace(mounted, effects=values)
-    factors = np.random.default_rng(3).uniform(0.5, 1.5, len(mounted.model.theta))
-    config = config.with_model(mounted.model.with_theta(mounted.model.theta * factors))
+    vehicle = with_fins(effect, mounted)
+    dive = simulated(vehicle, values, duration=60.0, noise=1.0)
+    config, true = dataclasses.replace(vehicle, effects=values), vehicle.model
+    factors = np.random.default_rng(3).uniform(0.5, 1.5, len(true.theta))
+    config = config.with_model(true.with_theta(true.theta * factors))
     task = estimator.problem(config)
     state, _ = estimator.fold(task, estimator.init(task), samples_of(config, dive))
     found = estimator.estimate(task, state, prior_of(config))
-    error = (found.values - mounted.model.theta) / found.std
+    error = (found.values - true.theta) / found.std
     assert np.sqrt(np.mean(error**2)) < 2.5
     assert np.median(found.std / prior_of(config).std) < 0.2
 
@@ -252,8 +276,8 @@ def test_coefficients_are_found_whatever_acts_besides(effect, estimator, mounted
 def test_all_effects_at_once(mounted):
     """They do not get into one another's way."""
     values = {e.name: typical(e, np.random.default_rng(3)) for e in EXACT}
-    config = dataclasses.replace(mounted, effects=values)
-    dive = simulated(mounted, values)
+    config = dataclasses.replace(finned(mounted), effects=values)
+    dive = simulated(config, values)
     result = score(config.dynamics, samples_of(config, dive), 5.0, effects=compiled(values))
     assert np.all(result.rmse < [3e-3, 3e-3, 3e-3, 2e-2, 2e-2, 5e-3])
 
@@ -333,6 +357,79 @@ def test_input_effects_act_one_after_the_other(heavy):
     acting = effects.acted(compiled(chosen), t, np.vstack([demands, demands[-1:]]))
     # A delay gives means of two demands within a step, and the others treat them as one.
     np.testing.assert_allclose(acting[:-1], expected, rtol=1e-12, atol=1e-12)
+
+
+# ------------------------------------------------------------------ effects on fins
+
+
+def read_of_fins(rng, n=300):
+    """Steps dt (n,) [s], and means and ends (n, 4) of angles that change in straight lines."""
+    dt = rng.uniform(0.005, 0.02, n)
+    t = np.append(0.0, np.cumsum(dt))[:, None]
+    knots = 0.35 * np.sin(2.0 * np.pi * rng.uniform(0.5, 0.8, 4) * t)
+    knots += 0.002 * np.cumsum(rng.standard_normal((n + 1, 4)), axis=0)
+    knots[1] = knots[0]  # they begin at rest
+    return dt, 0.5 * (knots[1:] + knots[:-1]), knots
+
+
+def acting_fins(dt, knots, follow):
+    """Means (n, 4) of fins that ``follow(read, fin, h)`` moves in 400 small steps to each."""
+    fin, out, small = knots[0].copy(), [], 400
+    for length, a, b in zip(dt, knots[:-1], knots[1:], strict=True):
+        total = np.zeros(4)
+        for k in range(small):
+            before = fin
+            fin = follow(a + (b - a) * (k + 0.5) / small, fin, length / small)
+            total += 0.5 * (before + fin) / small
+        out.append(total)
+    return np.array(out)
+
+
+def late_fins(dt, knots, time_constant):
+    def follow(read, fin, h):
+        return fin + (read - fin) * (1.0 - math.exp(-h / time_constant))
+
+    return acting_fins(dt, knots, follow)
+
+
+def limited_fins(dt, knots, rate, **limits):
+    most = np.array([*limits.values(), np.inf])
+
+    def follow(read, fin, h):
+        return fin + np.clip(np.clip(read, -most, most) - fin, -rate * h, rate * h)
+
+    return acting_fins(dt, knots, follow)
+
+
+STEER_FORMS = {
+    "fin_offset": lambda dt, knots, **by: 0.5 * (knots[1:] + knots[:-1]) + [*by.values(), 0.0],
+    "fin_lag": late_fins,
+    "fin_saturation": limited_fins,
+}
+
+
+@every_steer
+def test_equations_of_fins(effect):
+    rng = np.random.default_rng(9)
+    dt, means, knots = read_of_fins(rng)
+    parameters = typical(effect, rng)
+    found = effects.steered(compiled({effect.name: parameters}), dt, means, knots[1:])
+    expected = STEER_FORMS[effect.name](dt, knots, **parameters)
+    np.testing.assert_array_equal(found[:, 3], means[:, 3])  # the propeller is no fin
+    # a limit reached within a step counts as reached evenly over it
+    np.testing.assert_allclose(found[:, :3], expected[:, :3], atol=1e-3)
+    assert np.abs(found - means)[:, :3].max() > 0.01
+
+
+@every_steer
+def test_fins_at_null_are_where_they_are_read_and_finite_whatever_the_parameters(effect):
+    dt, means, knots = read_of_fins(np.random.default_rng(10))
+    dt[5] = 0.0
+    found = effects.steered(compiled({effect.name: at_null(effect)}), dt, means, knots[1:])
+    np.testing.assert_array_equal(found, means)
+    for parameters in choices(effect):
+        acting = compiled({effect.name: parameters})
+        assert np.isfinite(effects.steered(acting, dt, means, knots[1:])).all()
 
 
 # ------------------------------------------------------------------ their equations
@@ -741,5 +838,5 @@ def test_a_family_does_not_go_under_effects(heavy):
 
 
 def test_every_equation_above_is_of_an_effect_and_every_effect_has_one():
-    forms = {**INPUT_FORMS, **WRENCH_FORMS, **SENSOR_FORMS}
-    assert forms.keys() == {e.name for e in (*INPUT, *WRENCH, *SENSOR)}
+    forms = {**INPUT_FORMS, **STEER_FORMS, **WRENCH_FORMS, **SENSOR_FORMS}
+    assert forms.keys() == {e.name for e in (*INPUT, *STEER, *WRENCH, *SENSOR)}

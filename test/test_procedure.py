@@ -11,10 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from textbook import finned
 
 from rov_ident import config
 from rov_ident.cli import main
 from rov_ident.core.errors import UserError
+from rov_ident.core.messages import DRIVE
+from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.offline.coast_down import Run, _simulated, fit_coast_downs
 from rov_ident.sampling import preprocess
@@ -22,20 +25,30 @@ from rov_ident.sampling import preprocess
 EXAMPLE = Path(__file__).parent.parent / "examples" / "sea_trial.py"
 
 
-def test_the_whole_procedure(heavy, tmp_path, capsys):
-    """From raw logs to a model that predicts a run it has not seen as the true vehicle would."""
-    runpy.run_path(str(EXAMPLE))["main"](["--out", str(tmp_path)])
-    told = capsys.readouterr().out
-    rows = re.findall(r"^  ([uvwpqr]) ([\d.]+)  ([\d.]+)  ([\d.]+)$", told, re.MULTILINE)
-    assert [row[0] for row in rows] == list("uvwpqr")
-    before, after, true = np.array([row[1:] for row in rows], dtype=float).T
-    assert np.all(after < before)
-    assert np.all(after < 1.25 * true)
-    assert np.median(after / before) < 0.7
-    assert "surge: left alone" in told
-    fitted = config.load(tmp_path / "fitted.yaml").model
-    assert np.median(np.abs(fitted.theta / heavy.model.theta - 1.0)) < 0.04
-    assert "<svg" in (tmp_path / "report.html").read_text()
+def test_the_whole_procedure(tmp_path, capsys):
+    """From raw logs, by commands, to a model that predicts a run it has not seen as the true
+    vehicle would: thrust, drag and every channel of a vehicle under rudder, planes and propeller.
+    """
+    main_ = runpy.run_path(str(EXAMPLE))["main"]
+    main_(["--out", str(tmp_path)])
+    told = capsys.readouterr()
+    found = {}
+    for line in told.out.splitlines():
+        if numbers := re.findall(r" [uvwpqr] ([\d.]+)", line):
+            found[line.strip().split("  ")[0]] = np.array(numbers, dtype=float)
+    before, channels, together, true = found.values()
+    assert np.all(together < 1.15 * true)
+    assert np.median(together / before) < 0.8 and np.median(channels / before) < 0.9
+    assert "outliers replaced" in told.err and "z from 3 sources" in told.err
+    assert "speeds tell thrust and drag only relative to the inertia" in told.out + told.err
+    surge = json.loads((tmp_path / "zhao_surge.json").read_text())["coefficients"]
+    model = config.load(tmp_path / "true.yaml").model.values
+    assert surge["X_udot"]["lower"] <= model["X_udot"] <= surge["X_udot"]["upper"]
+    mass = config.load(tmp_path / "true.yaml").model.body.mass
+    inertia = (mass - surge["X_udot"]["value"]) / (mass - model["X_udot"])  # all that speeds tell
+    for name in ("X_n", "X_nn", "X_uu"):
+        assert surge[name]["value"] / inertia == pytest.approx(model[name], rel=0.05), name
+    assert "<svg" in (tmp_path / "joint.html").read_text()
 
 
 # ------------------------------------------------------------------ pieces
@@ -246,6 +259,24 @@ def test_a_log_is_prepared_on_the_command_line(tmp_path, capsys):
     messages = imported(path, "--cut", "5", "9", "--smooth", "0.1")
     assert [messages[0].stamp, messages[-1].stamp] == [6_000_000_000, 10_000_000_000]
     assert max(abs(m.angular[0]) for m in messages) < 0.004
+
+
+def test_fins_in_degrees_drive_a_log(heavy, tmp_path, capsys):
+    """The stretch in which a rudder moves is kept; angles recorded in degrees become radians."""
+    path = tmp_path / "log.csv"
+    t = np.arange(0.0, 30.0, 0.1)
+    rudder = np.where((t >= 10.0) & (t < 20.0), 12.0 * np.sign(np.sin(t)), 0.1)
+    sea_log(path, X=0.0 * t, rudder=rudder, yaw=np.degrees(0.01 * t))
+    options = ["--map", "delta_r=rudder", "--degrees", "delta_r", "yaw", "--cut-idle", "2"]
+    assert main(["import", str(path), "--out", str(tmp_path / "log.mcap"), *options]) == 0
+    assert "cut to 8.0 ... 21.9 s" in capsys.readouterr().err
+    bag, config_ = Bag(tmp_path / "log.mcap"), finned(heavy)
+    read = topics.messages(bag, topics.select(bag, config_), config_)
+    joints = [m for role, m in read if role == DRIVE]
+    assert max(abs(m.position[0]) for m in joints) == pytest.approx(np.radians(12.0))
+    command = ["import", str(path), "--out", str(tmp_path / "other.mcap"), "--map"]
+    assert main([*command, "delta_r=rudder", "--degrees", "u"]) == 2
+    assert "--degrees u" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from textbook import finned, steered_dive
 from tiers import more
 
 from rov_ident.config import dump, from_parameters, load, to_parameters
@@ -26,6 +27,9 @@ GIVEN = {
     "thruster_lag": {"time_constant": 0.1},
     "actuation_delay": {"delay": 0.1},
     "thruster_failure": {"gain_X": 0.8, "onset": 10.0},
+    "fin_offset": {"delta_s": 0.02, "delta_r": -0.03},
+    "fin_lag": {"time_constant": 0.1},
+    "fin_saturation": {"delta_r": 0.2, "rate": 0.6},
     "battery_sag": {"end_loss": 0.2},
     "ocean_current": {"north": 0.1, "east": -0.1, "down": 0.02},
     "constant_force": {"fx": 3.0, "fy": -2.0, "fz": 1.0},
@@ -57,11 +61,18 @@ def test_every_effect_that_can_be_estimated_is_tried():
     assert {*GIVEN, "velocity_latency"} == {name for name in EFFECTS if estimable(name)}
 
 
+def acting(config, samples):
+    """The wrench (N, 6) of thrusters and fins."""
+    fins = config.dynamics.input_wrench(samples["nu"], samples["inputs"][:, 0])
+    return samples["wrench"] + fins
+
+
 @pytest.mark.parametrize("effect", GIVEN)
 def test_jacobian_is_that_of_samples_made_with_other_values(heavy, effect):
     """Wrench and velocity of samples from a bag, by the configuration a little to either side."""
-    config = having(heavy, {effect: GIVEN[effect]})
-    run = dive(config, "steps", 15.0, EXACT, 1)
+    fins = EFFECTS[effect].steer is not None
+    config = having(finned(heavy) if fins else heavy, {effect: GIVEN[effect]})
+    run = steered_dive(config, 15.0, EXACT, 1)
     samples = joined(list(samples_of(config, run)))
     _, sides = parts(samples)
     measured = np.isfinite(samples["odometry"][:, 0])
@@ -71,7 +82,7 @@ def test_jacobian_is_that_of_samples_made_with_other_values(heavy, effect):
         low, high = (
             joined(list(samples_of(moved(config, name, parameter, step), run))) for step in (-h, h)
         )
-        wrench = (high["wrench"] - low["wrench"]) / (2.0 * h)
+        wrench = (acting(config, high) - acting(config, low)) / (2.0 * h)
         velocity = (low["odometry"] - high["odometry"]) / (2.0 * h)
         if EFFECTS[effect].body is None:
             tell = np.abs(wrench).max() + 1.0
@@ -118,6 +129,8 @@ TRUTH = {
     "thruster_saturation": {"limit_X": 25.0, "limit_Z": 50.0},
     "thruster_lag": {"time_constant": 0.13},
     "actuation_delay": {"delay": 0.13},
+    "fin_offset": {"delta_s": 0.03, "delta_r": -0.045},
+    "fin_lag": {"time_constant": 0.14},
     "ocean_current": {"north": 0.14, "east": -0.07, "down": 0.02},
     "buoyancy": {"delta": 4.0},
     "constant_force": {"fx": 4.0, "fy": -1.4, "fz": 1.3},
@@ -139,12 +152,13 @@ def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
     about wrong values of both, is kept. Where that leaves an error the fit is said to disagree with
     the data, and its intervals are wide (docs/live.md).
     """
-    world = having(heavy, {effect: TRUTH[effect]})
-    config = having(heavy, {effect: GIVEN[effect]})
-    off = 1.0 + 0.08 * np.random.default_rng(5).uniform(-1.0, 1.0, len(heavy.model.theta))
-    config = dataclasses.replace(config, model=config.model.with_theta(heavy.model.theta * off))
+    vehicle = finned(heavy) if EFFECTS[effect].steer else heavy
+    world, config = (having(vehicle, {effect: of[effect]}) for of in (TRUTH, GIVEN))
+    theta = vehicle.model.theta
+    off = 1.0 + 0.08 * np.random.default_rng(5).uniform(-1.0, 1.0, len(theta))
+    config = dataclasses.replace(config, model=config.model.with_theta(theta * off))
     online = OnlineEstimator(config, kind)
-    for _, role, message in dive(world, "steps", 120.0, Suite(), 4).messages:
+    for _, role, message in steered_dive(world, 120.0, Suite(), 4).messages:
         online.push(role, message)
     online.flush()
     report = online.report()

@@ -9,11 +9,14 @@ import itertools
 
 import numpy as np
 
+from rov_ident import config as configuration
 from rov_ident.core.frames import quaternion_to_matrix
+from rov_ident.model.coefficients import INPUTS
 from rov_ident.model.equations import skew
 from rov_ident.sampling import records
 from rov_ident.sampling.sample import SAMPLE
 from rov_ident.simulation import virtual_sensors as sensors
+from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.open_loop import simulate
 
 # ------------------------------------------------------------------ configurations
@@ -30,6 +33,26 @@ def with_section(config, section, **values):
     )
 
 
+def finned(config):
+    """The vehicle with stern planes, rudder and ailerons, whose joints are heard."""
+    plain = configuration.to_parameters(config)
+    plain.pop("estimate", None)
+    plain["coefficients"] |= {"Y_uudr": 40.0, "N_uudr": -15.0, "Z_uuds": -40.0, "M_uuds": -15.0}
+    plain["coefficients"] |= {"K_uuda": 8.0}
+    plain["inputs"] = {name: {"joint": name} for name in INPUTS[:3]}
+    return configuration.from_parameters(plain)
+
+
+def steered_dive(config, duration, suite, seed):
+    """A dive in steps, the fins that there are swinging by 0.3 rad at 0.4 to 0.6 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, duration, 1.0 / suite.wrench_rate)
+    demand = manoeuvre("steps", config.dynamics, t, rng)
+    there = [name in config.inputs.joints for name in INPUTS]
+    swings = 0.3 * np.sin(2.0 * np.pi * np.outer(t, [0.5, 0.4, 0.6, 0.0]))
+    return sensors.measure(config, t, demand, duration, suite, rng, swings * there)
+
+
 def read_only(parts):
     """The same arrays; whoever writes into them raises."""
     for part in parts:
@@ -39,7 +62,7 @@ def read_only(parts):
 
 
 def arrays(parts):
-    """Copies of all arrays and numbers in a tuple, inner tuples included, records field by field."""
+    """Copies of all arrays and numbers in a tuple, also in inner ones, records field by field."""
     out = []
     for part in parts:
         if isinstance(part, tuple):

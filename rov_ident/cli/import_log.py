@@ -43,6 +43,10 @@ def add(commands: common.Commands) -> None:
     )
     log = import_.add_argument_group("preparing a CSV, in this order")
     log.add_argument(
+        "--degrees", nargs="+", default=[], metavar="NAME",
+        help="angles and rates that were recorded in degrees (r yaw delta_r)",
+    )  # fmt: skip
+    log.add_argument(
         "--polarity", nargs="+", default=[], metavar="NAME",
         help="columns that were recorded with the opposite sign (w M)",
     )  # fmt: skip
@@ -91,7 +95,7 @@ def _import_ardupilot(options: argparse.Namespace, tell: "Progress") -> tuple[An
             "turn them into a wrench"
         )
     config = configuration.load(options.config)
-    for option in ("polarity", "despike", "depth", "smooth", "cut", "cut_idle"):
+    for option in ("degrees", "polarity", "despike", "depth", "smooth", "cut", "cut_idle"):
         if getattr(options, option):
             raise UserError(f"--{option.replace('_', '-')} is for a CSV alone")
     report = import_log(log, options.out, config, lambda share: tell(f"reading {log.name}", share))
@@ -111,6 +115,7 @@ def _import_csv(options: argparse.Namespace, tell: "Progress") -> tuple[Any, str
         options.log,
         options.out,
         columns=parse_columns(options.map),
+        degrees=options.degrees,
         body_frame=options.body_frame,
         mask_rates_above=options.mask_rates_above,
         wrench_timing=options.wrench_timing,

@@ -84,7 +84,7 @@ def first_centre(config: Config) -> dict[str, float]:
     centre = {}
     for name, mean, std, lower in zip(prior.names, prior.mean, prior.std, prior.lower, strict=True):
         if "." in name:
-            is_input = EFFECTS[name.partition(".")[0]].act is not None
+            is_input = EFFECTS[name.partition(".")[0]].of_actuators
             centre[name] = float(mean + _FIRST_LAG * std if is_input and mean == lower else mean)
     return centre
 

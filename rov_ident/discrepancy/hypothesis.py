@@ -12,6 +12,7 @@ import numpy as np
 
 from rov_ident.config import Config
 from rov_ident.config.prior import typical
+from rov_ident.config.schema import missing_inputs
 from rov_ident.discrepancy.multiple_shooting import Equations, equations
 from rov_ident.effects import EFFECTS, compiled
 from rov_ident.effects.base import Effect, EffectParameter
@@ -206,13 +207,22 @@ def axis_of(key: Key) -> str:
     return AXES[parse(name).row] if section == COEFFICIENTS else parameter(key).axis
 
 
+def moves_input(p: EffectParameter, h: Hypothesis) -> bool:
+    """Whether a parameter belongs to no input, or to one that is heard and does something."""
+    return not p.input or (p.input in h.model.inputs and p.input in h.config.inputs.joints)
+
+
 def units(effect: Effect, h: Hypothesis, roles: Container[str]) -> list[tuple[Key, ...]]:
     """The parameters of an effect that ``h`` lacks, in the groups in which they may join."""
     if effect.coefficients:
         have = {parse(n).place for n in h.coefficients}
-        return [((COEFFICIENTS, n),) for n in effect.coefficients if parse(n).place not in have]
+        new = [c for c in map(parse, effect.coefficients) if c.place not in have]
+        return [((COEFFICIENTS, c.name),) for c in new if not missing_inputs(c, h.config.inputs)]
     mine = [(effect.name, p.name) for p in effect.parameters if p.role in roles]
-    if any(p.axis for p in effect.parameters):
+    if effect.steer and not any(f in h.config.inputs.joints for f in h.model.inputs if f != "n"):
+        return []
+    mine = [key for key in mine if moves_input(parameter(key), h)]
+    if any(p.axis or p.input for p in effect.parameters):
         return [(key,) for key in mine if key not in h.values]
     return [] if effect.name in h.effects else [tuple(mine)]
 

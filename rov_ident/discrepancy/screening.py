@@ -19,6 +19,7 @@ from rov_ident.discrepancy.hypothesis import (
     axis_of,
     bounds,
     parameter,
+    role_of,
     units,
 )
 from rov_ident.discrepancy.output_error import Fitted
@@ -153,38 +154,42 @@ class Screening:
         return self._oscillating(now, effect) if "frequency" in roles else None
 
     def _limited(self, now: Fitted, effect: Effect) -> Candidate | None:
-        """Limits of the thrust on single axes, at shares of the largest command: beyond it a limit
-        does nothing, so that no derivative at the null shows it."""
-        problem, h = self._problem, now.hypothesis
-        largest = np.abs(problem.steps.demand).max(axis=0)
-        limits = {p.axis: (effect.name, p.name) for p in effect.parameters if p.role == "limit"}
-        driven = [a for a in limits if largest[AXES.index(a)] > 0.0]
-        driven = [a for a in driven if self._is_simulated(limits[a])]
-        before, columns, labels = problem.thrust(h.effects)[0], [], []
+        """Limits of the thrust on single axes, or of fins, at shares of the largest command: beyond
+        it a limit does nothing, so that no derivative at the null shows it."""
+        problem, h, motion = self._problem, now.hypothesis, now.linearisation.motion
+        given = {k: problem.largest(k) for k in self._own(effect, h) if role_of(k) == "limit"}
+        largest = {k: top for k, top in given.items() if top > 0.0}
+        columns, labels = [], []
         for share in _LIMITS:
-            values = {limits[a]: share * float(largest[AXES.index(a)]) for a in driven}
-            change = problem.thrust(h.having(values).effects)[0] - before
-            for a in driven:
-                column = np.zeros_like(change)
-                column[:, AXES.index(a)] = change[:, AXES.index(a)]
-                columns.append(column)
-                labels.append((a, share))
+            values = {k: share * top for k, top in largest.items()}
+            for k in largest:
+                of = values if axis_of(k) else {k: values[k]}  # axes act apart
+                change = problem.change(h, motion, effect, h.having(of).effects)
+                if axis := axis_of(k):
+                    change = np.where(np.arange(6) == AXES.index(axis), change, 0.0)
+                columns.append(change)
+                labels.append((k[1], str(share)))
         if not labels:
             return None
-        keys = [(a, str(share)) for a, share in labels]
         sensitivity = now.linearisation.sensitivity_to(np.stack(columns, axis=2))
-        scores = scores_of(now.linearisation, keys, sensitivity)
-        gains = {k: scores.solve([k])[1] for k in keys if scores.solve([k])[0][0] > 0.0}
+        scores = scores_of(now.linearisation, labels, sensitivity)
+        gains = {k: scores.solve([k])[1] for k in labels if scores.solve([k])[0][0] > 0.0}
         best = [
             max(mine, key=lambda k: gains[k])
-            for a in driven
-            if (mine := [k for k in gains if k[0] == a])
+            for own in largest
+            if (mine := [k for k in gains if k[0] == own[1]])
         ]
         selected, score, white = scores.select([(k,) for k in best])
         start = {
-            limits[a]: float(share) * float(largest[AXES.index(a)]) for a, share in selected.keys
+            (effect.name, own): float(share) * largest[effect.name, own]
+            for own, share in selected.keys
         }
         return Candidate(effect.name, start, score, white) if start else None
+
+    def _own(self, effect: Effect, h: Hypothesis) -> list[Key]:
+        """All parameters that h lacks of an effect, on axes that are simulated."""
+        own = units(effect, h, ("amplitude", "limit", "fixed", "place", "onset"))
+        return [k for unit in own for k in unit if self._is_simulated(k)]
 
     def _best_shape(
         self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]
@@ -260,7 +265,7 @@ def first_values(change: Mapping[Key, float]) -> dict[Key, float]:
     start = {}
     for key, delta in change.items():
         null, lower, upper = bounds(key)
-        if key[0] in EFFECTS and EFFECTS[key[0]].act is not None:
+        if key[0] in EFFECTS and EFFECTS[key[0]].of_actuators:
             farthest = FARTHEST * parameter(key).typical
             if parameter(key).unit in ("N", "N m"):
                 farthest = np.inf

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import interpolated
-from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key
+from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, parameter
 from rov_ident.discrepancy.multiple_shooting import (
     Motion,
     Steps,
@@ -28,9 +28,9 @@ from rov_ident.discrepancy.multiple_shooting import (
     wrenches,
 )
 from rov_ident.discrepancy.reading_noise import SMALL, draws, resting_noise
-from rov_ident.effects import EFFECTS, compiled
+from rov_ident.effects import EFFECTS, compiled, steered
 from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.model.coefficients import AXES, parse
+from rov_ident.model.coefficients import AXES, INPUTS, parse
 from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
 from rov_ident.simulation.open_loop import Guide, simulate
@@ -77,6 +77,7 @@ class WindowedProblem:
         if self.guided.any():
             nu_dot = np.diff(self._measured_at(nodes), axis=0) / np.diff(nodes)[:, None]
             given = np.where(self.guided, nu_dot, 0.0)
+        means, self._ends = _driven(streams, nodes)
         self.steps = Steps(
             nodes,
             quaternion_to_matrix(self.orientation),
@@ -84,7 +85,7 @@ class WindowedProblem:
             pieces,
             streams.demand[held],
             np.searchsorted(pieces, nodes[:-1]),
-            _means(streams, nodes),
+            means,
             given,
         )
         at = np.searchsorted(nodes, t)
@@ -111,6 +112,7 @@ class WindowedProblem:
         self._simulations = 0  # of all windows, so far
         self._stopped = False
         self._thrusts: dict[object, Array] = {}
+        self._driven: dict[object, Array] = {}
         self._noisy: dict[object, Array] = {}
         self._remembered = threading.local()  # wrenches along a motion
         self._counting = threading.Lock()
@@ -141,6 +143,20 @@ class WindowedProblem:
             known = self._thrusts[key] = thrust(self.steps, compiled(effects))
         return known
 
+    def driven(self, effects: Mapping[str, Mapping[str, float]]) -> Steps:
+        """The time axis with the inputs as they act, after the effects on fins."""
+        key = tuple(sorted((n, *v.values()) for n, v in effects.items() if EFFECTS[n].steer))
+        if not key:
+            return self.steps
+        known = self._driven.get(key)
+        if known is None:
+            if len(self._driven) > _REMEMBERED_THRUSTS:
+                self._driven = {}
+            steps = self.steps
+            known = steered(compiled(effects), np.diff(steps.t), steps.inputs, self._ends)
+            self._driven[key] = known
+        return self.steps._replace(inputs=known)
+
     def noisy_thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """What noise of the reading adds to the mean thrust in each step, (K, 6, draws)."""
         key = _inputs(effects)
@@ -170,7 +186,7 @@ class WindowedProblem:
         with self._counting:
             self._simulations += 1
         equations = guided_by(h.equations, self.guided)
-        motion = shoot(equations, self.steps, wrench, self.first, self.last, starts)
+        motion = shoot(equations, self.driven(h.effects), wrench, self.first, self.last, starts)
         return motion if np.isfinite(motion.nu[self.nodes]).all() else None
 
     def columns(self, h: Hypothesis, motion: Motion, keys: Sequence[Key]) -> Array:
@@ -182,7 +198,9 @@ class WindowedProblem:
             found = sorted((parse(n) for n in names), key=lambda c: not c.is_added_mass)
             model = Model(h.model.body, tuple(found), np.zeros(len(found)))
             at, eq = [place[COEFFICIENTS, c.name] for c in found], h.equations.acting
-            out[:, :, at] = regressors(equations(model, eq), self.steps, self._relative(h, motion))
+            out[:, :, at] = regressors(
+                equations(model, eq), self.driven(h.effects), self._relative(h, motion)
+            )
         for key in keys:
             if key in self.patterns:
                 out[:, :, place[key]] = self.patterns[key]
@@ -223,7 +241,9 @@ class WindowedProblem:
             mine.along, mine.wrenches = motion.middle, {}
         known: dict[object, Array] = mine.wrenches
         if key not in known:
-            known[key] = wrenches(h.equations._replace(acting=acting), self.steps, acted, motion)
+            known[key] = wrenches(
+                h.equations._replace(acting=acting), self.driven(effects), acted, motion
+            )
         return known[key]
 
     def _difference(
@@ -234,26 +254,48 @@ class WindowedProblem:
         moved, per_unit = dict(now), np.ones(6)
         for p in group:
             step = ONSET_STEP if p.role == "onset" else _SMALL_STEP * p.typical
-            if effect.act is not None and p.role == "amplitude":
+            if effect.of_actuators and p.role == "amplitude":
                 step = _AMPLITUDE_STEP * p.typical
             step = step if now[p.name] + step <= p.upper else -step
             moved[p.name] = now[p.name] + step
             per_unit[AXES.index(p.axis) if p.axis else slice(None)] = step
-        before, after = {**h.effects, effect.name: now}, {**h.effects, effect.name: moved}
+        return self.change(h, motion, effect, {**h.effects, effect.name: moved}) / per_unit
+
+    def change(
+        self, h: Hypothesis, motion: Motion, effect: Effect,
+        after: Mapping[str, Mapping[str, float]],
+    ) -> Array:  # fmt: skip
+        """Change (K, 6) of the wrench where an effect has other parameters."""
+        now, moved = h.effects.get(effect.name) or h.nulls(effect.name), after[effect.name]
+        before = {**h.effects, effect.name: now}
+        change: Array
         if effect.act is not None:
             change = self.thrust(after)[0] - self.thrust(before)[0]
+        elif effect.steer is not None:
+            nu = self._relative(h, motion).middle
+            made = [h.model.input_wrench(nu, self.driven(e).inputs) for e in (before, after)]
+            change = made[1] - made[0]
         elif effect.body is not None:
             base = h.model.body
             there = effect.body(base, **{k: moved[k] - now[k] for k in now})
             change = _of_body(there, motion, self.steps) - _of_body(base, motion, self.steps)
         else:
             change = self._wrenches(h, after, motion) - self._wrenches(h, before, motion)
-        return change / per_unit
+        return change
+
+    def largest(self, key: Key) -> float:
+        """Of what is commanded, where a parameter is a limit of it; of a rate, at which a fin would
+        turn from side to side in half a second."""
+        p = parameter(key)
+        if p.axis:
+            return float(np.abs(self.steps.demand[:, AXES.index(p.axis)]).max())
+        inputs = np.abs(self.steps.inputs).max(axis=0)
+        return float(inputs[INPUTS.index(p.input)] if p.input else 4.0 * inputs[:3].max())
 
     def errors(self, h: Hypothesis) -> Array:
         """Measured minus simulated velocity (N, 6) in open loop, each window from its measured
         state; NaN where that diverges."""
-        mean, slope = self.thrust(h.effects)
+        (mean, slope), inputs = self.thrust(h.effects), self.driven(h.effects).inputs
         acting, guide = compiled(h.effects), None
         nu = self._measured_at(self.steps.t)
         simulated = np.full((len(self.steps.t), 6), np.nan)
@@ -266,7 +308,7 @@ class WindowedProblem:
                 simulated[nodes] = simulate(
                     h.model, self.steps.t[nodes], mean[at], start,
                     orientation=self.orientation[first], wrench_slope=slope[at], guide=guide,
-                    effects=acting,
+                    effects=acting, inputs=inputs[at],
                 ).nu  # fmt: skip
         return self.measured - simulated[self.nodes]
 
@@ -291,14 +333,16 @@ def _of_body(body: RigidBody, motion: Motion, steps: Steps) -> Array:
     return wrench
 
 
-def _means(streams: Streams, nodes: Array) -> Array:
-    """The inputs' means (K, 4) over the steps between nodes (K + 1,)."""
+def _driven(streams: Streams, nodes: Array) -> tuple[Array, Array]:
+    """The inputs as read, means (K, 4) over the steps between nodes (K + 1,) and values (K, 4) at
+    their ends."""
     if not len(streams.inputs_t):
-        return np.zeros((len(nodes) - 1, streams.inputs.shape[1]))
+        none = np.zeros((len(nodes) - 1, streams.inputs.shape[1]))
+        return none, none
     t = np.unique(np.concatenate([nodes, streams.inputs_t]))
     total = integral(t, interpolated(streams.inputs_t, streams.inputs, t))
     means: Array = np.diff(total[np.searchsorted(t, nodes)], axis=0) / np.diff(nodes)[:, None]
-    return means
+    return means, interpolated(streams.inputs_t, streams.inputs, nodes[1:])
 
 
 def _subdivided(t: Array) -> Array:

@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 from rov_ident.core import plugins
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import inlined, kernel, lean
-from rov_ident.effects.base import MEMORY, SIZE, Array, Effect, EffectParameter, Reading, faults
+from rov_ident.effects.base import (
+    MEMORY,
+    SIZE,
+    STEER_MEMORY,
+    Array,
+    Effect,
+    EffectParameter,
+    Reading,
+    faults,
+)
 from rov_ident.model.equations import RigidBody, add_current
 
 
@@ -56,6 +65,7 @@ EFFECTS: dict[str, Effect] = _library()
 """Every effect by the name users give it."""
 
 _INPUT = sorted((e for e in EFFECTS.values() if e.act), key=lambda e: (e.order, e.name))
+_STEER = sorted((e for e in EFFECTS.values() if e.steer), key=lambda e: (e.order, e.name))
 _WRENCH = [e for e in EFFECTS.values() if e.wrench]
 _SENSE = sorted((e for e in EFFECTS.values() if e.sense), key=lambda e: (e.order, e.name))
 
@@ -92,7 +102,22 @@ def _wrenches(effects: list[Effect]) -> Any:
     return inlined(calls)
 
 
+def _steers(effects: list[Effect]) -> Any:
+    """The same of all effects on fins."""
+    if not effects:
+        return inlined(lambda i, there, parameters, state, dt, inputs: None)
+    first, others = cast(Any, effects[0].steer), _steers(effects[1:])
+
+    def calls(i, there, parameters, state, dt, inputs):  # type: ignore[no-untyped-def]
+        if there[i]:
+            first(parameters[i], state[i], dt, inputs)
+        others(i + 1, there, parameters, state, dt, inputs)
+
+    return inlined(calls)
+
+
 _ALL_ACTS = _acts(_INPUT)
+_ALL_STEERS = _steers(_STEER)
 _ALL_WRENCHES = _wrenches(_WRENCH)
 
 
@@ -108,6 +133,8 @@ class Acting(NamedTuple):
     wrenches: NDArray[np.bool_]
     wrench_parameters: Array  # (wrenches, SIZE)
     water: Array  # (3,) velocity of the water in the world [m/s]
+    steers: NDArray[np.bool_]
+    steer_parameters: Array  # (steers, SIZE)
 
 
 def compiled(effects: Values) -> Acting:
@@ -117,7 +144,9 @@ def compiled(effects: Values) -> Acting:
         effect = EFFECTS[name]
         if effect.water is not None:
             water = water + effect.water(**values)
-    return Acting(*_table(_INPUT, effects), *_table(_WRENCH, effects), water)
+    return Acting(
+        *_table(_INPUT, effects), *_table(_WRENCH, effects), water, *_table(_STEER, effects)
+    )
 
 
 def _table(library: list[Effect], effects: Values) -> tuple[NDArray[np.bool_], Array]:
@@ -192,9 +221,9 @@ def estimable(name: str) -> dict[str, float | None]:
     """The parameters of an effect that an estimator can follow while the vehicle moves.
 
     With each of them the value at which it is better left alone unless asked for: the null of a
-    parameter of one axis, of which an effect has several; None for others. An onset, a frequency
-    and a phase are not among them, nor what shows in no velocity (the sampler finds the biases of
-    an IMU itself), nor the noise of a reading.
+    parameter of one axis or fin, of which an effect has several, and of a limit; None for others.
+    An onset, a frequency and a phase are not among them, nor what shows in no velocity (the sampler
+    finds the biases of an IMU itself), nor the noise of a reading.
     """
     effect = EFFECTS[name]
     if effect.heading or effect.noise:
@@ -210,7 +239,7 @@ def estimable(name: str) -> dict[str, float | None]:
         if all((m.linear == same.linear).all() for m in moved):
             return {}
     return {
-        p.name: p.null if p.axis else None
+        p.name: p.null if p.axis or p.input or p.role == "limit" else None
         for p in effect.parameters
         if p.role in ("amplitude", "limit", "place")
     }
@@ -234,6 +263,29 @@ def acted(acting, t, command):
     for k in range(len(t)):
         dt = t[k + 1] - t[k] if k + 1 < len(t) else 0.0
         act(acting, state, t[k], dt, out[k])
+    return out
+
+
+def steering_memory() -> Array:
+    """The state of all effects on fins before the first reading."""
+    return np.zeros((len(_STEER), STEER_MEMORY))
+
+
+@kernel
+def steer(acting, state, dt, inputs):
+    """inputs (2, 4) read, their means over dt and their values at its end, become what acts."""
+    _ALL_STEERS(0, acting.steers, acting.steer_parameters, state, dt, inputs)
+
+
+@kernel
+def steered(acting, dt, means, ends):
+    """Means (N, 4) of what acts over steps of dt (N,), of means (N, 4) and ends (N, 4) read."""
+    out, state = means.copy(), np.zeros((len(acting.steers), STEER_MEMORY))
+    inputs = np.empty((2, means.shape[1]))
+    for k in range(len(dt)):
+        inputs[0], inputs[1] = means[k], ends[k]
+        steer(acting, state, dt[k], inputs)
+        out[k] = inputs[0]
     return out
 
 

@@ -22,6 +22,11 @@ An effect says what it does by exactly one of these, each in the file of the eff
     the effect's own, all zeros before the first call. Effects act in the order of ``order``. With
     ``noise(**parameters) -> (6,)``, the standard deviation of what is read beside the command,
     ``act`` takes back what it can of that, and nothing of it acts on a true command.
+``steer``
+    A kernel ``steer(p, state, dt, inputs)``: on entry ``inputs`` (2, 4) holds what was read of
+    :data:`rov_ident.model.coefficients.INPUTS`, the means over ``dt`` and the values at its end; on
+    return the same of what acts; with no ``dt`` the fins begin anew. ``state``
+    (:data:`STEER_MEMORY`,) is the effect's own, as of ``act``.
 ``sense``
     ``sense(reading, **parameters) -> reading`` and its inverse ``correct``: what the sensors give
     for true velocities, and back. A reading is a :class:`Reading` of one instant or of rows. The
@@ -42,7 +47,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
-from rov_ident.model.coefficients import parse
+from rov_ident.model.coefficients import INPUTS, parse
 
 Array = NDArray[np.float64]
 
@@ -54,6 +59,8 @@ Axes = tuple[str, str, str]
 
 MEMORY = 1024
 """Numbers that an input effect may keep from one call to the next."""
+STEER_MEMORY = 8
+"""The same of an effect on fins."""
 
 
 class Reading(NamedTuple):
@@ -85,6 +92,7 @@ class EffectParameter:
     typical: float
     axis: str = ""  # of a parameter that belongs to one axis of X Y Z K M N
     role: Role = "amplitude"
+    input: str = ""  # of one that belongs to one of INPUTS
 
 
 def per_axis(
@@ -102,6 +110,18 @@ def per_axis(
             f"{prefix}_{axis}", unit, f"{meaning} of {axis}", null, lower, upper, size, axis, role
         )
         for axis, unit, size in sizes
+    )
+
+
+def per_fin(
+    meaning: str, null: float, lower: float, upper: float, typical: float, role: Role = "amplitude"
+) -> tuple[EffectParameter, ...]:
+    """One parameter [rad] for each fin angle of INPUTS, named like it."""
+    return tuple(
+        EffectParameter(
+            fin, "rad", f"{meaning} {fin}", null, lower, upper, typical, role=role, input=fin
+        )
+        for fin in INPUTS[:3]
     )
 
 
@@ -126,7 +146,7 @@ def vector(
 class Effect:
     """An effect of the library; see the module for the hooks, of which each has exactly one.
 
-    ``place`` is where it enters: the *input* (between the commanded and the acting wrench), the
+    ``place`` is where it enters: the *input* (between what is commanded and what acts), the
     *motion* (between the motion through the water and what is measured) or the *wrench*.
     ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
     effect that does nearly the same and that every vehicle has: this one is looked for only in a
@@ -150,6 +170,7 @@ class Effect:
     water: Callable[..., Array] | None = None
     act: Callable[..., None] | None = None
     order: int = 0
+    steer: Callable[..., None] | None = None
     sense: Callable[..., Reading] | None = None
     correct: Callable[..., Reading] | None = None
     noise: Callable[..., Array] | None = None
@@ -157,12 +178,17 @@ class Effect:
     heading: Callable[..., float] | None = None
 
     @property
+    def of_actuators(self) -> bool:
+        """Whether it lies between what is commanded or read of an actuator and what acts."""
+        return bool(self.act or self.steer)
+
+    @property
     def of_sensors(self) -> bool:
         """Whether it changes what is measured, and no motion."""
         return bool(self.sense or self.late or self.heading or self.noise)
 
 
-_HOOKS = ("coefficients", "body", "wrench", "water", "act", "sense", "late", "heading")
+_HOOKS = ("coefficients", "body", "wrench", "water", "act", "steer", "sense", "late", "heading")
 
 
 def faults(effect: Any) -> str:

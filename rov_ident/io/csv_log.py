@@ -42,6 +42,7 @@ NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION, *_DRIVEN)
 _FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
 _SECOND = 1_000_000_000  # ns
 _LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
+_IN_RADIANS = (*_VELOCITIES[3:], *_ANGLES, *_FINS)
 _LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
 _WRAP_JUMP = 1.0  # rad within one row, and back in the next: no vehicle does that
 
@@ -69,7 +70,7 @@ class ImportReport:
 def import_csv(
     paths: Sequence[str | Path], out: str | Path, columns: Mapping[str, str] | None = None,
     body_frame: str = "frd", mask_rates_above: float | None = None, wrench_timing: str = "held",
-    prepare: Prepare | None = None, depths: Sequence[str] = (),
+    prepare: Prepare | None = None, depths: Sequence[str] = (), degrees: Sequence[str] = (),
 ) -> ImportReport:  # fmt: skip
     """Writes the rows of one or several CSV files (in the order of time) as a bag.
 
@@ -91,6 +92,7 @@ def import_csv(
             row, so that the wrench begins at the row's time, and velocity and pose, which are
             means too, are stamped in the middle.
         prepare: what is done to the columns before (`sampling.preprocess.Preparation`).
+        degrees: names of columns (rates, angles, fins) that hold degrees instead of radians.
         depths: further headings, of columns that `prepare` is given; their cells may be empty.
 
     Raises UserError: a file, column or cell that cannot be used, or a unit that cannot be right.
@@ -105,6 +107,10 @@ def import_csv(
         raise UserError(f"The limit of the rates must be positive, not {mask_rates_above}.")
     log = _Log.read([Path(path) for path in paths], columns or {}, depths)
     log.check_time()
+    for name in degrees:
+        if name not in log.data or name not in _IN_RADIANS:
+            raise UserError(f"--degrees {name}: the log has no such column of angles or rates")
+        log.data[name] = np.radians(log.data[name])
     log.check_angles()
     notes = log.prepare(prepare) if prepare else []
     if given := [
@@ -353,7 +359,7 @@ class _Log:
             if (large := np.flatnonzero(np.abs(angle) > _LARGEST_FIN)).size:
                 raise UserError(
                     f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
-                    "looks like degrees: convert it to rad."
+                    "looks like degrees: convert it to rad, or name it in --degrees."
                 )
         for name in _ANGLES:
             angle = self.data.get(name, np.zeros(1))
@@ -365,7 +371,7 @@ class _Log:
             if name != "yaw" or np.abs(np.diff(angle)).sum() > 10.0 * path_of_rates:
                 raise UserError(
                     f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
-                    "looks like degrees: convert it to rad."
+                    "looks like degrees: convert it to rad, or name it in --degrees."
                 )
 
 

@@ -290,7 +290,30 @@ def _stage(
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
+    if free[0] and not any(archive.each(_pushes_ahead)):
+        notes += _said_of_scale(config, names, covariance)
     return _Stage(names, values, covariance, states, more, unexplained, noise)
+
+
+def _pushes_ahead(samples: Samples) -> bool:
+    return bool(samples["wrench"][:, 0].any())
+
+
+def _said_of_scale(config: Config, names: Sequence[str], covariance: Array) -> list[str]:
+    """What speeds alone cannot tell of a propeller, whose thrust is measured nowhere: multiply
+    m - X_udot, thrust and drag by one number, and the motion is the same."""
+    there = _coefficients(config)
+    own = [n for n, c in there.items() if c.row == 0 and "n" in c.inputs]
+    if not own or "X_udot" not in names:
+        return []
+    i = names.index("X_udot")
+    known = NORMAL * float(np.sqrt(covariance[i, i]))
+    share = 100.0 * known / (config.model.body.mass - config.model.values["X_udot"])
+    return [
+        "speeds tell thrust and drag only relative to the inertia, whose X_udot is known to "
+        f"± {known:.2g} kg (95 %): by {share:.1f} % {', '.join(own)} and the drag may be off "
+        "together, which a known X_udot or a bollard pull settles (coast-down --bollard)"
+    ]
 
 
 def _start(

@@ -14,6 +14,7 @@ import numpy as np
 
 from rov_ident.config import Config, Fin, Shaft
 from rov_ident.core.messages import DRIVE, Array, Joints
+from rov_ident.effects import compiled, steer, steering_memory
 from rov_ident.model.coefficients import INPUTS
 
 _KEPT = 10.0  # s; of messages while no sample asks for them
@@ -35,11 +36,14 @@ class Driven:
         self._timeout = config.timeout
         self._joints = config.inputs.joints
         self.used = bool(self._joints)
+        self._effects = compiled(config.effects)
+        self._steers = bool(self._effects.steers.any())
 
     def clear(self) -> None:
         """Forget what has come."""
         self._t: dict[str, list[float]] = {name: [] for name in INPUTS}
         self._x: dict[str, list[float]] = {name: [] for name in INPUTS}
+        self._memory = steering_memory()
 
     def push(self, t: float, message: Joints) -> None:
         """Take the joints' state at t [s]; joints that nobody named are passed over."""
@@ -61,11 +65,13 @@ class Driven:
             self.counts[f"{DRIVE}: a message without any of the joints of inputs"] += 1
 
     def over(self, begin: float, end: float) -> tuple[Array, str]:
-        """Mean over an interval [s] and value at its end (2, 4); and which is missing, if any."""
+        """Mean over an interval [s] and value at its end (2, 4), as read; and which is missing, if
+        any."""
         out = np.zeros((2, len(INPUTS)))
         for name in self._joints:
             times, values = self._t[name], self._x[name]
             if not times or times[0] > end or end - times[-1] > self._timeout:
+                self._memory = steering_memory()
                 return out, name
             _forget(times, values, begin)
             first, last = bisect_left(times, begin), bisect_left(times, end)
@@ -75,6 +81,14 @@ class Driven:
             out[1, i] = x[-1]
             out[0, i] = np.trapezoid(x, knots) / (end - begin) if end > begin else x[-1]
         return out, ""
+
+    def acting(self, dt: float, inputs: Array) -> Array:
+        """What acts (2, 4) of the ``inputs`` that :meth:`over` has read of an interval."""
+        if not self._steers:
+            return inputs
+        acting = inputs.copy()
+        steer(self._effects, self._memory, dt, acting)
+        return acting
 
 
 def value_of(given: Fin | Shaft, message: Joints) -> float | None:

@@ -8,7 +8,8 @@ motion and the measured velocity become::
     M nu_dot + h(nu) - G down = wrench + J d,      measured = nu + V d + noise
 
 ``J`` (6, k) is the change of the wrench: difference quotients of the input effects, run beside the
-configured ones, and of the wrench effects at the measured motion; of effects on the rigid body
+configured ones, of effects on fins in what the configured fins make, and of the wrench effects, at
+the measured motion; of effects on the rigid body
 ``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration of the configured model. ``V`` (6, k)
 is the change of the measured velocity: of moving water, and of effects on the velocity sensors.
 """
@@ -35,9 +36,11 @@ from rov_ident.effects import (
     parameter,
     rigid_body,
     sense,
+    steer,
+    steering_memory,
 )
 from rov_ident.effects.base import EffectParameter, Reading
-from rov_ident.model.coefficients import AXES
+from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import Structure, coriolis, force_of_one
 
 _ZERO = np.zeros(3)
@@ -53,6 +56,7 @@ class EffectJacobians:
         self.size = k = len(config.estimate_effects)
         self._forces: list[int] = []  # indices of parameters
         self._bodies: list[int] = []
+        self._steers: list[tuple[int, Acting, Acting]] = []
         self._senses: list[tuple[int, Values, Values]] = []
         self._water = np.zeros((3, k))  # world
         self._latency = -1  # index of the velocities' delay; none
@@ -64,7 +68,7 @@ class EffectJacobians:
         for i, (name, own) in enumerate(config.estimate_effects):
             effect = EFFECTS[name]
             p = parameter(name, own)
-            low, high = self._displaced(name, p, effect.act is not None)
+            low, high = self._displaced(name, p, effect.of_actuators)
             self._width[i] = high[name][own] - low[name][own]
             if p.axis:
                 self._mask[:, i] = [axis == p.axis for axis in AXES]
@@ -73,6 +77,8 @@ class EffectJacobians:
             elif effect.act is not None or effect.wrench is not None:
                 self._forces.append(i)
                 variants += [compiled(low), compiled(high)]
+            elif effect.steer is not None:
+                self._steers.append((i, compiled(low), compiled(high)))
             elif effect.water is not None:
                 self._water[:, i] = compiled(high).water - compiled(low).water
                 self._water[:, i] /= self._width[i]
@@ -126,6 +132,15 @@ class EffectJacobians:
         self._around = np.zeros((count, 6))
         self._time = 0.0
         self._followed = np.zeros((2, 3))
+        self._steering = np.zeros((len(self._steers), 2, *steering_memory().shape))
+        self._steered = np.zeros((len(self._steers), 2, 2, len(INPUTS)))
+
+    def steer(self, dt: float, inputs: Array) -> None:
+        """The inputs (2, 4) that were read of the interval dt: means, and values at its end."""
+        for k, (_, *variants) in enumerate(self._steers):
+            for v, acting in enumerate(variants):
+                self._steered[k, v] = inputs
+                steer(acting, self._steering[k, v], dt, self._steered[k, v])
 
     def act(self, t: float, dt: float, command: Array) -> None:
         """The command (6,) holds from t to t + dt."""
@@ -136,7 +151,8 @@ class EffectJacobians:
     def about(self, config: Config) -> "EffectJacobians":
         """The same of a configuration with other values of the parameters; what is known stays."""
         new = EffectJacobians(config)
-        for name in ("_memory", "_around", "_impulse", "_time", "_velocity", "_followed"):
+        names = "_memory _around _impulse _time _velocity _followed _steering"
+        for name in names.split():
             setattr(new, name, getattr(self, name))
         return new
 
@@ -160,6 +176,10 @@ class EffectJacobians:
             self._motion, sample, self._acts, self._impulse, self._time, self._scale,
             self._velocity, self._about, self._followed, sides,
         )  # fmt: skip
+        for (i, *_), (low, high) in zip(self._steers, self._steered[:, :, 0], strict=True):
+            motion = self._motion
+            change = _force(motion, sample, low) - _force(motion, sample, high)
+            sides[:6, i] = change / self._width[i]
         self._impulse[:] = 0.0
         self._time = 0.0
 
@@ -195,7 +215,8 @@ def _variant(variants, v):
     """One of the variants, which are stacked."""
     return Acting(
         variants.inputs[v], variants.input_parameters[v], variants.wrenches[v],
-        variants.wrench_parameters[v], variants.water[v],
+        variants.wrench_parameters[v], variants.water[v], variants.steers[v],
+        variants.steer_parameters[v],
     )  # fmt: skip
 
 
@@ -212,6 +233,12 @@ def _act(variants, state, t, dt, command, impulse):
 def _surround(variants, t, nu, rotation, thrust, out):
     for v in range(len(variants.inputs)):
         add_wrenches(_variant(variants, v), t, nu, rotation, thrust, out[v])
+
+
+@kernel
+def _force(motion, samples, inputs):
+    """What the model needs (6,) at a sample (1,) for no acceleration, with other inputs (4,)."""
+    return force_of_one(motion.structure, motion.mass, motion.theta, samples[0].nu, inputs)
 
 
 @inlined

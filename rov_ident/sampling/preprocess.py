@@ -16,9 +16,9 @@ from rov_ident.model.equations import Array
 
 _ROBUST = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 _MEASURED = ("u", "v", "w", "p", "q", "r")
-_WRENCH = ("X", "Y", "Z", "K", "M", "N")
+_DRIVES = ("X", "Y", "Z", "K", "M", "N", "delta_s", "delta_r", "delta_a", "rpm")
 _UNEVEN = 0.1  # of a step: by so much steps may differ where a filter takes them as even
-_DRIVEN = 0.1  # of the largest wrench on an axis; what holds a vehicle in place is below
+_DRIVEN = 0.1  # of the most on an axis or of a fin; what holds a vehicle in place is below
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class Preparation:
                 data[name] = smoothed(data[name], period, self.smooth)
         begin, end = self.cut or (-np.inf, np.inf)
         if self.cut_idle is not None:
-            wrench = np.column_stack([data[name] for name in _WRENCH])
-            first, last = dynamic_stretch(t, wrench, self.cut_idle)
+            driven = np.column_stack([data[name] for name in _DRIVES if name in data])
+            first, last = dynamic_stretch(t, driven, self.cut_idle)
             begin, end = max(begin, first), min(end, last)
         kept = (t >= begin) & (t <= end)
         if np.count_nonzero(kept) < 3:
@@ -128,19 +128,19 @@ def smoothed(x: Array, period: float, corner: float) -> Array:
     return out
 
 
-def dynamic_stretch(t: Array, wrench: Array, margin: float) -> tuple[float, float]:
-    """From when to when [s] the vehicle is driven: a wrench (N, 6) that differs from that of the
-    first row by more than a share of the most it ever does, on any axis.
+def dynamic_stretch(t: Array, drives: Array, margin: float) -> tuple[float, float]:
+    """From when to when [s] the vehicle is driven: by wrench, fins or shaft (N, k), any of which
+    differs from its first row by more than a share of the most it ever does.
 
     With ``margin`` s on either side: coasting down tells of drag.
 
     Raises UserError if nothing is ever driven.
     """
-    effort = np.abs(wrench - wrench[0])
+    effort = np.abs(drives - drives[0])
     most = effort.max(axis=0)
     driven = t[(effort > _DRIVEN * most).any(axis=1)]
     if not len(driven):
-        raise UserError("the wrench is the same throughout: there is no dynamic stretch to keep")
+        raise UserError("what drives is the same throughout: there is no dynamic stretch to keep")
     return float(driven[0]) - margin, float(driven[-1]) + margin
 
 

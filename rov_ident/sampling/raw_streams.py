@@ -59,10 +59,13 @@ class Streams:
         """Axes (6,) whose velocity a simulation can only take as measured.
 
         Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
-        computed, without. What turns the vehicle is then unknown. A velocity that never changes was
-        not measured: a record in the plane holds zeros for the rest.
+        computed, without. What turns the vehicle is then unknown, unless fins do that are heard.
+        A velocity that never changes was not measured: a record in the plane holds zeros for the
+        rest.
         """
-        unknown: NDArray[np.bool_] = np.repeat([False, not self.demand[:, 3:].any()], 3)
+        unknown: NDArray[np.bool_] = np.repeat(
+            [False, not (self.demand[:, 3:].any() or self.inputs[:, :3].any())], 3
+        )
         return unknown | (np.nanmax(self.nu, axis=0) == np.nanmin(self.nu, axis=0))
 
     @property

@@ -99,6 +99,7 @@ class Sampler:
         self._take_delay(config)
         self.kinematic_filter.take_effects(config)
         self._acting.configure(config, self._jacobians)
+        self._driven.configure(config)
 
     def _clear(self) -> None:
         """Forget the buffered messages and the motion, not the clock's origin."""
@@ -205,7 +206,10 @@ class Sampler:
         whole, sample, sides = one_sample(self._size)
         missing = ""
         if self._driven.used:
-            sample["inputs"][0], missing = self._driven.over(begin, t)
+            read, missing = self._driven.over(begin, t)
+            sample["inputs"][0] = self._driven.acting(t - begin, read)
+            if self._jacobians is not None and not missing:
+                self._jacobians.steer(t - begin, read)
         imu = self._queues[IMU].popleft().message if instant.has_imu else None
         odometry, age = None, 0.0
         if instant.has_odometry:

@@ -34,6 +34,7 @@ from rov_ident.effects import (
     of_the_vehicle,
     reading_noise,
     sense,
+    steered,
     velocity_delay,
 )
 from rov_ident.effects.base import Reading
@@ -122,10 +123,11 @@ def measure(
     held = demand[np.clip(np.searchsorted(demand_t, t, side="right") - 1, 0, None)]
     effects = compiled(of_the_vehicle(config.effects))
     driven = interpolated(demand_t, inputs, t)
+    ends = np.vstack([driven[1:], driven[-1:]])
+    acting = steered(effects, np.diff(t, append=t[-1]), 0.5 * (driven + ends), ends)
     truth = simulate(
-        config.dynamics, t, acted(effects, t, held), start, effects=effects,
-        inputs=0.5 * (driven + np.vstack([driven[1:], driven[-1:]])),
-    )  # fmt: skip
+        config.dynamics, t, acted(effects, t, held), start, effects=effects, inputs=acting
+    )
     sensed = sense(_reading(truth, config), config.effects)
     late = t - velocity_delay(config.effects)
     delayed = np.stack([np.interp(late, t, column) for column in sensed.linear.T], axis=1)
