@@ -28,7 +28,8 @@ from rov_ident.offline.archive import Archive, Samples, total
 from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
 from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
 from rov_ident.reports.result import NORMAL, provenance
-from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers, over_ground, predicted
+from rov_ident.sampling.records import HORIZON, VELOCITIES, measured_motion, numbers, predicted
+from rov_ident.sampling.without_velocity import is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
 CHANNELS: dict[str, tuple[str, ...]] = {
@@ -89,6 +90,18 @@ def fit_batch(
     if kind not in KINDS:
         raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
     settings = settings or Settings()
+    unmeasured = [bag for bag, so in zip(archive.bags, archive.each(is_without_velocity)) if so]
+    if unmeasured:
+        if kind != "ml" or settings.stages:
+            raise refusal(unmeasured[0].path.name)
+        if len(unmeasured) < len(archive.bags):
+            raise UserError(
+                f"{unmeasured[0].path.name} has no linear velocity, and other bags have: fit those "
+                "with and those without apart (the one result as the other's configuration)"
+            )
+        # of a horizontal current nothing shows, and no velocity is late
+        odometry = replace(config.odometry, latency_std=0.0)
+        config = replace(config, current_std=0.0, odometry=odometry)
     tell = say or (lambda what: None)
     tell("open loop, as configured")
     before = open_loop_rmse(archive, config)
@@ -223,16 +236,23 @@ def _stage(
     def progress(what: str) -> None:
         say(f"{name}: {what}" if settings.stages else what)
 
-    solution = least_squares.solve(
-        archive.each,
-        config,
-        free,
-        instrumental=kind == "iv",
-        weighted=settings.weighted,
-        precision=precision,
-        progress=progress,
-    )
-    base = least_squares.base_parameters(names, solution.information, coefficients.std)
+    unmeasured = any(archive.each(is_without_velocity))
+    if unmeasured:  # as far as it is simulated, the motion tells least squares nothing
+        found, covariance = coefficients.mean, np.diag(coefficients.std**2)
+        scale = np.outer(coefficients.std, coefficients.std)
+        information = scale * predicted_information(archive, config.with_effects_held, free)
+    else:
+        solution = least_squares.solve(
+            archive.each,
+            config,
+            free,
+            instrumental=kind == "iv",
+            weighted=settings.weighted,
+            precision=precision,
+            progress=progress,
+        )
+        found, covariance, information = solution.values, solution.covariance, solution.information
+    base = least_squares.base_parameters(names, information, coefficients.std)
     more: dict[str, Any] = {
         "base_parameters": {
             "identifiable": [str(c) for c in base.combinations],
@@ -242,14 +262,14 @@ def _stage(
             "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
         }
     }
-    found, covariance, noise = solution.values, solution.covariance, None
+    noise = None
     unexplained = np.full(6, np.nan)
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
         else:
             least = Estimate(names, found, covariance, 0.0)
-            start, noise = _start(archive, config, coefficients, least, free), None
+            start = _start(archive, config, coefficients, least, free)
         likelihood = maximum_likelihood.maximise(
             archive.each,
             config,
@@ -264,6 +284,7 @@ def _stage(
         names = prior.names
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
+        unexplained[:2] = np.nan if unmeasured else unexplained[:2]
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
@@ -412,7 +433,7 @@ def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
 def _curves(samples: Samples, model: Model, effects: Acting) -> tuple[Array, Array, Array]:
     keep = slice(None, None, max(1, len(samples) // _POINTS))
     simulated = predicted(model, samples, HORIZON, None, effects)[keep]
-    return samples["t"][keep], over_ground(samples)[keep], simulated
+    return samples["t"][keep], measured_motion(samples)[keep], simulated
 
 
 def _as_read_by(archive: Archive, before: Config, after: Config) -> Archive:
