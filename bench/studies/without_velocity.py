@@ -7,7 +7,8 @@ The dives are those of at_sea.py, of whose odometry every linear velocity is mar
 Bars (exit status 1 where one is missed), of each case and driving:
 
 * 95 % intervals of the coefficients of heave, roll, pitch and yaw hold the truth in at least 90 %
-  of cases, or 95 % of the dives are said not to agree with the model;
+  of cases, or 95 % of the dives are said not to be told, as surge or sway is driven, or not to
+  agree with the model;
 * everything called converged is within four standard deviations (of a thousand, 0.1 are not).
 """
 

@@ -18,7 +18,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.effects import EFFECTS, Acting, compiled
-from rov_ident.estimation.consistency import consistency_of
+from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.model.coefficients import MOTIONS, Coefficient
 from rov_ident.model.equations import Model
@@ -42,6 +42,12 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
+AT_REST = 0.05  # of the axis's authority, rms: the wrench of keeping station, as in `check`
+DRIVEN_UNSEEN = (
+    "surge or sway is driven, and no velocity is measured: how fast it goes is unknown, and so are "
+    "the moments and the depth that follow from it; drive heave, roll, pitch and yaw while surge "
+    "and sway rest (or record a DVL)"
+)
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
 _POINTS = 1500  # of a curve in a picture
 
@@ -102,6 +108,7 @@ def fit_batch(
         # of a horizontal current nothing shows, and no velocity is late
         odometry = replace(config.odometry, latency_std=0.0)
         config = replace(config, current_std=0.0, odometry=odometry)
+        settings = replace(settings, readings=2 * settings.readings)
     tell = say or (lambda what: None)
     tell("open loop, as configured")
     before = open_loop_rmse(archive, config)
@@ -138,6 +145,11 @@ def fit_batch(
     )
     consistency = consistency_of(config, prior, values, unexplained)
     consistency = consistency.with_open_loop(before, after, chance)
+    if unmeasured:
+        forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
+        driven = float(np.max((forces / authority(config.dynamics))[:2]))
+        rest = Test("surge and sway at rest", driven, AT_REST, DRIVEN_UNSEEN)
+        consistency = replace(consistency, tests=(*consistency.tests, rest))
     motion = archive.each(_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
@@ -185,7 +197,10 @@ def _relinearised(
         settings = replace(settings, readings=settings.readings - 1)
         std = np.sqrt(np.diag(found.covariance))[first:]
         # what is left out is of second order in this
-        if settings.readings == 0 or (np.abs(found.values[first:] - before) < 0.3 * std).all():
+        settled = (np.abs(found.values[first:] - before) < 0.3 * std).all()
+        if settings.readings == 0 or settled:
+            if not settled:
+                told.append("parameters of effects have not settled: give a better configuration")
             notes += told
             return samples, found
         centre = dict(zip(centre, found.values[first:].tolist(), strict=True))
@@ -294,6 +309,14 @@ def _stage(
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
+    # Only turning moments and a tilt show u and v, and no measurement says whether these terms of
+    # the model are right: what they suggest is in the values, but the intervals are the prior's.
+    own = _coefficients(config).items()
+    impossible = [n for n, c in own if unmeasured and c.motions & {0, 1}]
+    for i in (names.index(n) for n in impossible):
+        covariance[i] = covariance[:, i] = 0.0
+        covariance[i, i] = prior.std[i] ** 2
+    more |= {"impossible": impossible} if unmeasured else {}
     removed = 1.0 - np.diag(covariance) / prior.std**2
     estimate = Estimate(names, found, covariance, 0.0)
     values = physical(config.dynamics, prior, estimate)
@@ -391,6 +414,12 @@ def predicted_information(
 
 
 # ------------------------------------------------------------------ open loop
+
+
+def _mean_square_wrench(samples: Samples) -> Array:
+    """(6,) over the samples."""
+    mean: Array = np.mean(samples["wrench"] ** 2, axis=0)
+    return mean
 
 
 def _range(samples: Samples) -> tuple[Array, Array]:

@@ -76,6 +76,8 @@ def _bars(before: Array, after: Array, key: str) -> str:
     for label, pick, unit in (
         ("linear", slice(0, 3), "m/s"), ("angular", slice(3, 6), "rad/s")
     ):  # fmt: skip
+        if not np.isfinite(before[pick]).any():
+            continue  # not measured
         models = {_BEFORE: before[pick], _AFTER: after[pick]}
         drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
         parts.append(plots.zoomable(drawn, f"{key}-{label}"))

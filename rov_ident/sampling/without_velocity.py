@@ -29,8 +29,8 @@ _MAX_STEP = 0.05  # s; a tenth of the time in which drag stops a small vehicle
 _FASTEST = 10.0  # m/s; a model that goes faster is wrong
 
 IMPOSSIBLE = (
-    "no linear velocity: surge and sway, and all that multiplies u or v, cannot be told and keep "
-    "what the configuration says of them"
+    "no linear velocity: heave, roll, pitch and yaw are told from attitude, rates and depth; surge "
+    "and sway, and all that multiplies u or v, cannot be told and keep the prior's intervals"
 )
 
 
