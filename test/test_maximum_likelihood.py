@@ -20,14 +20,20 @@ def in_one(samples):
     return lambda function, *arguments: [function(samples, *arguments)]
 
 
-def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1):
+def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1, velocity=True):
     run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
-    return smoothed(np.concatenate(list(records.samples_of(config, run))))
+    return smoothed(np.concatenate(list(records.samples_of(config, run, velocity))))
 
 
 @pytest.fixture(scope="module")
 def samples(heavy):
     return samples_of(heavy)
+
+
+@pytest.fixture(scope="module")
+def depths(heavy):
+    """Of the same dive, without linear velocities."""
+    return samples_of(heavy, velocity=False)
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +67,13 @@ def test_without_process_noise_the_innovation_is_the_output_error(heavy, samples
     assert np.abs(off).max() < 0.03
 
 
-@pytest.mark.parametrize("relative", [0.0, 0.01])
-def test_sensitivities_are_the_derivatives_of_the_innovations(heavy, samples, relative):
+@pytest.mark.parametrize(
+    ("relative", "seen"), [(0.0, "samples"), (0.01, "samples"), (0.01, "depths")]
+)
+def test_sensitivities_are_the_derivatives_of_the_innovations(heavy, relative, seen, request):
     """The score is minus half the cost's slope where the gain does not move, and the information
     is that of the differences of the innovations."""
-    part, model = samples[:1500], heavy.model
+    part, model = request.getfixturevalue(seen)[:1500], heavy.model
     noise = dataclasses.replace(ml.assumed(heavy), relative=relative)
     at = ml.one_pass(part, model, EVERY, noise)
     base = ml.innovations(part, model, noise)
@@ -90,9 +98,11 @@ def test_sensitivities_are_the_derivatives_of_the_innovations(heavy, samples, re
     np.testing.assert_allclose(score / size, at.score / size, atol=0.3)
 
 
-def test_innovations_of_the_truth_are_white_and_of_unit_size(heavy, samples):
-    found = ml.innovations(samples, heavy.model, ml.assumed(heavy))
-    for axis in range(6):
+@pytest.mark.parametrize(("seen", "axes"), [("samples", range(6)), ("depths", range(2, 6))])
+def test_innovations_of_the_truth_are_white_and_of_unit_size(heavy, seen, axes, request):
+    found = ml.innovations(request.getfixturevalue(seen), heavy.model, ml.assumed(heavy))
+    assert np.flatnonzero(np.isfinite(found.e).any(axis=0)).tolist() == list(axes)
+    for axis in axes:
         e = (found.e / np.sqrt(found.s))[:, axis]
         e = e[np.isfinite(e)]
         assert np.mean(e**2) == pytest.approx(1.0, abs=0.15)

@@ -1,17 +1,24 @@
-"""A bag of a vehicle without a velocity sensor: one sentence says what is impossible."""
+"""A vehicle without a velocity sensor: what can be told is, the rest is said to be impossible."""
 
+import json
 from itertools import islice
 
 import numpy as np
 import pytest
+import yaml
 
 import rov_ident as ri
 from bench import HEAVY, ROOT
+from bench.simulators import sea
+from bench.studies.without_velocity import stripped
 from rov_ident.cli.program import main
+from rov_ident.config.prior import prior_of
 from rov_ident.core.messages import Odometry
+from rov_ident.core.states import State
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.write_messages import write_messages
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.without_velocity import refuse_without_velocity
 
 NOT_MEASURED = {
@@ -75,18 +82,117 @@ def test_a_vehicle_at_rest_is_another_matter(messages, tmp_path):
     refuse(written(tmp_path / "rest.mcap", still, *NOT_MEASURED["zeros"]))
 
 
-def test_every_command_says_so(messages, tmp_path, capsys):
-    path = str(written(tmp_path / "dive.mcap", messages, *NOT_MEASURED["large variance"]))
+def test_without_depth_too_nothing_is_left(messages, tmp_path):
+    flat = [
+        (role, m._replace(position=np.zeros(3)) if isinstance(m, Odometry) else m)
+        for role, m in messages
+    ]
+    path = written(tmp_path / "flat.mcap", flat, *NOT_MEASURED["large variance"])
+    with pytest.raises(ri.UserError, match="neither linear velocity nor depth"):
+        ri.read(path, HEAVY)
+
+
+def test_who_cannot_do_without_names_the_way(messages, tmp_path, capsys):
+    path = str(written(tmp_path / "dive.mcap", messages, *NOT_MEASURED["NaN"]))
     given, out = ["--config", str(HEAVY)], str(tmp_path / "out")
     for command in (
-        ["fit", path, *given, "--estimator", "ml"],
-        ["fit", path, *given, "--estimator", "rls"],
-        ["check", path, *given],
-        ["identify", path, *given, "--out", out],
+        *(["fit", path, *given, "--estimator", kind] for kind in ("rls", "ukf", "ls", "iv")),
+        ["fit", path, *given, "--channels", "heave"],
         ["explain", path, *given, "--out", out],
-        ["plan", "--bag", path, *given],
     ):
         assert main(command) == 2, command
         shown = capsys.readouterr()
-        assert "dive.mcap has no linear velocity: /odom marks" in shown.err, command
-        assert "record a velocity sensor (DVL)" in shown.err and not shown.out
+        assert "dive.mcap has no linear velocity: " in shown.err, command
+        assert "--estimator ml" in shown.err and "(DVL)" in shown.err and not shown.out
+
+
+def test_bags_with_and_without_are_fitted_apart(messages, tmp_path):
+    without = written(tmp_path / "without.mcap", messages, *NOT_MEASURED["large variance"])
+    measured = written(tmp_path / "with.mcap", messages, None, None)
+    with pytest.raises(ri.UserError, match=r"without\.mcap has no linear velocity, and other bags"):
+        ri.fit([measured, without], HEAVY)
+
+
+# ------------------------------------------------------------------ what is told, and what is not
+
+
+def dive(folder, driving, seed, seconds):
+    """Bag, file and true coefficients of a dive by a simulator that shares no code with ours."""
+    vehicle = sea.draw_vehicle(np.random.default_rng([seed, 0]))
+    truth = sea.dive(vehicle, sea.Sea(), driving, seconds, np.random.default_rng([seed, 1]))
+    messages = stripped(sea.measured(truth, sea.Sea(), np.random.default_rng([seed, 2])))
+    parameters = sea.told(vehicle, sea.Sea(), np.random.default_rng([seed, 3]))
+    bag, file = folder / f"{driving}{seed}.mcap", folder / f"{driving}{seed}.yaml"
+    write_messages(bag, messages)
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+    return bag, file, vehicle.theta
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory):
+    """Heave and all rotations driven, surge and sway at rest."""
+    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 40.0)
+
+
+def sigmas(fit, theta):
+    """Errors in standard deviations, by name."""
+    at = [fit.names.index(name) for name in theta]
+    off = (fit.values[at] - np.array(list(theta.values()))) / fit.std[at]
+    return dict(zip(theta, off.tolist(), strict=True))
+
+
+def test_heave_and_turns_are_told_surge_and_sway_are_not(turning):
+    bag, file, theta = turning
+    fit = ri.fit(bag, file)
+    prior = prior_of(fit.given, effects=True)
+    for name, off in sigmas(fit, theta).items():
+        i = fit.names.index(name)
+        assert abs(off) < 4.0, name
+        if name[0] in "XY":
+            assert fit.states[i] is State.HELD and not fit.identifiable[i]
+            assert fit.std[i] == pytest.approx(prior.std[i])
+        else:
+            assert fit.identifiable[i], name
+    document = json.loads(fit.to_json())
+    assert document["impossible"] == [name for name in fit.given.estimate if name[0] in "XY"]
+    assert document["open_loop"]["rmse"]["u"] is None and document["open_loop"]["rmse"]["p"] > 0.0
+    assert any("no linear velocity" in note for note in fit.notes)
+    assert "Impossible to tell without linear velocity: X_udot" in fit.advice[0]
+    assert "Impossible to tell" in fit.page()
+    assert not {"ocean_current.north", "velocity_latency.delay"} & {*fit.names}
+
+
+def test_intervals_hold_over_seeds(tmp_path):
+    off = []
+    for seed in range(2, 8):
+        bag, file, theta = dive(tmp_path, "four-axis", seed, 40.0)
+        found = sigmas(ri.fit(bag, file), theta)
+        off += [abs(x) for name, x in found.items() if name[0] not in "XY"]
+    assert np.mean(np.array(off) < NORMAL) > 0.88  # of 72, by two standard deviations
+    assert max(off) < 4.0
+
+
+def test_where_surge_and_sway_are_driven_nothing_is_sure(tmp_path):
+    """How fast they go is not measured; it is said what to fly instead."""
+    bag, file, theta = dive(tmp_path, "pilot", 0, 30.0)
+    fit = ri.fit(bag, file)
+    assert not fit.consistency.consistent and State.CONVERGED not in fit.states
+    assert "while surge and sway rest" in fit.sentence
+    assert max(abs(x) for x in sigmas(fit, theta).values()) < 4.0
+
+
+def test_check_and_identify_go_the_same_way(turning, tmp_path, capsys):
+    bag, file, _ = turning
+    assert main(["check", str(bag), "--config", str(file)]) == 0
+    shown = capsys.readouterr().out
+    assert "velocity not measured" in shown and "fit for identification" in shown
+    out = tmp_path / "out"
+    assert main(["identify", str(bag), "--config", str(file), "--out", str(out)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "Without linear velocity it cannot be told what the model lacks" in shown
+    assert "cannot be told and keep the prior's intervals" in shown
+    page = (out / "report.html").read_text()
+    assert "Is it good now?" in page and "nan" not in page.lower().replace("nanm", "")
+    assert ri.load(out / "extended.yaml").name == "at_sea"
+    found = json.loads((out / "result.json").read_text())
+    assert found["explain"] is None and set(found["rmse"]) == {"p", "q", "r"}

@@ -327,13 +327,23 @@ def pilot(rng: np.random.Generator, t: Array) -> Array:
     return LEVELS * np.minimum(beyond, 1.0) * np.sign(stick) * [1.0, 1.0, 1.0, 0.0, 0.0, 1.0]
 
 
+def only(*axes: int) -> Callable[[np.random.Generator, Array], Array]:
+    """:func:`six_axes` of which only these are driven."""
+    return lambda rng, t: six_axes(rng, t) * np.isin(np.arange(6), axes)
+
+
 DRIVING: dict[str, Callable[[np.random.Generator, Array], Array]] = {
     "six-axis": six_axes,
     "pilot": pilot,
 }
+PARTIAL = {
+    "four-axis": only(2, 3, 4, 5),
+    **{name: only(2 + i) for i, name in enumerate(("heave", "roll", "pitch", "yaw"))},
+}
+"""Surge and sway rest."""
 # N m per sine of the tilt and per rad/s: of the autopilot that keeps the vehicle upright. It works
 # against the excitation of roll and pitch, so its gain is low there.
-LEVELLING = {"six-axis": (2.0, 0.3), "pilot": (4.0, 1.0)}
+LEVELLING = {"six-axis": (2.0, 0.3), "pilot": (4.0, 1.0), **dict.fromkeys(PARTIAL, (2.0, 0.3))}
 
 
 # ------------------------------------------------------------------ the dive
@@ -370,7 +380,7 @@ def dive(
     """The motion under a driver and an autopilot; commands change only between two steps."""
     plant, per_command = Plant(vehicle, sea), round(1.0 / COMMAND_RATE / STEP)
     command_t = np.arange(round(duration * COMMAND_RATE)) / COMMAND_RATE
-    demand = DRIVING[driving](rng, command_t)
+    demand = (DRIVING | PARTIAL)[driving](rng, command_t)
     demand[command_t < 1.0] = 0.0  # recording begins before the driving
     readings = rng.standard_normal((len(command_t), 6))
     level, damp = LEVELLING[driving]

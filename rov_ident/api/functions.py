@@ -32,7 +32,11 @@ from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
-from rov_ident.sampling.without_velocity import refuse_without_velocity
+from rov_ident.sampling.without_velocity import (
+    is_without_velocity,
+    refusal,
+    refuse_without_velocity,
+)
 
 File = str | os.PathLike[str]
 Files = File | Sequence[File]
@@ -203,6 +207,9 @@ def fit(
     with contextlib.ExitStack() as stack:
         if live:
             records = [read(path, given, progress) for path in paths]
+            for record in records:
+                if is_without_velocity(record.samples):
+                    raise refusal(record.path.name)
             many = archive.of_records(records)
             _check(many, given)
             say("estimating")

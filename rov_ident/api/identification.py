@@ -35,12 +35,14 @@ from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
 from rov_ident.reports.result import Shown
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON
+from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
+from rov_ident.sampling.without_velocity import is_without_velocity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = ("m/s",) * 3 + ("rad/s",) * 3
+_UNEXPLAINED = "Without linear velocity it cannot be told what the model lacks."
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class Identification(Shown):
 
     ``fit``: the coefficients, of the extended model where something was missing; its ``fitted`` is
     the configuration to use. ``explanation``: what was missing, and the errors on data that no fit
-    has used, those of the same structure fitted without them. ``checks``: of the dives used;
+    has used, those of the same structure fitted without them; None of dives without linear
+    velocity. ``checks``: of the dives used;
     ``left_out``: why others were not. ``judge``: the name of the dive that was held back, empty
     where parts of each dive were. ``next``: the manoeuvre to fly next; None where none is safe in
     the free water assumed. ``judged``: RMSE on the dive that was held back, of the configuration as
@@ -57,7 +60,7 @@ class Identification(Shown):
     """
 
     fit: Fit
-    explanation: Explanation
+    explanation: Explanation | None
     checks: tuple[Check, ...]
     left_out: Mapping[str, str]
     judge: str
@@ -68,14 +71,19 @@ class Identification(Shown):
     @property
     def given(self) -> Config:
         """The configuration as it was given."""
-        return self.explanation.given
+        return self.explanation.given if self.explanation else self.fit.given
 
     @property
     def errors(self) -> dict[str, tuple[float, float]]:
         """RMSE of the open-loop prediction by velocity, as configured and as identified; [m/s],
         [rad/s]."""
-        if self.judged:
-            both = self.judged["rmse_before"], self.judged["rmse"]
+        if self.judged or self.explanation is None:
+            both: tuple[Any, Any] = (
+                self.fit.more["open_loop_before"]["rmse"],
+                numbers(self.fit.rmse),
+            )
+            if self.judged:
+                both = self.judged["rmse_before"], self.judged["rmse"]
             return {n: (x, both[1][n]) for n, x in both[0].items() if None not in (x, both[1][n])}
         found = self.explanation.findings
         after = found.extended if found.effects else found.retuned
@@ -86,9 +94,11 @@ class Identification(Shown):
         """Whether the model is good now, in numbers."""
         before, after = ({n: pair[i] for n, pair in self.errors.items()} for i in (0, 1))
         known, total = sum(self.fit.identifiable), len(self.fit.names)
-        where = self.judge or "parts of the dives that were held back"
+        where, told = "what was fitted", _UNEXPLAINED
+        if self.explanation is not None:
+            where, told = "parts of the dives that were held back", self.explanation.sentence
         return (
-            f"{self.explanation.sentence} On {where}, {falls(before, after)}; the data determine "
+            f"{told} On {self.judge or where}, {falls(before, after)}; the data determine "
             f"{known} of {total} parameters."
         )
 
@@ -97,11 +107,12 @@ class Identification(Shown):
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.fit.names, self.fit.identifiable) if not known]
         advice = []
-        if self.explanation.findings.verdict == "unexplained":
+        findings = self.explanation.findings if self.explanation else None
+        if findings and findings.verdict == "unexplained":
             advice.append("Something is left that no known effect explains: see below what.")
         advice += [
             f"Fly next: {effect.manoeuvre} (it tells {effect.effect} from its rivals)."
-            for effect in self.explanation.findings.effects
+            for effect in (findings.effects if findings else ())
             if effect.manoeuvre
         ]
         if held:
@@ -121,10 +132,11 @@ class Identification(Shown):
     def table(self) -> Tables:
         """Every coefficient against the configured one, and the errors before and after."""
         rows = [
-            [name, f"{before:.3g}", f"{after:.3g}", unit]
-            for (name, (before, after)), unit in zip(self.errors.items(), _UNITS)
+            [name, f"{before:.3g}", f"{after:.3g}", _UNITS[VELOCITIES.index(name)]]
+            for name, (before, after) in self.errors.items()
         ]
-        title = f"RMSE of {HORIZON:g} s predictions on {self.judge or 'held-out parts'}"
+        parts = "held-out parts" if self.explanation else "what was fitted"
+        title = f"RMSE of {HORIZON:g} s predictions on {self.judge or parts}"
         errors = Table(title, ["", "as configured", "identified", "unit"], rows, text=(3,))
         known = dict(zip(self.given.model.names, self.given.model.theta.tolist()))
         columns = {
@@ -146,7 +158,7 @@ class Identification(Shown):
             "rmse": {n: {"before": b, "after": a} for n, (b, a) in self.errors.items()},
             "left_out": dict(self.left_out),
             "fit": json.loads(self.fit.to_json()),
-            "explain": json.loads(self.explanation.to_json()),
+            "explain": json.loads(self.explanation.to_json()) if self.explanation else None,
         }
         return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
@@ -169,7 +181,7 @@ class Identification(Shown):
                 [html.heading("Is it good now?"), errors.html(), html.heading("What to do next"),
                  html.bullets(self.advice)],
             ),
-            *of_explain.sections(self.explanation),
+            *(of_explain.sections(self.explanation) if self.explanation else ()),
             html.heading("The dives"),
             html.bullets([*(c.sentence for c in self.checks), *left_out]),
             html.table(["dive", "", "subject", ""], remarks, text=(1, 2, 3)) if remarks else "",
@@ -235,10 +247,12 @@ def identify(
     if judge is None and len(checked) > 1:
         judge, _ = min(checked, key=lambda pair: pair[1].duration)
     used = [path for path, _ in checked if path != judge]
-    explanation = explain(used, config, judge, progress=say)
-    extended = explanation.findings.verdict in ("explained", "unexplained")
-    start = explanation.extended if extended else given
-    explanation = _as_a_start(explanation, extended)
+    start, explanation = given, None
+    if not any(is_without_velocity(found.record.samples) for _, found in checked):
+        explanation = explain(used, config, judge, progress=say)
+        extended = explanation.findings.verdict in ("explained", "unexplained")
+        start = explanation.extended if extended else given
+        explanation = _as_a_start(explanation, extended)
     fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
     judged: dict[str, Any] = {}
     if judge is not None:
@@ -251,7 +265,7 @@ def identify(
         why.append(f"no next manoeuvre: {error}")
     checks = tuple(found for path, found in checked)
     name = judge.name if judge else ""
-    notes = (*why, *explanation.findings.notes)
+    notes = (*why, *(explanation.findings.notes if explanation else ()))
     return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
 
 

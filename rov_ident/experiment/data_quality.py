@@ -33,12 +33,15 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
+from rov_ident.offline import archive
+from rov_ident.offline.batch_fit import fit_batch
 from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online
 from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Shown
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
+from rov_ident.sampling.without_velocity import blanked, is_without_velocity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -179,8 +182,9 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     say = tell or (lambda what, share=None: None)
     record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
     say("looking at its messages")
-    bag = Bag(path)
-    streams = gather(inputs.messages(bag, inputs.select(bag, config), config), config)
+    bag, unmeasured = Bag(path), is_without_velocity(record.samples)
+    messages = inputs.messages(bag, inputs.select(bag, config), config)
+    streams = gather(blanked(messages) if unmeasured else messages, config)
     if streams.duration < 1.0:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     notes = [Remark("messages", WARNING, note) for note in record.notes]
@@ -188,7 +192,10 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     motion, quick = of_dynamics(record.samples, config), None
     if not any(remark.level == BAD for remark in motion):
         say("a quick fit")
-        quick = fit_online([record], config, "rls")
+        alone = archive.of_records([record])
+        quick = (
+            fit_batch(alone, config, "ml") if unmeasured else fit_online([record], config, "rls")
+        )
         motion = of_dynamics(record.samples, config.with_model(quick.fitted.model))
         remarks += [*_model(quick), *_coefficients(quick)]
     remarks += motion
@@ -234,12 +241,14 @@ def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
     for i, axis in enumerate(MOTIONS):
         unit, force = UNITS[i]
         low, high = np.quantile(streams.nu[:, i], [0.02, 0.98])
+        measured = i >= 3 or streams.nu[:, :3].any()
         driven = float(np.sqrt(np.mean(streams.demand[:, i] ** 2) + np.mean(steered[:, i] ** 2)))
-        text = f"from {low:.2f} to {high:.2f} {unit}, wrench {driven:.2g} {force} rms"
+        text = f"from {low:.2f} to {high:.2f} {unit}" if measured else "velocity not measured"
+        text += f", wrench {driven:.2g} {force} rms"
         level = GOOD
         if driven < DRIVEN * limits[i]:
             level, text = WARNING, text + ": not driven"
-        elif min(-low, high) < _ONE_WAY * max(-low, high):
+        elif measured and min(-low, high) < _ONE_WAY * max(-low, high):
             level, text = WARNING, text + ": one direction only, what is asymmetric does not show"
         yield Remark(f"excitation of {axis}", level, text)
 

@@ -30,6 +30,7 @@ from rov_ident.reports.result import NORMAL, Shown
 from rov_ident.reports.table import PLUS_MINUS, Table
 from rov_ident.sampling.records import samples_of
 from rov_ident.sampling.smoothing import smoothed
+from rov_ident.sampling.without_velocity import is_without_velocity
 from rov_ident.simulation.virtual_sensors import Dive, Suite
 
 if TYPE_CHECKING:
@@ -153,6 +154,7 @@ def propose(
         )
     n = len(config.estimate)
     now = predicted_information(bags, config) if bags is not None else np.zeros((n, n))
+    velocity = bags is None or not any(bags.each(is_without_velocity))
     before = prospects(config, now)
     size = _sizes(config)
     worst = before[int(np.argmax(np.array([p.std for p in before]) / size))].name
@@ -164,7 +166,7 @@ def propose(
         if found is None:
             left_out.append(f"{one.name}: not safe within the limits, however small")
             continue
-        information = _information(config, *found, duration, limits)
+        information = _information(config, *found, duration, limits, velocity)
         std = np.array([p.std for p in prospects(config, now + information)])
         candidates.append(Candidate(*found, information, duration, limits))
         scores.append(float((std / size).max() * (1.0 + _OTHERS * np.mean(std / size))))
@@ -221,9 +223,10 @@ def _safe(
 
 
 def _information(
-    config: Config, one: AlternatingTargets, flight: Flight, duration: float, limits: Limits
-) -> Array:
+    config: Config, one: AlternatingTargets, flight: Flight, duration: float, limits: Limits,
+    velocity: bool,
+) -> Array:  # fmt: skip
     run = closed_loop_manoeuvres.dive(config, one, duration, limits, Suite())
-    samples = smoothed(np.concatenate(list(samples_of(config, run))))
+    samples = smoothed(np.concatenate(list(samples_of(config, run, velocity))))
     estimated, noise = prior_of(config).estimated, assumed(config, LIKELY)
     return one_pass(samples, config.dynamics, estimated, noise).information

@@ -21,6 +21,7 @@ from rov_ident.offline.least_squares import PERIOD
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams, integral
 from rov_ident.sampling.sample import SAMPLE
+from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
 _GAP = 0.5  # s without a message, from which the sampler gives up the time between
@@ -114,7 +115,7 @@ def _frames(streams: Streams, config: Config) -> list[Remark]:
         gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
         rate = streams.nu[:, 3:]
         remarks.append(_signs("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
-    if streams.has_pose:
+    if streams.has_pose and streams.nu[:, :3].any():
         step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
         moved = streams.position[step:] - streams.position[:-step]
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
@@ -173,6 +174,10 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     if len(phi) < _FEWEST_ROWS or len(phi) != len(wrench):
         return []
     size = np.sqrt(np.mean(wrench**2, axis=0))
+    if is_without_velocity(samples):  # forces drive what is simulated itself
+        size[:3] = 0.0
+        if not np.any(size > DRIVEN * authority(config.dynamics)):
+            return []
     driven = size > DRIVEN * authority(config.dynamics)
     subject, moved = "wrench against motion", wrench - phi[:, :, -1]
     if not driven.any():

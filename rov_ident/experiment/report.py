@@ -15,7 +15,7 @@ from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.scales import authority
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
-from rov_ident.sampling.records import HORIZON, over_ground, predicted
+from rov_ident.sampling.records import HORIZON, measured_motion, predicted
 
 _MOST = 2000  # points of a curve
 
@@ -103,7 +103,7 @@ def _excitation(found: Check, config: Config) -> str:
     """Velocity against wrench: what is covered, in both directions."""
     samples = found.record.samples
     keep = slice(None, None, max(1, len(samples) // _MOST))
-    nu, tau = over_ground(samples)[keep], samples["wrench"][keep]
+    nu, tau = measured_motion(samples)[keep], samples["wrench"][keep]
     limits = authority(config.dynamics)
     pictures = []
     for i, (axis, name) in enumerate(zip(AXES, VELOCITIES, strict=True)):
@@ -124,7 +124,7 @@ def _motion(found: Check, config: Config) -> str:
     samples = found.record.samples
     run = predicted(config.dynamics, samples, HORIZON)
     keep = slice(None, None, max(1, len(samples) // _MOST))
-    t, nu = samples["t"][keep], over_ground(samples)[keep]
+    t, nu = samples["t"][keep], measured_motion(samples)[keep]
     pictures = []
     for i, name in enumerate(VELOCITIES):
         figure = plots.curves(

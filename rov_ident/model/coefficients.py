@@ -115,6 +115,14 @@ class Coefficient:
         return self.row if self.right >= INPUT else (self.right - PLAIN) % 6
 
     @property
+    def motions(self) -> frozenset[int]:
+        """Components of nu (0..5): that of its axis, and those that it multiplies."""
+        if self.is_added_mass:
+            return frozenset((self.row, self.column))
+        factors = [i for i in (self.left, self.right) if PLAIN <= i < INPUT]
+        return frozenset((self.row, *(0 if i == SQUARE else (i - PLAIN) % 6 for i in factors)))
+
+    @property
     def is_one_sided(self) -> bool:
         """Acts only where the axis's own velocity is negative (``Z_ww_neg``)."""
         return NEGATIVE <= self.right < SQUARE

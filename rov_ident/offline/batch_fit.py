@@ -18,7 +18,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.effects import EFFECTS, Acting, compiled
-from rov_ident.estimation.consistency import consistency_of
+from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.model.coefficients import MOTIONS, Coefficient
 from rov_ident.model.equations import Model
@@ -28,7 +28,8 @@ from rov_ident.offline.archive import Archive, Samples, total
 from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
 from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
 from rov_ident.reports.result import NORMAL, provenance
-from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers, over_ground, predicted
+from rov_ident.sampling.records import HORIZON, VELOCITIES, measured_motion, numbers, predicted
+from rov_ident.sampling.without_velocity import is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
 CHANNELS: dict[str, tuple[str, ...]] = {
@@ -41,6 +42,12 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
+AT_REST = 0.05  # of the axis's authority, rms: the wrench of keeping station, as in `check`
+DRIVEN_UNSEEN = (
+    "surge or sway is driven, and no velocity is measured: how fast it goes is unknown, and so are "
+    "the moments and the depth that follow from it; drive heave, roll, pitch and yaw while surge "
+    "and sway rest (or record a DVL)"
+)
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
 _POINTS = 1500  # of a curve in a picture
 
@@ -89,6 +96,19 @@ def fit_batch(
     if kind not in KINDS:
         raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
     settings = settings or Settings()
+    unmeasured = [bag for bag, so in zip(archive.bags, archive.each(is_without_velocity)) if so]
+    if unmeasured:
+        if kind != "ml" or settings.stages:
+            raise refusal(unmeasured[0].path.name)
+        if len(unmeasured) < len(archive.bags):
+            raise UserError(
+                f"{unmeasured[0].path.name} has no linear velocity, and other bags have: fit those "
+                "with and those without apart (the one result as the other's configuration)"
+            )
+        # of a horizontal current nothing shows, and no velocity is late
+        odometry = replace(config.odometry, latency_std=0.0)
+        config = replace(config, current_std=0.0, odometry=odometry)
+        settings = replace(settings, readings=2 * settings.readings)
     tell = say or (lambda what: None)
     tell("open loop, as configured")
     before = open_loop_rmse(archive, config)
@@ -125,6 +145,11 @@ def fit_batch(
     )
     consistency = consistency_of(config, prior, values, unexplained)
     consistency = consistency.with_open_loop(before, after, chance)
+    if unmeasured:
+        forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
+        driven = float(np.max((forces / authority(config.dynamics))[:2]))
+        rest = Test("surge and sway at rest", driven, AT_REST, DRIVEN_UNSEEN)
+        consistency = replace(consistency, tests=(*consistency.tests, rest))
     motion = archive.each(_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
@@ -172,7 +197,10 @@ def _relinearised(
         settings = replace(settings, readings=settings.readings - 1)
         std = np.sqrt(np.diag(found.covariance))[first:]
         # what is left out is of second order in this
-        if settings.readings == 0 or (np.abs(found.values[first:] - before) < 0.3 * std).all():
+        settled = (np.abs(found.values[first:] - before) < 0.3 * std).all()
+        if settings.readings == 0 or settled:
+            if not settled:
+                told.append("parameters of effects have not settled: give a better configuration")
             notes += told
             return samples, found
         centre = dict(zip(centre, found.values[first:].tolist(), strict=True))
@@ -223,16 +251,23 @@ def _stage(
     def progress(what: str) -> None:
         say(f"{name}: {what}" if settings.stages else what)
 
-    solution = least_squares.solve(
-        archive.each,
-        config,
-        free,
-        instrumental=kind == "iv",
-        weighted=settings.weighted,
-        precision=precision,
-        progress=progress,
-    )
-    base = least_squares.base_parameters(names, solution.information, coefficients.std)
+    unmeasured = any(archive.each(is_without_velocity))
+    if unmeasured:  # as far as it is simulated, the motion tells least squares nothing
+        found, covariance = coefficients.mean, np.diag(coefficients.std**2)
+        scale = np.outer(coefficients.std, coefficients.std)
+        information = scale * predicted_information(archive, config.with_effects_held, free)
+    else:
+        solution = least_squares.solve(
+            archive.each,
+            config,
+            free,
+            instrumental=kind == "iv",
+            weighted=settings.weighted,
+            precision=precision,
+            progress=progress,
+        )
+        found, covariance, information = solution.values, solution.covariance, solution.information
+    base = least_squares.base_parameters(names, information, coefficients.std)
     more: dict[str, Any] = {
         "base_parameters": {
             "identifiable": [str(c) for c in base.combinations],
@@ -242,14 +277,14 @@ def _stage(
             "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
         }
     }
-    found, covariance, noise = solution.values, solution.covariance, None
+    noise = None
     unexplained = np.full(6, np.nan)
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
         else:
             least = Estimate(names, found, covariance, 0.0)
-            start, noise = _start(archive, config, coefficients, least, free), None
+            start = _start(archive, config, coefficients, least, free)
         likelihood = maximum_likelihood.maximise(
             archive.each,
             config,
@@ -264,6 +299,7 @@ def _stage(
         names = prior.names
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
+        unexplained[:2] = np.nan if unmeasured else unexplained[:2]
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
@@ -273,6 +309,14 @@ def _stage(
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
+    # Only turning moments and a tilt show u and v, and no measurement says whether these terms of
+    # the model are right: what they suggest is in the values, but the intervals are the prior's.
+    own = _coefficients(config).items()
+    impossible = [n for n, c in own if unmeasured and c.motions & {0, 1}]
+    for i in (names.index(n) for n in impossible):
+        covariance[i] = covariance[:, i] = 0.0
+        covariance[i, i] = prior.std[i] ** 2
+    more |= {"impossible": impossible} if unmeasured else {}
     removed = 1.0 - np.diag(covariance) / prior.std**2
     estimate = Estimate(names, found, covariance, 0.0)
     values = physical(config.dynamics, prior, estimate)
@@ -395,6 +439,12 @@ def predicted_information(
 # ------------------------------------------------------------------ open loop
 
 
+def _mean_square_wrench(samples: Samples) -> Array:
+    """(6,) over the samples."""
+    mean: Array = np.mean(samples["wrench"] ** 2, axis=0)
+    return mean
+
+
 def _range(samples: Samples) -> tuple[Array, Array]:
     """Where the motion is for all but a thousandth of the time, either side."""
     low, high = np.quantile(samples["nu"], [0.001, 0.999], axis=0)
@@ -435,7 +485,7 @@ def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
 def _curves(samples: Samples, model: Model, effects: Acting) -> tuple[Array, Array, Array]:
     keep = slice(None, None, max(1, len(samples) // _POINTS))
     simulated = predicted(model, samples, HORIZON, None, effects)[keep]
-    return samples["t"][keep], over_ground(samples)[keep], simulated
+    return samples["t"][keep], measured_motion(samples)[keep], simulated
 
 
 def _as_read_by(archive: Archive, before: Config, after: Config) -> Archive:

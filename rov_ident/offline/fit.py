@@ -100,6 +100,12 @@ class Fit(Shown, Result):
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.names, self.identifiable) if not known]
         advice = []
+        if impossible := self.more.get("impossible"):
+            held = [name for name in held if name not in impossible]
+            advice.append(
+                f"Impossible to tell without linear velocity: {', '.join(impossible)}. A velocity "
+                "sensor (DVL) would. For the rest drive heave and turns, surge and sway at rest."
+            )
         if held:
             advice.append(
                 f"Not determined by these data: {', '.join(held)}. rov-ident plan says which "

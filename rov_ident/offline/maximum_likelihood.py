@@ -18,6 +18,14 @@ one recursion beside its covariance's; that the gain depends on theta, too, mult
 innovation, which no later one is correlated with, and is left out. R, floor and rel are themselves
 estimated by maximum likelihood (Fisher scoring).
 
+Where no linear velocity is measured, the depth z is one more state, which the velocities move and
+which is measured in the place of w (:mod:`rov_ident.sampling.without_velocity`)::
+
+    z_dot = k . (v + water),   z_measured = z + noise
+
+Then u and v hang on the model and the wrench alone, and what is not known of their coefficients is
+in the information about all others, through the Munk moments and, in a tilted vehicle, the depth.
+
 The inverse of the information ``J = sum (de/dtheta)'(de/dtheta) / s`` is the Cramer-Rao bound at
 these noise levels. Coefficients' covariances are not taken from it alone, as residuals may be
 coloured: the covariance of the accumulated score stands between two inverse informations.
@@ -61,6 +69,7 @@ _DOUBTFUL = 0.03  # of the axis's authority, lasting a second: what may be unexp
 _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first level to the least
 _SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better than a hundredth
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
+_ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
 _NONE = np.zeros(0)
 LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
 
@@ -423,7 +432,7 @@ _SCRATCH = record(
         ("wrench", "f8", (6,)),  # that acts
         ("z", "f8", (6,)),  # nu as measured
         ("r", "f8", (6,)),  # its variance
-        ("cross", "f8", (6,)),  # covariance of nu with one component of it
+        ("cross", "f8", (6,)),  # covariance of nu with the depth
     ]
 )
 
@@ -434,12 +443,15 @@ class _Work(NamedTuple):
     of_motion: Array  # (6, m)
     drive: Array  # (6, n)
     spare: Array  # (6, n)
+    along: Array  # (7,)
+    deep: Array  # (7,)
     scratch: NDArray[np.void]  # (1,) of _SCRATCH
 
 
 @inlined
 def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
-    """Velocity x (6,), covariance p (6, 6), sensitivity (6, n) to the sample's time."""
+    """Velocity x (6,), covariance p (6, 6), sensitivity (6, n) to the sample's time; with the depth
+    behind the velocity one more of each."""
     s, n = work.scratch[0], len(eq.estimated)
     wrench_of(eq.one_theta, sample, side, s.wrench)
     force_of(sample, s.wrench, eq.restoring, s.force, s.slope)
@@ -451,6 +463,8 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
     dt = sample.dt / steps
     for step in range(steps):
         late = step * dt - 0.5 * sample.dt
+        if len(x) > 6:
+            _sink(sample, 0.5 * dt, x, p, sensitivity, work)
         linearised_step(eq.structure, eq.theta, eq.one_theta, x, late, dt, s)
         if n > 0:
             momentum_columns(eq.structure, s.middle_nu_dot, work.of_rate)
@@ -465,6 +479,49 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
                     total += s.into[i, a] * process[a] * s.into[j, a]
                 s.noise[i, j] = total / (dt * dt)
         advance_covariance(s.transition, s.noise, dt, p, s.product)
+        if len(x) > 6:
+            _sunk(sample, 0.5 * dt, x, p, sensitivity, work)
+
+
+@inlined
+def _sink(sample, half, x, p, sensitivity, work):
+    """The depth's part of a step in the velocities before it: z += half k . v, by trapezoids.
+
+    ``work.along`` (7,): covariance with k . v; ``work.deep`` (7,): with the depth after this.
+    """
+    for j in range(7):
+        work.along[j] = 0.0
+        for i in range(3):
+            work.along[j] += p[j, i] * sample.down[i]
+        work.deep[j] = p[6, j] + half * work.along[j]
+    climb = work.along[0] * sample.down[0] + work.along[1] * sample.down[1]
+    climb += work.along[2] * sample.down[2]
+    p[6, 6] += half * (2.0 * work.along[6] + half * climb)
+    for i in range(3):
+        x[6] += half * sample.down[i] * (x[i] + 2.0 * sample.water[i])
+        for j in range(sensitivity.shape[1]):
+            sensitivity[6, j] += half * sample.down[i] * sensitivity[i, j]
+
+
+@inlined
+def _sunk(sample, half, x, p, sensitivity, work):
+    """The depth's part in the velocities after the step."""
+    phi, cross = work.scratch[0].transition, work.scratch[0].cross
+    for j in range(6):
+        before, after = 0.0, 0.0
+        for i in range(6):
+            before += phi[j, i] * work.deep[i]
+        for i in range(3):
+            after += p[j, i] * sample.down[i]
+        cross[j] = before + half * after
+        work.along[j] = 2.0 * before + half * after
+    for i in range(3):
+        x[6] += half * sample.down[i] * x[i]
+        p[6, 6] += half * sample.down[i] * work.along[i]
+        for j in range(sensitivity.shape[1]):
+            sensitivity[6, j] += half * sample.down[i] * sensitivity[i, j]
+    for j in range(6):
+        p[6, j] = p[j, 6] = cross[j]
 
 
 @kernel
@@ -477,9 +534,20 @@ def _filter(
     n, m = len(eq.estimated), len(eq.theta)
     work = _Work(
         np.empty((6, m)), np.empty((6, m)), np.empty((6, m)), np.empty((6, n)), np.empty((6, n)),
-        np.empty(1, dtype=_SCRATCH),
+        np.empty(7), np.empty(7), np.empty(1, dtype=_SCRATCH),
     )  # fmt: skip
-    x, old, p, sensitivity = np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((6, n))
+    size = 6
+    for k in range(len(samples)):
+        if samples[k].depth_variance > 0.0:
+            size = 7
+            break
+    x, old, p, sensitivity = (
+        np.zeros(size),
+        np.zeros(6),
+        np.zeros((size, size)),
+        np.zeros((size, n)),
+    )
+    cross = np.zeros(size)
     now, lagged, row, scale = np.zeros(n), np.zeros(n), np.zeros(n), np.ones(n)
     s = work.scratch[0]
     for i in range(6):
@@ -497,15 +565,21 @@ def _filter(
                 s.z[i] -= side[6 + i, j] * (eq.one_theta[first + j, 0] - side[12, j])
         if sample.restart or not started or not sample.dt > 0.0:
             started = True
+            p[:] = 0.0
             for i in range(6):
                 x[i] = sample.nu[i]
                 old[i] = sample.nu[i]
-                p[i, :] = 0.0
                 if eq.free[i]:
                     known = sample.odometry_variance[i]
                     if i >= 3 and sample.gyro_variance > 0.0:
                         known = sample.gyro_variance
                     p[i, i] = known * measurement[i]
+                    if i < 3 and size > 6:  # as large as its working speed
+                        p[i, i] = known
+            if size > 6:
+                x[6], p[6, 6] = sample.depth, sample.depth_variance * measurement[2]
+                if not sample.depth_variance > 0.0:
+                    p[6, 6] = _ANY_DEPTH
             sensitivity[:] = 0.0
             lagged[:] = 0.0
             if len(all_nu) > 0:
@@ -524,31 +598,50 @@ def _filter(
             if not eq.free[i]:
                 x[i] = sample.nu[i]
                 continue
-            if np.isnan(s.z[i]):
+            if size > 6 and i == 2 and sample.depth_variance > 0.0:
+                # z at the sample, and how far the vehicle has sunk since it was measured
+                late, e = sample.depth_age, sample.depth - x[6]
+                for j in range(size):
+                    cross[j] = p[j, 6]
+                for j in range(n):
+                    row[j] = sensitivity[6, j]
+                for a in range(3):
+                    back = late * sample.down[a]
+                    e += back * (x[a] + sample.water[a])
+                    for j in range(size):
+                        cross[j] -= back * p[j, a]
+                    for j in range(n):
+                        row[j] -= back * sensitivity[a, j]
+                total = cross[6] + sample.depth_variance * measurement[2]
+                for a in range(3):
+                    total -= late * sample.down[a] * cross[a]
+            elif np.isnan(s.z[i]):
                 continue
-            e, size = s.z[i] - x[i], p[i, i] + s.r[i] * measurement[i]
+            else:
+                e, total = s.z[i] - x[i], p[i, i] + s.r[i] * measurement[i]
+                for j in range(size):
+                    cross[j] = p[j, i]
+                for j in range(n):
+                    row[j] = sensitivity[i, j]
+                    if eq.estimated[j] >= first:
+                        row[j] += side[6 + i, eq.estimated[j] - first]
             if len(all_e) > 0:
                 all_e[k, i] = e
-                all_s[k, i] = size
-            if e * e > gate * gate * size:
+                all_s[k, i] = total
+            if e * e > gate * gate * total:
                 sums[2] += 1.0
                 if len(all_e) > 0:
                     all_e[k, i] = np.nan
                 continue
-            sums[0] += e * e / size + np.log(size)
+            sums[0] += e * e / total + np.log(total)
             sums[1] += 1.0
             for j in range(n):
-                row[j] = sensitivity[i, j]
-                if eq.estimated[j] >= first:
-                    row[j] += side[6 + i, eq.estimated[j] - first]
-                now[j] += row[j] * (e / size)
+                now[j] += row[j] * (e / total)
             for g in range(n):
-                f = row[g] / size
+                f = row[g] / total
                 for j in range(n):
                     information[g, j] += f * row[j]
-            for j in range(6):
-                s.cross[j] = p[j, i]
-            correct(x, p, sensitivity, row, s.cross, size, e)
+            correct(x, p, sensitivity, row, cross, total, e)
         if len(all_nu) > 0:
             for i in range(6):
                 all_nu[k, i] = x[i]

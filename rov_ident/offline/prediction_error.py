@@ -10,7 +10,7 @@ from rov_ident.core.messages import Array
 from rov_ident.effects import EFFECTS, Acting, compiled
 from rov_ident.model.equations import Model
 from rov_ident.offline.archive import Archive, Samples
-from rov_ident.sampling.records import HORIZON, over_ground, predicted
+from rov_ident.sampling.records import HORIZON, measured_motion, predicted
 
 _DRAWS = 8  # the RMS over them is known to 25 %
 _STEP = 0.1  # standard deviations: small enough to be linear, and to stay physical
@@ -61,7 +61,7 @@ def _squares(
 ) -> tuple[Array, int]:
     measured = samples["measured"]
     with np.errstate(invalid="ignore"):
-        error = predicted(model, samples, HORIZON, free, effects) - over_ground(samples)
+        error = predicted(model, samples, HORIZON, free, effects) - measured_motion(samples)
     return np.sum(error[measured] ** 2, axis=0), int(measured.sum())
 
 

@@ -61,7 +61,8 @@ def _curves(drawn: Sequence[Curves], key: str) -> list[str]:
 
 def _rmse(errors: Sequence[Array]) -> Array:
     joined = np.concatenate(errors)
-    joined = joined[np.isfinite(joined).all(axis=1)]
+    known = np.isfinite(joined).any(axis=0)  # without a velocity sensor u, v, w are not
+    joined = joined[np.isfinite(joined[:, known]).all(axis=1)]
     rmse: Array = np.sqrt(np.mean(joined**2, axis=0)) if len(joined) else np.full(6, np.nan)
     return rmse
 
@@ -75,6 +76,8 @@ def _bars(before: Array, after: Array, key: str) -> str:
     for label, pick, unit in (
         ("linear", slice(0, 3), "m/s"), ("angular", slice(3, 6), "rad/s")
     ):  # fmt: skip
+        if not np.isfinite(before[pick]).any():
+            continue  # not measured
         models = {_BEFORE: before[pick], _AFTER: after[pick]}
         drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
         parts.append(plots.zoomable(drawn, f"{key}-{label}"))

@@ -168,6 +168,7 @@ def draw_curves(
             ax.axvspan(max(begin, x[0]), min(end, x[-1]), color=INK, alpha=0.08, lw=0)
     if measured is not None:
         ax.plot(x, measured, color=INK, lw=3.2, alpha=0.35, label=MEASURED)
+    if measured is not None and np.isfinite(measured).any():
         low, high = np.nanmin(measured), np.nanmax(measured)
         reach = LIMIT * (high - low)
         drawn = np.concatenate([[low, high], *models.values()])

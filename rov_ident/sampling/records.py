@@ -19,7 +19,7 @@ from rov_ident.model.equations import Model
 from rov_ident.sampling.sample import believed, joined, stretches
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import describe
-from rov_ident.sampling.without_velocity import refuse_without_velocity
+from rov_ident.sampling.without_velocity import IMPOSSIBLE, has_velocity, is_without_velocity
 from rov_ident.simulation.open_loop import open_loop
 from rov_ident.simulation.virtual_sensors import Dive
 
@@ -61,8 +61,8 @@ def read_record(
     bag = Bag(Path(path))
     topics = inputs.select(bag, config)
     total = inputs.total(bag, topics)
-    refuse_without_velocity(bag, topics, config)
-    sampler = Sampler(config if columns else config.with_effects_held)
+    measured = has_velocity(bag, topics, config)
+    sampler = Sampler(config if columns else config.with_effects_held, measured)
     parts: list[NDArray[np.void]] = []
     unusable: Counter[str] = Counter()
     for done, (role, message) in enumerate(inputs.messages(bag, topics, config, unusable)):
@@ -78,6 +78,7 @@ def read_record(
     counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
+    notes += [] if measured else [f"{bag.path.name}: {IMPOSSIBLE}"]
     notes += _said_of_inputs(config, samples)
     if len(samples) < 2:
         raise UserError(
@@ -140,6 +141,14 @@ def over_ground(samples: NDArray[np.void]) -> Array:
     return nu
 
 
+def measured_motion(samples: NDArray[np.void]) -> Array:
+    """:func:`over_ground`, NaN where no linear velocity was measured, but simulated."""
+    nu = over_ground(samples)
+    if is_without_velocity(samples):
+        nu[:, :3] = np.nan
+    return nu
+
+
 @dataclass(frozen=True)
 class Score:
     """Open-loop simulation against measurement: rmse and R2 (6,) per velocity component."""
@@ -172,9 +181,10 @@ def numbers(values: Array) -> dict[str, float | None]:
     }
 
 
-def samples_of(config: Config, run: Dive) -> Iterator[np.ndarray]:
-    """The samples (k,) of a dive as an estimator configured so would see them."""
-    sampler = Sampler(config)
+def samples_of(config: Config, run: Dive, velocity: bool = True) -> Iterator[np.ndarray]:
+    """The samples (k,) of a dive as an estimator configured so would see them, with or without its
+    linear velocities."""
+    sampler = Sampler(config, velocity)
     for _, role, message in run.messages:
         yield sampler.push(role, message)
     yield sampler.flush()

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.core.jit import record
+from rov_ident.core.jit import floats, record
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import INPUTS
 
@@ -40,6 +40,8 @@ SAMPLE = record(
         ("gyro_variance", "f8"),
         ("gyro_bias", "f8", (3,)),  # rad/s: what was taken off the gyro here
         ("attitude", "f8", (4,)),  # as the odometry has it; NaN: not measured
+        # m, s, m2: of the body origin so long before t, where no linear velocity is measured
+        *floats((), "depth depth_age depth_variance"),  # a variance of zero: not measured
     ]
 )
 

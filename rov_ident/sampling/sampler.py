@@ -43,6 +43,7 @@ from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.queues import Instant, Queues, Waiting
 from rov_ident.sampling.sample import joined, one_sample, sample_type
 from rov_ident.sampling.validation import CLOCK_STEP, REPEATED, RESTARTS, Validation
+from rov_ident.sampling.without_velocity import SimulatedVelocity, blank
 
 _LONGEST_INTERVAL = 0.5  # s without a measurement: restart rather than bridge
 _SILENCE = 2.0  # usual intervals, and CLOCK_STEP, without any message: the clock may have stepped
@@ -57,9 +58,11 @@ class Sampler:
     ``counts`` holds how many messages of each kind were taken or, by reason, refused; bad data
     never raises. ``origin`` is the stamp [ns] of t = 0. Who wants the single commands (t [s],
     wrench (6,)) of the samples sets ``commands`` to a list, and empties it now and then.
+
+    Without ``velocity`` the odometry's linear velocities are not looked at; samples have its depth.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, velocity: bool = True) -> None:
         self.validation = Validation()
         self.counts = self.validation.counts
         self.origin: int | None = None
@@ -70,6 +73,7 @@ class Sampler:
         self.kinematic_filter = KinematicFilter(config)
         self._acting = ActingWrench(config)
         self._driven = Driven(config, self.counts)
+        self._simulated = None if velocity else SimulatedVelocity(config)
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
         self._usual = 0.0  # s between samples
@@ -86,6 +90,8 @@ class Sampler:
         self.kinematic_filter.configure(config)
         self._acting.configure(config, self._jacobians)
         self._driven.configure(config)
+        if self._simulated is not None:
+            self._simulated.configure(config)
 
     def _take_delay(self, config: Config) -> None:
         self._late.delay = velocity_delay(config.effects)
@@ -116,6 +122,8 @@ class Sampler:
 
     def push(self, role: str, message: Message) -> NDArray[np.void]:
         """Take a message as it is on the wire; the samples (k,) of SAMPLE that are now complete."""
+        if self._simulated is not None and isinstance(message, Odometry):
+            message = blank(message)
         reason = self.validation.judge(role, message)
         if reason in RESTARTS:
             done = self.flush()
@@ -217,6 +225,8 @@ class Sampler:
             age = t - measured_at
         assert imu is None or isinstance(imu, Imu)
         assert odometry is None or isinstance(odometry, Odometry)
+        if odometry is not None and self._simulated is not None:
+            odometry = odometry._replace(linear=self._simulated.v)
         if self._jacobians is not None:
             motion = self.kinematic_filter.state[0]
             self._jacobians.measure(motion["v"], motion["rate"], has_imu=imu is not None)
@@ -226,6 +236,9 @@ class Sampler:
             sample, t, 0.0 if restart else dt, restart, self._acting.hold, wrench or _NO_WRENCH,
             odometry, age, imu,
         )  # fmt: skip
+        if self._simulated is not None:
+            self._simulated.fill(sample, odometry, age)
+            self.kinematic_filter.state["v"] = self._simulated.v + sample["water"]
         if stopped:
             self.counts["imu: gap, odometry alone"] += 1
         if odometry is not None and not taken:
