@@ -70,6 +70,7 @@ class Sampler:
         self._driven = Driven(config, self.counts)
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
+        self._position = np.zeros(3)  # m: the last that was measured
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -192,6 +193,9 @@ class Sampler:
             age = t - measured_at
         assert imu is None or isinstance(imu, Imu)
         assert odometry is None or isinstance(odometry, Odometry)
+        if odometry is not None and np.isfinite(odometry.position).all():
+            self._position = odometry.position
+        sample["position"][0] = self._position
         if self._jacobians is not None:
             motion = self.kinematic_filter.state[0]
             self._jacobians.measure(motion["v"], motion["rate"], has_imu=imu is not None)
