@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 from textbook import finned, steered_dive
 
@@ -46,6 +47,7 @@ CONTRACT = {
     "thrust_advance": "k", "coriolis": "", "crossflow": "", "fin_lift": "",
     "fin_offset": "delta_s delta_r delta_a", "fin_lag": "time_constant",
     "fin_saturation": "delta_s delta_r delta_a rate",
+    "empirical": "scale axis first second first_low first_high second_low second_high",
     "thruster_saturation": "limit_X limit_Y limit_Z limit_K limit_M limit_N",
 }  # fmt: skip
 
@@ -65,6 +67,13 @@ every_wrench = pytest.mark.parametrize("effect", WRENCH, ids=lambda e: e.name)
 every_sensor = pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.name)
 
 
+# Of the empirical effect: heave by pitch rate and depth.
+SHAPE = {
+    "axis": 2.0, "first": 5.0, "second": 12.0, "first_low": -0.4, "first_high": 0.5,
+    "second_low": -1.0, "second_high": 2.0,
+}  # fmt: skip
+
+
 def at_null(effect: Effect) -> dict[str, float]:
     return {p.name: p.null for p in effect.parameters}
 
@@ -79,6 +88,7 @@ def typical(effect: Effect, rng: np.random.Generator | None = None) -> dict[str,
             "frequency": p.typical * share,
             "fixed": 15.0 * share,
             "limit": p.typical * share,
+            "shape": SHAPE.get(p.name, 8.0 * share - 6.0),
         }.get(p.role, p.null + share * p.typical)
     return values
 
@@ -217,6 +227,8 @@ def test_close_to_null_little_changes(effect, mounted, without):
     for p in effect.parameters:
         if p.role == "amplitude":
             near[p.name] += little * p.typical * (1 if p.null < p.upper else -1)
+        elif p.role == "shape":
+            near[p.name] = typical(effect)[p.name]
         elif p.role == "limit":  # it has its null wherever no command reaches it
             near[p.name] = (1.0 - little) * largest(p, plain)
     difference = content(simulated(with_fins(effect, mounted), {effect.name: near}))
@@ -578,7 +590,25 @@ def tether(t, nu, rotation, k, x, y, z):
     return at_a_point(-k * np.linalg.norm(va) * va, place)
 
 
+def smooth(t, nu, rotation, scale, axis, first, second, first_low, first_high, second_low,
+           second_high, **weights):  # fmt: skip
+    """Heave by pitch rate and depth: a product of splines with evenly spaced knots."""
+    assert (axis, first, second) == (2, 5, 12)
+
+    def values(x, low, high):
+        y = 3.0 * np.clip((x - low) / (high - low), 0.0, 1.0)
+        knots = np.arange(-3.0, 7.0)
+        return np.array([BSpline(knots, row, 3)(y) for row in np.eye(6)])
+
+    table = np.reshape([weights[f"w{i}"] for i in range(36)], (6, 6))
+    force = values(nu[4], first_low, first_high) @ table
+    return scale * force @ values(POSITION[2], second_low, second_high) * np.eye(6)[2]
+
+
+POSITION = np.array([3.0, -2.0, 1.2])
+
 WRENCH_FORMS = {
+    "empirical": smooth,
     "thrust_advance": advancing,
     "payload": payload,
     "wave": wave,
@@ -594,7 +624,8 @@ THRUST = np.array([40.0, -25.0, 30.0, 2.0, -1.0, 3.0])
 
 def wrench_of(effect, t, nu, rotation, parameters):
     out = np.zeros(6)
-    effects.add_wrenches(compiled({effect.name: parameters}), t, nu, rotation, THRUST, out)
+    acting = compiled({effect.name: parameters})
+    effects.add_wrenches(acting, t, POSITION, nu, rotation, THRUST, out)
     return out
 
 
@@ -737,7 +768,7 @@ def test_the_tether_feels_the_water_not_the_ground(heavy):
     around = effects.surroundings(acting)
     nu, work = np.zeros(6), np.zeros(1, CURRENT)[0]
     effects.add_surroundings(
-        *around, model.structure, mass, theta, 0.0, nu, np.eye(3), nu, work, out
+        *around, model.structure, mass, theta, 0.0, nu[:3], nu, np.eye(3), nu, work, out
     )
     hull = 13.7 * 0.5 + 141.0 * 0.25
     np.testing.assert_allclose(out, [hull + 10.0 * 0.25, 0, 0, 0, 0, 0], atol=1e-12)

@@ -19,6 +19,7 @@ GRAVITY = 9.81
 
 # Effects that the library lacks, by how their force is computed (_unknown_force).
 POWER, FRICTION, FOAM, HALOCLINE, SPRING, SHAKE, DRIFT, CROSS, REACTION, HEADING = range(1, 11)
+BUMP, SLOPE = 11, 12
 
 
 # ------------------------------------------------------------------ matrices
@@ -272,6 +273,11 @@ def _unknown_force(kind, axis, p, t, position, r, nu, out):
         out[axis] += p[0] * abs(nu[0]) * nu[0]
     elif kind == HEADING:
         out[axis] += p[0] * math.sin(math.atan2(r[1, 0], r[0, 0]) - p[1])
+    elif kind == BUMP:
+        out[axis] -= p[0] * math.tanh(20.0 * v) * math.exp(-(((abs(v) - p[1]) / p[2]) ** 2))
+    elif kind == SLOPE:
+        pitch = -math.asin(min(max(r[2, 0], -1.0), 1.0))
+        out[axis] += p[0] * math.tanh((position[2] - p[1]) / p[2]) * math.sin(4.0 * pitch)
 
 
 @_fast

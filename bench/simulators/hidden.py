@@ -514,6 +514,8 @@ UNKNOWN: dict[str, Unknown] = {
     "heading_moment": Unknown(
         fossen.HEADING, "N", ("heading",), 0.25, "a yaw moment by sin of heading"
     ),
+    "bump": Unknown(fossen.BUMP, "X", ("{0}",), 0.5, "drag that is largest at one speed"),
+    "slope": Unknown(fossen.SLOPE, "XZ", ("pitch", "depth"), 0.4, "by depth and pitch at once"),
 }
 
 
@@ -872,6 +874,10 @@ def _foreign(seed: int, name: str | None, strength: float, s: Setting) -> _Forei
         p[0] *= _sign(rng) / speed[0] ** 2
     elif kind.kind == fossen.HEADING:
         p[1] = rng.uniform(-math.pi, math.pi)
+    elif kind.kind == fossen.BUMP:
+        p[1], p[2] = rng.uniform(0.4, 0.6) * speed[axis], 0.15 * speed[axis]
+    elif kind.kind == fossen.SLOPE:
+        p[1], p[2] = rng.uniform(-0.5, 0.5), rng.uniform(0.4, 0.8)
     own = VELOCITIES[axis]
     return _Foreign(kind.kind, axis, p, tuple(d.format(own) for d in kind.depends_on))
 

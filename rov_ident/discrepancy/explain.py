@@ -14,7 +14,13 @@ import numpy as np
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.discrepancy import extension, repetition, sensor_choice, sensor_consistency
+from rov_ident.discrepancy import (
+    empirical_term,
+    extension,
+    repetition,
+    sensor_choice,
+    sensor_consistency,
+)
 from rov_ident.discrepancy.findings import (
     changes,
     finding,
@@ -37,12 +43,13 @@ from rov_ident.discrepancy.held_out import (
 )
 from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
-from rov_ident.discrepancy.results import Finding, Findings, Residual, Verdict
+from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Verdict
 from rov_ident.discrepancy.screening import HULL_DAMPING
-from rov_ident.discrepancy.search import Search, Trials
+from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import HEADING, NOISE
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Shown
@@ -54,6 +61,7 @@ if TYPE_CHECKING:
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
 _NEAR_NOISE = 3.0  # times what fitted windows leave: a prediction of twice the time drifts further
+_AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
@@ -177,6 +185,7 @@ def explain(
     say("judging on held-out data", 0.9)
     judge = Judge(WindowedProblem(judged, to_judge), sensors)
     _judge_effects(search, judge, retuned, model)
+    _add_term(search, judge, retuned, model)
     if search.config is not config:
         std = sensor_choice.noise_std(streams, search.config.effects[NOISE])
         of_sensors.append(noise_finding(search, judge, model.final, config, std))
@@ -192,6 +201,10 @@ def explain(
         records = repetition.Records(streams, bags, joined(bags)[1])
         of_dynamics = repetition.in_each(search, records, last, of_dynamics)
     found += of_dynamics
+    for i, f in enumerate(found):
+        if f.effect == empirical_term.NAME:
+            found[i] = empirical_term.described(f, last.hypothesis)
+            residual = residual or [empirical_term.residual(f, last.hypothesis)]
     minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
     verdict: Verdict = "unexplained" if residual else "explained" if found else "agrees"
     if verdict == "agrees" and is_practical(judge.gain(search.given, retuned.hypothesis)):
@@ -324,6 +337,36 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
             model.final = retuned
         else:
             model.final = refit(kept, model.final.linearisation) or retuned
+
+
+def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> None:
+    """What is left becomes a term without a name, if that gains on held-out data; or a named effect
+    that explains as much, which is not sure, as it was not found by itself."""
+    rest = model.final
+    term = empirical_term.found(search.problem, rest)
+    if term is None:
+        return
+    best, name = term, empirical_term.NAME
+    lacking, h = search.screening.lacks_plainer, rest.hypothesis
+    candidates = [c for c in search.screening.candidates(rest) if not lacking(c.name, h)]
+    rivals = {added_effect(rest, f): f for f in search.fit_best(rest, candidates)}
+    for rival, fitted in rivals.items():
+        as_good = rest.squares - fitted.squares >= _AS_GOOD * (rest.squares - term.squares)
+        as_good = as_good or judge.better(fitted.hypothesis, term.hypothesis)
+        if as_good and search.is_determined(rest, fitted) and fitted.squares < best.squares:
+            best, name = fitted, rival
+    gain = finding(search, judge, retuned, best, name, Trial(rest, rivals))
+    if not is_practical(gain.gain):
+        return
+    others = gain.alternatives
+    if name != empirical_term.NAME:
+        others = (*others, Alternative(empirical_term.NAME, "fits this bag as well"))
+    model.final = best
+    model.found.append(
+        dataclasses.replace(
+            gain, separable=False, manoeuvre=EFFECTS[name].manoeuvre, alternatives=others
+        )
+    )
 
 
 def _supports_another(search: Search, judge: Judge, model: _Model, name: str) -> bool:

@@ -43,6 +43,7 @@ class Steps(NamedTuple):
     t: Array  # (K + 1,) s
     rotation: Array  # (K + 1, 3, 3), body -> world
     middle: Array  # (K, 3, 3), half-way through the step
+    position: Array  # (K, 3) m, in the world, as measured there
     piece_t: Array  # (J + 1,) s
     demand: Array  # (J, 6)
     piece: Indices  # (K,)
@@ -170,8 +171,9 @@ def _wrenches(around, current, structure, added, theta, steps, thrust, nu, scrat
         now = 0.5 * (t[k] + t[k + 1])
         extend_inputs(1, structure, steps.inputs[k], s.extended)
         add_surroundings(
-            around, current, structure, added, theta, now, nu[k], middle[k], thrust[k], s, out[k]
-        )
+            around, current, structure, added, theta, now, steps.position[k], nu[k], middle[k],
+            thrust[k], s, out[k],
+        )  # fmt: skip
 
 
 _LANES = 8  # six axes, none, and one more to fill the vectors
@@ -202,7 +204,9 @@ _SCRATCH = record(
 
 
 @inner
-def _acceleration(around, current, structure, added, theta, restoring, t, rotation, given, s, out):
+def _acceleration(
+    around, current, structure, added, theta, restoring, t, position, rotation, given, s, out
+):
     """nu_dot (6,) at s.nu into out, ``given`` on guided axes; s.push (6,) is the thrusters'."""
     for i in range(6):
         s.velocity[i], s.thrust[i] = s.nu[i, 0], s.push[i]
@@ -210,8 +214,8 @@ def _acceleration(around, current, structure, added, theta, restoring, t, rotati
             s.push[i] += restoring[i, j] * rotation[2, j]
     if around is not None:  # numba leaves this out where it is None
         add_surroundings(
-            around, current, structure, added, theta, t, s.velocity, rotation, s.thrust, s.current,
-            s.push,
+            around, current, structure, added, theta, t, position, s.velocity, rotation,
+            s.thrust, s.current, s.push,
         )  # fmt: skip
     h = s.h
     generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
@@ -228,7 +232,7 @@ def _acceleration(around, current, structure, added, theta, restoring, t, rotati
 
 
 @inner
-def _differentiate(around, current, structure, added, theta, wide, t, rotation, s):
+def _differentiate(around, current, structure, added, theta, wide, t, position, rotation, s):
     """s.by_velocity (6, 6): the derivative of the wrench on the vehicle by its velocity s.nu. Lane
     j is a little faster along axis j, the last along none; ``wide`` (n, _LANES) is theta in each,
     s.thrust (6,) what the thrusters give.
@@ -244,8 +248,8 @@ def _differentiate(around, current, structure, added, theta, wide, t, rotation, 
             for i in range(6):
                 s.velocity[i], s.push[i] = nearby[i, k], 0.0
             add_surroundings(
-                around, current, structure, added, theta, t, s.velocity, rotation, s.thrust,
-                s.current, s.push,
+                around, current, structure, added, theta, t, position, s.velocity, rotation,
+                s.thrust, s.current, s.push,
             )  # fmt: skip
             for i in range(6):
                 h[i, k] -= s.push[i]
@@ -291,7 +295,7 @@ def _shoot(
                 s.nearby_mass[i, j, k] = mass[i, j, 0]
     slope, nu, given = s.slope, s.end, s.end[:0]
     node, rotations, middles, guided = steps.t, steps.rotation, steps.middle, steps.given
-    inputs = steps.inputs
+    inputs, position = steps.inputs, steps.position
     reached, halfway, nu_dots = motion.nu, motion.middle, motion.nu_dot
     phi, gamma = motion.phi, motion.gamma
     for w in range(len(first)):
@@ -316,8 +320,8 @@ def _shoot(
                 elif stage == 3:
                     rotation = rotations[k + 1]
                 _acceleration(
-                    around, current, structure, added, theta, restoring, t + ahead, rotation,
-                    given, s, slope[stage],
+                    around, current, structure, added, theta, restoring, t + ahead, position[k],
+                    rotation, given, s, slope[stage],
                 )  # fmt: skip
                 runge_kutta(stage, dt, s.begin, slope[stage], s.nu[:, 0], nu)
             worst = 0.0
@@ -329,10 +333,12 @@ def _shoot(
                 s.push[i] = wrench[0, k, i]
             t += 0.5 * dt
             _acceleration(
-                around, current, structure, added, theta, restoring, t, middles[k], given, s,
-                nu_dots[k],
+                around, current, structure, added, theta, restoring, t, position[k], middles[k],
+                given, s, nu_dots[k],
             )  # fmt: skip
-            _differentiate(around, current, structure, added, theta, wide, t, middles[k], s)
+            _differentiate(
+                around, current, structure, added, theta, wide, t, position[k], middles[k], s
+            )
             _advance(inverse, dt, s, phi[k], gamma[k])
             if not worst < 50.0:  # no vehicle moves so; NaN too
                 for n in range(k + 1, last[w] + 1):

@@ -78,10 +78,12 @@ class WindowedProblem:
             nu_dot = np.diff(self._measured_at(nodes), axis=0) / np.diff(nodes)[:, None]
             given = np.where(self.guided, nu_dot, 0.0)
         means, self._ends = _driven(streams, nodes)
+        middle = 0.5 * (nodes[1:] + nodes[:-1])
         self.steps = Steps(
             nodes,
             quaternion_to_matrix(self.orientation),
-            quaternion_to_matrix(orientation_at(streams, 0.5 * (nodes[1:] + nodes[:-1]))),
+            quaternion_to_matrix(orientation_at(streams, middle)),
+            interpolated(streams.t, streams.position, middle),
             pieces,
             streams.demand[held],
             np.searchsorted(pieces, nodes[:-1]),
@@ -306,7 +308,7 @@ class WindowedProblem:
                 guide = Guide(~self.guided, nu[nodes], self.orientation[nodes])
             with contextlib.suppress(UserError):
                 simulated[nodes] = simulate(
-                    h.model, self.steps.t[nodes], mean[at], start,
+                    h.model, self.steps.t[nodes], mean[at], start, self.steps.position[at[0]],
                     orientation=self.orientation[first], wrench_slope=slope[at], guide=guide,
                     effects=acting, inputs=inputs[at],
                 ).nu  # fmt: skip

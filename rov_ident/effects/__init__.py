@@ -91,13 +91,13 @@ def _acts(effects: list[Effect]) -> Any:
 def _wrenches(effects: list[Effect]) -> Any:
     """The same of all wrench effects."""
     if not effects:
-        return inlined(lambda i, there, parameters, t, nu, rotation, thrust, out: None)
+        return inlined(lambda i, there, parameters, t, position, nu, rotation, thrust, out: None)
     first, others = cast(Any, effects[0].wrench), _wrenches(effects[1:])
 
-    def calls(i, there, parameters, t, nu, rotation, thrust, out):  # type: ignore[no-untyped-def]
+    def calls(i, there, parameters, t, position, nu, rotation, thrust, out):  # type: ignore
         if there[i]:
-            first(parameters[i], t, nu, rotation, thrust, out)
-        others(i + 1, there, parameters, t, nu, rotation, thrust, out)
+            first(parameters[i], t, position, nu, rotation, thrust, out)
+        others(i + 1, there, parameters, t, position, nu, rotation, thrust, out)
 
     return inlined(calls)
 
@@ -296,25 +296,26 @@ def surroundings(acting: Acting) -> tuple[Acting | None, tuple[float, ...] | Non
 
 
 @inlined
-def add_wrenches(acting, t, nu, rotation, thrust, out):
-    """Add to out (6,) what the wrench effects do at time t and nu (6,) relative to the water, while
-    the thrusters give ``thrust`` (6,)."""
-    _ALL_WRENCHES(0, acting.wrenches, acting.wrench_parameters, t, nu, rotation, thrust, out)
+def add_wrenches(acting, t, position, nu, rotation, thrust, out):
+    """Add to out (6,) what the wrench effects do at time t, at ``position`` (3,) in the world and
+    nu (6,) relative to the water, while the thrusters give ``thrust`` (6,)."""
+    there, parameters = acting.wrenches, acting.wrench_parameters
+    _ALL_WRENCHES(0, there, parameters, t, position, nu, rotation, thrust, out)
 
 
 @inlined
 def add_surroundings(
-    around, current, structure, added_mass, theta, t, nu, rotation, thrust, s, out
+    around, current, structure, added_mass, theta, t, position, nu, rotation, thrust, s, out
 ):
-    """Add to out (6,) what wrench effects and moving water do at time t and nu (6,) over ground,
-    while the thrusters give ``thrust`` (6,).
+    """Add to out (6,) what wrench effects and moving water do at time t, ``position`` (3,) and nu
+    (6,) over ground, while the thrusters give ``thrust`` (6,).
 
     ``around`` and ``current`` are of :func:`surroundings`; ``structure``, ``added_mass`` (6, 6, 1)
     and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world;
     s is a record of :data:`rov_ident.model.equations.CURRENT`, work space.
     """
     if current is None:  # numba leaves out what is not so
-        add_wrenches(around, t, nu, rotation, thrust, out)
+        add_wrenches(around, t, position, nu, rotation, thrust, out)
     else:
         north, east, down = current
         water = (
@@ -323,4 +324,4 @@ def add_surroundings(
             rotation[0, 2] * north + rotation[1, 2] * east + rotation[2, 2] * down,
         )
         add_current(structure, added_mass, theta, nu, water, s, out)
-        add_wrenches(around, t, s.relative, rotation, thrust, out)
+        add_wrenches(around, t, position, s.relative, rotation, thrust, out)

@@ -9,11 +9,11 @@ An effect says what it does by exactly one of these, each in the file of the eff
     ``body(rigid_body, **parameters) -> rigid_body``: another rigid body (centre of gravity,
     buoyancy).
 ``wrench``
-    A kernel ``wrench(p, t, nu, rotation, thrust, out)`` that adds to the wrench ``out`` (6,) on the
-    body: ``p`` the parameters in their order (padded to :data:`SIZE`; an array or a tuple, to be
-    read one by one), ``t`` [s] since the first message, ``nu`` (6,) body velocities relative to the
-    water, ``rotation`` (3, 3) body -> world (NED), ``thrust`` (6,) what the thrusters give after
-    the effects on the input.
+    A kernel ``wrench(p, t, position, nu, rotation, thrust, out)`` that adds to the wrench ``out``
+    (6,) on the body: ``p`` the parameters in their order (padded to :data:`SIZE`; an array or a
+    tuple, to be read one by one), ``t`` [s] since the first message, ``position`` (3,) in the world
+    (NED), ``nu`` (6,) body velocities relative to the water, ``rotation`` (3, 3) body -> world,
+    ``thrust`` (6,) what the thrusters give after the effects on the input.
 ``water``
     ``water(**parameters) -> (3,)``: the velocity of the water in the world [m/s].
 ``act``
@@ -51,10 +51,10 @@ from rov_ident.model.coefficients import INPUTS, parse
 
 Array = NDArray[np.float64]
 
-SIZE = 8
+SIZE = 44
 """The most parameters that a kernel takes."""
 
-Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed"]
+Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed", "shape"]
 Axes = tuple[str, str, str]
 
 MEMORY = 1024
@@ -80,7 +80,7 @@ class EffectParameter:
     starts and the width of the prior of an estimator. An ``amplitude`` makes the effect vanish at
     its null; so does a ``limit``, which shows only once it is below what the thrusters are asked
     for. The other roles (where it attaches, when it begins, its frequency and phase) do nothing
-    while the amplitudes are at their nulls; ``fixed`` is never estimated.
+    while the amplitudes are at their nulls; ``fixed`` and ``shape`` are never estimated as such.
     """
 
     name: str

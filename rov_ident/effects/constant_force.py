@@ -10,7 +10,7 @@ from rov_ident.effects.base import NED, Effect, vector
 
 
 @kernel
-def wrench(p, t, nu, rotation, thrust, out):
+def wrench(p, t, position, nu, rotation, thrust, out):
     for i in range(3):
         for j in range(3):
             out[i] += rotation[j, i] * p[j]

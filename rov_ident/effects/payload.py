@@ -10,7 +10,7 @@ from rov_ident.model.equations import GRAVITY
 
 
 @kernel
-def wrench(p, t, nu, rotation, thrust, out):
+def wrench(p, t, position, nu, rotation, thrust, out):
     if t < p[4]:
         return
     weight = GRAVITY * p[0]

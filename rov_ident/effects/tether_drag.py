@@ -10,7 +10,7 @@ from rov_ident.effects.base import Effect, EffectParameter, vector
 
 
 @kernel
-def wrench(p, t, nu, rotation, thrust, out):
+def wrench(p, t, position, nu, rotation, thrust, out):
     k, x, y, z = p[0], p[1], p[2], p[3]
     u = nu[0] + nu[4] * z - nu[5] * y
     v = nu[1] + nu[5] * x - nu[3] * z

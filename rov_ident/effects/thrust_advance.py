@@ -10,7 +10,7 @@ from rov_ident.effects.base import Effect, EffectParameter
 
 
 @kernel
-def wrench(p, t, nu, rotation, thrust, out):
+def wrench(p, t, position, nu, rotation, thrust, out):
     for i in range(3):
         out[i] -= p[0] * nu[i] * abs(thrust[i])
 

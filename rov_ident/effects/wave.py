@@ -11,7 +11,7 @@ from rov_ident.effects.base import NED, Effect, EffectParameter, vector
 
 
 @kernel
-def wrench(p, t, nu, rotation, thrust, out):
+def wrench(p, t, position, nu, rotation, thrust, out):
     swing = math.sin(2.0 * math.pi * p[3] * t + p[4])
     for i in range(3):
         for j in range(3):

@@ -162,7 +162,8 @@ def _surround(effects, sample, around):
     In a straight line in between, as the motion is.
     """
     out, now = sample[0], np.zeros(6)
-    add_wrenches(effects, out.t, out.nu, rotation(out.orientation), out.wrench, now)
+    to_world = rotation(out.orientation)
+    add_wrenches(effects, out.t, out.position, out.nu, to_world, out.wrench, now)
     for i in range(6):
         before = now[i] if out.restart else around[i]
         out.surroundings[i] = 0.5 * (before + now[i])

@@ -188,7 +188,7 @@ class EffectJacobians:
         now = np.zeros_like(self._around)
         thrust = row["wrench"] - row["surroundings"]
         to_world = rotation(row["orientation"])
-        _surround(self._variants, row["t"], row["nu"], to_world, thrust, now)
+        _surround(self._variants, row["t"], row["position"], row["nu"], to_world, thrust, now)
         before = now if row["restart"] else self._around
         self._time = self._time or 1.0
         self._impulse += 0.5 * self._time * (before + now)
@@ -230,9 +230,9 @@ def _act(variants, state, t, dt, command, impulse):
 
 
 @kernel
-def _surround(variants, t, nu, rotation, thrust, out):
+def _surround(variants, t, position, nu, rotation, thrust, out):
     for v in range(len(variants.inputs)):
-        add_wrenches(_variant(variants, v), t, nu, rotation, thrust, out[v])
+        add_wrenches(_variant(variants, v), t, position, nu, rotation, thrust, out[v])
 
 
 @kernel

@@ -129,7 +129,7 @@ def predicted(
         inputs = np.vstack([part["inputs"][1:, 0], part["inputs"][-1:, 0]])
         out[first:end] = open_loop(
             model, part["t"], thrust, over_ground(part), part["orientation"], horizon, slope, free,
-            effects, inputs,
+            effects, inputs, part["position"],
         )  # fmt: skip
     return out
 

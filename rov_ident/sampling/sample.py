@@ -24,6 +24,7 @@ SAMPLE = record(
         ("nu", "f8", (6,)),  # m/s, rad/s: through the water
         ("water", "f8", (3,)),  # m/s: velocity of the water in body axes; nu + water: over ground
         ("orientation", "f8", (4,)),  # w x y z, body -> world
+        ("position", "f8", (3,)),  # m: in the world, as last measured
         ("down", "f8", (3,)),  # unit, body axes
         ("down_slope", "f8", (3,)),  # per s, over the interval
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings

@@ -77,6 +77,7 @@ class Sampler:
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
         self._usual = 0.0  # s between samples
+        self._position = np.zeros(3)  # m: the last that was measured
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -227,6 +228,9 @@ class Sampler:
         assert odometry is None or isinstance(odometry, Odometry)
         if odometry is not None and self._simulated is not None:
             odometry = odometry._replace(linear=self._simulated.v)
+        if odometry is not None and np.isfinite(odometry.position).all():
+            self._position = odometry.position
+        sample["position"][0] = self._position
         if self._jacobians is not None:
             motion = self.kinematic_filter.state[0]
             self._jacobians.measure(motion["v"], motion["rate"], has_imu=imu is not None)

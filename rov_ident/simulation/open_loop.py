@@ -111,14 +111,14 @@ def simulate(
 def open_loop(
     model: Model, t: Array, wrench: Array, nu: Array, orientation: Array, horizon: float,
     wrench_slope: Array | None = None, free: NDArray[np.bool_] | None = None,
-    effects: Acting | None = None, inputs: Array | None = None,
+    effects: Acting | None = None, inputs: Array | None = None, position: Array | None = None,
 ) -> Array:  # fmt: skip
     """Velocities (N, 6) predicted open loop over windows of ``horizon`` seconds.
 
     Each window starts from the measured ``nu`` (N, 6) and ``orientation`` (N, 4) at its first
     sample; rows whose prediction has left all reason (a diverging model) hold infinity. Components
     not marked in ``free`` (6,) follow the measurement. ``effects`` and ``inputs`` as for
-    :func:`simulate`.
+    :func:`simulate`, ``position`` (N, 3) as measured.
     """
     free = np.ones(6, dtype=bool) if free is None else free
     slope = np.zeros_like(wrench) if wrench_slope is None else wrench_slope
@@ -129,7 +129,8 @@ def open_loop(
         try:
             guide = Guide(free, nu[window], orientation[window])
             predicted[window] = simulate(
-                model, t[window], wrench[window], nu[first], None, orientation[first],
+                model, t[window], wrench[window], nu[first],
+                None if position is None else position[first], orientation[first],
                 slope[window], guide, effects, None if inputs is None else inputs[window],
             ).nu  # fmt: skip
         except UserError:
@@ -239,8 +240,8 @@ def _simulate(
                         s.velocity[j], s.thrust[j] = stage[7 + j], s.push[j]
                     rotate(stage[3:7], s.rotation)
                     add_surroundings(
-                        around, current, structure, added_mass, theta, t[i] + now, s.velocity,
-                        s.rotation, s.thrust, s.current, s.push,
+                        around, current, structure, added_mass, theta, t[i] + now, stage[:3],
+                        s.velocity, s.rotation, s.thrust, s.current, s.push,
                     )  # fmt: skip
                 _derivative(structure, theta, restoring, guided, s, slope)
                 if n == 0 and k == 0:

@@ -1,0 +1,45 @@
+"""What has no name becomes a smooth term, found where no effect of the library is like it."""
+
+import dataclasses
+
+import pytest
+
+from bench.simulators import hidden
+from bench.studies.explain import gain_of_unknown, streams_of
+from rov_ident import config as configuration
+from rov_ident.discrepancy.explain import explain
+from rov_ident.effects.empirical import OF, ON
+
+DIVE = hidden.Conditions(duration=120.0)
+
+
+@pytest.mark.parametrize(
+    "name, seed, strength",
+    [("bump", 1, 0.15), ("slope", 2, 0.1), ("shaking", 1, 0.2), ("heading_moment", 2, 0.3)],
+)
+def test_an_unknown_effect_is_mended_without_a_name(name, seed, strength, tmp_path):
+    """80 % of the gain of the true wrench; what is written simulates it, and is read again."""
+    case = hidden.draw(seed, (), strength, unknown=name, conditions=DIVE)
+    streams = streams_of(case)
+    found = explain([streams], case.config)
+    (term,) = [f for f in found.findings.effects if f.effect == "empirical"]
+    assert found.findings.verdict == "unexplained" and not term.separable
+    assert not [f for f in found.findings.effects if f.separable]
+    assert term.gain.percent / 100.0 > 0.8 * gain_of_unknown(case, streams)
+    shape = found.extended.effects["empirical"]
+    assert case.axis in (ON[int(shape["axis"])], term.axes[0])
+    variables = {OF[int(shape[n])] for n in ("first", "second")}
+    assert variables & {d.format(case.axis) for d in case.depends_on}
+    assert term.sentence.startswith(f"On {ON[int(shape['axis'])]} something without a name depends")
+    configuration.dump(found.extended, tmp_path / "extended.yaml")
+    again = configuration.load(tmp_path / "extended.yaml")
+    assert again.effects["empirical"] == shape
+    assert ("empirical", "scale") in again.estimate_effects
+
+
+def test_a_cause_that_has_a_name_is_not_hidden():
+    """Neither a named effect nor a clean bag gets a term."""
+    case = hidden.draw(3, ("lift",), 0.5, conditions=dataclasses.replace(DIVE, duration=90.0))
+    assert "empirical" not in [
+        f.effect for f in explain([streams_of(case)], case.config).findings.effects
+    ]
