@@ -4,7 +4,7 @@ import dataclasses
 import json
 
 import pytest
-from program import run
+from program import run_alone
 
 import rov_ident as ri
 from bench import ROOT
@@ -34,7 +34,7 @@ def dives(tmp_path_factory):
 
 def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     paths = [dives / f"{name}.mcap" for name in ("long", "short", "rest")]
-    done = run("identify", *paths, "--config", WRONG, "--out", tmp_path / "found")
+    done = run_alone("identify", *paths, "--config", WRONG, "--out", tmp_path / "found")
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "found" / "result.json").read_text())
     assert result["judge"] == "short.mcap"
@@ -60,7 +60,7 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
 
 def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
     out = tmp_path / "found"
-    done = run("identify", dives / "rest.mcap", "--config", WRONG, "--out", out)
+    done = run_alone("identify", dives / "rest.mcap", "--config", WRONG, "--out", out)
     assert done.returncode == 2
     assert "no dive is fit" in done.stderr and "fly instead: " in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
