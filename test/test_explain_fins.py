@@ -20,7 +20,7 @@ def hidden(effect, seed):
     drawn = {
         "fin_lag": {"time_constant": rng.uniform(0.2, 0.4)},
         "fin_offset": {"delta_r": rng.choice([-1.0, 1.0]) * rng.uniform(0.03, 0.06)},
-        "fin_saturation": {"rate": rng.uniform(0.08, 0.12)},
+        "fin_saturation": {"delta_r": rng.uniform(0.2, 0.24)},
     }[effect]
     return values | drawn, drawn
 
@@ -41,7 +41,7 @@ def test_nothing_is_named_where_the_file_is_right(tmp_path):
 @pytest.mark.parametrize("effect", ["fin_lag", "fin_offset", "fin_saturation"])
 def test_a_hidden_effect_on_fins_is_named(effect, tmp_path):
     values, drawn = hidden(effect, 2)
-    found = explained(configuration.load(REMUS), {effect: values}, tmp_path / "dive.mcap", 1)
+    found = explained(configuration.load(REMUS), {effect: values}, tmp_path / "dive.mcap", 3)
     assert found.effects[0].effect == effect and found.effects[0].gain.percent > 10.0
     for name, true in drawn.items():
         told = found.effects[0].parameters[name]

@@ -9,6 +9,8 @@ import math
 from rov_ident.core.jit import kernel
 from rov_ident.effects.base import Effect, EffectParameter, per_fin
 
+_NO_RATE = 1e3  # rad/s; then the reading's course within a step is taken as it is
+
 
 @kernel
 def steer(p, state, dt, inputs):
@@ -19,7 +21,7 @@ def steer(p, state, dt, inputs):
         for k in range(2):
             inputs[k, i] = min(max(inputs[k, i], -p[i]), p[i])
         end, before = inputs[1, i], state[1 + i]
-        if known and dt > 0.0:
+        if known and dt > 0.0 and rate < _NO_RATE:
             slope, behind = (end - begin) / dt, begin - before
             turn = math.copysign(rate, behind)
             closing = rate - slope * math.copysign(1.0, behind)
@@ -42,7 +44,7 @@ EFFECT = Effect(
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
     parameters=(
         *per_fin("largest", 10.0, 0.0, 10.0, 0.2, role="limit"),
-        EffectParameter("rate", "rad/s", "largest", 1e3, 0.01, 1e3, 0.5, role="limit"),
+        EffectParameter("rate", "rad/s", "largest", _NO_RATE, 0.01, _NO_RATE, 0.5, role="limit"),
     ),
     steer=steer,
     order=10,
