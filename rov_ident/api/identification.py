@@ -121,8 +121,8 @@ class Identification(Shown):
             )
         if self.explanation is None:
             advice.append(
-                "Fly next: heave, roll, pitch and yaw at changing levels while surge and sway rest; "
-                "a velocity sensor (DVL) alone tells surge and sway."
+                "Fly next: heave, roll, pitch and yaw at changing levels while surge and sway "
+                "rest; a velocity sensor (DVL) alone tells surge and sway."
             )
         if self.next is not None:
             advice.append(f"Fly next: {self.next.sentence}.")
