@@ -119,6 +119,11 @@ class Identification(Shown):
             advice.append(
                 f"Not determined by these dives (the prior made the value): {', '.join(held)}."
             )
+        if self.explanation is None:
+            advice.append(
+                "Fly next: heave, roll, pitch and yaw at changing levels while surge and sway "
+                "rest; a velocity sensor (DVL) alone tells surge and sway."
+            )
         if self.next is not None:
             advice.append(f"Fly next: {self.next.sentence}.")
         better = float(np.median([after / before for before, after in self.errors.values()])) < 1.0
@@ -259,8 +264,8 @@ def identify(
         with _opened([judge], given, say) as held_back:
             judged = validation(held_back, given, fitted.fitted)
     proposal, why = None, list(fitted.notes)
-    try:
-        proposal = plan(fitted.fitted, used, progress=say)
+    try:  # what is planned drives surge and sway
+        proposal = plan(fitted.fitted, used, progress=say) if explanation else None
     except UserError as error:
         why.append(f"no next manoeuvre: {error}")
     checks = tuple(found for path, found in checked)
