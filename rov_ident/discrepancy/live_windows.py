@@ -47,7 +47,6 @@ MEMORY = 36  # windows: three minutes, the length of a bag of the study (docs/ex
 
 _SPACING = 0.045  # s; closer measurements (above 20 Hz) add cost, hardly information
 _FEWEST = 8  # measurements in a window, as in `windowed_problem`
-_DRAWS = 2  # of the noise of the reading in each window, of which three dozen are added up; effort
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed: twelve windows
 
 
@@ -60,9 +59,6 @@ class Window(NamedTuple):
     power: float  # of r + J theta
     residuals: int  # so many of them
     strength: Array  # (6, C) squared wrenches of a unit of each watched one, over the authority
-    by_noise: Array  # (P + 1, P + 1): products of what noise of the wrench's reading adds to the
-    # sensitivities and, last, to r + J theta; of normal, moment and power that much is its own
-    trembling: Array  # (P, P): covariance that noise of the reading gives to J'r
 
 
 class Task(NamedTuple):
@@ -151,7 +147,6 @@ def step(
         float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b]),
         linear.count,
         np.sum((force / authority(h.model)[:, None]) ** 2, axis=0),
-        *_by_noise(task, problem, linearisation, force),
     )
     blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
     noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
@@ -182,39 +177,6 @@ def _without_tilt(
     rss = whole.rss - whole.gradient[0, p:] @ turn
     linear = LinearProblem(whole.keys[:p], normal, gradient, rss, whole.count)
     return linear, np.sqrt(np.mean(left**2, axis=0))
-
-
-def _by_noise(
-    task: Task, problem: WindowedProblem, linearisation: Linearisation, force: Array
-) -> tuple[Array, Array]:
-    """What noise of the reading does, as `Window` has it: by draws of the noise, each of
-    which moves thrust and simulated motion (errors in variables, see `reading_noise`)."""
-    h, motion = linearisation.hypothesis, linearisation.motion
-    keys = (*task.base, *task.watched)
-    out, trembling = np.zeros(2 * (len(keys) + 1,)), np.zeros(2 * (len(keys),))
-    if not problem.reading_std.any():
-        return out, trembling
-    sensitivities = np.hstack([linearisation.columns, linearisation.sensitivity_to(force)])
-    thrusts = problem.noisy_thrust(h.effects)[:, :, :_DRAWS]
-    at_nodes = problem.moved(motion, thrusts)
-    before = np.concatenate([problem.columns(h, motion, task.base), force], axis=2)
-    for i in range(_DRAWS):
-        there = problem.under_noise(i)
-        half = motion.middle + 0.5 * (at_nodes[1:, :, i] + at_nodes[:-1, :, i])
-        moved = motion._replace(middle=half)
-        after = [there.columns(h, moved, task.base), _columns(task, there, h, moved)]
-        change = np.concatenate(after, axis=2) - before
-        every = np.concatenate([change, -thrusts[:, :, [i]]], axis=2)
-        columns = linearisation.sensitivity_to(every)
-        out += columns.T @ columns / _DRAWS
-        score = sensitivities.T @ columns[:, -1]
-        trembling += np.outer(score, score) / _DRAWS
-    theta = np.zeros(len(keys) + 1)
-    theta[: len(h.values)], theta[-1] = list(h.values.values()), 1.0
-    last = out @ theta  # of r + J theta
-    out[-1, -1] = theta @ last
-    out[:-1, -1] = out[-1, :-1] = last[:-1]
-    return out, trembling
 
 
 def _columns(task: Task, problem: WindowedProblem, h: Hypothesis, motion: Motion) -> Array:

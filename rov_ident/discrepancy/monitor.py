@@ -32,7 +32,7 @@ from rov_ident.discrepancy.hypothesis import (
 )
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.live_windows import WINDOW, State, Task, Window, init, step, task_of
-from rov_ident.discrepancy.selection import VERY_STRONG, Scores, regressed, variance_inflation
+from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.compilation import any_vehicle
 from rov_ident.model.coefficients import ABSOLUTE, AXES, MOTIONS, NEGATIVE, ONE, VELOCITIES, parse
@@ -48,7 +48,6 @@ ALARM = 1e-4
 SHARE = 0.5  # of the residual's mean power in one of six components that an effect must explain
 SMALLEST = 0.2  # of the size at which it matters: less is what the attitude is off by
 
-_KNOWN = 0.5  # of the information on a parameter that noise of the reading must not have made
 _AS_GOOD = 0.8  # of what the best explains: a rival, as second order may make up the difference
 _ALIKE = 0.9  # of what the best explains: named instead, if it has fewer parameters
 _AXIS_SHARE = 0.3  # of the squared wrench on the strongest axis: acts on this one, too
@@ -85,7 +84,7 @@ def suspicions(task: Task, state: State) -> list[Suspicion]:
     """What the remembered windows say is missing, the plainest first; empty when nothing is."""
     if len(state.windows) < FEWEST:
         return []
-    memory, if_noise = (_Memory(task, state.windows, noise) for noise in (False, True))
+    memory = _Memory(task, state.windows)
     chosen: list[Key] = []
     found: list[Suspicion] = []
     units = list(task.units)
@@ -94,10 +93,7 @@ def suspicions(task: Task, state: State) -> list[Suspicion]:
         chosen += best.keys
         # To second order the remainder of an effect looks like others: only its own axes follow.
         units = [u for u in units if effect_of(u[0]) == best.effect and u[0] not in chosen]
-    found = [s for s in found if memory.holds_without_best_window(s.keys, chosen)]
-    # all are of one effect: some part of it must show through the noise
-    through = (if_noise.holds_without_best_window(s.keys, chosen) for s in found)
-    return found if any(through) else []
+    return [s for s in found if memory.holds_without_best_window(s.keys, chosen)]
 
 
 def penalty(size: int, tried: int) -> float:
@@ -130,21 +126,12 @@ class _Trial(NamedTuple):
 
 
 class _Memory:
-    """The sum of windows; ``linear`` is their problem with all parameters at zero. With
-    ``if_noise`` as if what looks like noise of the wrench's reading were just that (the corrected
-    score of Nakamura 1990): it can also be a command that trembles, so a cause must show either
-    way."""
+    """The sum of windows; ``linear`` is their problem with all parameters at zero."""
 
-    def __init__(self, task: Task, windows: Sequence[Window], if_noise: bool = False) -> None:
-        self.task, self.if_noise = task, if_noise
+    def __init__(self, task: Task, windows: Sequence[Window]) -> None:
+        self.task = task
         self.normals, moments = (np.array([w[i] for w in windows]) for i in (1, 2))
         powers, count = np.array([w.power for w in windows]), sum(w.residuals for w in windows)
-        self.plain = self.normals.sum(axis=0)
-        self.trembling = np.sum([w.trembling for w in windows], axis=0)
-        if if_noise:
-            noise = np.array([w.by_noise for w in windows])
-            self.normals = self.normals - noise[:, :-1, :-1]
-            moments, powers = moments - noise[:, :-1, -1], powers - noise[:, -1, -1]
         keys = (*task.base, *task.watched)
         self.linear = LinearProblem(keys, self.normals.sum(axis=0), moments, powers, count)
         self.strength = np.sum([w.strength for w in windows], axis=0)
@@ -160,7 +147,7 @@ class _Memory:
         m[:b] += prior[:b] * self.task.centre
         value = scaled_solve(n, m, 1e-9)
         gradient = moments - self.normals[:, at[:, None], at] @ value
-        rss = whole.rss - (moments + gradient) @ value
+        rss = np.maximum(whole.rss - (moments + gradient) @ value, 0.0)
         return value, LinearProblem(keys, n, gradient, rss, whole.count)
 
     def best(self, chosen: list[Key], units: Sequence[tuple[Key, ...]]) -> Suspicion | None:
@@ -232,31 +219,8 @@ class _Memory:
         _, after = self.solve([*rest, *keys])
         taken = before.rss - after.rss
         inflation = variance_inflation(after, np.arange(len(after.keys)))
-        if self.if_noise:
-            inflation = max(inflation, self.by_noise(after, keys))
         asked = penalty(len(keys), len(self.task.units))
-        at = after.index(keys)
-        if not (
-            np.diag(after.normal)[at] > _KNOWN * np.diag(self.plain)[self.linear.index(keys)]
-        ).all():
-            return False
         return bool(taken.sum() - taken.max() > asked * inflation)
-
-    def by_noise(self, after: LinearProblem, keys: Sequence[Key]) -> float:
-        """The variance inflation that noise of the wrench's reading makes for these parameters, the
-        others refitted along: it moves the simulated vehicle for seconds, on one axis more than
-        on most."""
-        at = after.index(keys)
-        rest = after.index(k for k in after.keys if k not in set(keys))
-        turned = np.zeros((len(after.keys), len(at)))
-        turned[at] = np.eye(len(at))
-        turned[rest] = -regressed(after.normal, rest, at)
-        whole = self.linear.index(after.keys)
-        scores = self.trembling[np.ix_(whole, whole)]
-        information = np.diag(turned.T @ after.normal @ turned)
-        if information.min() <= 0.0:  # noise explains more than was there
-            return np.inf
-        return float(1.0 + np.mean(np.diag(turned.T @ scores @ turned) / information))
 
     def _whole_effects(self, chosen: list[Key], trials: Sequence[_Trial]) -> list[_Trial]:
         """All units of an effect that has several, to be compared with effects of one unit."""

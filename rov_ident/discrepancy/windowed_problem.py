@@ -6,7 +6,6 @@ its parameters.
 """
 
 import contextlib
-import copy
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -25,7 +24,6 @@ from rov_ident.discrepancy.multiple_shooting import (
     guided_by,
     regressors,
     shoot,
-    tangent,
     thrust,
     wrenches,
 )
@@ -174,25 +172,6 @@ class WindowedProblem:
             moved = [thrust(self.steps._replace(demand=d), acting)[0] for d in demands]
             known = self._noisy[key] = np.stack([(m - base) / SMALL for m in moved], axis=2)
         return known
-
-    def moved(self, motion: Motion, force: Array) -> Array:
-        """How velocities at the nodes (K + 1, 6, P) move under wrenches (K, 6, P) besides, the
-        initial ones held."""
-        nodes = np.arange(len(motion.nu))
-        inside = np.zeros(len(nodes), dtype=bool)
-        for first, last in zip(self.first, self.last, strict=True):
-            inside[first : last + 1] = True
-        out = np.zeros((len(nodes), 6, force.shape[2]))
-        out[inside] = tangent(motion, self.first, self.last, nodes[inside], force)
-        return out
-
-    def under_noise(self, draw: int) -> "WindowedProblem":
-        """The same with a draw of the noise of the reading added to its demand."""
-        noise = draws(self.reading_std, len(self.streams.demand))[draw]
-        there = copy.copy(self)
-        there.steps = self.steps._replace(demand=self.steps.demand + noise[self._held])
-        there._thrusts, there._remembered = {}, threading.local()
-        return there
 
     def motion(self, h: Hypothesis, starts: Array) -> Motion | None:
         """Simulate from initial velocities (W, 6); None where that diverges, or where the mass
