@@ -26,6 +26,7 @@ _HOOKS = {
     "sense": "stands between the motion and what is measured",
     "late": "delays the velocities that are measured",
     "heading": "turns the heading that is measured",
+    "steer": "stands between the commanded angles of fins and those that act",
     "noise": "adds noise to the reading of the wrench",
 }
 

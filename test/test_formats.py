@@ -351,7 +351,10 @@ def vehicles(draw, heavy):
     those = sorted(name for name, effect in EFFECTS.items() if effect.parameters)
     chosen = draw(st.lists(st.sampled_from(those), max_size=4, unique=True))
     plain["effects"] = {
-        name: {p.name: p.null + 0.1 * p.typical for p in EFFECTS[name].parameters}
+        name: {
+            p.name: p.null + (0.1 if p.null < p.upper else -0.1) * p.typical
+            for p in EFFECTS[name].parameters
+        }
         for name in chosen
     }
     if draw(st.booleans()):
@@ -435,7 +438,10 @@ def test_every_coefficient_and_effect_is_held_or_named(name, heavy, tmp_path):
         if effect.parameters:
             plain = parameters(heavy)
             plain["effects"] = {
-                effect.name: {p.name: p.null + 0.1 * p.typical for p in effect.parameters}
+                effect.name: {
+                    p.name: p.null + (0.1 if p.null < p.upper else -0.1) * p.typical
+                    for p in effect.parameters
+                }
             }
             out = export(configuration.from_parameters(plain), name)
             assert out.content != base.content or any(effect.name in what for what in out.lost)

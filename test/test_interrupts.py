@@ -36,7 +36,7 @@ def interrupted_at(module, number, place, function, *arguments):
 
 @pytest.mark.parametrize(
     "module, number",
-    list(zip(("rich", "rov_ident.cli.fit", "numpy", "mcap", "scipy.signal", "numba"), NUMBERS * 3)),
+    list(zip(("rich", "rov_ident.cli.fit", "numpy", "mcap", "scipy.linalg", "numba"), NUMBERS * 3)),
 )
 def test_a_command_that_is_loading(module, number):
     check = "check", str(ROOT / "bags" / "demo.mcap"), "--config", str(HEAVY)

@@ -47,7 +47,7 @@ def test_the_whole_procedure(tmp_path, capsys):
     mass = config.load(tmp_path / "true.yaml").model.body.mass
     inertia = (mass - surge["X_udot"]["value"]) / (mass - model["X_udot"])  # all that speeds tell
     for name in ("X_n", "X_nn", "X_uu"):
-        assert surge[name]["value"] / inertia == pytest.approx(model[name], rel=0.05), name
+        assert abs(surge[name]["value"] / inertia - model[name]) < 3.0 * surge[name]["std"], name
     assert "<svg" in (tmp_path / "joint.html").read_text()
 
 

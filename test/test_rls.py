@@ -1,6 +1,7 @@
 """Recursive least squares: against textbook forms, through windup, gaps and changes."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,6 +93,23 @@ def test_nothing_learnt_is_the_prior(heavy):
     np.testing.assert_allclose(estimate.values, prior.mean, rtol=1e-14)
     np.testing.assert_allclose(estimate.covariance, np.diag(prior.std**2), atol=1e-14)
     np.testing.assert_allclose(rls.variance(task, rls.init(task)), prior.std**2, rtol=1e-12)
+
+
+def test_the_prior_is_that_of_the_coefficients_whatever_the_coordinates():
+    shipped = Path(__file__).parent.parent / "config" / "bluerov2_heavy.yaml"
+    config = configuration.load(shipped).with_nuisance
+    config = dataclasses.replace(config, effects={**config.effects, "buoyancy": {"delta": 2.0}})
+    task, prior = rls.problem(config), prior_of(config, effects=True)
+    assert task.thrust >= 0 and task.per_thrust.sum() > 12
+    state = rls.init(task)
+    n = len(prior.std)
+    assert not np.tril(state.root[:, :n], -1).any()
+    estimate = rls.estimate(task, state, prior)
+    np.testing.assert_allclose(estimate.values, prior.mean, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(estimate.std, prior.std, rtol=1e-9)
+    correlation = estimate.covariance / np.outer(prior.std, prior.std)
+    np.testing.assert_allclose(correlation, np.eye(n), atol=1e-9)
+    np.testing.assert_allclose(rls.variance(task, state), prior.std**2, rtol=1e-9)
 
 
 def test_no_samples(heavy):

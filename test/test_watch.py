@@ -114,11 +114,17 @@ def test_watching_changes_no_estimate():
 
 
 def test_which_effects_are_watched():
-    """Sensors disagree among themselves, waves need a frequency, a limit of thrust a search, a
-    battery fades too slowly, and what has no name has no size."""
+    """Sensors disagree among themselves, waves need a frequency, a limit of thrust or of fins a
+    search, a battery fades too slowly, and what has no name has no size."""
     sensors = {name for name, effect in EFFECTS.items() if effect.of_sensors}
     left = {name for name, effect in EFFECTS.items() if not is_watched(effect)}
-    assert left == sensors | {"wave", "battery_sag", "thruster_saturation", "empirical"}
+    assert left == sensors | {
+        "wave",
+        "battery_sag",
+        "thruster_saturation",
+        "fin_saturation",
+        "empirical",
+    }
 
 
 @pytest.mark.parametrize("size", [1, 3, 6])

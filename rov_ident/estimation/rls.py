@@ -156,6 +156,12 @@ def problem(config: Config) -> Problem:
     if (i := task.thrust) >= 0:
         s0, upper = task.theta[task.estimated[i]], prior_of(config, True).upper[i]
         task.highest[i] = min(task.highest[i], s0 / task.scale[i] * (1.0 - s0 / upper))
+        # prior standard deviations of the coordinates
+        std = np.linalg.norm(np.linalg.inv(_jacobian(task, np.zeros(len(task.scale)))), axis=1)
+        task.reach[:] = REACH * std
+        task.highest[task.per_thrust] = np.minimum(-task.start, task.reach)[task.per_thrust]
+        free = task.per_thrust & ~prior_of(config, True).negative
+        task.highest[free] = task.reach[free]
     return task
 
 
@@ -165,7 +171,8 @@ def init(task: Problem) -> State:
     scalars = np.zeros(1, dtype=_SCALARS)
     scalars["free"], scalars["rho"] = n, 1.0
     root = np.eye(n, n + 1)
-    root[:, :n] = np.linalg.inv(_jacobian(task, np.zeros(n)))
+    # of the prior, a unit matrix for the coefficients themselves
+    root[:, :n] = np.linalg.qr(_jacobian(task, np.zeros(n)))[1]
     return State(
         np.arange(n),
         root,
@@ -697,7 +704,7 @@ def _add_up(task, state, work, since):
     for a in range(n):
         change[a], state.solution[a] = gradient[a] - state.solution[a], gradient[a]
         highest = task.highest[state.order[a]]
-        state.deviation[a] = min(max(gradient[a], -REACH), highest)
+        state.deviation[a] = min(max(gradient[a], -task.reach[state.order[a]]), highest)
         gradient[a] = 0.0
     for i in range(6):
         total = 0.0

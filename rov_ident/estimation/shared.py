@@ -45,6 +45,7 @@ class Problem(NamedTuple):
     # behind them the estimated parameters of effects
     scale: Array  # (n,) prior standard deviations
     start: Array  # (n,) prior means over those
+    reach: Array  # (n,) scaled deviation that they are not off by, either way
     highest: Array  # (n,) scaled deviation that the coefficients of RLS's observer do not exceed
     drift: Array  # (n,) variance density of the random walk of scaled parameters, 1/s
     rigid_body: Array  # (6, 6)
@@ -74,6 +75,7 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         theta_of(config),
         prior.std,
         start,
+        np.full(len(start), REACH),
         np.where(prior.negative, np.minimum(-start, REACH), REACH),
         drift_of(config, prior.names),
         body.mass_matrix,
