@@ -46,8 +46,11 @@ def test_the_whole_procedure(tmp_path, capsys):
     assert surge["X_udot"]["lower"] <= model["X_udot"] <= surge["X_udot"]["upper"]
     mass = config.load(tmp_path / "true.yaml").model.body.mass
     inertia = (mass - surge["X_udot"]["value"]) / (mass - model["X_udot"])  # all that speeds tell
-    for name in ("X_n", "X_nn", "X_uu"):
-        assert abs(surge[name]["value"] / inertia - model[name]) < 3.0 * surge[name]["std"], name
+    values = {name: surge[name]["value"] / inertia for name in ("X_n", "X_nn", "X_uu")}
+    assert values["X_uu"] == pytest.approx(model["X_uu"], rel=0.03)
+    for n in (10.0, 20.0):  # 1/s, in the trial; k1 and k2 apart are told less well
+        thrust, truth = (v["X_n"] * n + v["X_nn"] * n**2 for v in (values, model))
+        assert thrust == pytest.approx(truth, rel=0.03)
     assert "<svg" in (tmp_path / "joint.html").read_text()
 
 
