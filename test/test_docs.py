@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 from test_inputs import configured
+from tiers import more
 
 from rov_ident import config
 from rov_ident.cli.program import _commands, _parser
@@ -32,8 +33,8 @@ def blocks(path, language):
     return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.M | re.S)
 
 
-@pytest.mark.timeout(600)  # the first use of anything compiles it
-@pytest.mark.parametrize("name", ["tutorial.md", "tutorial-own-bag.md"])
+@pytest.mark.timeout(1800)  # the first use of anything compiles it
+@pytest.mark.parametrize("name", ["tutorial.md", *more("tutorial-own-bag.md")])
 def test_every_command_of_a_tutorial_runs(tmp_path, name):
     """One after the other, as a reader does, where the shipped files are at hand."""
     for folder in ("bags", "config"):
@@ -52,7 +53,7 @@ def test_every_command_of_a_tutorial_runs(tmp_path, name):
     for command in commands:
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", command],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=400,
+            cwd=tmp_path, env=environment, capture_output=True, text=True,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         if "R2" in done.stdout and "fitted" in command:

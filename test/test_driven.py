@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiers import more
 
 import rov_ident as ri
 from rov_ident import config as configuration
@@ -280,7 +281,7 @@ def dives(remus, tmp_path_factory):
     return found
 
 
-@pytest.mark.parametrize("estimator", ["rls", "ukf"])
+@pytest.mark.parametrize("estimator", [*more("rls"), "ukf"])
 def test_fin_coefficients_are_found_again(estimator, dives):
     """Of 8 intervals of 95 % at most 2 miss (three or more: 0.6 % of such tests), and the error
     that the prior had, 17 %, falls to less than half in the median."""

@@ -5,6 +5,7 @@ import pytest
 from bench.studies import torture_live
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("kind", ["rls", "ukf"])
 def test_five_minutes(kind, domain):
     rows = list(torture_live.loaded(kind, 365.0, warm=4))  # buffers fill for four minutes

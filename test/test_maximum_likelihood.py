@@ -179,6 +179,7 @@ def archive_of(tmp_path_factory):
     return make
 
 
+@pytest.mark.study
 def test_a_channel_fitted_alone_holds_in_the_joint_run(heavy, off, archive_of):
     """One axis moves at a time; then all move at once.
 

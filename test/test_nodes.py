@@ -16,6 +16,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
+from tiers import more
 
 from bench.simulators.live import (
     ROUNDING,
@@ -404,6 +405,7 @@ def nothing_compiled(tmp_path, monkeypatch):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
 
 
+@pytest.mark.study
 def test_the_first_start_on_a_computer(domain, heavy, heavy_path, nothing_compiled):
     """Estimates come long before anything is compiled, and in the end each message was used."""
     messages = dive(heavy, "steps", 40.0, seed=1).messages
@@ -505,7 +507,7 @@ def test_interrupt_in_the_instant_in_which_it_is_up(domain, heavy_path):
         assert "Traceback" not in said
 
 
-@pytest.mark.parametrize("estimator", ["rls", "ukf"])
+@pytest.mark.parametrize("estimator", ["rls", *more("ukf")])
 def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
     """An effect that is configured is estimated; one that is missing is named in /diagnostics."""
     document = config.to_parameters(heavy)

@@ -21,6 +21,8 @@ from packaging.utils import canonicalize_name
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
+from bench import HEAVY
+from bench.studies import fuzz
 from rov_ident import config
 from rov_ident.config import PARAMETERS
 from rov_ident.core.errors import UserError
@@ -157,11 +159,13 @@ def hostile(tmp_path):
     assert not (tmp_path / "kernels").exists()
 
 
-def program(name, *arguments, cwd, **variables):
+def program(name, *arguments, cwd, stdout=None, **variables):
     """As a shell starts it, in a folder."""
     script = Path(sys.executable).with_name(name)
-    command, environment = [script, *map(str, arguments)], {**os.environ, **variables}
-    return subprocess.Popen(command, cwd=cwd, env=environment, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [script, *map(str, arguments)], cwd=cwd, env={**os.environ, **variables}, text=True,
+        stdout=stdout, stderr=subprocess.PIPE,
+    )  # fmt: skip
 
 
 def test_workers_take_no_code_from_the_current_folder(tmp_path, hostile, heavy_path, short_dive):
@@ -174,7 +178,27 @@ def test_workers_take_no_code_from_the_current_folder(tmp_path, hostile, heavy_p
     assert process.returncode == 0, said
 
 
-@pytest.mark.parametrize("name", ["rls_node", "replay"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("import", "--out", "dive.mcap", "--config", fuzz.CORPUS / "configuration/thrusters.yaml",
+         fuzz.CORPUS / "log/dive.bin"),
+        ("nomoto", fuzz.CORPUS / "zigzag/run.csv", "--report", "zigzag.html"),
+        ("forces", fuzz.CORPUS / "forces/drift.csv", "--report", "forces.html"),
+        ("import-model", fuzz.CORPUS / "model/robot.urdf", "--config", HEAVY,
+         "--out", "robot.yaml"),
+        ("plan", "--config", HEAVY, "--out", "plan.mcap"),
+    ],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_commands_take_no_code_from_the_current_folder(hostile, words):
+    """Those with libraries of their own: for logs, tables, models and pictures."""
+    process = program("rov-ident", *words, cwd=hostile, stdout=subprocess.DEVNULL)
+    _, said = process.communicate(timeout=240)
+    assert process.returncode == 0, said
+
+
+@pytest.mark.parametrize("name", ["rls_node", "ukf_node", "replay"])
 def test_compilers_and_nodes_take_no_code_from_the_current_folder(
     tmp_path, hostile, heavy_path, short_dive, domain, name
 ):
@@ -266,14 +290,14 @@ def done_by(graph, name):
 
 
 OTHERS = {
-    "controller_bridge": ["rov_ident.nodes", "controller_bridge", "--ros-args", "--params-file",
+    "controller_bridge": ["controller_bridge", "--ros-args", "--params-file",
                           str(ROOT / "config" / "bluerov2_heavy.yaml"), "-p",
                           "controller:=/controller", "-r", "coefficients:=/ukf_node/coefficients"],
-    "example_controller": ["rov_ident.nodes", "example_controller", "--ros-args", "--params-file",
+    "example_controller": ["example_controller", "--ros-args", "--params-file",
                            str(ROOT / "config" / "bluerov2_heavy.yaml"),
                            "-r", "coefficients:=/ukf_node/coefficients"],
-    "dashboard": ["rov_ident.nodes", "dashboard_node", "--ros-args", "-p", "port:=0"],
-    "rov_ident_watch": ["rov_ident", "watch"],
+    "dashboard": ["dashboard_node", "--ros-args", "-p", "port:=0"],
+    "rov_ident_watch": ["rov-ident", "watch"],
 }  # fmt: skip
 
 
@@ -285,29 +309,30 @@ def test_every_node_has_a_policy():
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_another_node_does_what_its_policy_says(domain, name):
-    """The bridge, the controller, the page and the terminal, beside two estimators."""
+def test_another_node_does_what_its_policy_says(domain, hostile, name):
+    """The bridge, the controller, the page and the terminal, beside two estimators.
+
+    They take no code from the current folder either.
+    """
     context = rclpy.Context()
     rclpy.init(args=[], context=context)
     graph = rclpy.create_node("graph", context=context)
     for estimator in ("rls", "ukf"):
         graph.create_publisher(DiagnosticArray, f"/{estimator}_node/coefficients", LATCHED)
-    process = subprocess.Popen(
-        [sys.executable, "-m", *OTHERS[name]], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    process = program(*OTHERS[name], cwd=hostile, stdout=subprocess.DEVNULL)
     allowed = {"request": set(), **policy(name)}
     end, done = time.monotonic() + 60.0, {}
     try:
         while done != allowed and time.monotonic() < end:
             time.sleep(0.2)
-            assert process.poll() is None
+            assert process.poll() is None, process.stderr.read()
             done = done_by(graph, name)
         assert done == allowed
         time.sleep(1.0)  # nor does it begin anything else
         assert done_by(graph, name) == allowed
     finally:
         process.terminate()
-        process.wait(240)
+        process.communicate(timeout=240)
         graph.destroy_node()
         rclpy.try_shutdown(context=context)
 

@@ -12,12 +12,13 @@ from bench import DATA, ROOT
 from rov_ident.cli.program import main
 from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS
 from rov_ident.config.writing import annotated
-from rov_ident.core.messages import Imu, Odometry
+from rov_ident.core.frames import from_core, to_core
+from rov_ident.core.messages import IMU, ODOMETRY, Imu, Odometry
 from rov_ident.core.yaml_file import parse
 from rov_ident.io import topics
-from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_reader import ROLE_NAMES, Bag
 from rov_ident.io.bag_writer import BagWriter
-from rov_ident.io.cdr import encode
+from rov_ident.io.cdr import ROLE_TYPES, encode
 
 DEMO = ROOT / "bags" / "demo.mcap"
 LOGS = DATA / "ardusub"
@@ -105,6 +106,31 @@ def test_a_bag_of_mavros_by_its_usual_names(tmp_path, mavros, capsys):
     said = capsys.readouterr().err
     assert "nothing that can be wrench" in said and "as it is" not in said
     assert f"It can be used, with other records than {mavros.name};" in said
+
+
+def test_check_compares_the_mounting_with_the_tree(tmp_path, mavros, short_dive):
+    """Of the file that init made of it, and of one that knows nothing of the IMU's place."""
+    bag, out = tmp_path / "dive.mcap", tmp_path / "c.yaml"
+    assert main(["init", str(mavros), "--vehicle", "bluerov2_heavy", "--out", str(out)]) == 0
+    (tree,) = Bag(mavros).iter_raw(["/tf_static"])
+    with BagWriter(bag) as writer:
+        writer.write("/tf_static", tree.type_name, 1, tree.data)
+        for arrival, role, message in short_dive:
+            message = to_core(message)
+            if role == ODOMETRY:
+                message = message._replace(frame_id="map", child_frame_id="base_link")
+            else:
+                message = message._replace(frame_id="imu_link" if role == IMU else "base_link")
+            message = from_core(message)
+            name = f"/{ROLE_NAMES[role]}"
+            writer.write(name, ROLE_TYPES[role], arrival, encode(message))
+    shipped, made = ri.load(SHIPPED), ri.load(out)
+    for imu, expected in ((shipped.imu, {"imu.position", "imu.rotation"}), (made.imu, set())):
+        found = ri.check(bag, dataclasses.replace(shipped, imu=imu))
+        said = {r.subject: r.text for r in found.remarks if "/tf_static" in r.text}
+        assert said.keys() == expected
+        if expected:
+            assert said["imu.position"].startswith("[0.1, 0.0, -0.2] by /tf_static")
 
 
 def test_two_twists_of_mavros_are_told_apart_by_their_usual_names(tmp_path):

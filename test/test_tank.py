@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiers import more
 
 from bench import DATA
 from rov_ident import config as configuration
@@ -46,7 +47,7 @@ def test_nodes_identify_the_measured_vehicle(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not TANK.is_dir(), reason="the measured tank record is not here")
-@pytest.mark.parametrize("y_v", [None, 0.0, -20.0])
+@pytest.mark.parametrize("y_v", [None, *more(0.0, -20.0)])
 def test_what_a_linear_model_lacks_is_named(y_v: float | None, tmp_path: Path) -> None:
     """Whatever linear drag it begins with: quadratic drag, and a lag of the thrusters."""
     document = configuration.to_parameters(configuration.load(CONFIG))

@@ -85,7 +85,7 @@ def mixed(rows, every):
     "names, alpha, dt, kind",
     [
         (12, 0.1, 0.05, "odometry"),
-        (30, 0.1, 0.05, "mixed"),
+        *more((30, 0.1, 0.05, "mixed")),
         *more((15, 0.5, 0.02, "mixed"), (15, 1.0, 0.05, "odometry"), (12, 0.1, 0.2, "mixed")),
     ],
 )

@@ -162,6 +162,7 @@ def test_heave_and_turns_are_told_surge_and_sway_are_not(turning):
     assert not {"ocean_current.north", "velocity_latency.delay"} & {*fit.names}
 
 
+@pytest.mark.study
 def test_intervals_hold_over_seeds(tmp_path):
     off = []
     for seed in range(2, 8):
@@ -172,6 +173,7 @@ def test_intervals_hold_over_seeds(tmp_path):
     assert max(off) < 4.0
 
 
+@pytest.mark.study
 def test_where_surge_and_sway_are_driven_nothing_is_sure(tmp_path):
     """How fast they go is not measured; it is said what to fly instead."""
     bag, file, theta = dive(tmp_path, "pilot", 0, 30.0)
@@ -196,3 +198,16 @@ def test_check_and_identify_go_the_same_way(turning, tmp_path, capsys):
     assert ri.load(out / "extended.yaml").name == "at_sea"
     found = json.loads((out / "result.json").read_text())
     assert found["explain"] is None and set(found["rmse"]) == {"p", "q", "r"}
+
+
+def test_plan_lets_surge_and_sway_rest(turning):
+    """And what no manoeuvre can show is not what it aims at."""
+    bag, file, _ = turning
+    found = ri.plan(file, [bag], duration=20.0)
+    assert found.candidates
+    assert not any(any(c.manoeuvre.amplitude[:2]) for c in found.candidates)
+    assert any("surge and sway have to rest" in reason for reason in found.left_out)
+    now, then = (
+        next(p for p in side if p.name == found.worst) for side in (found.before, found.after)
+    )
+    assert found.worst[0] not in "XY" and then.std < 0.9 * now.std

@@ -206,8 +206,11 @@ def _of_bag(path: Path, found: _Found) -> None:
         found.notes.append(f"{path.name} has no IMU: angular rates come from the odometry alone")
     for note in seen.notes:
         found.notes.append(note)
-    signs = FLIP_BODY if found.parameters["vehicle"].get("frame") != "flu" else np.ones(3)
-    mounted = topics.mounting(bag, seen)
+    signs = FLIP_BODY if found.parameters["vehicle"].get("frame") == "flu" else np.ones(3)
+    frames = {
+        role: (source.frame_id, source.child_frame_id) for role, source in seen.sources.items()
+    }
+    mounted = topics.mounting(bag, frames)
     for key, vector in mounted.items():
         found.put(key, [round(float(x), 6) + 0.0 for x in signs * vector], "/tf_static")
     if "/tf_static" in bag.topics and not mounted:

@@ -166,6 +166,7 @@ def library(limits: Limits) -> list[AlternatingTargets]:
         ("lateral swing (sway and yaw)", (0.0, b, 0.0, _TURN), none),
         ("surge swing with yaw zigzag", (a, 0.0, 0.0, _TURN), none),
         ("longitudinal swing (heave, with pitch multisine)", (0.0, 0.0, c, 0.0), (0.0, 0.7)),
+        ("heave swing and yaw zigzag, with roll and pitch multisine", (0.0, 0.0, c, _TURN), both),
         ("swing of all axes", (a, b, c, _TURN), both),
         ("swing of all axes, small", (0.5 * a, 0.5 * b, 0.5 * c, 0.5 * _TURN), (0.35, 0.35)),
     ]

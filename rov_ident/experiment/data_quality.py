@@ -6,7 +6,7 @@ the configuration lacks, and how well each coefficient is known after it.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -52,6 +52,7 @@ UNITS = (("m/s", "N"),) * 3 + (("rad/s", "N m"),) * 3  # of velocity and wrench 
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
 _SEEN = 2.8  # standard deviations: of nine suppositions one seems further off in 5 % of dives
+_MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
 
 
@@ -183,12 +184,15 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
     say("looking at its messages")
     bag, unmeasured = Bag(path), is_without_velocity(record.samples)
-    messages = inputs.messages(bag, inputs.select(bag, config), config)
+    topics = inputs.select(bag, config)
+    messages = inputs.messages(bag, topics, config)
     streams = gather(blanked(messages) if unmeasured else messages, config)
     if streams.duration < 1.0:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     notes = [Remark("messages", WARNING, note) for note in record.notes]
+    frames = inputs.first_frames(bag, topics, config)
     remarks = [*of_messages(streams, config), *notes, *_excitation(streams, config)]
+    remarks += _mountings(inputs.mounting(bag, frames), config)
     motion, quick = of_dynamics(record.samples, config), None
     if not any(remark.level == BAD for remark in motion):
         say("a quick fit")
@@ -211,6 +215,20 @@ def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
         Prospect(name, x, unit, s, of_fit(x, s, wide, s**2 < (1.0 - IDENTIFIABLE) * wide**2), wide)
         for name, x, unit, s, wide in rows
     )
+
+
+def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
+    """Whether `/tf_static` says of the sensors what the configuration says."""
+    for key, vector in told.items():
+        section, name = key.split(".")
+        configured = np.array(getattr(getattr(config, section), name))
+        if np.abs(vector - configured).max() > _MOUNTED:
+            bag, file = ([round(float(x), 3) + 0.0 for x in v] for v in (vector, configured))
+            yield Remark(
+                key, WARNING,
+                f"{bag} by /tf_static of the bag, {file} in the configuration (forward, starboard, "
+                "down): correct the wrong one",
+            )  # fmt: skip
 
 
 _MODEL = "model and data"

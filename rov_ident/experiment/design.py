@@ -22,6 +22,7 @@ from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Flight, Limits
 from rov_ident.experiment.data_quality import Prospect, prospects
 from rov_ident.io.write_messages import write_messages
+from rov_ident.model.coefficients import parse
 from rov_ident.model.equations import Array
 from rov_ident.offline.archive import Archive
 from rov_ident.offline.batch_fit import predicted_information
@@ -30,7 +31,7 @@ from rov_ident.reports.result import NORMAL, Shown
 from rov_ident.reports.table import PLUS_MINUS, Table
 from rov_ident.sampling.records import samples_of
 from rov_ident.sampling.smoothing import smoothed
-from rov_ident.sampling.without_velocity import is_without_velocity
+from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity
 from rov_ident.simulation.virtual_sensors import Dive, Suite
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ _DRAWS = 3  # vehicles within the present uncertainty, for which a manoeuvre mus
 _SHRINK = 0.75  # of a manoeuvre that is not safe; seven times until it is the smallest
 _SMALLEST = 0.15  # of the size in the library: smaller ones move a vehicle hardly more than noise
 _SHORTEST = 10.0  # s
+_SHOWN = 0.99  # of the present uncertainty: more than that left is as good as nothing learnt
 _OTHERS = 0.05  # weight of the mean over all coefficients, which decides where the worst is alike
 
 
@@ -157,10 +159,13 @@ def propose(
     velocity = bags is None or not any(bags.each(is_without_velocity))
     before = prospects(config, now)
     size = _sizes(config)
-    worst = before[int(np.argmax(np.array([p.std for p in before]) / size))].name
+    relative = np.array([p.std for p in before]) / size
     vehicles = _vehicles(config, now)
-    candidates, left_out, scores = [], [], []
+    candidates, left_out, predicted = [], [], []
     for one in closed_loop_manoeuvres.library(limits):
+        if not velocity and any(one.amplitude[:2]):
+            left_out.append(f"{one.name}: without a velocity sensor surge and sway have to rest")
+            continue
         tell(one.name)
         found = _safe(config, vehicles, one, duration, limits)
         if found is None:
@@ -169,9 +174,17 @@ def propose(
         information = _information(config, *found, duration, limits, velocity)
         std = np.array([p.std for p in prospects(config, now + information)])
         candidates.append(Candidate(*found, information, duration, limits))
-        scores.append(float((std / size).max() * (1.0 + _OTHERS * np.mean(std / size))))
+        predicted.append(std / size)
     if not candidates:
         raise UserError("no manoeuvre is safe within these limits: allow more room or less thrust")
+    # what no manoeuvre shows decides nothing
+    shown = np.min(predicted, axis=0) < _SHOWN * relative
+    if not velocity:
+        shown &= [not is_impossible(parse(name)) for name in config.estimate]
+    if not shown.any():
+        shown[:] = True
+    worst = before[int(np.argmax(np.where(shown, relative, 0.0)))].name
+    scores = [float(r[shown].max() * (1.0 + _OTHERS * np.mean(r[shown]))) for r in predicted]
     best = int(np.argmin(scores))
     after = prospects(config, now + candidates[best].information)
     others = [(c.manoeuvre.name, s) for c, s in zip(candidates, scores, strict=True)]

@@ -22,6 +22,7 @@ import numpy as np
 from rov_ident.config import Config, Inputs, schema, thruster_signal
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import (
+    FLIP_BODY,
     from_core,
     quaternion_between,
     quaternion_multiply,
@@ -326,6 +327,9 @@ def _full(type_name: str) -> str:
 # ------------------------------------------------------------------ what a bag has
 
 
+FrameIds = tuple[str, str]
+
+
 class Seen(NamedTuple):
     """A topic of a bag that can serve: `topic`, its type as `nav_msgs/Odometry`, its rate [Hz], and
     the frames of its first message."""
@@ -391,11 +395,25 @@ def _seen(bag: Bag, topic: str, kind: str) -> Seen:
     return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)
 
 
-def mounting(bag: Bag, seen: Survey) -> dict[str, Array]:
-    """Where `/tf_static` says that the sensors are, (3,) each, forward-left-up in the body frame:
-    `imu.position`, `imu.rotation`, `odometry.position`; what it does not say is left out.
+def first_frames(bag: Bag, chosen: Mapping[str, str], config: Config) -> dict[str, FrameIds]:
+    """(frame_id, child_frame_id) of the first message of odometry and IMU, by role; ``chosen`` are
+    the topics by role."""
+    found: dict[str, FrameIds] = {}
+    only = {role: topic for role, topic in chosen.items() if role in (ODOMETRY, POSE, IMU)}
+    for role, message in messages(bag, only, config):
+        found.setdefault(role, (message.frame_id, getattr(message, "child_frame_id", "")))
+        if len(found) == len({ODOMETRY, IMU} & set(only)):
+            break
+    return found
 
-    The body frame is that of the odometry (its child), or `base_link`.
+
+def mounting(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Array]:
+    """Where `/tf_static` says that the sensors are, (3,) each, forward-starboard-down in the body
+    frame: `imu.position` [m], `imu.rotation` [rad], `odometry.position` [m]; what it does not say
+    is left out.
+
+    ``frames`` as `first_frames` gives them. The body frame is that of the odometry (its child), or
+    `base_link`; the tree has its axes forward, left, up.
     """
     if "/tf_static" not in bag.topics:
         return {}
@@ -422,12 +440,11 @@ def mounting(bag: Bag, seen: Survey) -> dict[str, Array]:
             attitude = quaternion_multiply(q, attitude)
         return None
 
-    motion, imu = seen.sources.get(ODOMETRY), seen.sources.get(IMU)
-    body = motion.child_frame_id if motion and motion.child_frame_id else "base_link"
+    motion, child = frames.get(ODOMETRY, ("", ""))
     found: dict[str, Array] = {}
-    if imu and (at := placed(imu.frame_id, body)):
-        found["imu.position"] = at[0]
-        found["imu.rotation"] = np.array(quaternion_to_euler(at[1]))
-    if motion and not motion.child_frame_id and (at := placed(motion.frame_id, body)):
-        found["odometry.position"] = at[0]
+    if IMU in frames and (at := placed(frames[IMU][0], child or "base_link")):
+        found["imu.position"] = FLIP_BODY * at[0]
+        found["imu.rotation"] = FLIP_BODY * quaternion_to_euler(at[1])
+    if motion and not child and (at := placed(motion, "base_link")):
+        found["odometry.position"] = FLIP_BODY * at[0]
     return found

@@ -29,7 +29,7 @@ from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
 from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, measured_motion, numbers, predicted
-from rov_ident.sampling.without_velocity import is_without_velocity, refusal
+from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
 CHANNELS: dict[str, tuple[str, ...]] = {
@@ -309,10 +309,9 @@ def _stage(
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
-    # Only turning moments and a tilt show u and v, and no measurement says whether these terms of
-    # the model are right: what they suggest is in the values, but the intervals are the prior's.
+    # What moments and tilt suggest of these is in the values, but the intervals are the prior's.
     own = _coefficients(config).items()
-    impossible = [n for n, c in own if unmeasured and c.motions & {0, 1}]
+    impossible = [n for n, c in own if unmeasured and is_impossible(c)]
     for i in (names.index(n) for n in impossible):
         covariance[i] = covariance[:, i] = 0.0
         covariance[i, i] = prior.std[i] ** 2

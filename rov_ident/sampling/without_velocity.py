@@ -20,6 +20,7 @@ from rov_ident.core.messages import ODOMETRY, Message, Odometry
 from rov_ident.core.quaternions import rotation
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
+from rov_ident.model.coefficients import Coefficient
 from rov_ident.model.equations import force_of_one
 from rov_ident.model.scales import WORKING_SPEED
 
@@ -102,6 +103,13 @@ def blank(message: Odometry) -> Odometry:
 def is_without_velocity(samples: NDArray[np.void]) -> bool:
     """Whether samples (k,) of SAMPLE have depths in place of linear velocities."""
     return bool((samples["depth_variance"] > 0.0).any())
+
+
+def is_impossible(coefficient: Coefficient) -> bool:
+    """Whether a coefficient cannot be told without linear velocity: it multiplies u or v, or acts
+    along them. Only turning moments and a tilt show these, and no measurement says whether such
+    terms of the model are right."""
+    return bool(coefficient.motions & {0, 1})
 
 
 class SimulatedVelocity:
