@@ -24,7 +24,7 @@ _SUPPOSED = (
     2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
 )
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
-_WHITE = 2.0  # times what noise explains: half of it is then something else
+_WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
 _CHANCE = 2.0  # standard deviations: what 5 % of fits exceed if one direction decides
 
@@ -121,9 +121,9 @@ def consistency_of(
 
     ``values`` (n,) are not yet drawn to what is physically possible. ``unexplained`` (6,) is the
     force that lasts a second and that the model does not have, relative to the working wrench; NaN
-    where it is not known. ``lasting`` (6,), of the recursive estimators, is the power of innovations
-    that are added up over a second, in motion: 1 is expected, NaN where it is not known. ``sensors``
-    are test ratios of the odometry's parts against the IMU.
+    where it is not known. ``lasting`` (6,), of the recursive estimators, is the power of
+    innovations added up over a second in motion: 1 is expected, NaN where it is not known.
+    ``sensors`` are test ratios of the odometry's parts against the IMU.
     """
     tests = []
     for axis, share in zip(AXES, unexplained.tolist(), strict=True):
@@ -162,7 +162,7 @@ def consistency_of(
             Test(
                 f"odometry and IMU: {part}", float(np.sqrt(ratio)), _SENSORS,
                 f"the {part} of the odometry and the IMU contradict each other (they differ by "
-                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings, stamps and biases",
+                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings, stamps, biases",
             )
         )  # fmt: skip
     return Consistency(tuple(tests))

@@ -352,7 +352,7 @@ def _judge_tilt(k, s):
     """How uncertain the attitude is, where its error lasts a second.
 
     With white noise of density q of the gyro and r of the attitude, the error of their steady
-    filter has the density ``2 q r / (q + w^2 r)`` at the frequency w: little more than ``2 q / w^2``
+    filter has the density ``2 q r / (q + w^2 r)`` at the frequency w: nearly ``2 q / w^2``,
     whatever r is. Without a gyro nothing is known of how long an error lasts.
     """
     k.tilt = 0.0
