@@ -42,11 +42,15 @@ def dive(case, driving, seed):
 
 def report_of(case, driving, seed, kind):
     vehicle, parameters, messages = dive(case, driving, seed)
+    return vehicle, reported(parameters, messages, kind)
+
+
+def reported(parameters, messages, kind):
     online = OnlineEstimator(configuration.from_parameters(parameters), kind)
     for _, role, message in messages:
         online.push(role, message)
     online.flush()
-    return vehicle, online.report()
+    return online.report()
 
 
 @pytest.mark.parametrize(
@@ -75,6 +79,44 @@ def test_what_a_model_cannot_explain_is_said_and_nothing_has_converged(case, kin
     assert report.consistency.sentence in [test.failure for test in failed]
 
 
+PILOTED = {
+    "sag": lambda rng: {
+        "resistance": rng.uniform(0.02, 0.03), "advance": rng.uniform(0.2, 0.3),
+        "discharge": rng.uniform(0.3, 1.0),
+    },
+    "gyro bias": lambda rng: {
+        "gyro_bias": tuple(rng.uniform(0.008, 0.02, 3) * rng.choice([-1.0, 1.0], 3)),
+        "gyro_is_shared": True,
+    },
+    "clocks": lambda rng: {"imu_clock": rng.uniform(0.02, 0.03) * rng.choice([-1.0, 1.0])},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "kind", "seed"),
+    [
+        *itertools.product(PILOTED, ("rls", "ukf"), (1,)),
+        *more(*itertools.product(PILOTED, ("rls", "ukf"), (2, 3))),
+    ],
+)
+def test_so_it_is_where_a_pilot_rests_between(case, kind, seed):
+    """Noise has come down again by the end of the dive, and the last messages agree."""
+    rng = np.random.default_rng([seed, 19])
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(**PILOTED[case](rng))
+    truth = sea.dive(vehicle, unknown, "pilot", 100.0, rng)
+    report = reported(sea.told(vehicle, unknown, rng), sea.measured(truth, unknown, rng), kind)
+    assert not report.consistency.consistent
+    assert State.CONVERGED not in report.states
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_a_righting_moment_of_a_measured_attitude_is_no_news(kind):
+    """Roll and pitch of a vehicle that a pilot steers: innovations as large as noise explains."""
+    _, report = report_of("", "pilot", 1, kind)
+    lasting = {t.name: t.value for t in report.consistency.tests if t.name.startswith("whiteness")}
+    assert lasting["whiteness: K"] < 1.3 and lasting["whiteness: M"] < 1.3
+
+
 def test_a_fit_says_so_and_widens_its_intervals(tmp_path):
     vehicle, parameters, messages = dive("sag", "six-axis", 3)
     write_messages(tmp_path / "dive.mcap", messages)
@@ -101,12 +143,14 @@ def test_each_question_has_its_limit(heavy):
     prior, quiet = prior_of(config, effects=True), np.full(6, 0.001)
     names = prior.names
 
-    def failed(values=prior.mean, unexplained=quiet, sensors=None):
-        found = consistency_of(config, prior, values, unexplained, sensors)
+    def failed(values=prior.mean, unexplained=quiet, lasting=None, sensors=None):
+        found = consistency_of(config, prior, values, unexplained, lasting, sensors)
         return [test.name for test in found.tests if not test.passed]
 
     assert failed() == []
     assert failed(unexplained=np.array([0.0, 0.0, 0.02, 0.0, np.nan, 0.0])) == ["unexplained: Z"]
+    lasting = np.array([3.9, np.nan, 0.1, 1.0, 4.1, 2.0])
+    assert failed(lasting=lasting) == ["whiteness: M"]
     assert failed(sensors={"velocity": 1.2, "attitude": 16.0}) == ["odometry and IMU: attitude"]
     far = prior.mean.copy()
     far[names.index("thrust_scale.scale")] -= 3.0 * 0.15

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from rov_ident.config.prior import prior_of
+from rov_ident.core.whiteness import LARGEST
 from rov_ident.estimation import rls, ukf
-from rov_ident.estimation.innovation_monitor import LARGEST, NIS_TIME, first_monitor, lost, watch
+from rov_ident.estimation.innovation_monitor import NIS_TIME, TIME, first_monitor, lost, watch
 from rov_ident.estimation.process_noise import process
 from rov_ident.sampling.records import samples_of
 from rov_ident.simulation.virtual_sensors import dive
@@ -27,7 +28,7 @@ def watched(monitor, constants, i, innovations, moving):
     for e in innovations:
         monitor[i].since = 0.05
         monitor[i].acting = 10.0 * monitor[i].density
-        count += watch(monitor[i], constants[0], i, 1.5, moving, 5.0, e)
+        count += watch(monitor[i], constants[0], i, 1.5, moving, moving, 5.0, e)
     return count
 
 
@@ -62,6 +63,22 @@ def test_white_innovations_are_no_change_and_no_outliers(heavy):
     assert watched(monitor, constants, 1, white, True) == 0
     assert monitor["nis"][1] == pytest.approx(1.0, abs=0.6)
     assert monitor["density"][1] < constants["first"][0, 1]
+
+
+def test_what_lasts_a_second_in_motion_is_told_from_noise(heavy):
+    """By the power of sums: also where the NIS of each innovation hardly differs from 1."""
+    constants, rng = process(heavy), np.random.default_rng(4)
+    for lasting, least, most in ((0.0, 0.4, 2.0), (0.6, 4.0, 20.0)):
+        monitor = first_monitor(constants)
+        pushed = np.repeat(rng.choice([-1.0, 1.0], 240), 20)  # for a second each
+        e = rng.standard_normal(len(pushed)) + lasting * pushed
+        watched(monitor, constants, 3, e[: 24 * 20], True)
+        assert monitor["judged"][3] == pytest.approx(24.0 - TIME, abs=0.1)
+        watched(monitor, constants, 3, 3.0 * e, False)  # nor does rest say anything
+        assert monitor["judged"][3] == pytest.approx(24.0 - TIME, abs=0.1)
+        watched(monitor, constants, 3, e, True)
+        assert least < monitor["power"][3] < most
+        assert monitor["nis"][3] < 2.5
 
 
 @numba.njit

@@ -144,6 +144,7 @@ def test_rows_are_the_tangent_of_a_textbook_observer(heavy, fine, slope):
     rows["dt"][0], rows["restart"][0] = 0.0, True
     rows["odometry_variance"][:], rows["gyro_variance"] = 1e-8, 1e-8
     rows["odometry"][::2, :3] = np.nan  # the gyro twice as often
+    rows["tilt"] = 1e-6
     if slope:  # any wrench within the interval, as long as both sides use it alike
         rows["wrench_slope"] = np.random.default_rng(1).standard_normal((len(rows), 6))
         rows["wrench_slope"] *= [20.0, 20.0, 20.0, 2.0, 2.0, 2.0]

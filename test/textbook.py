@@ -220,6 +220,9 @@ def innovations(config, theta, rows, densities, gains=None):
                 transition[:, i] = (there - back) / 2e-6
             strength = (wrench.relative_std * row["wrench"]) ** 2 + np.square(wrench.floor_std)
             strength *= wrench.correlation_time
+            for axis in np.eye(3):  # the vehicle a little turned, and weight in its axes with it
+                turned = model.body.restoring @ np.cross(row["down"], axis)
+                strength += row["tilt"] * np.square(turned)
             noise = inverse @ np.diag(strength) @ inverse.T + np.diag(density)
             p = transition @ p @ transition.T + dt * noise
         for i in range(6):

@@ -24,6 +24,7 @@ _SUPPOSED = (
     2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
 )
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
+_WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
 _CHANCE = 2.0  # standard deviations: what 5 % of fits exceed if one direction decides
 
@@ -113,13 +114,16 @@ def consistency_of(
     prior: Prior,
     values: Array,
     unexplained: Array,
+    lasting: Array | None = None,
     sensors: Mapping[str, float] | None = None,
 ) -> Consistency:
     """Judge an estimate.
 
     ``values`` (n,) are not yet drawn to what is physically possible. ``unexplained`` (6,) is the
     force that lasts a second and that the model does not have, relative to the working wrench; NaN
-    where it is not known. ``sensors`` are test ratios of the odometry's parts against the IMU.
+    where it is not known. ``lasting`` (6,), of the recursive estimators, is the power of
+    innovations added up over a second in motion: 1 is expected, NaN where it is not known.
+    ``sensors`` are test ratios of the odometry's parts against the IMU.
     """
     tests = []
     for axis, share in zip(AXES, unexplained.tolist(), strict=True):
@@ -129,6 +133,16 @@ def consistency_of(
                     f"unexplained: {axis}", share, FIRST_FORCE,
                     f"something acts along {axis} that the model does not have: {share:.1%} of "
                     "the working wrench; rov-ident explain looks for the cause",
+                )
+            )  # fmt: skip
+    powers = [] if lasting is None else lasting.tolist()
+    for axis, power in zip(AXES, powers):
+        if np.isfinite(power):
+            tests.append(
+                Test(
+                    f"whiteness: {axis}", float(np.sqrt(power)), _WHITE,
+                    f"predictions along {axis} are off for a second by {np.sqrt(power):.1f} times "
+                    "what noise explains: rov-ident explain looks for the cause",
                 )
             )  # fmt: skip
     supposed = {".".join(key) for key in config.nuisance_std}
@@ -148,7 +162,7 @@ def consistency_of(
             Test(
                 f"odometry and IMU: {part}", float(np.sqrt(ratio)), _SENSORS,
                 f"the {part} of the odometry and the IMU contradict each other (they differ by "
-                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings and stamps",
+                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings, stamps, biases",
             )
         )  # fmt: skip
     return Consistency(tuple(tests))

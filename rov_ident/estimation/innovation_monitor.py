@@ -8,6 +8,8 @@ standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mea
   as a coefficient. It starts high and comes down: what an estimator learns with too little process
   noise weighs too much for ever. Innovations are added up over a second: what they have in common
   is process noise, while each alone is nearly all the sensor's.
+* *Whiteness.* Noise that comes down where the vehicle rests is not what it does in motion: the
+  power of the sums, averaged over a minute of motion, says whether the model explains that, too.
 * *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
   average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
@@ -18,15 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.jit import inlined, record
+from rov_ident.core.whiteness import LARGEST, SUM_TIME, averaged
 
 # "Constants of the process noise" and "Forgetting" are tables of docs/accuracy.md.
-SUM_TIME = 1.0  # s; over which innovations are added up ("Constants of the process noise")
 FIRST_TIME, TIME = 1.0, 20.0  # s; twice the power doubles the density: at first, later (same table)
 _FASTEST = 0.1  # the most by which one innovation moves an average: ten are needed for anything
 STEADY = 4.0  # a squared sum counts for at most this: 2 sigma, beyond which 5 % of normal ones are
-LARGEST = 3.0  # sigma that one innovation counts for at most: 0.3 % of normal ones are larger
 NIS_TIME = 2.0  # s; over which the NIS is averaged ("Forgetting")
 LEVEL_TIME = 60.0  # s; over which the usual NIS is averaged: several manoeuvres of ten seconds
+# s of an axis's own motion, in which innovations teach and do not test: what they owe to
+# coefficients far off is expected of them to first order only ("Does the model explain the data?")
+_LESSON = 5.0
 _LOST = 2  # outliers in a row: by chance as rare as the square of the share of outliers
 
 MONITOR = record(
@@ -37,6 +41,9 @@ MONITOR = record(
         ("expected", "f8"),  # variance of that
         ("since", "f8"),  # s since this velocity was measured: counted by the estimator
         ("seen", "f8"),  # s of innovations so far
+        ("driven", "f8"),  # s in which this velocity moved, of these
+        ("judged", "f8"),  # s since which the power is averaged
+        ("power", "f8"),  # of normalised sums, averaged: 1 is expected
         ("nis", "f8"),  # averaged: 1 is expected
         ("usual", "f8"),  # averaged for longer
         ("outliers", "i8"),  # in a row: of linear and of angular velocity, with their first axes
@@ -49,7 +56,7 @@ def first_monitor(process: NDArray[np.void]) -> NDArray[np.void]:
     """(6,) of MONITOR, before any innovation; ``process`` (1,) of PROCESS."""
     out = np.zeros(6, dtype=MONITOR)
     out["density"] = np.maximum(process["first"][0], process["floor"][0])
-    out["nis"] = out["usual"] = 1.0
+    out["power"] = out["nis"] = out["usual"] = 1.0
     return out
 
 
@@ -62,8 +69,10 @@ def interrupt(m):
 
 
 @inlined
-def watch(m, process, i, room, moving, gate, innovation):
+def watch(m, process, i, room, moving, own, gate, innovation):
     """Take in a normalised innovation of axis i; whether it is an outlier.
+
+    ``moving`` says whether any velocity is, ``own`` whether that of this axis is.
 
     ``room`` is the power of summed innovations from which process noise is added; 1 is expected.
     Noise that is added by chance does not go below the floor by chance: the less room, the more
@@ -79,8 +88,12 @@ def watch(m, process, i, room, moving, gate, innovation):
     if moving:
         keep = np.exp(-m.since / SUM_TIME)
         m.seen += m.since
+        m.driven += m.since if own else 0.0
         m.summed = keep * m.summed + min(max(innovation, -LARGEST), LARGEST)
         m.expected = keep * keep * m.expected + 1.0
+        if m.seen > TIME and m.driven > _LESSON:
+            m.judged += m.since
+            m.power = averaged(m.power, m.judged, m.since, m.summed, m.expected)
         excess = min(m.summed * m.summed / m.expected, STEADY) - room
         blend = min(m.since / min(FIRST_TIME + 0.25 * m.seen, TIME), _FASTEST)
         density = max(m.density + blend * excess * m.acting, process.floor[i])

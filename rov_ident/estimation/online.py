@@ -17,6 +17,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
 from rov_ident.core.threads import one_blas_thread
+from rov_ident.core.whiteness import JUDGED_TIME
 from rov_ident.effects import EFFECTS, parameter
 from rov_ident.estimation import innovation_monitor, rls, ukf
 from rov_ident.estimation.consistency import Consistency, consistency_of
@@ -349,8 +350,8 @@ class OnlineEstimator:
         """The present coefficients, made physical, with their state in words."""
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         consistency = consistency_of(
-            self.config, self.prior, raw.values, self._unexplained(),
-            self.sampler.kinematic_filter.test_ratios,
+            self.config, self.prior, raw.values, self._unexplained(), self._lasting(),
+            self.sampler.kinematic_filter.contradictions,
         )  # fmt: skip
         gain = gain_of(raw.covariance, self.prior.std)
         covariance = raw.covariance + rigid_body_covariance(
@@ -396,6 +397,11 @@ class OnlineEstimator:
         monitor, first = self._state.monitor, self._task.process["first"][0]
         share = FIRST_FORCE * np.sqrt(monitor["density"] / first)
         return np.where(monitor["seen"] > innovation_monitor.TIME, share, np.nan)
+
+    def _lasting(self) -> Array:
+        """(6,): power of innovations added up over a second, NaN where that is not known."""
+        monitor = self._state.monitor
+        return np.where(monitor["judged"] > JUDGED_TIME, monitor["power"], np.nan)
 
     @property
     def stamp(self) -> int:

@@ -1,7 +1,8 @@
 """What moves the vehicle besides the model, as process noise: one definition for both estimators.
 
-Two parts. The noise of the thruster wrench is configured (``wrench``). What the model lacks is not
-known beforehand: it starts high and follows the innovations (``innovation_monitor``).
+Three parts. The noise of the thruster wrench is configured (``wrench``). The righting moment is
+that of a measured attitude. What the model lacks is not known beforehand: it starts high and
+follows the innovations (``innovation_monitor``).
 """
 
 import numpy as np
@@ -22,6 +23,7 @@ PROCESS = record(
         ("largest", "f8", (6,)),  # and its most
         ("relative", "f8"),  # variance of the wrench relative to its square
         ("least", "f8", (6,)),  # its variance at zero wrench
+        ("restoring", "f8", (6, 3)),  # N, N m: times the unit vector down, the wrench of weight
         ("lasting", "f8"),  # s; how long an error of it lasts, at least
     ]
 )
@@ -39,6 +41,7 @@ def process(config: Config) -> NDArray[np.void]:
     out["largest"] = np.maximum(out["floor"], np.square(LARGEST_FORCE * working))
     out["relative"] = wrench.relative_std**2
     out["least"] = np.square(wrench.floor_std)
+    out["restoring"] = model.body.restoring
     out["lasting"] = wrench.correlation_time
     return out
 
@@ -47,11 +50,20 @@ def process(config: Config) -> NDArray[np.void]:
 def wrench_noise(constants, sample, out):
     """out (6,): variance density [N2 s, (N m)2 s] of the wrench; an error lasts as long as it.
 
+    A tilt by the small angles a turns down d by ``d x a``, and changes the wrench ``R d`` of weight
+    by ``(R_i x d) a``. Without that, a vehicle at rest would be one that a righting moment does not
+    move, and thrust and coefficients be learnt from it: too large, and too surely.
+
     Whether some of the wrench is in doubt, so that nothing about noise can be learnt.
     """
     lasting, doubtful = max(constants.lasting, sample.hold), False
     for i in range(6):
         known = constants.relative * sample.wrench[i] ** 2 + constants.least[i]
-        out[i] = lasting * (known + sample.wrench_doubt[i])
+        x, y, z = constants.restoring[i]
+        a = y * sample.down[2] - z * sample.down[1]
+        b = z * sample.down[0] - x * sample.down[2]
+        c = x * sample.down[1] - y * sample.down[0]
+        tilted = sample.tilt * (a * a + b * b + c * c)
+        out[i] = lasting * (known + sample.wrench_doubt[i]) + tilted
         doubtful |= sample.wrench_doubt[i] > 0.0
     return doubtful

@@ -96,7 +96,10 @@ class ReferenceUkf:
         inverse = np.linalg.inv(mass + raised(mass, self.task.lightest))
         strength = (wrench.relative_std * row["wrench"]) ** 2 + np.square(wrench.floor_std)
         lasting = max(wrench.correlation_time, row["hold"])
-        forces = lasting * (inverse * (strength + row["wrench_doubt"])) @ inverse.T
+        strength = lasting * (strength + row["wrench_doubt"])
+        turned = np.cross(self.model.body.restoring, row["down"])
+        strength += row["tilt"] * np.square(turned).sum(axis=1)
+        forces = (inverse * strength) @ inverse.T
         q = np.zeros_like(self.filter.P)
         q[:6, :6] = (forces + np.diag(density)) * row["dt"]
         return q

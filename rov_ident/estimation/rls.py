@@ -616,7 +616,8 @@ def _update(task, state, work, sample, side, info):
             s.spread[2, i] = s.spread[1, count]
             count += 1
             measured, info.nis[i] = True, e * e
-            outlier |= watch(state.monitor[i], task.process[0], i, _ROOM, moving, gate, e)
+            own = work.moving[i] != 0
+            outlier |= watch(state.monitor[i], task.process[0], i, _ROOM, moving, own, gate, e)
         if measured:
             anew |= lost(state.monitor, first, outlier)
         if outlier:

@@ -461,8 +461,9 @@ def _update(task, state, work, sample, side, out):
             predicted, spread = _seen(task, x, p, side, i)
             innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
             out.nis[i] = innovation**2
+            own = sample.moving[i] != 0
             outlier |= watch(
-                state.monitor[i], task.process[0], i, _ROOM, moving, s.gate, innovation
+                state.monitor[i], task.process[0], i, _ROOM, moving, own, s.gate, innovation
             )
         anew |= lost(state.monitor, first, outlier)
         if outlier:

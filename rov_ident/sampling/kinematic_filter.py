@@ -19,6 +19,7 @@ from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.messages import Array, Imu, Odometry
 from rov_ident.core.quaternions import rotation, turned
+from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME, averaged
 from rov_ident.effects import affects_sensors, compiled, correct, heading_error
 from rov_ident.effects.base import Reading
 from rov_ident.sampling.queues import MERGE
@@ -35,6 +36,9 @@ STATE = record(
         ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2
         ("refused", "i8"),  # attitudes in a row
+        ("since_attitude", "f8"),  # s since one was measured
+        ("turned", "f8"),  # rad2: variance of what the noise of the rates has turned it by since
+        ("tilt", "f8"),  # rad2 s: variance density of its error, where that lasts a second
         ("v", "f8", (3,)),  # m/s over ground, at the origin
         ("power", "f8", (6,)),  # mean square of nu, of late
         ("rate", "f8", (3,)),  # rad/s, bias removed
@@ -50,6 +54,10 @@ STATE = record(
         ("p_vb", "f8"),
         ("p_bb", "f8"),
         ("test_ratio", "f8", (3,)),  # NIS over its expectation, averaged, of _PARTS
+        # of the same, by axis: normalised innovations added up with fading memory, their variance,
+        # power of these sums, averaged; s since the last one, and since the first
+        *floats((3, 3), "summed lasting"),
+        *floats((3,), "expected since judged"),
     ]
 )
 
@@ -134,6 +142,7 @@ class KinematicFilter:
     def clear(self) -> None:
         """Forget the motion and the biases of the IMU."""
         self.state = np.zeros(1, dtype=STATE)
+        self.state["lasting"] = 1.0
         self.state["gyro_bias_variance"] = self._settings["gyro_bias_variance"]
         self._last_imu = -math.inf  # s
         self._measured = np.zeros(1, dtype=_MEASURED)
@@ -155,6 +164,14 @@ class KinematicFilter:
     def test_ratios(self) -> dict[str, float]:
         """Test ratios of the parts of the odometry against the IMU, of late; 1 is expected."""
         return dict(zip(_PARTS, self.state["test_ratio"][0].tolist(), strict=True))
+
+    @property
+    def contradictions(self) -> dict[str, float]:
+        """The same, or the power of what differs for a second in the last minute if it is more."""
+        known = self.state["judged"][0] > JUDGED_TIME
+        powers = np.where(known, self.state["lasting"][0].max(axis=1), 0.0)
+        largest = np.maximum(self.state["test_ratio"][0], powers)
+        return dict(zip(_PARTS, largest.tolist(), strict=True))
 
     def step(
         self,
@@ -227,8 +244,23 @@ def _assign(a, b):
 
 
 @inlined
-def _average(test_ratio, part, nis):
-    test_ratio[part] += _AVERAGE * (min(nis, _LARGEST_NIS) - test_ratio[part])
+def _compare(k, part, difference, variance):
+    """Take in the difference (3,) of odometry and IMU; its square over the expected one."""
+    nis, since = 0.0, k.since[part]
+    keep = np.exp(-since / SUM_TIME)
+    k.since[part] = 0.0
+    k.judged[part] += since
+    k.expected[part] = keep * keep * k.expected[part] + 1.0
+    for i in range(3):
+        innovation = difference[i] / np.sqrt(variance)
+        nis += innovation * innovation / 3.0
+        counted = min(max(innovation, -LARGEST), LARGEST)
+        k.summed[part, i] = keep * k.summed[part, i] + counted
+        k.lasting[part, i] = averaged(
+            k.lasting[part, i], k.judged[part], since, k.summed[part, i], k.expected[part]
+        )
+    k.test_ratio[part] += _AVERAGE * (min(nis, _LARGEST_NIS) - k.test_ratio[part])
+    return nis
 
 
 @inlined
@@ -262,6 +294,7 @@ def _predict_attitude(k, s, rate, dt, has_imu, gyro_variance):
             mean_rate[i] = 0.5 * (rate[i] + k.rate[i])
     _assign(k.q, turned(k.q, mean_rate * dt))
     k.attitude_variance += gyro_variance * dt * dt + _DRIFT * dt
+    k.turned += gyro_variance * dt * dt
     if has_imu:
         k.attitude_variance += dt * (dt * k.gyro_bias_variance - 2.0 * k.attitude_gyro_bias)
         k.attitude_gyro_bias -= dt * k.gyro_bias_variance
@@ -293,8 +326,7 @@ def _correct_attitude(k, s, q):
     e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
     sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
     e *= 2.0 * sign
-    nis = (e[0] ** 2 + e[1] ** 2 + e[2] ** 2) / (3.0 * total)
-    _average(k.test_ratio, _ATTITUDE, nis)
+    nis = _compare(k, _ATTITUDE, e, total)
     credible, anew = nis < s.gate**2, False
     if not credible and k.chances > 0:
         anew = credible = True
@@ -313,6 +345,22 @@ def _correct_attitude(k, s, q):
         if k.refused > 1:  # a lone one must not open the gate, nor give the next weight
             k.attitude_variance += _GROWTH * k.attitude_variance + s.attitude_variance
     return credible, anew
+
+
+@inlined
+def _judge_tilt(k, s):
+    """How uncertain the attitude is, where its error lasts a second.
+
+    With white noise of density q of the gyro and r of the attitude, the error of their steady
+    filter has the density ``2 q r / (q + w^2 r)`` at the frequency w: nearly ``2 q / w^2``,
+    whatever r is. Without a gyro nothing is known of how long an error lasts.
+    """
+    k.tilt = 0.0
+    if k.inertial and k.since_attitude > 0.0:
+        r = s.attitude_variance * k.since_attitude
+        q = k.turned / k.since_attitude * SUM_TIME**2
+        k.tilt = 2.0 * q * r / (q + r)
+    k.since_attitude = k.turned = 0.0
 
 
 @inlined
@@ -355,11 +403,10 @@ def _predict_velocity(k, s, acceleration, dt):
 @inlined
 def _correct_velocity(k, s, v, variance, begins, anew):
     """Correct by the velocity v (3,); whether it was taken, and whether all begins anew."""
-    total, nis = k.p_vv + variance, 0.0
+    total, nis, difference, taken = k.p_vv + variance, 0.0, np.empty(3), True
     for i in range(3):
-        nis += (v[i] - k.v[i]) ** 2
-    nis /= 3.0 * total
-    taken = True
+        difference[i] = v[i] - k.v[i]
+        nis += difference[i] ** 2 / (3.0 * total)
     if not begins and k.chances > 0:
         # Nobody knows yet which of two that contradict each other is wrong.
         anew = anew or nis > s.gate**2
@@ -371,14 +418,13 @@ def _correct_velocity(k, s, v, variance, begins, anew):
         k.p_vb = 0.0
         k.p_bb = s.accelerometer_bias_variance
     else:
-        _average(k.test_ratio, _VELOCITY, nis)
+        _compare(k, _VELOCITY, difference, total)
         taken = nis <= s.gate**2
         if taken:
             gain, bias_gain = k.p_vv / total, k.p_vb / total
             for i in range(3):
-                innovation = v[i] - k.v[i]
-                k.v[i] += gain * innovation
-                k.accelerometer_bias[i] += bias_gain * innovation
+                k.v[i] += gain * difference[i]
+                k.accelerometer_bias[i] += bias_gain * difference[i]
             k.p_bb -= bias_gain * k.p_vb
             k.p_vb *= 1.0 - gain
             k.p_vv *= 1.0 - gain
@@ -392,13 +438,11 @@ def _correct_gyro_bias(k, s, rate, m, share, r_angular, gyro_variance):
     """Compare the gyro at the odometry's instant, ``share`` of dt ago, with the odometry's rate."""
     total = k.gyro_bias_variance + r_angular + gyro_variance
     gain, angle_gain = k.gyro_bias_variance / total, k.attitude_gyro_bias / total
-    change, nis = np.empty(3), 0.0
+    change = np.empty(3)
     for i in range(3):
         then = rate[i] + share * (k.rate[i] - rate[i])
         change[i] = then - m.angular[i]
-        nis += change[i] ** 2 / (3.0 * total)
-    _average(k.test_ratio, _RATE, nis)
-    if nis < s.gate**2:
+    if _compare(k, _RATE, change, total) < s.gate**2:
         k.gyro_bias_variance *= 1.0 - gain
         k.attitude_variance -= angle_gain * k.attitude_gyro_bias
         k.attitude_gyro_bias *= 1.0 - gain
@@ -459,6 +503,9 @@ def fuse(
         else:
             rate[i] = m.angular[i] if has_odometry else k.rate[i]
     if k.known:
+        for part in range(3):
+            k.since[part] += dt
+        k.since_attitude += dt
         _predict_attitude(k, s, rate, dt, has_imu, gyro_variance)
     anew = False
     if has_odometry:
@@ -468,6 +515,7 @@ def fuse(
             _begin_attitude(k, s, q)
         else:
             credible, anew = _correct_attitude(k, s, q)
+        _judge_tilt(k, s)
         if credible:
             _assign(out.attitude, q)
     _assign(out.orientation, k.q)
@@ -519,7 +567,7 @@ def fuse(
         out.restart = out.anew = True
         for i in range(6):
             k.power[i] = 0.0
-    out.measured = taken
+    out.measured, out.tilt = taken, k.tilt
     _assign(k.rate, rate)
     r_rate = gyro_variance if has_imu else r_angular
     blend = min(dt / _POWER_TIME, 1.0)  # a single value may well be noise

@@ -27,6 +27,7 @@ SAMPLE = record(
         ("position", "f8", (3,)),  # m: in the world, as last measured
         ("down", "f8", (3,)),  # unit, body axes
         ("down_slope", "f8", (3,)),  # per s, over the interval
+        ("tilt", "f8"),  # rad2 s: variance density of an error of down that lasts a second
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
         ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt

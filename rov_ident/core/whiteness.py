@@ -1,0 +1,21 @@
+"""Whether innovations are white: the power of their sums, which is then 1 in the mean.
+
+What a model lacks, or one sensor says against another, lasts longer than noise does: in a sum over
+a second it stands out from what would be lost in each innovation alone.
+"""
+
+from rov_ident.core.jit import inlined
+
+SUM_TIME = 1.0  # s; over which innovations are added up ("Constants of the process noise")
+LARGEST = 3.0  # sigma that one innovation counts for at most: 0.3 % of normal ones are larger
+AVERAGE_TIME = 60.0  # s; over which the power is averaged: several manoeuvres of ten seconds
+JUDGED_TIME = 20.0  # s; after which it is known: by chance it is then above 2 in 0.1 % of cases
+_MOST = 100.0  # that one sum counts for: 10 sigma, or what is long over would be held against it
+
+
+@inlined
+def averaged(power, judged, since, summed, expected):
+    """The mean ``power`` after one more sum, of variance ``expected``; ``since`` seconds after the
+    one before, ``judged`` seconds after the first."""
+    blend = min(since / min(judged + SUM_TIME, AVERAGE_TIME), 1.0)
+    return power + blend * (min(summed * summed / expected, _MOST) - power)
