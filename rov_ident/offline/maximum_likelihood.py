@@ -81,18 +81,22 @@ class Noise:
     ``measurement`` (6,) multiplies the variances that the samples state; ``floor`` (6,) is the
     density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
     relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
+    ``restoring`` (6, 3) [N, N m] times the unit vector down is the wrench of weight, which has the
+    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact.
     """
 
     measurement: Array
     floor: Array
     relative: float
     correlation_time: float
+    restoring: Array
 
     def process(self, samples: Samples) -> Array:
         """Density (k, 6) of the wrench's error."""
         lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
         variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
-        density: Array = self.floor + lasting * variance
+        turned = np.square(np.cross(self.restoring, samples["down"][:, None])).sum(axis=2)
+        density: Array = self.floor + lasting * variance + samples["tilt"][:, None] * turned
         return density
 
 
@@ -104,7 +108,8 @@ def assumed(config: Config, least: float = _SMALLEST) -> Noise:
     w = config.wrench
     smallest = least * authority(config.dynamics)
     floor = np.maximum(np.array(w.floor_std), smallest) ** 2 * w.correlation_time
-    return Noise(np.ones(6), floor, w.relative_std, w.correlation_time)
+    restoring = config.dynamics.body.restoring
+    return Noise(np.ones(6), floor, w.relative_std, w.correlation_time, restoring)
 
 
 class _Equations(NamedTuple):
@@ -311,7 +316,8 @@ def maximise(
         doubtful = np.maximum(likely.floor, (_DOUBTFUL * authority(config.dynamics)) ** 2)
         starts = [likely, replace(likely, floor=doubtful)]
     else:
-        starts = [replace(likely, floor=np.zeros(6), relative=0.0)]
+        exact = np.zeros_like(likely.restoring)
+        starts = [replace(likely, floor=np.zeros(6), relative=0.0, restoring=exact)]
     if first_noise is not None:
         starts = [first_noise]
     say = progress or (lambda what: None)
