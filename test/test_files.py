@@ -123,7 +123,7 @@ REFUSED = {
     "": "it is a folder",
     "..": "it is a folder",
     "~nosuchuser/x": "the shell knows no folder ~nosuchuser",
-    "/proc/none/x": "cannot be written",
+    "/proc/none/x": "/proc takes no files",
 }
 
 
@@ -133,12 +133,8 @@ def test_places_that_are_refused(places, name):
     inputs = [places / "dive.mcap", places / "recorded", None]
     before = {p: p.stat().st_mtime_ns for p in places.iterdir() if p.exists()}
 
-    def checked_and_written():
-        check_output(path, inputs)
-        write_file(path, "")
-
     with pytest.raises(UserError, match=REFUSED[name]) as refusal:
-        checked_and_written()
+        check_output(path, inputs)
     assert "\n" not in str(refusal.value) and len(str(refusal.value)) < 500
     assert {p: p.stat().st_mtime_ns for p in places.iterdir() if p.exists()} == before
 

@@ -10,7 +10,7 @@ from test_bags import write_mcap
 import rov_ident as ri
 from bench import DATA, ROOT
 from rov_ident.cli.program import main
-from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS
+from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS, from_parameters, to_parameters
 from rov_ident.config.writing import annotated
 from rov_ident.core.frames import from_core, to_core
 from rov_ident.core.messages import IMU, ODOMETRY, Imu, Odometry
@@ -131,6 +131,29 @@ def test_check_compares_the_mounting_with_the_tree(tmp_path, mavros, short_dive)
         assert said.keys() == expected
         if expected:
             assert said["imu.position"].startswith("[0.1, 0.0, -0.2] by /tf_static")
+
+
+def test_a_borrowed_mass_is_not_trusted(tmp_path, capsys):
+    """The vehicle is heavier than the shipped one, in water as heavy: all coefficients look smaller
+    by as much, which nothing in the motion shows."""
+    rng, out = np.random.default_rng(5), tmp_path / "c.yaml"
+    assert main(["init", "--vehicle", "bluerov2_heavy", "--out", str(out)]) == 0
+    assert "Weigh yours" in capsys.readouterr().err
+    assert main(["init", "--vehicle", "bluerov2_heavy", "--out", str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert "from bluerov2_heavy.yaml: ASSUMED" in out.read_text()
+    parameters = to_parameters(ri.load(SHIPPED))
+    heavier = rng.uniform(1.08, 1.15)
+    for name in ("mass", "buoyancy"):
+        parameters["vehicle"][name] *= heavier
+    parameters["vehicle"]["inertia"] = [heavier * x for x in parameters["vehicle"]["inertia"]]
+    world = from_parameters(parameters)
+    ri.simulate(world, manoeuvre="steps", duration=60.0, seed=3).save(tmp_path / "dive.mcap")
+    fit = ri.fit(tmp_path / "dive.mcap", out, "rls")
+    for name, true in world.model.values.items():
+        i = fit.names.index(name)
+        assert abs(fit.values[i] - true) < 3.0 * fit.std[i], name
+    assert "Weigh the vehicle: thrust is 0." in fit.advice[0]
 
 
 def test_two_twists_of_mavros_are_told_apart_by_their_usual_names(tmp_path):

@@ -22,8 +22,12 @@ from rov_ident.io.bag_reader import Bag
 _MODELS = (".urdf", ".xml", ".sdf")
 _OF_FRAME = {1: "bluerov2", 2: "bluerov2_heavy"}  # FRAME_CONFIG of ArduSub
 _HEAD = """Written by `rov-ident init`. Options at their defaults are commented out.
-Lines with UNKNOWN need a value; "from" says where a value comes from; check what is assumed.
+Lines with UNKNOWN need a value; "from" says where a value comes from; check what is ASSUMED.
 Then: rov-ident check DIVE --config THIS_FILE"""
+
+
+# of a mass that nobody has weighed: what is built onto a vehicle, and ballast, are a tenth of it
+_BORROWED = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Draft:
         if self.unknown:
             return f"To be given before it can be used: {', '.join(self.unknown)}."
         other = f", with other records than {self.unfit}" if self.unfit else " as it is"
-        return f"It can be used{other}; check what is marked as assumed."
+        return f"It can be used{other}; check what is marked ASSUMED."
 
     def save(self, path: File) -> None:
         """Write the file. Raises UserError if it cannot be written."""
@@ -69,8 +73,17 @@ class _Found:
         """A shipped vehicle's own file."""
         document = parse_file(shipped(f"config/{vehicle}.yaml"))
         self.parameters, self.remarks = document["/**"]["ros__parameters"], {}
-        self.remarks["vehicle.mass"] = f"the shipped {vehicle}.yaml, as all without a source: weigh"
-        self.remarks["vehicle.buoyancy"] = f"{vehicle}.yaml: measure, trim is yours"
+        assumed = f"{vehicle}.yaml: ASSUMED"
+        for name in ("mass", "buoyancy", "cog", "cob", "inertia"):
+            self.remarks[f"vehicle.{name}"] = assumed
+        for name in self.parameters["coefficients"]:
+            self.remarks[f"coefficients.{name}"] = assumed
+        for name in ("mass_std", "inertia_std"):
+            self.put(f"vehicle.{name}", _BORROWED, "not weighed: remove it when mass is yours")
+        self.notes.append(
+            f"Mass and buoyancy are those of {vehicle}.yaml. Weigh yours: thrust, mass and all "
+            "coefficients k times as large move alike, so all are wrong by as much as the mass"
+        )
 
 
 def init(

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, say
+from rov_ident.core.errors import UserError
 from rov_ident.core.files import VEHICLES
 
 
@@ -18,12 +19,18 @@ def add(commands: Commands) -> None:
     init.add_argument(
         "--out", type=Path, metavar="FILE", help="where to write it (standard output)"
     )
+    init.add_argument("--force", action="store_true", help="also over a file that is there already")
 
 
 def _init(options: argparse.Namespace) -> None:
     from rov_ident.api.start import init
 
     check_outputs([options.out], [options.record])
+    if options.out and options.out.exists() and not options.force:
+        raise UserError(
+            f"{options.out} is there already, perhaps edited by hand: choose another name, or give "
+            "--force"
+        )
     with progress(options) as tell:
         draft = init(options.record, options.vehicle, progress=tell)
     if options.out:

@@ -8,6 +8,7 @@ import os
 import secrets
 import stat
 import sys
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO
@@ -191,7 +192,11 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
         return f"{folder} is not a folder"
     if not os.access(place if kind else folder, os.W_OK):
         return f"{place if kind else folder} is not yours to write in"
-    return ""
+    try:  # a file system may refuse what permissions allow; the file has no name, where it can
+        with tempfile.TemporaryFile(dir=folder):
+            return ""
+    except OSError as error:
+        return f"{folder} takes no files ({error.strerror})"
 
 
 def _begins(path: Path, how: bytes) -> bool:

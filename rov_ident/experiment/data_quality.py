@@ -35,7 +35,7 @@ from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import fit_batch
-from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online
+from rov_ident.offline.fit import IDENTIFIABLE, SCALE, Fit, fit_online, thrust_or_mass
 from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Shown
 from rov_ident.reports.table import Table, Tables
@@ -240,6 +240,7 @@ def _model(quick: Fit) -> Iterator[Remark]:
     yield Remark(_MODEL, GOOD if agree else BAD, quick.consistency.sentence)
     prior = prior_of(quick.given, effects=True)
     columns = quick.values, quick.std, prior.mean, prior.std
+    values = dict(zip(quick.names, quick.values.tolist(), strict=True))
     seen = [
         (*name.split("."), f"{x:.3g} ± {NORMAL * std:.2g} {unit}".removesuffix(" 1"), mean)
         for name, unit, x, std, mean, wide in zip(quick.names, quick.units, *columns, strict=True)
@@ -248,6 +249,8 @@ def _model(quick: Fit) -> Iterator[Remark]:
     for effect, parts in groupby(seen, key=lambda part: part[0]):
         text = ", ".join(f"{own} {told} (configured: {mean:g})" for _, own, told, mean in parts)
         text += "; a fit estimates it along, but the simulation as configured lacks it"
+        if effect == "thrust_scale":
+            text += f". Weigh the vehicle: {thrust_or_mass(values[SCALE])}"
         yield Remark(effect.replace("_", " "), WARNING, text)
 
 

@@ -46,6 +46,17 @@ class Curves:
     after: Array
 
 
+SCALE = "thrust_scale.scale"
+
+
+def thrust_or_mass(scale: float) -> str:
+    """What a thrust that is ``scale`` times the configured one may be instead."""
+    return (
+        f"thrust is {scale:.2f} times what the configuration says, or mass, inertia and buoyancy "
+        f"are {1.0 / scale:.2f} times that: motion alone cannot tell the one from the other"
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Fit(Shown, Result):
     """Coefficients identified from dives.
@@ -100,6 +111,10 @@ class Fit(Shown, Result):
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.names, self.identifiable) if not known]
         advice = []
+        if SCALE in self.names:
+            i = self.names.index(SCALE)
+            if abs(self.values[i] - self.given.value(SCALE)) > self.quantile * self.std[i]:
+                advice.append(f"Weigh the vehicle: {thrust_or_mass(self.values[i])}.")
         if impossible := self.more.get("impossible"):
             held = [name for name in held if name not in impossible]
             advice.append(
