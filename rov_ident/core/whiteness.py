@@ -9,7 +9,7 @@ from rov_ident.core.jit import inlined
 SUM_TIME = 1.0  # s; over which innovations are added up ("Constants of the process noise")
 LARGEST = 3.0  # sigma that one innovation counts for at most: 0.3 % of normal ones are larger
 AVERAGE_TIME = 60.0  # s; over which the power is averaged: several manoeuvres of ten seconds
-JUDGED_TIME = 20.0  # s; after which it is known: by chance it is then above 2 in 0.1 % of cases
+JUDGED_TIME = 20.0  # s; after which it is known: chance then takes its root beyond 1.5 in 0.1 %
 _MOST = 100.0  # that one sum counts for: 10 sigma, or what is long over would be held against it
 
 
