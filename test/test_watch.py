@@ -7,15 +7,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tiers import more
 
 from bench.simulators import hidden
+from bench.studies.watch import said
 from rov_ident.core.messages import Array
 from rov_ident.discrepancy.live_windows import MEMORY, WINDOW, is_watched
 from rov_ident.discrepancy.monitor import ALARM, Monitor, penalty, suspicions
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.sample import SAMPLE
-from rov_ident.simulation.virtual_sensors import Suite, dive
+from rov_ident.simulation.manoeuvres import manoeuvre
+from rov_ident.simulation.virtual_sensors import Suite, dive, measure
 
 
 def watching(config, kind="rls"):
@@ -62,6 +65,40 @@ def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
     assert not any(play(watching(case.config, kind), case.messages))
 
 
+@pytest.mark.parametrize("seed", [9101, *more(*range(9117, 9122))])
+def test_noise_of_the_reading_is_not_taken_for_a_cause(seed):
+    """No thruster gives it: it moves the simulated vehicle only. As the nodes run by default."""
+    assert not said(seed, 120.0, known=False)
+
+
+def test_what_is_missing_is_named_under_noise_of_the_reading():
+    conditions = hidden.Conditions(duration=90.0, reading=(0.5, 0.06))
+    case = hidden.draw(200, ("constant_force",), 0.5, conditions=conditions)
+    found = play(watching(case.config), case.messages)[-1]
+    assert found and found[0].effect == "constant_force"
+
+
+@pytest.mark.parametrize("acts", [False, True])
+def test_a_command_that_trembles_is_told_from_noise_of_the_reading(heavy, acts):
+    """What looks alike where it is read, a vehicle follows or does not."""
+    exact = dataclasses.replace(heavy.wrench, relative_std=0.0)
+    heavy = dataclasses.replace(heavy, wrench=exact)
+    t, std = np.arange(0.0, 75.0, 0.02), np.repeat([0.5, 0.06], 3)
+    rng = np.random.default_rng(4)
+    demand = manoeuvre("steps", heavy.dynamics, t, rng)
+    noise = {f"std_{axis}": value for axis, value in zip("XYZKMN", std, strict=True)}
+    noisy = dataclasses.replace(heavy, effects={"wrench_noise": noise})
+    if acts:
+        demand = demand + std * rng.standard_normal(demand.shape)
+    suite = Suite(wrench_std=0.0)
+    run = measure(heavy if acts else noisy, t, demand, 75.0, suite, rng)
+    online = watching(heavy)
+    assert not any(play(online, run.messages))
+    reading = online.monitor._state.reading
+    assert reading.std == pytest.approx(std, rel=0.15)
+    assert (reading.is_noise[3:] == (not acts)).all()  # forces move little: they may stay untold
+
+
 @pytest.mark.parametrize("every", [True, False])
 def test_what_a_single_window_says_proves_nothing(every):
     """A knock or a gust fills one window, and something always fits that."""
@@ -72,10 +109,11 @@ def test_what_a_single_window_says_proves_nothing(every):
     at = [*task.base, *(key for unit in task.units for key in unit)].index(("buoyancy", "delta"))
     windows, lacking = list(state.windows), 20.0 if every else 80.0  # N
     for i in range(len(windows)) if every else [7]:
-        old = windows[i]
-        more = lacking * old.normal[at]
-        power = old.power + 2.0 * lacking * old.moment[at] + lacking * more[at]
-        windows[i] = old._replace(moment=old.moment + more, power=power)
+        old = windows[i].sums
+        change = lacking * old.normal[at]
+        power = old.power + 2.0 * lacking * old.moment[at] + lacking * change[at]
+        sums = old._replace(moment=old.moment + change, power=power)
+        windows[i] = windows[i]._replace(sums=sums, doubt=None)
     found = suspicions(task, state._replace(windows=windows))
     assert bool(found) == every
 

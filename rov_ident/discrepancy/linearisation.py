@@ -8,6 +8,7 @@ parameters can be tried on a :class:`Linearisation` without simulating again.
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,16 +44,31 @@ class LinearProblem:
         return np.array([place[key] for key in keys], dtype=np.int64)
 
 
+class MoreNoise(NamedTuple):
+    """Noise of a single window beside that of its velocities, in units of which ``whitening`` (6 N,
+    6 N) makes both together white; ``taken`` (K, 6) is the wrench of it that was taken off what
+    moves the vehicle, so that residuals are as if it were still in."""
+
+    whitening: Array
+    taken: Array
+
+
 class Linearisation:
     """A hypothesis simulated through all windows: residuals ``error`` (6 N,), initial velocities
     eliminated, divided by the standard deviations ``noise`` (6,), and sensitivities; ``starts`` (W,
-    6) are the initial velocities."""
+    6) are the initial velocities. With ``more`` noise both are whitened."""
 
     def __init__(
-        self, problem: WindowedProblem, h: Hypothesis, starts: Array, noise: Array, motion: Motion
+        self,
+        problem: WindowedProblem,
+        h: Hypothesis,
+        starts: Array,
+        noise: Array,
+        motion: Motion,
+        more: "MoreNoise | None" = None,
     ) -> None:
         self.problem, self.hypothesis, self.starts = problem, h, starts
-        self.noise, self.motion = noise, motion
+        self.noise, self.motion, self.more = noise, motion, more
         error = (problem.measured - motion.nu[problem.nodes]) / noise
         spread = 1.4826 * np.median(np.abs(error), axis=0)  # the standard deviation if normal
         self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
@@ -61,6 +77,13 @@ class Linearisation:
         self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
         j0 = tangent(motion, problem.first, problem.last, problem.nodes)
         j0 = j0[:, :, ~problem.guided] * self._weight[:, :, None]
+        if more is not None:
+            j0 = (more.whitening @ j0.reshape(error.size, -1)).reshape(j0.shape)
+            moved = tangent(
+                motion, problem.first, problem.last, problem.nodes, more.taken[..., None]
+            )
+            error = error - moved[:, :, 0] * self._weight
+            error = (more.whitening @ error.ravel()).reshape(error.shape)
         self._q, self._r = [], []
         for a, b in self._spans():
             q, r = np.linalg.qr(j0[a:b].reshape(6 * (b - a), -1))
@@ -78,7 +101,7 @@ class Linearisation:
         lock in Python 3.11."""
         if self._sensitivities is None:
             keys = self.hypothesis.keys
-            raw = self._unprojected(self.problem.columns(self.hypothesis, self.motion, keys))
+            raw = self.unprojected(self.problem.columns(self.hypothesis, self.motion, keys))
             spans = zip(self._q, self._spans(), strict=True)
             starts = [q.T @ raw[6 * a : 6 * b] for q, (a, b) in spans]
             columns = self._projected(raw)
@@ -120,15 +143,28 @@ class Linearisation:
             part -= q @ (q.T @ part)
         return raw
 
+    def over_variance(self, error: Array) -> tuple[Array, Array]:
+        """Of a single window with more noise: the residuals (N, 6) over the variance of that noise
+        and their own, and the square that is expected of them."""
+        assert self.more is not None
+        back = self._projected(self.more.whitening.copy())
+        return (back.T @ error).reshape(-1, 6), np.sum(back**2, axis=0).reshape(-1, 6)
+
+    def pushed_by(self, error: Array) -> Array:
+        """The transpose of :meth:`unprojected` without whitening: (N, 6) to wrenches (K, 6)."""
+        e = self.problem
+        return adjoint(self.motion, e.first, e.last, error * self._weight, e.nodes)
+
     def sensitivity_to(self, force: Array) -> Array:
         """Sensitivities (6 N, C) of the simulated velocities to wrenches (K, 6, C)."""
-        return self._projected(self._unprojected(force))
+        return self._projected(self.unprojected(force))
 
-    def _unprojected(self, force: Array) -> Array:
+    def unprojected(self, force: Array) -> Array:
         """The same (6 N, C) with the initial velocities held."""
         e = self.problem
         j = tangent(self.motion, e.first, e.last, e.nodes, force)
-        return (j * self._weight[:, :, None]).reshape(-1, force.shape[2])
+        j = (j * self._weight[:, :, None]).reshape(-1, force.shape[2])
+        return j if self.more is None else self.more.whitening @ j
 
     def having(self, keys: Sequence[Key], columns: Array) -> LinearProblem:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
@@ -202,8 +238,12 @@ class Linearisation:
 
 
 def linearise(
-    problem: WindowedProblem, h: Hypothesis, starts: Array, noise: Array
+    problem: WindowedProblem,
+    h: Hypothesis,
+    starts: Array,
+    noise: Array,
+    more: MoreNoise | None = None,
 ) -> Linearisation | None:
     """Simulate a hypothesis from initial velocities (W, 6); None where that diverges."""
     motion = problem.motion(h, starts)
-    return None if motion is None else Linearisation(problem, h, starts, noise, motion)
+    return None if motion is None else Linearisation(problem, h, starts, noise, motion, more)

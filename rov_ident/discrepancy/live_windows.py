@@ -35,6 +35,14 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.multiple_shooting import Motion
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.discrepancy.wrench_smoothing import (
+    Known,
+    Reading,
+    Smoothed,
+    matters,
+    smoothed,
+    tilts,
+)
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import parse
@@ -50,15 +58,41 @@ _FEWEST = 8  # measurements in a window, as in `windowed_problem`
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed: twelve windows
 
 
-class Window(NamedTuple):
-    """What is remembered of a window; P parameters: the estimated ones, then those watched."""
+class Sums(NamedTuple):
+    """Normal equations; P parameters: the estimated ones, then those watched."""
 
-    t: float  # s, of its end
     normal: Array  # (P, P)
     moment: Array  # (P,): J'(r + J theta), theta zero for those watched
     power: float  # of r + J theta
+
+
+class Window(NamedTuple):
+    """What is remembered of a window, C of its parameters being watched."""
+
+    t: float  # s, of its end
+    sums: Sums
     residuals: int  # so many of them
     strength: Array  # (6, C) squared wrenches of a unit of each watched one, over the authority
+    doubt: "Doubt | None"  # where the wrench was smoothed
+
+
+class Doubt(NamedTuple):
+    """What noise of the wrench's reading leaves open in a window: the equations with sensitivities
+    along the motion that the wrench as read makes, and what of ``normal`` is only errors of the
+    smoothed wrench, which act on sensitivities."""
+
+    as_read: Sums
+    errors: Array  # (P, P)
+
+
+class Scored(NamedTuple):
+    """A window with all that is watched: its problem, sensitivities (R, P), the size (6,) of what
+    it leaves unexplained, and the wrenches (K, 6, C) of what is watched."""
+
+    linear: LinearProblem
+    columns: Array
+    left: Array
+    force: Array
 
 
 class Task(NamedTuple):
@@ -79,6 +113,7 @@ class State(NamedTuple):
 
     windows: tuple[Window, ...]
     noise: Array  # (6,): standard deviation of what a window leaves unexplained
+    reading: Reading
 
 
 def is_watched(effect: Effect) -> bool:
@@ -115,7 +150,7 @@ def _sizes(config: Config, keys: Sequence[Key]) -> dict[Key, float]:
 def init(task: Task) -> State:
     odometry, imu = task.config.odometry, task.config.imu
     angular = min(odometry.angular_std, imu.gyro_std)
-    return State((), np.repeat([odometry.linear_std, angular], 3))
+    return State((), np.repeat([odometry.linear_std, angular], 3), Reading())
 
 
 def step(
@@ -131,26 +166,60 @@ def step(
         return state
     names = [n if section == COEFFICIENTS else f"{section}.{n}" for section, n in task.base]
     h = Hypothesis(task.config, {k: values[n] for k, n in zip(task.base, names, strict=True)})
-    linearisation = linearise(problem, h, problem.measured_starts(), state.noise)
-    if linearisation is None:
+    reading = state.reading.after(streams.demand, task.config.wrench.relative_std)
+    problem.reading_std = reading.std
+    plain = linearise(problem, h, problem.measured_starts(), state.noise)
+    if plain is None:
         return state
-    force = _columns(task, problem, h, linearisation.motion)
-    linear, seen = _without_tilt(task, linearisation, force)
-    theta = np.array(list(h.values.values()))
-    b = len(theta)
-    through = linear.normal[:, :b] @ theta
-    gradient = linear.gradient[0]
+    theta, smooth = np.array(list(h.values.values())), None
+    if matters(plain):
+        known = _known(task, state.windows, theta)
+        smooth, reading = smoothed(plain, reading, task.config.odometry.attitude_std, known)
+    best = _scored(task, plain if smooth is None else smooth.smooth)
     window = Window(
         float(streams.t[-1]),
-        linear.normal,
-        gradient + through,
-        float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b]),
-        linear.count,
-        np.sum((force / authority(h.model)[:, None]) ** 2, axis=0),
+        _sums(best.linear, theta),
+        best.linear.count,
+        np.sum((best.force / authority(h.model)[:, None]) ** 2, axis=0),
+        None if smooth is None else _doubt(task, smooth, best, theta),
     )
     blend = min(WINDOW / _NOISE_TIME, 1.0) if state.windows else 1.0
-    noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(seen, 1e-6) ** 2)
-    return State((*state.windows[-(MEMORY - 1) :], window), noise)
+    noise = np.sqrt((1.0 - blend) * state.noise**2 + blend * np.maximum(best.left, 1e-6) ** 2)
+    return State((*state.windows[-(MEMORY - 1) :], window), noise, reading)
+
+
+def _known(task: Task, windows: Sequence[Window], theta: Array) -> Known:
+    """What the windows say of the estimated parameters, the estimates theta (B,) as a prior."""
+    b = len(theta)
+    normal = np.diag(task.prior) + sum(w.sums.normal[:b, :b] for w in windows)
+    return Known(normal, task.prior * theta + sum(w.sums.moment[:b] for w in windows))
+
+
+def _scored(task: Task, linearisation: Linearisation) -> Scored:
+    force = _columns(task, linearisation.problem, linearisation.hypothesis, linearisation.motion)
+    columns = linearisation.sensitivity_to(force)
+    if linearisation.more is None:
+        linear, left = _without_tilt(task, linearisation, force)
+    else:
+        linear = linearisation.having(task.watched, columns)
+        over, expected = linearisation.over_variance(linearisation.error)
+        ratio = np.mean(over**2, axis=0) / np.mean(expected, axis=0)
+        left = linearisation.noise * np.sqrt(ratio)
+    return Scored(linear, np.hstack([linearisation.columns, columns]), left, force)
+
+
+def _doubt(task: Task, smooth: Smoothed, best: Scored, theta: Array) -> Doubt:
+    as_read, drawn = (_scored(task, s) for s in (smooth.as_read, smooth.drawn))
+    errors = drawn.columns - best.columns
+    return Doubt(_sums(as_read.linear, theta), errors.T @ errors)
+
+
+def _sums(linear: LinearProblem, theta: Array) -> Sums:
+    """The normal equations about the common origin, of a window at the coefficients theta (B,)."""
+    b, gradient = len(theta), linear.gradient[0]
+    through = linear.normal[:, :b] @ theta
+    power = float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b])
+    return Sums(linear.normal, gradient + through, power)
 
 
 def _without_tilt(
@@ -162,9 +231,7 @@ def _without_tilt(
     attitude's noise as its prior, beside what is watched, whose wrenches ``force`` are (K, 6, C).
     """
     problem, h = linearisation.problem, linearisation.hypothesis
-    down = problem.steps.middle[:, 2, :]
-    tilted = np.cross(np.eye(3)[None], down[:, None, :]) @ h.model.body.restoring.T  # (K, 3, 6)
-    both = np.concatenate([force, tilted.transpose(0, 2, 1)], axis=2)
+    both = np.concatenate([force, tilts(problem, h)], axis=2)
     columns = linearisation.sensitivity_to(both)
     whole = linearisation.having((*task.watched, *(("tilt", a) for a in "xyz")), columns)
     p = len(whole.keys) - 3

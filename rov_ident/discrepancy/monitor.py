@@ -31,8 +31,17 @@ from rov_ident.discrepancy.hypothesis import (
     unit_of,
 )
 from rov_ident.discrepancy.linearisation import LinearProblem
-from rov_ident.discrepancy.live_windows import WINDOW, State, Task, Window, init, step, task_of
-from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
+from rov_ident.discrepancy.live_windows import (
+    WINDOW,
+    State,
+    Sums,
+    Task,
+    Window,
+    init,
+    step,
+    task_of,
+)
+from rov_ident.discrepancy.selection import VERY_STRONG, Scores, regressed, variance_inflation
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.compilation import any_vehicle
 from rov_ident.model.coefficients import ABSOLUTE, AXES, MOTIONS, NEGATIVE, ONE, VELOCITIES, parse
@@ -48,6 +57,7 @@ ALARM = 1e-4
 SHARE = 0.5  # of the residual's mean power in one of six components that an effect must explain
 SMALLEST = 0.2  # of the size at which it matters: less is what the attitude is off by
 
+_ERRORS = 0.5  # of the information on a parameter that errors of the smoothed wrench may be
 _AS_GOOD = 0.8  # of what the best explains: a rival, as second order may make up the difference
 _ALIKE = 0.9  # of what the best explains: named instead, if it has fewer parameters
 _AXIS_SHARE = 0.3  # of the squared wrench on the strongest axis: acts on this one, too
@@ -84,7 +94,7 @@ def suspicions(task: Task, state: State) -> list[Suspicion]:
     """What the remembered windows say is missing, the plainest first; empty when nothing is."""
     if len(state.windows) < FEWEST:
         return []
-    memory = _Memory(task, state.windows)
+    memory = _Memory(task, state.windows, [w.sums for w in state.windows])
     chosen: list[Key] = []
     found: list[Suspicion] = []
     units = list(task.units)
@@ -93,7 +103,16 @@ def suspicions(task: Task, state: State) -> list[Suspicion]:
         chosen += best.keys
         # To second order the remainder of an effect looks like others: only its own axes follow.
         units = [u for u in units if effect_of(u[0]) == best.effect and u[0] not in chosen]
-    return [s for s in found if memory.holds_without_best_window(s.keys, chosen)]
+    found = [s for s in found if memory.holds_without_best_window(s.keys, chosen)]
+    doubts = [w.doubt for w in state.windows]
+    if all(d is None for d in doubts):
+        return found
+    # smoothing lends the commands what is missing, and what is lent proves nothing
+    sums = [w.sums if d is None else d.as_read for w, d in zip(state.windows, doubts, strict=True)]
+    as_read = _Memory(task, state.windows, sums)
+    errors = np.sum([d.errors for d in doubts if d is not None], axis=0)
+    found = [s for s in found if memory.are_seen(s.keys, chosen, errors)]
+    return [s for s in found if as_read.holds_without_best_window(s.keys, chosen)]
 
 
 def penalty(size: int, tried: int) -> float:
@@ -128,10 +147,9 @@ class _Trial(NamedTuple):
 class _Memory:
     """The sum of windows; ``linear`` is their problem with all parameters at zero."""
 
-    def __init__(self, task: Task, windows: Sequence[Window]) -> None:
-        self.task = task
-        self.normals, moments = (np.array([w[i] for w in windows]) for i in (1, 2))
-        powers, count = np.array([w.power for w in windows]), sum(w.residuals for w in windows)
+    def __init__(self, task: Task, windows: Sequence[Window], sums: Sequence[Sums]) -> None:
+        self.task, count = task, sum(w.residuals for w in windows)
+        self.normals, moments, powers = map(np.array, zip(*sums, strict=True))
         keys = (*task.base, *task.watched)
         self.linear = LinearProblem(keys, self.normals.sum(axis=0), moments, powers, count)
         self.strength = np.sum([w.strength for w in windows], axis=0)
@@ -221,6 +239,18 @@ class _Memory:
         inflation = variance_inflation(after, np.arange(len(after.keys)))
         asked = penalty(len(keys), len(self.task.units))
         return bool(taken.sum() - taken.max() > asked * inflation)
+
+    def are_seen(self, keys: Sequence[Key], chosen: Sequence[Key], errors: Array) -> bool:
+        """Whether most of the information on parameters, the others refitted along, is of motion
+        and commands, and not of their ``errors`` (P, P): of these how large they are is known
+        only to some tenths."""
+        rest = self.linear.index([*self.task.base, *(k for k in chosen if k not in keys)])
+        at = self.linear.index(keys)
+        turned = np.zeros((len(self.linear.keys), len(at)))
+        turned[at] = np.eye(len(at))
+        turned[rest] = -regressed(self.linear.normal, rest, at)
+        ours, theirs = (np.diag(turned.T @ m @ turned) for m in (self.linear.normal, errors))
+        return bool((theirs < _ERRORS * ours).all())
 
     def _whole_effects(self, chosen: list[Key], trials: Sequence[_Trial]) -> list[_Trial]:
         """All units of an effect that has several, to be compared with effects of one unit."""

@@ -93,9 +93,7 @@ def guided_by(eq: Equations, guided: NDArray[np.bool_]) -> Equations:
 
 def thrust(steps: Steps, acting: Acting) -> Array:
     """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
-    wrench = steps.demand.copy()
-    if acting.inputs.any():
-        _thrust(acting, memory(), steps.piece_t, wrench)
+    wrench = _acted(steps, acting)
     share = np.diff(steps.piece_t)[:, None] * wrench
     length = np.diff(steps.t)[:, None]
     mean = np.add.reduceat(share, steps.piece) / length
@@ -103,6 +101,21 @@ def thrust(steps: Steps, acting: Acting) -> Array:
     late = middle - np.repeat(of_step, np.diff(np.append(steps.piece, len(wrench))))
     slope = 12.0 / length**3 * np.add.reduceat(share * late[:, None], steps.piece)
     return np.stack([mean, slope])
+
+
+def mean_thrust(steps: Steps, acting: Acting) -> Array:
+    """The mean (K, 6) alone."""
+    share = np.diff(steps.piece_t)[:, None] * _acted(steps, acting)
+    mean: Array = np.add.reduceat(share, steps.piece) / np.diff(steps.t)[:, None]
+    return mean
+
+
+def _acted(steps: Steps, acting: Acting) -> Array:
+    """The wrench (J, 6) in each piece, after the input effects."""
+    wrench = steps.demand.copy()
+    if acting.inputs.any():
+        _thrust(acting, memory(), steps.piece_t, wrench)
+    return wrench
 
 
 def shoot(

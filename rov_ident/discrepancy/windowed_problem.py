@@ -6,6 +6,7 @@ its parameters.
 """
 
 import contextlib
+import copy
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -22,6 +23,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     Steps,
     equations,
     guided_by,
+    mean_thrust,
     regressors,
     shoot,
     thrust,
@@ -172,6 +174,26 @@ class WindowedProblem:
             moved = [thrust(self.steps._replace(demand=d), acting)[0] for d in demands]
             known = self._noisy[key] = np.stack([(m - base) / SMALL for m in moved], axis=2)
         return known
+
+    def response(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+        """What a unit of each reading of the wrench adds to the mean thrust in each step, (K, 6,
+        D), by changes of the size of their noise."""
+        base, acting = mean_thrust(self.steps, compiled(effects)), compiled(effects)
+        out = np.zeros((*base.shape, len(self.streams.demand)))
+        step = SMALL * np.where(self.reading_std > 0.0, self.reading_std, 1.0)
+        for i in range(out.shape[2]):
+            at = self._held == i
+            if at.any():
+                moved = self.steps._replace(demand=self.steps.demand + step * at[:, None])
+                out[:, :, i] = (mean_thrust(moved, acting) - base) / step
+        return out
+
+    def with_less(self, taken: Array) -> "WindowedProblem":
+        """The same with something (D, 6) taken off what was read of the wrench."""
+        other = copy.copy(self)
+        other.steps = self.steps._replace(demand=self.steps.demand - taken[self._held])
+        other._thrusts, other._noisy, other._remembered = {}, {}, threading.local()
+        return other
 
     def motion(self, h: Hypothesis, starts: Array) -> Motion | None:
         """Simulate from initial velocities (W, 6); None where that diverges, or where the mass
