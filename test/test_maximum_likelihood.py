@@ -46,11 +46,13 @@ EVERY = np.arange(15)
 
 
 def exact(heavy):
-    """The wrench without error, and the start too: pure output error of one long simulation."""
+    """Wrench and attitude without error, and the start too: pure output error of one long
+    simulation."""
     noise = ml.assumed(heavy)
     return dataclasses.replace(
-        noise, measurement=np.full(6, 1e-12), floor=np.zeros(6), relative=0.0
-    )
+        noise, measurement=np.full(6, 1e-12), floor=np.zeros(6), relative=0.0,
+        restoring=np.zeros((6, 3)),
+    )  # fmt: skip
 
 
 def test_without_process_noise_the_innovation_is_the_output_error(heavy, samples):

@@ -144,7 +144,7 @@ def test_a_borrowed_mass_is_not_trusted(tmp_path, capsys):
     assert "from bluerov2_heavy.yaml: ASSUMED" in out.read_text()
     parameters = to_parameters(ri.load(SHIPPED))
     heavier = rng.uniform(1.08, 1.15)
-    for name in ("mass", "buoyancy"):
+    for name in ("mass", "weight", "buoyancy"):
         parameters["vehicle"][name] *= heavier
     parameters["vehicle"]["inertia"] = [heavier * x for x in parameters["vehicle"]["inertia"]]
     world = from_parameters(parameters)

@@ -47,6 +47,7 @@ class Curves:
 
 
 SCALE = "thrust_scale.scale"
+_NOTICED = 0.1  # of the scale's prior standard deviation: 1.5 % of thrust
 
 
 def thrust_or_mass(scale: float) -> str:
@@ -111,10 +112,9 @@ class Fit(Shown, Result):
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.names, self.identifiable) if not known]
         advice = []
-        if SCALE in self.names:
-            i = self.names.index(SCALE)
-            if abs(self.values[i] - self.given.value(SCALE)) > self.quantile * self.std[i]:
-                advice.append(f"Weigh the vehicle: {thrust_or_mass(self.values[i])}.")
+        scale = float(dict(zip(self.names, self.values)).get(SCALE, 1.0))
+        if abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
+            advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
         if impossible := self.more.get("impossible"):
             held = [name for name in held if name not in impossible]
             advice.append(
