@@ -130,6 +130,7 @@ def test_a_mounting_is_no_heading(heavy, yaw):
     world, config = world_and_belief(heavy, "sensor_misalignment", mounting, {}, rng)
     findings = findings_of(world, config, NO_IMU, 3)
     assert [f.effect for f in findings.effects] == ["sensor_misalignment"]
+    assert findings.effects[0].separable
     assert findings.effects[0].parameters["yaw"].value == pytest.approx(yaw, abs=0.02)
 
 

@@ -63,3 +63,15 @@ def test_what_a_linear_model_lacks_is_named(y_v: float | None, tmp_path: Path) -
     streams = gather(inputs.messages(bag, inputs.select(bag, config), config), config)
     named = {f.effect for f in explain([streams], config).findings.effects}
     assert {"quadratic_damping", "thruster_lag"} <= named
+
+
+@pytest.mark.skipif(not TANK.is_dir(), reason="the measured tank record is not here")
+def test_a_mounting_that_only_the_pose_asks_for_is_not_sure(tmp_path: Path) -> None:
+    """There is no IMU, so that nothing ties the pose to gravity, and the thrust cannot tell."""
+    config = configuration.load(ROOT / "config" / "bluerov2_heavy.yaml")
+    path = tmp_path / "tank.mcap"
+    import_csv([TANK / "11_57_50_3dof.csv"], path, mask_rates_above=1.5, wrench_timing="bin")
+    bag = Bag(path)
+    streams = gather(inputs.messages(bag, inputs.select(bag, config), config), config)
+    findings = explain([streams], config).findings
+    assert not any(f.separable for f in findings.effects if f.effect == "sensor_misalignment")

@@ -170,7 +170,7 @@ def explain(
     choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config, any(headings))
     of_sensors = sensor_findings(
         streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
-        choice.alternatives, choice.fixed, as_headed,
+        choice.alternatives, choice.fixed, as_headed, choice.unsure,
     )  # fmt: skip
     if len(bags) > 1:
         of_sensors = repetition.of_sensors(bags, config, of_sensors, headings[: len(bags)])

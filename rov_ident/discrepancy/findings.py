@@ -235,11 +235,13 @@ def sensor_findings(
     alternatives: Mapping[str, Sequence[str]] | None = None,
     fixed: Container[Key] = (),
     as_headed: Streams | None = None,
+    unsure: Container[str] = (),
 ) -> list[Finding]:
     """Findings of the sensor effects ``found`` in the spans ``fit`` of the streams, by how much
     better the sensors agree in the spans ``held`` of the streams ``judged``. Each cannot be told
-    from its ``alternatives``; the parameters ``fixed`` are at their null. ``as_headed``: the
-    streams judged with the headings of their records as they were."""
+    from its ``alternatives``, nor those ``unsure`` from what has no name; the parameters ``fixed``
+    are at their null. ``as_headed``: the streams judged with the headings of their records as they
+    were."""
     findings = []
     after = sensor_consistency.comparisons(judged, config, found)
     for name in found:
@@ -259,8 +261,9 @@ def sensor_findings(
         }
         words = sentence(name, parameters, gain)
         rivals = tuple(Alternative(n, _EQUAL) for n in (alternatives or {}).get(name, ()))
-        run = EFFECTS[name].manoeuvre if rivals else None
-        findings.append(Finding(name, (), parameters, None, gain, not rivals, run, rivals, words))
+        sure = not rivals and name not in unsure
+        run = None if sure else EFFECTS[name].manoeuvre
+        findings.append(Finding(name, (), parameters, None, gain, sure, run, rivals, words))
     return findings
 
 

@@ -40,13 +40,14 @@ Sensors = dict[str, dict[str, float]]
 class Choice:
     """The sensor effects that are believed, the standard deviations of their parameters, those that
     the data cannot tell from the choice, by effect, and what was not believed, in words; ``fixed``
-    are parameters that were held at their null."""
+    are parameters that were held at their null, ``unsure`` effects that only the pose asks for."""
 
     sensors: Sensors
     std: Mapping[Key, float]
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     fixed: frozenset[Key] = frozenset()
     notes: tuple[str, ...] = ()
+    unsure: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,13 @@ def _without_refuted(data: _Data, choice: Choice) -> Choice:
             notes = (*choice.notes, words + "the thrust: it is not applied")
             choice = dataclasses.replace(rest, alternatives=choice.alternatives, notes=notes)
             squares = without
+        elif name == MOUNTING and not (
+            len(data.streams.imu_t) or (without is not None and surely_less(squares, without))
+        ):
+            # the pose may be tilted against the velocities instead: nothing ties it to gravity
+            words = f"{name}: the pose may be tilted instead; the thrust cannot tell"
+            notes, unsure = (*choice.notes, words), choice.unsure | {name}
+            choice = dataclasses.replace(choice, notes=notes, unsure=unsure)
     return choice
 
 
