@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import pytest
 from program import run_alone
@@ -14,6 +15,7 @@ from rov_ident.discrepancy.extension import Kept
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import validation
+from rov_ident.reports.table import number
 
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
 
@@ -56,6 +58,13 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     places = [page.index(text) for text in ("falls by", "X_udot", "Fly next", "Measured and sim")]
     assert places == sorted(places)
     assert "Fly next" in done.stdout
+    # what is to be changed is what was written, and what it gains is told once
+    (box,) = re.findall("<pre>(.*?)</pre>", page, re.DOTALL)
+    lines = {line.split("#")[0].strip() for line in box.splitlines()}
+    changed = [name for name in found.model.names if found.value(name) != given.value(name)]
+    assert len(changed) > 5
+    assert {f"{name}: {number(found.value(name), 4)}" for name in changed} <= lines
+    assert page.count("Is it good now?") == 1 and "What it gains" not in page
 
 
 def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):

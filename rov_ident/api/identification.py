@@ -188,7 +188,7 @@ class Identification(Shown):
             ),
             *(of_explain.sections(self.explanation) if self.explanation else ()),
             html.heading("The dives"),
-            html.bullets([*(c.sentence for c in self.checks), *left_out]),
+            html.bullets([*(c.sentence for c in self.checks), *left_out, *notes]),
             html.table(["dive", "", "subject", ""], remarks, text=(1, 2, 3)) if remarks else "",
         ]  # fmt: skip
         return html.page(

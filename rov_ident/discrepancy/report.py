@@ -27,7 +27,12 @@ _SENSES = (("astern", "forward"), _SIDES, ("up", "down"), _SIDES, ("bow down", "
 SENSES = dict(zip(VELOCITIES, _SENSES))
 """What a negative and a positive velocity mean."""
 
+_BEFORE_THE_FIT = (
+    "All from here on is from the search that came before the last fit, whose values are those "
+    'above and in extended.yaml; "retuned" and "extended" are models of the search.'
+)
 _TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
+_COMMENTS = 40  # characters to the left of what a line was, but for lists
 _TOLD = 3  # parameters of an effect in the verdict
 _SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
 _STRETCH = 30.0  # s of motion that is shown
@@ -175,16 +180,24 @@ def page(explanation: Explanation) -> str:
     return report.page(title, verdict(f), sections(explanation), origin)
 
 
-def sections(explanation: Explanation) -> list[str]:
-    """The parts of the page below its headline."""
-    f, before = explanation.findings, explanation.given
+def sections(explanation: Explanation, fitted: Config | None = None) -> list[str]:
+    """The parts of the page below its headline.
+
+    ``fitted``: the configuration that is written in place of the extended one, where a fit followed
+    the search. What that gains is then told elsewhere.
+    """
+    f = explanation.findings
     rmse, shown = _shown(explanation)
     key = _legend(shown)
+    change = [report.heading("What to change"), *_change(explanation, fitted)]
+    if fitted is None:
+        gains = [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))]
+        begin = [report.beside(change, gains)]
+    else:
+        begin = [*change, report.heading("The search for what is missing")]
+        begin.append(report.paragraph(_BEFORE_THE_FIT))
     parts = [
-        report.beside(
-            [report.heading("What to change"), *_change(before, explanation)],
-            [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))],
-        ),
+        *begin,
         report.heading("Measured and simulated"),
         _legend([plots.MEASURED, *shown]),
         *_motion(explanation, shown),
@@ -239,15 +252,15 @@ def _legend(labels: Iterable[str]) -> str:
     return report.legend({label: entries[label] for label in labels})
 
 
-def _change(before: Config, explanation: Explanation) -> list[str]:
-    old = configuration.to_parameters(before)
-    new = configuration.to_parameters(explanation.extended)
+def _change(explanation: Explanation, fitted: Config | None) -> list[str]:
+    old = configuration.to_parameters(explanation.given)
+    new = configuration.to_parameters(fitted or explanation.extended)
     news = {k: new[k] for k in sorted(new, key=lambda k: k != "effects")}  # what is new first
     lines = _lines(old, news)
-    if explanation.findings.verdict == "agrees" or not lines:
+    if (fitted is None and explanation.findings.verdict == "agrees") or not lines:
         nothing = "Nothing. extended.yaml holds the refitted coefficients, which predict no better."
         return [report.paragraph(nothing)]
-    width = max(len(line) for line, _ in lines)
+    width = min(_COMMENTS, max(len(line) for line, _ in lines))
     text = "\n".join(f"{line:<{width}}  {was}".rstrip() for line, was in lines)
     return [
         report.code(text),
