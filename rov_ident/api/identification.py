@@ -205,7 +205,7 @@ class Identification(Shown):
                 [html.heading("Is it good now?"), errors.html(), html.heading("What to do next"),
                  html.bullets(self.advice)],
             ),
-            *(of_explain.sections(self.explanation) if self.explanation else ()),
+            *(of_explain.sections(self.explanation, self.fit.fitted) if self.explanation else ()),
             html.heading("The dives"),
             html.bullets([*(c.sentence for c in self.checks), *left_out, *notes]),
             html.table(["dive", "", "subject", ""], remarks, text=(1, 2, 3)) if remarks else "",
