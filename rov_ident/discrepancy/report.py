@@ -229,7 +229,7 @@ def sections(explanation: Explanation, fitted: Config | None = None) -> list[str
         ]
     else:
         parts.append(report.paragraph("Nothing that depends on motion, place or time."))
-    parts += _retuned(f)
+    parts += _retuned(f, fitted or explanation.extended)
     if f.notes:
         parts += [report.heading("Notes"), report.bullets(f.notes)]
     return parts
@@ -458,25 +458,26 @@ def _in_each_record(r: Repetition) -> list[str]:
     return [report.paragraph(words), report.table(heads, rows)]
 
 
-def _retuned(f: Findings) -> list[str]:
+def _retuned(f: Findings, written: Config) -> list[str]:
     if not f.changed:
         return []
     rows = []
     for name, c in f.changed.items():
         after, std = estimate(c.after, c.std)
         sigma = number(abs(c.after - c.before) / c.std, 2) if c.std > 0.0 else "-"
-        rows.append([name, number(c.before, 4), after, std, c.unit, sigma, parse(name).meaning])
-    bent = (
-        " Where an effect is missing they bend to make up for it: the values to use are those of "
-        "extended.yaml, refitted together with the effects."
-    )
+        to_use, _ = estimate(written.value(name), c.std)
+        row = [name, number(c.before, 4), after, std, to_use, c.unit, sigma, parse(name).meaning]
+        rows.append(row)
+    bent = "Where an effect is missing they bend to make up for it. "
+    head = ["", "from", "to", "std", "extended.yaml", "unit", "off by [std]", "meaning"]
     return [
         report.heading("Retuned coefficients"),
         report.paragraph(
             "What refitting the coefficients that the simulation already has makes of them, "
-            f"before any effect is added.{bent if f.effects else ' extended.yaml has them.'}"
+            "before any effect is added, from the data that the search may fit. "
+            f"{bent if f.effects else ''}The values to use are those of extended.yaml, fitted last."
         ),
-        report.table(["", "from", "to", "std", "unit", "off by [std]", "meaning"], rows, (4, 6)),
+        report.table(head, rows, (5, 7)),
     ]
 
 
