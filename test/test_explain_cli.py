@@ -1,5 +1,6 @@
 """`rov-ident explain` as a command: its three files, its words, and wrong use."""
 
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -12,7 +13,7 @@ from bench import HEAVY
 from bench.simulators.hidden import Conditions, draw
 from rov_ident import config as configuration
 from rov_ident.discrepancy import report as told
-from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Value
+from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Together, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.io.write_messages import write_messages
 from rov_ident.simulation.virtual_sensors import dive

@@ -11,7 +11,7 @@ from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.files import write_file
 from rov_ident.discrepancy.explain import Explanation
-from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, predicted
+from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, judged, predicted
 from rov_ident.discrepancy.results import Finding, Findings, Gain, Repetition, Residual, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -209,15 +209,7 @@ def sections(explanation: Explanation, fitted: Config | None = None) -> list[str
     if f.effects:
         parts.append(report.heading("What is missing, and how sure that is"))
         parts += [_card(finding) for finding in f.effects]
-    if f.minor:
-        values = [", ".join(valued(n, v) for n, v in m.parameters.items()) for m in f.minor]
-        gains = [f"{m.gain.percent:.1f} %" for m in f.minor]
-        rows = zip([called(m.effect) for m in f.minor], values, gains, strict=True)
-        parts += [
-            report.heading("Minor effects"),
-            report.paragraph("Seen in the data, but of less than 2 % gain or not surely of any."),
-            report.table(["effect", "parameters", "gain"], [*map(list, rows)], text=(1,)),
-        ]
+    parts += minor(f.minor)
     parts.append(report.heading("What is left"))
     if f.residual:
         parts += [
@@ -441,6 +433,26 @@ def _card(finding: Finding) -> str:
         run = finding.manoeuvre or effect.manoeuvre
         parts.append(report.paragraph(f"{why} The run that would tell: {run}."))
     return report.card(name[0].upper() + name[1:], parts)
+
+
+def minor(effects: Sequence[Finding]) -> list[str]:
+    """Effects that are not worth a change, each with the interval of its gain."""
+    if not effects:
+        return []
+    rows = []
+    for f in effects:
+        gain = judged(f.gain)
+        values = ", ".join(valued(n, v) for n, v in f.parameters.items())
+        told = f"{gain.percent:.1f} % ({gain.low:.1f} to {gain.high:.1f})"
+        rows.append([called(f.effect), values, told])
+    return [
+        report.heading("Minor effects"),
+        report.paragraph(
+            "Seen in the data, but of less than 2 % gain, not surely of any (the interval holds "
+            "0), or not supported by all of the data."
+        ),
+        report.table(["effect", "parameters", "gain (95 %)"], rows, text=(1,)),
+    ]
 
 
 def _in_each_record(r: Repetition) -> list[str]:
