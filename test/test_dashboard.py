@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import io
 import json
 import math
 import re
@@ -19,14 +20,16 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
 from geometry_msgs.msg import WrenchStamped
+from rich.console import Console
 
 from bench import HEAVY, ROOT
 from bench.simulators.live import in_pace, same_to_rounding
 from rov_ident import config
 from rov_ident.core.states import State
 from rov_ident.dashboard import server
-from rov_ident.dashboard.store import BINS, MOST, POINTS, Series, Status, Store, plain
+from rov_ident.dashboard.store import BINS, MOST, POINTS, Estimator, Series, Status, Store, plain
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
+from rov_ident.nodes import watch_terminal
 from rov_ident.simulation import virtual_sensors as sensors
 
 CONFIGS = ROOT / "config"
@@ -612,6 +615,28 @@ async def _until_all_are_shown(url, expected, publish):
         assert len(state[node]["correlation"]) == len(report.names)
         assert len(state[node]["residuals"]["rows"]) > 5
         assert len(state[node]["history"]["rows"]) >= 1
+
+
+@pytest.mark.parametrize("kinds", [["rls"], ["rls", "ukf"]])
+def test_watch_cuts_no_name_and_no_state_in_a_narrow_terminal(kinds):
+    given = config.load(CONFIGS / "bluerov2_heavy.yaml")
+    heard = {}
+    for kind in kinds:
+        report = OnlineEstimator(given, kind).report()
+        states = tuple(State.CONVERGING for _ in report.names)
+        known = Estimator(f"/{kind}_node", "heavy", replace(report, states=states))
+        heard[f"/{kind}_node"] = known, 0.1
+    assert "thruster_lag.time_constant" in report.names
+    for width, units in ((200, True), (80, len(kinds) == 1)):
+        console = Console(file=io.StringIO(), width=width)
+        console.print(watch_terminal._picture(heard, console))
+        lines = console.file.getvalue().splitlines()
+        text = "\n".join(lines)
+        assert "…" not in text and max(map(len, lines)) <= width
+        assert text.count("converging") == len(kinds) * len(report.names)
+        assert ("N s2/m2" in text) == units
+        if units:
+            assert all(name in text for name in report.names)
 
 
 def test_watch_hears_nobody(domain):

@@ -1,5 +1,6 @@
 """`rov-ident explain` as a command: its three files, its words, and wrong use."""
 
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -12,7 +13,7 @@ from bench import HEAVY
 from bench.simulators.hidden import Conditions, draw
 from rov_ident import config as configuration
 from rov_ident.discrepancy import report as told
-from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Value
+from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Together, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.io.write_messages import write_messages
 from rov_ident.simulation.virtual_sensors import dive
@@ -163,6 +164,25 @@ def test_page_tells_what_to_change_and_why(page):
     ):  # fmt: skip
         assert part in text, part
     assert "nan" not in text.lower().split()
+
+
+def test_retuned_coefficients_stand_beside_those_that_are_written(page, folder):
+    extended = configuration.load(folder / "new/out/extended.yaml")
+    found = json.loads((folder / "new/out/findings.json").read_text())["retuned"]["changed"]
+    assert "<th>extended.yaml</th>" in page
+    for name, entry in found.items():
+        (row,) = re.findall(f"<tr><td>{name}</td>(.*?)</tr>", page)
+        written, _ = told.estimate(extended.value(name), entry["std"])
+        assert re.findall("<td>(.*?)</td>", row)[3] == written
+
+
+def test_a_minor_effect_shows_the_interval_of_its_gain():
+    lag = finding("thruster_lag", time_constant=(0.24, "s"))
+    unsure = dataclasses.replace(lag, gain=Gain("q", 0.02, 0.019, 4.0, -1.8, 9.5))
+    together = Together(3.0, 1.0, 5.0)
+    jointly = dataclasses.replace(lag, gain=dataclasses.replace(unsure.gain, together=together))
+    for f, shown in ((unsure, "4.0 % (-1.8 to 9.5)"), (jointly, "3.0 % (1.0 to 5.0)")):
+        assert shown in "".join(told.minor([f]))
 
 
 def test_page_follows_the_colours_of_the_reader(page):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import pytest
 from program import run_alone
@@ -12,8 +13,10 @@ from rov_ident.api import identification
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import Kept
 from rov_ident.discrepancy.hypothesis import Hypothesis
+from rov_ident.estimation import consistency
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import validation
+from rov_ident.reports.table import number
 
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
 
@@ -56,6 +59,13 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     places = [page.index(text) for text in ("falls by", "X_udot", "Fly next", "Measured and sim")]
     assert places == sorted(places)
     assert "Fly next" in done.stdout
+    # what is to be changed is what was written, and what it gains is told once
+    (box,) = re.findall("<pre>(.*?)</pre>", page, re.DOTALL)
+    lines = {line.split("#")[0].strip() for line in box.splitlines()}
+    changed = [name for name in found.model.names if found.value(name) != given.value(name)]
+    assert len(changed) > 5
+    assert {f"{name}: {number(found.value(name), 4)}" for name in changed} <= lines
+    assert page.count("Is it good now?") == 1 and "What it gains" not in page
 
 
 def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
@@ -65,6 +75,21 @@ def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
     assert "no dive is fit" in done.stderr and "fly instead: " in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not out.exists()
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_a_fit_that_the_data_contradict_is_doubted_in_the_headline(dives, agree):
+    fit = ri.fit(dives / "short.mcap", WRONG, "ls")
+    failed = consistency.Test("open loop: w", 1.0 if agree else 2.0, 1.05, "w is predicted worse")
+    fit = dataclasses.replace(
+        fit, consistency=consistency.Consistency((failed,)), notes=("has not settled",)
+    )
+    errors = {"rmse_before": {"w": 0.2}, "rmse": {"w": 0.1}}
+    found = identification.Identification(fit, None, (), {}, "", None, errors, fit.notes)
+    head = found.page().partition("<h2>")[0]
+    assert ("Data and model disagree" in head and "w is predicted worse" in head) != agree
+    assert ("not to be relied on" in found.advice[-1]) != agree
+    assert "has not settled" in found.page()
 
 
 @dataclasses.dataclass(frozen=True)

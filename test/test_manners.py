@@ -1,6 +1,7 @@
 """What every command does alike: quiet, progress, machine-readable results, completion."""
 
 import asyncio
+import io
 import json
 import os
 import pty
@@ -11,11 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
+from rich.console import Console
 
+import rov_ident as ri
 from bench import HEAVY
 from rov_ident.cli import program as cli
 from rov_ident.cli.program import main
 from rov_ident.reports import html, plots
+from rov_ident.reports.table import Table
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -172,6 +176,47 @@ def test_curves_are_read_out_and_zoomed_together(tmp_path):
     path.write_text(html.page("curves", "", [html.panels(panels, "")], ""))
     assert path.stat().st_size < 5e6
     asyncio.run(_zoom(path))
+
+
+def _long_names():
+    names = [*ri.load(HEAVY).model.names, "thruster_lag.time_constant", "velocity_latency.delay"]
+    rows = [[n, "-0.0000007", "0.000088", "N m s2/rad2", "-1.19", "converging"] for n in names]
+    return Table("fit", ["", "value", "± 95 %", "unit", "configured", "state"], rows, text=(3, 5))
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_a_table_with_long_names_shows_all_of_its_columns(tmp_path):
+    table = _long_names().html()
+    path = tmp_path / "page.html"
+    beside = html.beside_table([table], [html.bullets(["What to do next."])])
+    path.write_text(html.page("table", "", [beside], ""))
+    hidden = "(s => s.scrollWidth - s.clientWidth)(document.querySelector('.scroll'))"
+
+    async def look():
+        async with chromium() as browser:
+            await browser.open(path.as_uri(), 1425)
+            await browser.until("document.readyState == 'complete'")
+            assert await browser.evaluate(hidden) <= 0
+
+    asyncio.run(look())
+
+
+@pytest.mark.parametrize("width", [120, 80, 66, 40])
+def test_no_name_and_no_state_is_cut_in_a_terminal(width):
+    """Where there is no room the units go first; then what is widest is folded."""
+    table = _long_names()
+    console = Console(file=io.StringIO(), width=width)
+    console.print(table)
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= width and not any("…" in line for line in lines)
+    assert any("N m s2/rad2" in line for line in lines) == (width > 100)
+    cells = [[c.strip() for c in line.split("│")] for line in lines if "│" in line]
+    if width > 100:  # framed
+        cells = [row[1:-1] for row in cells]
+    for i in (0, -1):
+        assert "".join(row[i] for row in cells) == "".join(row[i] for row in table.rows)
+    if width > 60:
+        assert [row[-1] for row in cells if row[-1]] == ["converging"] * len(table.rows)
 
 
 async def _zoom(path):

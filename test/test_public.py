@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_info
 
 import rov_ident as ri
 from rov_ident.cli.program import main
+from rov_ident.config import dump
 
 ROOT = Path(__file__).parent.parent
 CONTRACT = (
@@ -307,6 +308,18 @@ def test_a_comparison_is_in_standard_deviations_of_the_difference(tmp_path, caps
     assert main(["compare", str(a), str(b), "--json", str(out)]) == 0
     assert json.loads(out.read_text()) == json.loads(found.to_json())
     assert "1 of 2 coefficients" in capsys.readouterr().out
+
+
+def test_values_without_intervals_are_not_judged(tmp_path, capsys):
+    given = ri.load(HEAVY)
+    name = given.model.names[3]
+    dump(given.with_values({name: 1.25 * given.value(name)}), tmp_path / "b.yaml")
+    assert main(["compare", str(HEAVY), str(tmp_path / "b.yaml")]) == 0
+    shown = capsys.readouterr().out
+    assert f"1 of {len(given.model.names)} coefficients differ; neither has intervals" in shown
+    assert "fit --json" in shown and "95 % interval of the difference" not in shown
+    (row,) = [line for line in shown.splitlines() if name in line]
+    assert ("-25.0" if given.value(name) < 0.0 else "+25.0") in row
 
 
 def test_every_kind_of_result_can_be_compared(tmp_path, fit, results):

@@ -106,6 +106,19 @@ def test_who_cannot_do_without_names_the_way(messages, tmp_path, capsys):
         assert "--estimator ml" in shown.err and "(DVL)" in shown.err and not shown.out
 
 
+def test_nothing_scores_what_was_not_measured(messages, tmp_path, capsys):
+    path = str(written(tmp_path / "dive.mcap", messages, *NOT_MEASURED["large variance"]))
+    found = tmp_path / "found.json"
+    command = ["simulate", "--config", str(HEAVY), "--bag", path, "--json", str(found)]
+    assert main([*command, "--out", str(tmp_path / "out.mcap")]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "/s" in line]
+    assert ["not measured" in row for row in rows] == [True] * 3 + [False] * 3
+    velocities = json.loads(found.read_text())["velocities"]
+    assert velocities["u"]["r2"] is None and velocities["u"]["rmse"] is None
+    assert velocities["r"]["rmse"] > 0.0
+    assert ri.simulate(HEAVY, bag=path).plot()
+
+
 def test_bags_with_and_without_are_fitted_apart(messages, tmp_path):
     without = written(tmp_path / "without.mcap", messages, *NOT_MEASURED["large variance"])
     measured = written(tmp_path / "with.mcap", messages, None, None)

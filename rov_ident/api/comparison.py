@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from rov_ident.api.identification import Identification
     from rov_ident.discrepancy.explain import Explanation
 
+_WITH_INTERVALS = (
+    "Results have intervals, parameter files have none: compare result.json of identify, or the "
+    "JSON that fit --json writes."
+)
 _LARGEST_FILE = 100 << 20  # bytes; more than any result has
 
 
@@ -76,6 +80,11 @@ class Comparison(Shown):
         return self.difference / np.where(std > 0.0, std, np.nan)
 
     @property
+    def percent(self) -> Array:
+        """The difference in percent of the first value (n,); NaN where that is zero."""
+        return 100.0 * self.difference / np.where(self.a == 0.0, np.nan, np.abs(self.a))
+
+    @property
     def changed(self) -> tuple[str, ...]:
         """The names whose difference is outside its 95 % interval, the surest first."""
         sure = np.nan_to_num(np.abs(self.deviations))
@@ -85,6 +94,13 @@ class Comparison(Shown):
     def sentence(self) -> str:
         """How many coefficients changed, and which one most surely."""
         n, chance = len(self.names), 0.05 * len(self.names)
+        if not self.difference_std.any():
+            differ = np.count_nonzero(self.difference)
+            return (
+                f"From {self.labels[0]} to {self.labels[1]}, {differ} of {n} coefficients differ; "
+                "neither has intervals, so nothing can be said of whether that is more than "
+                f"chance. {_WITH_INTERVALS}"
+            )
         text = (
             f"From {self.labels[0]} to {self.labels[1]}, {len(self.changed)} of {n} coefficients "
             f"differ by more than the 95 % interval of the difference (by chance: {chance:.1f})"
@@ -95,21 +111,30 @@ class Comparison(Shown):
         return f"{text}; most surely {self.changed[0]}, by {self.deviations[first]:+.1f} std."
 
     def table(self) -> Table:
-        """Both values with half of their 95 % intervals, and the difference in its std."""
+        """Both values with half of their 95 % intervals, and the difference in percent of the
+        first and in its std; of values without intervals, the difference in percent alone."""
         a, b = self.labels
-        offs = (f"{off:+.1f}" if math.isfinite(off) else "-" for off in self.deviations)
+        percents, offs = (
+            [f"{x:+.1f}" if math.isfinite(x) else "-" for x in xs]
+            for xs in (self.percent, self.deviations)
+        )
         rows = [
-            [name, *first, *second, unit, off, "changed" if name in self.changed else ""]
-            for name, first, second, unit, off in zip(
+            [name, *first, *second, unit, percent, off, "changed" if name in self.changed else ""]
+            for name, first, second, unit, percent, off in zip(
                 self.names,
                 map(_written, self.a, self.a_std),
                 map(_written, self.b, self.b_std),
                 self.units,
+                percents,
                 offs,
             )
         ]
-        head = ["", a, PLUS_MINUS, b, PLUS_MINUS, "unit", "difference [std]", ""]
-        return Table(f"{a} against {b}", head, rows, text=(5, 7))
+        head = ["", a, PLUS_MINUS, b, PLUS_MINUS, "unit", "difference [%]", "[std]", ""]
+        if not self.difference_std.any():
+            keep = (0, 1, 3, 5, 6)
+            head, rows = [head[i] for i in keep], [[row[i] for i in keep] for row in rows]
+            return Table(f"{a} against {b}", head, rows, text=(3,))
+        return Table(f"{a} against {b}", head, rows, text=(5, 8))
 
     def plot(self) -> "Figure":
         """Both values with their 95 % intervals, relative to the first."""

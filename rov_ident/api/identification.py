@@ -28,6 +28,7 @@ from rov_ident.core.files import write_file
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import EXTENDED
+from rov_ident.estimation.consistency import CAUSE
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
@@ -98,9 +99,19 @@ class Identification(Shown):
         if self.explanation is not None:
             where, told = "parts of the dives that were held back", self.explanation.sentence
         return (
-            f"{told} On {self.judge or where}, {falls(before, after)}; the data determine "
-            f"{known} of {total} parameters."
+            f"{self._doubt}{told} On {self.judge or where}, {falls(before, after)}; "
+            f"the data determine {known} of {total} parameters."
         )
+
+    @property
+    def _doubt(self) -> str:
+        """What the model and the data disagree in, in a sentence; empty where they agree."""
+        if self.fit.consistency.consistent:
+            return ""
+        why = self.fit.consistency.sentence
+        if self.explanation is not None:
+            why = why.replace(CAUSE, "what explain found is below")
+        return f"Data and model disagree, and intervals are wide: {why}. "
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -127,11 +138,17 @@ class Identification(Shown):
         if self.next is not None:
             advice.append(f"Fly next: {self.next.sentence}.")
         better = float(np.median([after / before for before, after in self.errors.values()])) < 1.0
-        advice.append(
-            "Use extended.yaml in place of the configuration, for nodes and commands."
-            if better
-            else "Keep the configuration: extended.yaml predicts no better than it does."
-        )
+        if not better:
+            advice.append("Keep the configuration: extended.yaml predicts no better than it does.")
+        elif self._doubt:
+            advice.append(
+                "Use extended.yaml to predict, better than the configuration does; its "
+                "coefficients are not to be relied on, as data and model disagree."
+            )
+        else:
+            advice.append(
+                "Use extended.yaml in place of the configuration, for nodes and commands."
+            )
         return tuple(advice)
 
     def table(self) -> Tables:
@@ -180,15 +197,17 @@ class Identification(Shown):
             if r.level != GOOD
         ]
         left_out = [f"{name} is left out: {why}" for name, why in self.left_out.items()]
+        told = self.explanation.findings.notes if self.explanation else ()
+        notes = [note for note in self.notes if note not in told]
         sections = [
-            html.beside(
+            html.beside_table(
                 [html.heading("Coefficients, against those configured"), coefficients.html()],
                 [html.heading("Is it good now?"), errors.html(), html.heading("What to do next"),
                  html.bullets(self.advice)],
             ),
-            *(of_explain.sections(self.explanation) if self.explanation else ()),
+            *(of_explain.sections(self.explanation, self.fit.fitted) if self.explanation else ()),
             html.heading("The dives"),
-            html.bullets([*(c.sentence for c in self.checks), *left_out]),
+            html.bullets([*(c.sentence for c in self.checks), *left_out, *notes]),
             html.table(["dive", "", "subject", ""], remarks, text=(1, 2, 3)) if remarks else "",
         ]  # fmt: skip
         return html.page(

@@ -23,8 +23,8 @@ from rov_ident.sampling.records import (
     HORIZON,
     VELOCITIES,
     Score,
+    measured_motion,
     numbers,
-    over_ground,
     predicted,
     score,
 )
@@ -45,8 +45,9 @@ class Simulation(Shown):
     forward-starboard-down, at ``t`` (k,) [s].
 
     Beside a bag: ``measured`` (k, 6) what the bag has, ``whole`` and ``windows`` the error of the
-    simulation in one run and in windows of HORIZON seconds, and ``free`` (6,) which axes were
-    simulated. Of a manoeuvre, these are None, and ``messages`` are what simulated sensors saw.
+    simulation in one run and in windows of HORIZON seconds, all NaN where no velocity was measured,
+    and ``free`` (6,) which axes were simulated. Of a manoeuvre, these are None, and ``messages``
+    are what simulated sensors saw.
     """
 
     name: str
@@ -79,11 +80,13 @@ class Simulation(Shown):
                 for name, x, unit in zip(VELOCITIES, self.nu.T, _UNITS)
             ]
             return Table(self.sentence, ["", "least", "most", "rms", "unit"], rows, text=(4,))
-        rows = [
-            [VELOCITIES[i], f"{self.whole.r2[i]:.3f}", f"{self.whole.rmse[i]:.4f}",
-             f"{self.windows.rmse[i]:.4f}", _UNITS[i]]
-            for i in self._chosen
-        ]  # fmt: skip
+        rows = []
+        for i in self._chosen:
+            scores = (self.whole.r2[i], self.whole.rmse[i], self.windows.rmse[i])
+            cells = [f"{x:.{d}f}" for x, d in zip(scores, (3, 4, 4))]
+            if not np.isfinite(self.whole.rmse[i]):
+                cells = ["not measured", "-", "-"]
+            rows.append([VELOCITIES[i], *cells, _UNITS[i]])
         head = ["", "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit"]
         return Table(f"open-loop simulation against {self.name}", head, rows, text=(4,))
 
@@ -188,7 +191,7 @@ def simulate(
         t,
         nu,
         odometry_of(t, nu),
-        over_ground(record.samples),
+        measured_motion(record.samples),
         free,
         score(model, record.samples, math.inf, free, effects),
         score(model, record.samples, HORIZON, free, effects),

@@ -170,16 +170,17 @@ def improved(gain: Gain) -> str:
 
 def is_practical(gain: Gain) -> bool:
     """Whether a gain is sure, and large enough to matter."""
-    judged = _judged(gain)
-    return judged.percent >= 100.0 * PRACTICAL and judged.low > 0.0
+    part = judged(gain)
+    return part.percent >= 100.0 * PRACTICAL and part.low > 0.0
 
 
 def is_sure(gain: Gain) -> bool:
     """Whether predictions improve, be it by little."""
-    return _judged(gain).low > 0.0
+    return judged(gain).low > 0.0
 
 
-def _judged(gain: Gain) -> Gain | Together:
+def judged(gain: Gain) -> Gain | Together:
+    """The part of a gain that decides about it."""
     return gain if gain.low > 0.0 or gain.together is None else gain.together
 
 

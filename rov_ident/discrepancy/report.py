@@ -11,7 +11,7 @@ from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.files import write_file
 from rov_ident.discrepancy.explain import Explanation
-from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, predicted
+from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, judged, predicted
 from rov_ident.discrepancy.results import Finding, Findings, Gain, Repetition, Residual, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -27,7 +27,12 @@ _SENSES = (("astern", "forward"), _SIDES, ("up", "down"), _SIDES, ("bow down", "
 SENSES = dict(zip(VELOCITIES, _SENSES))
 """What a negative and a positive velocity mean."""
 
+_BEFORE_THE_FIT = (
+    "All from here on is from the search that came before the last fit, whose values are those "
+    'above and in extended.yaml; "retuned" and "extended" are models of the search.'
+)
 _TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
+_COMMENTS = 40  # characters to the left of what a line was, but for lists
 _TOLD = 3  # parameters of an effect in the verdict
 _SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
 _STRETCH = 30.0  # s of motion that is shown
@@ -175,16 +180,24 @@ def page(explanation: Explanation) -> str:
     return report.page(title, verdict(f), sections(explanation), origin)
 
 
-def sections(explanation: Explanation) -> list[str]:
-    """The parts of the page below its headline."""
-    f, before = explanation.findings, explanation.given
+def sections(explanation: Explanation, fitted: Config | None = None) -> list[str]:
+    """The parts of the page below its headline.
+
+    ``fitted``: the configuration that is written in place of the extended one, where a fit followed
+    the search. What that gains is then told elsewhere.
+    """
+    f = explanation.findings
     rmse, shown = _shown(explanation)
     key = _legend(shown)
+    change = [report.heading("What to change"), *_change(explanation, fitted)]
+    if fitted is None:
+        gains = [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))]
+        begin = [report.beside(change, gains)]
+    else:
+        begin = [*change, report.heading("The search for what is missing")]
+        begin.append(report.paragraph(_BEFORE_THE_FIT))
     parts = [
-        report.beside(
-            [report.heading("What to change"), *_change(before, explanation)],
-            [report.heading("What it gains"), key, *_gains(rmse, bool(explanation.held))],
-        ),
+        *begin,
         report.heading("Measured and simulated"),
         _legend([plots.MEASURED, *shown]),
         *_motion(explanation, shown),
@@ -196,15 +209,7 @@ def sections(explanation: Explanation) -> list[str]:
     if f.effects:
         parts.append(report.heading("What is missing, and how sure that is"))
         parts += [_card(finding) for finding in f.effects]
-    if f.minor:
-        values = [", ".join(valued(n, v) for n, v in m.parameters.items()) for m in f.minor]
-        gains = [f"{m.gain.percent:.1f} %" for m in f.minor]
-        rows = zip([called(m.effect) for m in f.minor], values, gains, strict=True)
-        parts += [
-            report.heading("Minor effects"),
-            report.paragraph("Seen in the data, but of less than 2 % gain or not surely of any."),
-            report.table(["effect", "parameters", "gain"], [*map(list, rows)], text=(1,)),
-        ]
+    parts += minor(f.minor)
     parts.append(report.heading("What is left"))
     if f.residual:
         parts += [
@@ -216,7 +221,7 @@ def sections(explanation: Explanation) -> list[str]:
         ]
     else:
         parts.append(report.paragraph("Nothing that depends on motion, place or time."))
-    parts += _retuned(f)
+    parts += _retuned(f, fitted or explanation.extended)
     if f.notes:
         parts += [report.heading("Notes"), report.bullets(f.notes)]
     return parts
@@ -239,15 +244,15 @@ def _legend(labels: Iterable[str]) -> str:
     return report.legend({label: entries[label] for label in labels})
 
 
-def _change(before: Config, explanation: Explanation) -> list[str]:
-    old = configuration.to_parameters(before)
-    new = configuration.to_parameters(explanation.extended)
+def _change(explanation: Explanation, fitted: Config | None) -> list[str]:
+    old = configuration.to_parameters(explanation.given)
+    new = configuration.to_parameters(fitted or explanation.extended)
     news = {k: new[k] for k in sorted(new, key=lambda k: k != "effects")}  # what is new first
     lines = _lines(old, news)
-    if explanation.findings.verdict == "agrees" or not lines:
+    if (fitted is None and explanation.findings.verdict == "agrees") or not lines:
         nothing = "Nothing. extended.yaml holds the refitted coefficients, which predict no better."
         return [report.paragraph(nothing)]
-    width = max(len(line) for line, _ in lines)
+    width = min(_COMMENTS, max(len(line) for line, _ in lines))
     text = "\n".join(f"{line:<{width}}  {was}".rstrip() for line, was in lines)
     return [
         report.code(text),
@@ -430,6 +435,26 @@ def _card(finding: Finding) -> str:
     return report.card(name[0].upper() + name[1:], parts)
 
 
+def minor(effects: Sequence[Finding]) -> list[str]:
+    """Effects that are not worth a change, each with the interval of its gain."""
+    if not effects:
+        return []
+    rows = []
+    for f in effects:
+        gain = judged(f.gain)
+        values = ", ".join(valued(n, v) for n, v in f.parameters.items())
+        told = f"{gain.percent:.1f} % ({gain.low:.1f} to {gain.high:.1f})"
+        rows.append([called(f.effect), values, told])
+    return [
+        report.heading("Minor effects"),
+        report.paragraph(
+            "Seen in the data, but of less than 2 % gain, not surely of any (the interval holds "
+            "0), or not supported by all of the data."
+        ),
+        report.table(["effect", "parameters", "gain (95 %)"], rows, text=(1,)),
+    ]
+
+
 def _in_each_record(r: Repetition) -> list[str]:
     """Whether an effect is the same in each of several records, and what it is in each."""
     words = "It is the same in each record." if r.same else "The records differ in it."
@@ -445,25 +470,26 @@ def _in_each_record(r: Repetition) -> list[str]:
     return [report.paragraph(words), report.table(heads, rows)]
 
 
-def _retuned(f: Findings) -> list[str]:
+def _retuned(f: Findings, written: Config) -> list[str]:
     if not f.changed:
         return []
     rows = []
     for name, c in f.changed.items():
         after, std = estimate(c.after, c.std)
         sigma = number(abs(c.after - c.before) / c.std, 2) if c.std > 0.0 else "-"
-        rows.append([name, number(c.before, 4), after, std, c.unit, sigma, parse(name).meaning])
-    bent = (
-        " Where an effect is missing they bend to make up for it: the values to use are those of "
-        "extended.yaml, refitted together with the effects."
-    )
+        to_use, _ = estimate(written.value(name), c.std)
+        row = [name, number(c.before, 4), after, std, to_use, c.unit, sigma, parse(name).meaning]
+        rows.append(row)
+    bent = "Where an effect is missing they bend to make up for it. "
+    head = ["", "from", "to", "std", "extended.yaml", "unit", "off by [std]", "meaning"]
     return [
         report.heading("Retuned coefficients"),
         report.paragraph(
             "What refitting the coefficients that the simulation already has makes of them, "
-            f"before any effect is added.{bent if f.effects else ' extended.yaml has them.'}"
+            "before any effect is added, from the data that the search may fit. "
+            f"{bent if f.effects else ''}The values to use are those of extended.yaml, fitted last."
         ),
-        report.table(["", "from", "to", "std", "unit", "off by [std]", "meaning"], rows, (4, 6)),
+        report.table(head, rows, (5, 7)),
     ]
 
 

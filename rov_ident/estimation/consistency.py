@@ -20,6 +20,7 @@ from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES
 from rov_ident.sampling.records import VELOCITIES
 
+CAUSE = "rov-ident explain looks for the cause"
 _SUPPOSED = (
     2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
 )
@@ -92,7 +93,7 @@ class Consistency:
                     Test(
                         f"open loop: {component}", new / most, _WORSE,
                         f"the fit predicts {component} worse than the configuration does (error "
-                        f"{new:.3g} instead of {old:.3g}): rov-ident explain looks for the cause",
+                        f"{new:.3g} instead of {old:.3g}): {CAUSE}",
                     )
                 )  # fmt: skip
         return Consistency(tuple(tests))
@@ -132,7 +133,7 @@ def consistency_of(
                 Test(
                     f"unexplained: {axis}", share, FIRST_FORCE,
                     f"something acts along {axis} that the model does not have: {share:.1%} of "
-                    "the working wrench; rov-ident explain looks for the cause",
+                    f"the working wrench; {CAUSE}",
                 )
             )  # fmt: skip
     powers = [] if lasting is None else lasting.tolist()
@@ -142,7 +143,7 @@ def consistency_of(
                 Test(
                     f"whiteness: {axis}", float(np.sqrt(power)), _WHITE,
                     f"predictions along {axis} are off for a second by {np.sqrt(power):.1f} times "
-                    "what noise explains: rov-ident explain looks for the cause",
+                    f"what noise explains: {CAUSE}",
                 )
             )  # fmt: skip
     supposed = {".".join(key) for key in config.nuisance_std}

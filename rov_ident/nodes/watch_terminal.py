@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import chain
-from typing import Any
+from typing import Any, Literal
 
 from rich import box
 from rich.console import Console, Group
@@ -23,12 +23,15 @@ from rov_ident.dashboard.store import GONE, Estimator, Store, plain
 from rov_ident.estimation.online import Report
 from rov_ident.nodes.conversions import entries, for_json
 from rov_ident.nodes.watch_node import watching
+from rov_ident.reports.table import fitting
 
 Heard = Mapping[str, tuple[Estimator, float]]
 """By the full name of a node: what it published, and how long ago [s]."""
 
 _REFRESH = 4.0  # Hz; nodes publish at 5 Hz
 _SETTLING = 3.5  # s; without a new one: DDS repeats announcements every 3 s
+_LAYOUTS = ((True, True), (False, True), (False, False))
+"""Whether there are columns of excitation and of units: what is dropped where there is no room."""
 _COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Level.STALE: "dim"}
 
 
@@ -127,7 +130,9 @@ def _picture(heard: Heard, console: Console) -> Group | Text:
     parts: list[Text | Table] = []
     for namespace, names in vehicles.items():
         parts += [_health(name, *heard[name]) for name in names]
-        parts.append(_table(namespace, {name: heard[name][0] for name in names}, console.width))
+        estimators = {name: heard[name][0] for name in names}
+        layouts = (_table(namespace, estimators, *more) for more in _LAYOUTS)
+        parts.append(fitting(layouts, console, console.width))
     return Group(*parts)
 
 
@@ -142,11 +147,10 @@ def _health(name: str, known: Estimator, silent: float) -> Text:
     return text
 
 
-def _table(namespace: str, estimators: Mapping[str, Estimator], width: int) -> Table:
-    wide = width >= 60 + 30 * len(estimators)
+def _table(namespace: str, estimators: Mapping[str, Estimator], excited: bool, unit: bool) -> Table:
     title = namespace.rstrip("/") or None
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("")
+    table.add_column("", overflow="fold")
     units: dict[str, str] = {}
     columns = []
     for node, known in estimators.items():
@@ -154,12 +158,14 @@ def _table(namespace: str, estimators: Mapping[str, Estimator], width: int) -> T
         units.update(zip(known.report.names, known.report.units))
         columns.append(_cells(known.report))
         short = node.rpartition("/")[2].removesuffix("_node")
-        for head in (short, "std", "state", "excited")[: 3 + wide]:
-            table.add_column(head, justify="left" if head == "state" else "right")
-    table.add_column("unit")
-    for name, unit in units.items():
-        rows = (cells.get(name, [Text()] * 4)[: 3 + wide] for cells in columns)
-        table.add_row(name, *chain.from_iterable(rows), unit)
+        for head in (short, "std", "state", "excited")[: 3 + excited]:
+            justify: Literal["left", "right"] = "left" if head == "state" else "right"
+            table.add_column(head, justify=justify, overflow="fold")
+    if unit:
+        table.add_column("unit", overflow="fold")
+    for name, of in units.items():
+        rows = (cells.get(name, [Text()] * 4)[: 3 + excited] for cells in columns)
+        table.add_row(name, *chain.from_iterable(rows), *([of] if unit else []))
     return table
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from rov_ident.core.messages import Array
 from rov_ident.offline.fit import Curves, Fit
 from rov_ident.reports import plots
-from rov_ident.reports.html import beside, bullets, heading, legend, origin, panels, paragraph
+from rov_ident.reports.html import beside_table, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
 from rov_ident.reports.table import Tables
 from rov_ident.sampling.records import HORIZON, VELOCITIES
@@ -22,7 +22,7 @@ def page(fit: Fit) -> str:
     coefficients = shown.parts[0] if isinstance(shown, Tables) else shown
     judged, drawn = fit.judged, fit.curves
     sections = [
-        beside(
+        beside_table(
             [heading("Coefficients"), coefficients.html()],
             [heading("What to do next"), bullets(fit.advice)],
         ),

@@ -77,6 +77,11 @@ def beside(*parts: Sequence[str]) -> str:
     return "<div class='beside'>" + "".join(f"<div>{''.join(p)}</div>" for p in parts) + "</div>"
 
 
+def beside_table(table: Sequence[str], *parts: Sequence[str]) -> str:
+    """A table as wide as it is, and parts of a page beside it where there is room."""
+    return beside(table, *parts).replace("'beside'", "'beside table'", 1)
+
+
 def card(title: str, parts: Sequence[str]) -> str:
     """A framed part of the page."""
     return f"<section class='card'><h3>{escape(title)}</h3>{''.join(parts)}</section>"

@@ -1,14 +1,14 @@
 """Tables of text, for a terminal, a page and a notebook; numbers written as their digits allow."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import StringIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    from rich.console import Console, ConsoleOptions, Group, RenderResult
     from rich.table import Table as RichTable
 
 PLUS_MINUS = "± 95 %"
@@ -28,15 +28,24 @@ class Table:
     rows: Sequence[Sequence[str]]
     text: Sequence[int] = ()
 
-    def __rich__(self) -> "RichTable":
+    def __rich_console__(self, console: "Console", options: "ConsoleOptions") -> "RenderResult":
+        yield fitting((self._rich(), self._rich(narrow=True)), console, options.max_width)
+
+    def _rich(self, narrow: bool = False) -> "RichTable":
+        """``narrow``: without units and without a frame."""
         from rich.table import Table as RichTable
         from rich.text import Text
 
-        table = RichTable(title=Text(self.title), title_justify="left")
-        for i, name in enumerate(self.head):
-            table.add_column(Text(name), justify="left" if i == 0 or i in self.text else "right")
+        columns = [i for i, name in enumerate(self.head) if not (narrow and name == "unit")]
+        title = self.title if len(columns) == len(self.head) else f"{self.title} [SI units]"
+        frame = not narrow
+        table = RichTable(title=Text(title), title_justify="left", show_edge=frame, pad_edge=frame)
+        for i in columns:
+            justify: Literal["left", "right"] = "left" if i == 0 or i in self.text else "right"
+            # in a narrow terminal the widest columns are folded first, and nothing is cut
+            table.add_column(Text(self.head[i]), justify=justify, overflow="fold")
         for row in self.rows:
-            table.add_row(*map(Text, row))
+            table.add_row(*(Text(row[i]) for i in columns))
         return table
 
     def __str__(self) -> str:
@@ -84,6 +93,17 @@ class Tables:
         from rov_ident.reports.html import fragment
 
         return fragment([self.html()])
+
+
+def fitting(tables: "Iterable[RichTable]", console: "Console", width: int) -> "RichTable":
+    """The first table of which ``width`` characters need no column folded, or the last."""
+    from rich.measure import Measurement
+
+    unbound = console.options.update_width(10_000)
+    for table in tables:
+        if Measurement.get(console, unbound, table).maximum <= width:
+            break
+    return table
 
 
 def _printed(table: Table) -> str:

@@ -164,9 +164,10 @@ def score(
     free: NDArray[np.bool_] | None = None,
     effects: Acting | None = None,
 ) -> Score:
-    """Score the simulation of :func:`predicted` where the velocity was measured."""
+    """Score the simulation of :func:`predicted` where the velocity was measured: NaN where none
+    was."""
     measured = samples["measured"]
-    nu = over_ground(samples)[measured]
+    nu = measured_motion(samples)[measured]
     error = predicted(model, samples, horizon, free, effects)[measured] - nu
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(np.mean(error**2, axis=0))
