@@ -65,6 +65,7 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     changed = [name for name in found.model.names if found.value(name) != given.value(name)]
     assert len(changed) > 5
     assert {f"{name}: {number(found.value(name), 4)}" for name in changed} <= lines
+    assert all(line.find("#") < 60 for line in box.splitlines() if "[" not in line)
     assert page.count("Is it good now?") == 1 and "What it gains" not in page
 
 

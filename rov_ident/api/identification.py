@@ -110,7 +110,7 @@ class Identification(Shown):
             return ""
         why = self.fit.consistency.sentence
         if self.explanation is not None:
-            why = why.replace(CAUSE, "what explain found is below")
+            why = why.replace(CAUSE, "what explain found follows")
         return f"Data and model disagree, and intervals are wide: {why}. "
 
     @property

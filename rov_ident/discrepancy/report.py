@@ -32,7 +32,6 @@ _BEFORE_THE_FIT = (
     'above and in extended.yaml; "retuned" and "extended" are models of the search.'
 )
 _TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
-_COMMENTS = 40  # characters to the left of what a line was, but for lists
 _TOLD = 3  # parameters of an effect in the verdict
 _SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
 _STRETCH = 30.0  # s of motion that is shown
@@ -252,7 +251,7 @@ def _change(explanation: Explanation, fitted: Config | None) -> list[str]:
     if (fitted is None and explanation.findings.verdict == "agrees") or not lines:
         nothing = "Nothing. extended.yaml holds the refitted coefficients, which predict no better."
         return [report.paragraph(nothing)]
-    width = min(_COMMENTS, max(len(line) for line, _ in lines))
+    width = max((len(line) for line, _ in lines if not line.endswith("]")), default=0)
     text = "\n".join(f"{line:<{width}}  {was}".rstrip() for line, was in lines)
     return [
         report.code(text),
