@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve
 
+from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.linearisation import Linearisation, linearise
 from rov_ident.discrepancy.output_error import Fitted, refit
@@ -290,5 +290,4 @@ def _penalised(
 def _solved(normal: Array, right: Array) -> Array:
     """The solution of normal equations (n, n), held where the data say nothing."""
     size = np.diag(normal) + 1e-9 * float(np.trace(normal)) / max(len(normal), 1) + 1e-300
-    out: Array = solve(normal + 1e-9 * np.diag(size), right, assume_a="sym")
-    return out
+    return scaled_solve(normal, right, 1e-9, np.sqrt(size))
