@@ -9,6 +9,7 @@ from test_bags import write_mcap
 
 import rov_ident as ri
 from bench import DATA, ROOT
+from rov_ident.api import identification
 from rov_ident.cli.program import main
 from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS, from_parameters, to_parameters
 from rov_ident.config.writing import annotated
@@ -154,6 +155,10 @@ def test_a_borrowed_mass_is_not_trusted(tmp_path, capsys):
         i = fit.names.index(name)
         assert abs(fit.values[i] - true) < 3.0 * fit.std[i], name
     assert "Weigh the vehicle: thrust is 0." in fit.advice[0]
+    found = identification.Identification(
+        fit, None, (), {}, "", None, {"rmse_before": {"w": 0.2}, "rmse": {"w": 0.1}}, ()
+    )
+    assert fit.advice[0] in found.advice
 
 
 def test_two_twists_of_mavros_are_told_apart_by_their_usual_names(tmp_path):

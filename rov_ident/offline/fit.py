@@ -108,13 +108,18 @@ class Fit(Shown, Result):
         return told
 
     @property
+    def to_weigh(self) -> tuple[str, ...]:
+        """That the vehicle should be weighed, where its mass may be off instead of the thrust."""
+        scale = float(dict(zip(self.names, self.values)).get(SCALE, 1.0))
+        if abs(scale - 1.0) <= _NOTICED * self.given.wrench.scale_std:
+            return ()
+        return (f"Weigh the vehicle: {thrust_or_mass(scale)}.",)
+
+    @property
     def advice(self) -> tuple[str, ...]:
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.names, self.identifiable) if not known]
-        advice = []
-        scale = float(dict(zip(self.names, self.values)).get(SCALE, 1.0))
-        if abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
-            advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
+        advice = [*self.to_weigh]
         if impossible := self.more.get("impossible"):
             held = [name for name in held if name not in impossible]
             advice.append(
