@@ -231,6 +231,6 @@ def test_the_thrusters_of_a_real_heavy(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "thruster 1, 2, 5, 8 pushes the other way than the configuration says" in said
     assert "6 % of the log is armed" in said
-    assert main(["init", str(LOGS / "a.tlog"), "--out", str(out)]) == 0
+    assert main(["init", str(LOGS / "a.tlog"), "--out", str(out), "--force"]) == 0
     said = capsys.readouterr().err
     assert "no velocity (a DVL" in said and "next: " not in said

@@ -78,14 +78,14 @@ class Identification(Shown):
     def errors(self) -> dict[str, tuple[float, float]]:
         """RMSE of the open-loop prediction by velocity, as configured and as identified; [m/s],
         [rad/s]."""
-        if self.judged or self.explanation is None:
-            both: tuple[Any, Any] = (
-                self.fit.more["open_loop_before"]["rmse"],
-                numbers(self.fit.rmse),
-            )
-            if self.judged:
-                both = self.judged["rmse_before"], self.judged["rmse"]
+        both: tuple[Any, Any] | None = None
+        if self.judged:
+            both = self.judged["rmse_before"], self.judged["rmse"]
+        elif self.explanation is None:
+            both = self.fit.more["open_loop_before"]["rmse"], numbers(self.fit.rmse)
+        if both is not None:
             return {n: (x, both[1][n]) for n, x in both[0].items() if None not in (x, both[1][n])}
+        assert self.explanation is not None
         found = self.explanation.findings
         after = found.extended if found.effects else found.retuned
         return {name: (found.baseline[name], after[name]) for name in found.baseline}
