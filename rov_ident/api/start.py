@@ -79,7 +79,7 @@ class _Found:
         for name in self.parameters["coefficients"]:
             self.remarks[f"coefficients.{name}"] = assumed
         for name in ("mass_std", "inertia_std"):
-            self.put(f"vehicle.{name}", _BORROWED, "not weighed: remove it when mass is yours")
+            self.put(f"vehicle.{name}", _BORROWED, "a guess: remove it once it is weighed")
         self.notes.append(
             f"Mass and buoyancy are those of {vehicle}.yaml. Weigh yours: thrust, mass and all "
             "coefficients k times as large move alike, so all are wrong by as much as the mass"
