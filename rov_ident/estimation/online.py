@@ -21,6 +21,7 @@ from rov_ident.core.whiteness import JUDGED_TIME
 from rov_ident.effects import EFFECTS, parameter
 from rov_ident.estimation import innovation_monitor, rls, ukf
 from rov_ident.estimation.consistency import Consistency, consistency_of
+from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.estimation.shared import INFO
@@ -153,6 +154,7 @@ class OnlineEstimator:
         """Back to the prior; the input buffers and counts go on, in whatever frames come next."""
         self.sampler.validation.forget_frames()
         self._state = self._module.init(self._task)
+        self._update = IteratedUpdate(self._state) if self.kind == "rls" else None
         self._last_t = math.nan
         self._recalled = 0  # ns: the stamp before the first sample
         # information over the prior's: in the window that is filling, and in the one before
@@ -173,6 +175,7 @@ class OnlineEstimator:
         """Take other settings of the same model and coefficients; what is learnt stays."""
         self.config = config = config.with_nuisance
         self._task = self._module.problem(config)
+        self._begin_window()
         self.sampler.configure(config)
         self._centre(self._present)
 
@@ -211,7 +214,10 @@ class OnlineEstimator:
 
     def flush(self) -> NDArray[np.void]:
         """The input has ended or stopped: use what still waits for a late topic."""
-        return self.take(self.sampler.flush())
+        info = self.take(self.sampler.flush())
+        if self._update:
+            self._state = self._update.look_back(self._task, self._state)
+        return info
 
     @one_blas_thread()
     def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
@@ -227,7 +233,7 @@ class OnlineEstimator:
             samples = samples.copy()
             samples["restart"][0] = True
             self._paused = False
-        self._state, info = self._module.fold(self._task, self._state, samples)
+        info = self._fold(samples)
         self._last_t = float(samples["t"][-1])
         for reason in self._module.REFUSALS:
             if count := int(np.count_nonzero(info["reason"] == reason)):
@@ -242,9 +248,29 @@ class OnlineEstimator:
                 self.monitor.look(window, self.report().by_name)
         return info
 
+    def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
+        """Samples (k,) into the state, which RLS looks back on as often as their times say."""
+        fold, task, update = self._module.fold, self._task, self._update
+        if not update:
+            self._state, info = fold(task, self._state, samples)
+            return info
+        infos = []
+        while len(samples):
+            count = update.until_due(samples)
+            self._state, info = fold(task, self._state, samples[:count])
+            self._state = update.after(task, self._state, samples[:count])
+            samples = samples[count:]
+            infos.append(info)
+        return np.concatenate(infos) if len(infos) > 1 else infos[0]
+
+    def _begin_window(self) -> None:
+        if self._update:
+            self._update.begin(self._state)
+
     def next_record(self) -> None:
         """Another record follows: inputs begin anew, what is learnt stays."""
         self.sampler, self._settled = Sampler(self.config), math.nan
+        self._begin_window()
         self._centre(self._present)
 
     @property
@@ -330,6 +356,7 @@ class OnlineEstimator:
     def _begin_with(self, memory: Memory) -> None:
         """Know what is in the memory and nothing else."""
         self._state, self._centred = memory.state, math.nan
+        self._begin_window()
         self._learnt_about, self._settled = self._about, math.nan
         self._gained, self._window = memory.gained.copy(), memory.window.copy()
         self._variance, self._safe = memory.variance, memory.safe

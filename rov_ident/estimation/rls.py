@@ -125,6 +125,7 @@ _SCALARS = record(
         ("peak", "f8", (6,)),  # squared velocities, their peaks of late
         ("free", "i8"),  # so many of the first columns take rows
         ("started", "?"),
+        ("pinned", "?"),  # the observer keeps the coefficients that it has
     ]
 )
 
@@ -197,6 +198,24 @@ def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State,
     return state, info
 
 
+def fold_about(
+    task: Problem, state: State, samples: NDArray[np.void], solution: Array
+) -> State | None:
+    """:func:`fold` with an observer at one solution (n,), in the order of the coefficients.
+
+    None if the velocities run away with it.
+    """
+    state = State(*(part.copy() for part in state))
+    info = np.zeros(len(samples), dtype=INFO)
+    deviation = np.clip(solution, -task.reach, task.highest)[state.order]
+    state.nu[:] += state.sensitivity @ (deviation - state.deviation)
+    state.deviation[:] = deviation
+    state.scalars["pinned"] = True
+    _fold(task, state, *parts(samples), info)
+    state.scalars["pinned"] = False
+    return None if (info["reason"] == UNPREDICTABLE).any() else state
+
+
 def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
     """One sample (1,) of SAMPLE; the next state and what happened (1,) of INFO."""
     assert len(sample) == 1
@@ -217,6 +236,12 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
         unit @ covariance @ unit.T,
         float(state.scalars["t"][0]),
     )
+
+
+def solution_of(task: Problem, state: State) -> tuple[Array, Array]:
+    """The coordinates and their standard deviations, both (n,) in the order of the coefficients."""
+    place, inverse = np.argsort(state.order), inverse_of(state.root)
+    return (inverse @ state.root[:, -1])[place], np.linalg.norm(inverse, axis=1)[place]
 
 
 def variance(task: Problem, state: State) -> Array:
@@ -704,8 +729,9 @@ def _add_up(task, state, work, since):
         state.nu[i] += total
     for a in range(n):
         change[a], state.solution[a] = gradient[a] - state.solution[a], gradient[a]
-        highest = task.highest[state.order[a]]
-        state.deviation[a] = min(max(gradient[a], -task.reach[state.order[a]]), highest)
+        if not state.scalars[0].pinned:
+            highest = task.highest[state.order[a]]
+            state.deviation[a] = min(max(gradient[a], -task.reach[state.order[a]]), highest)
         gradient[a] = 0.0
     for i in range(6):
         total = 0.0

@@ -1,0 +1,69 @@
+"""Rows of RLS that were taken about poor estimates, taken again about better ones.
+
+A row of the least squares is right to first order in the distance of the coefficients it was taken
+about. Before much is known that distance is large: rows then claim to know combinations of
+coefficients that the motion does not tell, and no later row takes that back ("Looking back" in
+docs/accuracy.md). So the samples of a window are kept, with the state from before them. Once the
+estimate has left the values that the rows were taken about, the samples are folded again from that
+state, with an observer at the estimate as it is now: the iterated update (Bell and Cathey 1993,
+IEEE Trans. Automat. Contr. 38, 294), which is a Gauss-Newton step, over a window.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.core.jit import interpreting
+from rov_ident.core.messages import Array
+from rov_ident.estimation import rls
+from rov_ident.estimation.shared import Problem
+
+# s after the beginning of a window, which ends with the last; doubled, so that at most twice as
+# many samples are folded again as come in. "Looking back" has the study.
+_TIMES = (7.5, 15.0, 30.0)
+_MOVED = 1.0  # standard deviations, by which an estimate may be off in any case
+
+
+class IteratedUpdate:
+    """The samples of a window and the state before them; begins with a ``state``."""
+
+    def __init__(self, state: rls.State) -> None:
+        self.begin(state)
+
+    def begin(self, state: rls.State) -> None:
+        """A new window: what was learnt before stays as it is."""
+        self._before, self._samples = state, list[NDArray[np.void]]()
+        self._about: Array = state.solution[np.argsort(state.order)]
+        self._began, self._looks = np.nan, 0
+
+    def until_due(self, samples: NDArray[np.void]) -> int:
+        """How many of the next samples (k,) are to be folded before :meth:`after` is asked."""
+        if np.isnan(self._began) and len(samples):
+            self._began = float(samples["t"][0])
+        due = np.flatnonzero(samples["t"] >= self._began + _TIMES[self._looks])
+        return int(due[0]) + 1 if len(due) else len(samples)
+
+    def after(self, task: Problem, state: rls.State, samples: NDArray[np.void]) -> rls.State:
+        """The state to go on with, after these samples (k,) were folded."""
+        self._samples.append(samples.copy())
+        if samples["t"][-1] < self._began + _TIMES[self._looks]:
+            return state
+        state = self.look_back(task, state)
+        self._looks += 1
+        if self._looks == len(_TIMES):
+            self.begin(state)
+        return state
+
+    def look_back(self, task: Problem, state: rls.State) -> rls.State:
+        """The state with the window's samples folded about its estimate, if that has moved.
+
+        Not while kernels are interpreted, when it would take minutes.
+        """
+        solution, std = rls.solution_of(task, state)
+        moved = np.abs(solution - self._about) > _MOVED * std
+        if interpreting() or not self._samples or not moved.any():
+            return state
+        again = rls.fold_about(task, self._before, np.concatenate(self._samples), solution)
+        if again is None:
+            return state
+        self._about = solution
+        return again
