@@ -17,6 +17,8 @@ It is *recursive least squares* still, on the rows of a linearised prediction er
 (filtered accelerations and products of measured velocities) would need no observer, but ends at six
 times the Cramer-Rao bound instead of one and a half (docs/accuracy.md).
 
+Rows that were taken about poor coefficients are taken again (``iterated_update``).
+
 The information is kept as a triangular root R of ``R'R = sum of phi' phi / s`` (Householder; it
 keeps half the digits that the covariance form loses), in coefficients scaled by their prior
 standard deviation about their prior value: the prior is the unit matrix.
