@@ -13,7 +13,5 @@ EFFECT = Effect(
     beyond="quadratic_damping",
     manoeuvre="runs along two axes at once, and from one axis into another without a stop between",
     source="Faltinsen (1990), Sea Loads on Ships and Offshore Structures, ch. 7",
-    coefficients=(
-        *("X_u_abs_v", "X_u_abs_w", "Y_v_abs_u", "Y_v_abs_w", "Z_w_abs_u", "Z_w_abs_v"),
-    ),
+    coefficients=("X_u_abs_v", "X_u_abs_w", "Y_v_abs_u", "Y_v_abs_w", "Z_w_abs_u", "Z_w_abs_v"),
 )
