@@ -33,6 +33,7 @@ def hidden(name, rng):
         "heading_offset": ({"yaw": u(0.1, 0.6)}, {}),
         "coriolis": ({}, {"X_vr": u(15.0, 25.0), "Y_ur": -u(10.0, 20.0), "X_wq": -u(10.0, 20.0)}),
         "crossflow": ({}, {"Y_v_abs_r": -u(50.0, 90.0), "N_v_abs_r": -u(10.0, 15.0)}),
+        "oblique_damping": ({}, {"X_u_abs_v": -u(60.0, 120.0), "Z_w_abs_u": -u(80.0, 160.0)}),
     }[name]
 
 
@@ -62,6 +63,7 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
         "heading_offset",
         "coriolis",
         "crossflow",
+        "oblique_damping",
     ],
 )
 def test_each_cause_is_named_alone_and_with_its_size(heavy, name, seed):

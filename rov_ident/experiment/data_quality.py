@@ -17,6 +17,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.states import CONVERGED, State, of_fit
 from rov_ident.experiment.messages_alone import (
@@ -222,13 +223,23 @@ def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
     for key, vector in told.items():
         section, name = key.split(".")
         configured = np.array(getattr(getattr(config, section), name))
-        if np.abs(vector - configured).max() > _MOUNTED:
+        turned = name == "rotation"
+        apart = _angle(vector, configured) if turned else np.abs(vector - configured).max()
+        if apart > _MOUNTED:
             bag, file = ([round(float(x), 3) + 0.0 for x in v] for v in (vector, configured))
             yield Remark(
                 key, WARNING,
                 f"{bag} by /tf_static of the bag, {file} in the configuration (forward, starboard, "
                 "down): correct the wrong one",
             )  # fmt: skip
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Of the rotation [rad] that leads from roll, pitch, yaw (3,) to others. The angles themselves
+    may differ where it is nothing: pi and -pi, or roll and yaw of a sensor that looks up."""
+    p, q = quaternion_from_euler(*a), quaternion_from_euler(*b)
+    between = quaternion_multiply(p * [1.0, -1.0, -1.0, -1.0], q)
+    return float(2.0 * np.arctan2(np.linalg.norm(between[1:]), abs(between[0])))
 
 
 _MODEL = "model and data"
