@@ -126,15 +126,13 @@ def rigid_body_covariance(
     rows = np.array([[source.get(name, 0.0) for name in names] for source in sources])
     if gain is not None:
         rows = rows @ gain.T
-    covariance: Array = rows.T @ rows
-    return covariance
+    return rows.T @ rows
 
 
 def gain_of(covariance: Array, std: Array) -> Array:
     """The share (n, n) of the data in an estimate: I - P P0^-1, P (n, n) after them and P0 the
     prior's, diagonal with ``std`` (n,)."""
-    share: Array = np.eye(len(std)) - covariance / std**2
-    return share
+    return np.eye(len(std)) - covariance / std**2
 
 
 THRUST_SCALE = "thrust_scale.scale"

@@ -83,8 +83,7 @@ numba.config.CACHE_DIR = str(CACHE)
 
 def _decorator(**options: Any) -> Callable[[F], F]:
     def compiled(function: F) -> F:
-        dispatcher: F = numba.njit(error_model="numpy", **options)(function)
-        return dispatcher
+        return numba.njit(error_model="numpy", **options)(function)
 
     return compiled
 

@@ -198,8 +198,7 @@ def reading_noise(effects: Values) -> Array:
     """Standard deviations (6,) of what is read of the wrench beside the command [N, N m]."""
     parts = ((EFFECTS[name].noise, values) for name, values in effects.items())
     squares = [noise(**values) ** 2 for noise, values in parts if noise is not None]
-    std: Array = np.sqrt(np.sum([np.zeros(6), *squares], axis=0))
-    return std
+    return np.sqrt(np.sum([np.zeros(6), *squares], axis=0))
 
 
 def of_the_vehicle(effects: Values) -> Values:

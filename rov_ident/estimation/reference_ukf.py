@@ -58,8 +58,7 @@ class ReferenceUkf:
         mass = self.model.with_theta(theta).mass_matrix
         mass = mass + raised(mass, self.task.lightest)
         force = force_of_one(self.model.structure, mass, theta, nu, self._row["inputs"][0])
-        nu_dot: Array = np.linalg.solve(mass, tau - force - self.model.restoring_force(down))
-        return nu_dot
+        return np.linalg.solve(mass, tau - force - self.model.restoring_force(down))
 
     def _restart(self) -> None:
         """Begin from the measured velocity; the coefficients stay."""

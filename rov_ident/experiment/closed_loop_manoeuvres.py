@@ -43,8 +43,7 @@ class Limits:
     @property
     def half(self) -> Array:
         """Half the sides (3,) less a margin."""
-        half: Array = 0.5 * np.array(self.tank) - _MARGIN
-        return half
+        return 0.5 * np.array(self.tank) - _MARGIN
 
 
 @dataclass(frozen=True)
@@ -62,8 +61,7 @@ class AlternatingTargets:
     def target(self, t: float) -> Array:
         """Position [m] and heading [rad] (4,) aimed at."""
         sides = np.floor(t / np.array(self.period)) % 2 == 0
-        target: Array = np.where(sides, 1.0, -1.0) * np.array(self.amplitude)
-        return target
+        return np.where(sides, 1.0, -1.0) * np.array(self.amplitude)
 
     def scaled(self, factor: float) -> "AlternatingTargets":
         amplitude, torque = (tuple(factor * x for x in of) for of in (self.amplitude, self.torque))

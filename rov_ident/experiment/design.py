@@ -197,8 +197,7 @@ def propose(
 def _sizes(config: Config) -> Array:
     """What a standard deviation is compared with (n,): the value, or a share of what matters."""
     prior, model = prior_of(config), config.dynamics
-    size: Array = np.maximum(np.abs(prior.mean), 0.2 * typical(model)[prior.estimated])
-    return size
+    return np.maximum(np.abs(prior.mean), 0.2 * typical(model)[prior.estimated])
 
 
 def _vehicles(config: Config, information: Array) -> list[Config]:

@@ -323,8 +323,7 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
 def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
     i = bisect_right(times, t)
     if i and times[i - 1] == t:
-        found: Array = quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
-        return found
+        return quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
     if i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP:
         return None
     share = (t - times[i - 1]) / (times[i] - times[i - 1])

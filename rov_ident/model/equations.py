@@ -173,10 +173,7 @@ class Model:
 
     def _force(self, nu: Array, inputs: Array | None) -> Array:
         given = np.zeros(len(INPUTS)) if inputs is None else _vector(inputs)
-        force: Array = force_of_one(
-            self.structure, self.mass_matrix, self.theta, _vector(nu), given
-        )
-        return force
+        return force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu), given)
 
     @property
     def mass_matrix(self) -> Array:

@@ -62,16 +62,14 @@ def t200(voltage: float) -> Array:
     after = max(1, int(np.searchsorted(known, voltage)))
     low, high = known[after - 1], known[after]
     share = (voltage - low) / (high - low)
-    thrust: Array = KILOGRAM_FORCE * ((1.0 - share) * _curve(low) + share * _curve(high))
-    return thrust
+    return KILOGRAM_FORCE * ((1.0 - share) * _curve(low) + share * _curve(high))
 
 
 def _curve(voltage: float) -> Array:
     from scipy.interpolate import PchipInterpolator  # here: it takes its time to import
 
     rows = CURVES[voltage]
-    curve: Array = PchipInterpolator(list(rows), list(rows.values()))(_PULSES)
-    return curve
+    return PchipInterpolator(list(rows), list(rows.values()))(_PULSES)
 
 
 def allocation(position: Array, direction: Array) -> Array:
@@ -102,8 +100,7 @@ class Allocator:
         commands, needed = np.asarray(commands, dtype=float), self._channels.max() + 1
         if len(commands) < needed:
             raise ValueError(f"an array of {len(commands)} values, but thrusters needs {needed}")
-        tau: Array = self.matrix @ self._forces(commands[self._channels], voltage)
-        return tau
+        return self.matrix @ self._forces(commands[self._channels], voltage)
 
     def _forces(self, commands: Array, voltage: float | None) -> Array:
         if not np.isfinite(commands).all():

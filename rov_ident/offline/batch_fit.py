@@ -440,8 +440,7 @@ def predicted_information(
 
 def _mean_square_wrench(samples: Samples) -> Array:
     """(6,) over the samples."""
-    mean: Array = np.mean(samples["wrench"] ** 2, axis=0)
-    return mean
+    return np.mean(samples["wrench"] ** 2, axis=0)
 
 
 def _range(samples: Samples) -> tuple[Array, Array]:

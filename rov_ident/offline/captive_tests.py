@@ -425,8 +425,7 @@ def column(name: str, nu: Array, fins: Mapping[str, Array]) -> Array:
         return np.ones(len(nu))
     c, inputs = parse(name), [fins.get(x, np.zeros(len(nu))) for x in INPUT_LETTERS]
     extended = extended_states(np.ascontiguousarray(nu), np.ascontiguousarray(np.array(inputs).T))
-    column: Array = extended[:, c.left] * extended[:, c.right]
-    return column
+    return extended[:, c.left] * extended[:, c.right]
 
 
 def unit(name: str) -> str:

@@ -107,8 +107,7 @@ def solve(
     def residual(moments: Moments, x: Array) -> Array:
         tail = np.append(-x, 1.0)
         squares = np.einsum("i,kij,j->k", tail, moments.sums, tail)
-        std: Array = np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
-        return std
+        return np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
 
     say("least squares")
     moments = total(each(moments_of, batch))

@@ -96,8 +96,7 @@ class Noise:
         lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
         variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
         turned = np.square(np.cross(self.restoring, samples["down"][:, None])).sum(axis=2)
-        density: Array = self.floor + lasting * variance + samples["tilt"][:, None] * turned
-        return density
+        return self.floor + lasting * variance + samples["tilt"][:, None] * turned
 
 
 def assumed(config: Config, least: float = _SMALLEST) -> Noise:

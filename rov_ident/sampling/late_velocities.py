@@ -61,5 +61,4 @@ def _attitude(before: Odometry, after: Odometry, since: float, until: float) -> 
     if forward @ backward < 0.0:
         backward = -backward
     q = _between(forward, backward, share)
-    out: Array = q / np.linalg.norm(q)
-    return out
+    return q / np.linalg.norm(q)

@@ -124,8 +124,7 @@ def smoothed(x: Array, period: float, corner: float) -> Array:
     width = 2 * half + 1
     if len(x) < width:
         raise UserError(f"{len(x)} rows are too few to smooth at {corner:g} Hz: {width} are needed")
-    out: Array = savgol_filter(x, width, 3)
-    return out
+    return savgol_filter(x, width, 3)
 
 
 def dynamic_stretch(t: Array, drives: Array, margin: float) -> tuple[float, float]:

@@ -78,8 +78,7 @@ def _rotation_vector(q: Array, reference: Array) -> Array:
     vector = np.where(real[:, None] < 0.0, -vector, vector)
     size = np.linalg.norm(vector, axis=1)
     angle = 2.0 * np.arctan2(size, np.abs(real))
-    turn: Array = vector * (angle / np.maximum(size, 1e-12))[:, None]
-    return turn
+    return vector * (angle / np.maximum(size, 1e-12))[:, None]
 
 
 @kernel
