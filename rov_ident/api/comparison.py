@@ -15,12 +15,10 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
-from rov_ident.reports.result import NORMAL, Result, Shown
+from rov_ident.reports.result import NORMAL, Figure, Result, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from rov_ident.api.identification import Identification
     from rov_ident.discrepancy.explain import Explanation
 
@@ -136,7 +134,7 @@ class Comparison(Shown):
             return Table(f"{a} against {b}", head, rows, text=(3,))
         return Table(f"{a} against {b}", head, rows, text=(5, 8))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """Both values with their 95 % intervals, relative to the first."""
         from rov_ident.reports import plots
 
@@ -160,7 +158,7 @@ class Comparison(Shown):
         document = {"a": self.labels[0], "b": self.labels[1], "coefficients": entries}
         others = ("changed", "only_a", "only_b", "sentence", "notes")
         document |= {key: getattr(self, key) for key in others}
-        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+        return as_json(document)
 
 
 def _written(value: float, std: float) -> tuple[str, str]:

@@ -43,9 +43,10 @@ def start(
 
 
 @contextmanager
-def safe_workers() -> Iterator[None]:
-    """The same for processes that a pool of workers starts within this context."""
-    added = {name: value for name, value in _SAFE.items() if name not in os.environ}
+def environment(ours: Mapping[str, str] = _SAFE) -> Iterator[None]:
+    """Set what of ``ours`` is not set, within this context; by default what makes the processes
+    safe that a pool of workers starts."""
+    added = {name: value for name, value in ours.items() if name not in os.environ}
     os.environ.update(added)
     try:
         yield

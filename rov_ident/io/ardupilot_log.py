@@ -260,7 +260,6 @@ def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
 
 
 _Row = tuple[int, str, Message]
-_ROLES = (ODOMETRY, IMU, WRENCH)
 
 
 def _ns(t: int) -> int:

@@ -354,16 +354,10 @@ class _Log:
 
     def check_angles(self) -> None:
         """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates."""
-        for name in _FINS:
+        for name in (*_FINS, *_ANGLES):
             angle = self.data.get(name, np.zeros(1))
-            if (large := np.flatnonzero(np.abs(angle) > _LARGEST_FIN)).size:
-                raise UserError(
-                    f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
-                    "looks like degrees: convert it to rad, or name it in --degrees."
-                )
-        for name in _ANGLES:
-            angle = self.data.get(name, np.zeros(1))
-            large = np.flatnonzero(np.abs(angle) > 2.0 * np.pi)
+            most = _LARGEST_FIN if name in _FINS else 2.0 * np.pi
+            large = np.flatnonzero(np.abs(angle) > most)
             if not large.size:
                 continue
             turned = np.linalg.norm(self.matrix(_VELOCITIES[3:]), axis=1)

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import rclpy
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -34,6 +35,7 @@ except ImportError:
 __all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "GuardedNode", "live", "subscribed"]
 
 AnyNode = TypeVar("AnyNode", bound=Node)
+_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class GuardedNode(Node):  # type: ignore[misc]
@@ -64,22 +66,14 @@ class GuardedNode(Node):  # type: ignore[misc]
         guarded = self._guarded(topic, callback)
         return super().create_subscription(type_, topic, guarded, *arguments, **options)
 
-    def create_timer(
-        self, period: float, callback: Callable[..., Any], *arguments: Any, **options: Any
-    ) -> Any:
-        guarded = self._guarded("timer", callback)
-        return super().create_timer(period, guarded, *arguments, **options)
+    def create_timer(self, period: float, callback: Callable[..., Any], group: Any = None) -> Any:
+        """On the steady clock, so that a node under `use_sim_time` works without `/clock`."""
+        return super().create_timer(period, self._guarded("timer", callback), group, _STEADY)
 
     def create_service(
-        self,
-        type_: Any,
-        service: str,
-        callback: Callable[..., Any],
-        *arguments: Any,
-        **options: Any,
+        self, type_: Any, service: str, callback: Callable[..., Any], **options: Any
     ) -> Any:
-        guarded = self._guarded(service, callback)
-        return super().create_service(type_, service, guarded, *arguments, **options)
+        return super().create_service(type_, service, self._guarded(service, callback), **options)
 
     def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(callback)  # rclpy looks at its arguments

@@ -15,7 +15,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
@@ -122,9 +121,8 @@ class ControllerBridge(GuardedNode):
         self.create_service(Trigger, "~/approve", self._approve, callback_group=looks)
         self.create_service(Trigger, "~/revert", self._revert, callback_group=looks)
         self.create_service(SetBool, "~/enable", self._enable, callback_group=looks)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_LOOK_PERIOD, self._look, looks, clock=steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers, clock=steady)
+        self.create_timer(_LOOK_PERIOD, self._look, looks)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers)
         parameters.follow(self, partial(parameters.own, self, _OWN), self._take_parameters)
 
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:

@@ -13,7 +13,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, WrenchStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
@@ -69,8 +68,7 @@ class ExampleController(GuardedNode):
         self.create_subscription(DiagnosticArray, "coefficients", self._take, LATCHED)
         self.create_subscription(Twist, "cmd_vel", self._obey, _LATEST)
         self.create_subscription(Odometry, "odom", self._measure, _LATEST, raw=True)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / _RATE, self._control, clock=steady)
+        self.create_timer(1.0 / _RATE, self._control)
 
     def _own_parameter(self, name: str, value: Array) -> Array:
         if self.has_parameter(name):

@@ -10,7 +10,6 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -43,8 +42,7 @@ class WatchNode(GuardedNode):
         self._known: set[str] = set()
         take = self._take_diagnostics
         self.create_subscription(DiagnosticArray, "/diagnostics", take, _BEST_EFFORT, raw=True)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_SEARCH_PERIOD, self._search, clock=steady)
+        self.create_timer(_SEARCH_PERIOD, self._search)
 
     def _search(self) -> None:
         """Subscribe to the estimators that are new."""

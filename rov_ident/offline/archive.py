@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.core.children import safe_workers
+from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.threads import limit_process
 from rov_ident.sampling.records import Record, read_record
@@ -106,7 +106,7 @@ def opened(
                 progress(path.name, i + 1, len(paths))
 
     if dask:
-        with safe_workers(), _cluster(dask, jobs) as client:
+        with children.environment(), _cluster(dask, jobs) as client:
 
             def on_dask(config: Config, columns: bool = False) -> Archive:
                 read = _on_dask(client, paths, config, columns)
@@ -116,7 +116,7 @@ def opened(
     elif jobs > 1 and len(paths) > 1:
         # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
         with (
-            safe_workers(),
+            children.environment(),
             tempfile.TemporaryDirectory(prefix="rov_ident-") as folder,
             ProcessPoolExecutor(min(jobs, len(paths)), get_context("spawn"), limit_process) as pool,
         ):

@@ -139,10 +139,7 @@ def fit_batch(
     tell("open loop, fitted")
     judged = _as_read_by(archive, config, now)
     after = open_loop_rmse(judged, now)
-    learnt = [i for i, state in enumerate(states.values()) if state is not State.HELD]
-    chance = by_chance(
-        judged, now, [prior.names[i] for i in learnt], covariance[np.ix_(learnt, learnt)]
-    )
+    chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
     consistency = consistency_of(config, prior, values, unexplained)
     consistency = consistency.with_open_loop(before, after, chance)
     if unmeasured:

@@ -16,7 +16,6 @@ that has them from its added mass must not count them twice: with ``added_mass``
 before the fit.
 """
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -34,7 +33,7 @@ from rov_ident.io.csv_table import CsvTable, read_csv
 from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, parse
 from rov_ident.model.equations import Model, build, coriolis, extended_states
 from rov_ident.model.fins import CROSS, X
-from rov_ident.reports.result import Result, provenance
+from rov_ident.reports.result import Result, as_json, provenance
 from rov_ident.reports.table import PLUS_MINUS, Table
 
 _FIN_COLUMNS = {
@@ -140,9 +139,9 @@ def read_table(
     table = read_csv(path)
     if len(table.lines) > _MOST_ROWS:
         raise UserError(f"{path} has {len(table.lines)} rows: thin it to {_MOST_ROWS}")
-    reader = _Reader(table, dict(columns or {}), nondimensional is not None)
+    reader = _Reader(table, dict(columns or {}))
     notes: list[str] = []
-    nu, speed = _states(reader, drift, notes)
+    nu, speed = _states(reader, drift)
     fins = _fins(reader)
     reader.refuse_likely()
     forces = _forces(reader, speed, nondimensional)
@@ -163,8 +162,8 @@ def read_table(
 class _Reader:
     """Columns in our names, remembering which headings were used."""
 
-    def __init__(self, table: CsvTable, columns: dict[str, str], primes: bool) -> None:
-        self.table, self.columns, self.primes = table, columns, primes
+    def __init__(self, table: CsvTable, columns: dict[str, str]) -> None:
+        self.table, self.columns = table, columns
         self.used: set[str] = set()
         self.has_flow = False
         for name, heading in columns.items():
@@ -278,7 +277,7 @@ def _likely(heading: str) -> str:
     return f"{name}_{known}" if angular else name
 
 
-def _states(reader: _Reader, drift: str, notes: list[str]) -> tuple[Array, Array]:
+def _states(reader: _Reader, drift: str) -> tuple[Array, Array]:
     """nu (n, 6) and the speed (n,)."""
     n, path = len(reader.table.lines), reader.table.path
     direct = {name: x for name in VELOCITIES if (x := reader.column(name)) is not None}
@@ -638,7 +637,7 @@ def to_json(
         "coriolis_taken_off": coriolis_taken_off,
         "notes": list(notes),
     }
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    return as_json(document)
 
 
 def headline(fits: Mapping[str, AxisFit]) -> Table:

@@ -10,7 +10,6 @@ Fitted by output error: u is simulated from the shaft speed n, run by run, each 
 starting speed, and compared with the measured one.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.io.csv_table import read_csv
 from rov_ident.model.equations import Array
-from rov_ident.reports.result import Result
+from rov_ident.reports.result import Result, as_json
 
 _UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
 
@@ -50,7 +49,7 @@ class CoastDown(Result):
             "speed_rmse_mps": self.rmse,
             "provenance": self.provenance,
         }
-        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+        return as_json(result)
 
 
 def read_run(path: Path, columns: Mapping[str, str]) -> tuple[Run, str]:

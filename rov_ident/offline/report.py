@@ -66,10 +66,6 @@ def _rmse(errors: Sequence[Array]) -> Array:
     return np.sqrt(np.mean(joined**2, axis=0)) if len(joined) else np.full(6, np.nan)
 
 
-def _unit(i: int) -> str:
-    return "m/s" if i < 3 else "rad/s"
-
-
 def _bars(before: Array, after: Array, key: str) -> str:
     parts = []
     for label, pick, unit in (

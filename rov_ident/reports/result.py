@@ -1,13 +1,14 @@
 """What every identification gives, whatever its method: named numbers, their covariance, and from
 which data they come; and what every result of a command can do: table, picture, file, JSON."""
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from rov_ident.core.messages import Array
 from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    import matplotlib.figure
 
+Figure: TypeAlias = "matplotlib.figure.Figure"
 NORMAL = 1.959964  # half of a 95 % interval, in standard deviations
 
 
@@ -41,7 +43,7 @@ class Shown(ABC):
         """The result as a table of text: print it."""
 
     @abstractmethod
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The result as a picture, a figure of matplotlib that is not registered with pyplot."""
 
     @abstractmethod
@@ -164,6 +166,11 @@ class Result:
         for column in more.values():
             rows = [[*row, cell] for row, cell in zip(rows, column, strict=True)]
         return Table(title, ["", "value", PLUS_MINUS, "unit", *more], rows, text=(3, 3 + len(more)))
+
+
+def as_json(document: Mapping[str, Any]) -> str:
+    """A result as text for machines. Raises ValueError for a number that is not finite."""
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def provenance(files: Iterable[tuple[str, str]], **more: str) -> dict[str, Any]:

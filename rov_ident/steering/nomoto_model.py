@@ -15,7 +15,6 @@ infinite or negative)::
 """
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -26,7 +25,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
 from rov_ident.core.messages import Array
 from rov_ident.core.runge_kutta import NODES, runge_kutta
-from rov_ident.reports.result import NORMAL, Result
+from rov_ident.reports.result import NORMAL, Result, as_json
 from rov_ident.steering.zigzag import Zigzag
 
 STEP = 0.05  # s, largest of the integration
@@ -151,7 +150,7 @@ def to_json(model: Nomoto, validation: float | None = None, diverges: bool = Fal
         }
     if validation is not None:
         document["validation"] = {"heading_rmse_rad": validation, "diverges": diverges}
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    return as_json(document)
 
 
 @kernel
