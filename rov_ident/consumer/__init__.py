@@ -1,7 +1,5 @@
 """Who uses the coefficients: controllers in Python, parameters of other nodes, other simulators.
-
-Takes estimates or configurations and gives them in others' terms; identifies nothing.
-"""
+Estimates or configurations are given in others' terms; nothing is identified."""
 
 from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel, Taken
 

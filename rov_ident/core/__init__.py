@@ -1,4 +1,2 @@
-"""What every room may use: errors, messages, axes, quaternions, files, compiled kernels, results.
-
-Knows nothing of vehicles, configurations or ROS. No room is imported from here.
-"""
+"""What every room may use: errors, messages, axes, quaternions, files, compiled kernels. Knows
+nothing of vehicles, configurations or ROS, and imports from no room."""
