@@ -1,7 +1,4 @@
-"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish.
-
-Nothing here computes a coefficient.
-"""
+"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish."""
 
 import os
 import sys

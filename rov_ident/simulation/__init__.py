@@ -1,4 +1,2 @@
-"""Open-loop simulation, manoeuvres, and sensors that measure a simulated motion.
-
-Moves the model of a configuration; knows no samples and no estimator.
-"""
+"""Open-loop simulation, manoeuvres, and sensors that measure a simulated motion: the model of a
+configuration moves, without samples and estimators."""
