@@ -1,8 +1,6 @@
-"""A plain log (CSV) into a bag of the topics `odom`, `thruster_wrench` and `joint_states`.
-
-Nothing is resampled or filtered. What the log does not tell (an attitude, a position) is filled in
-so that it agrees with the velocities, and said in the report.
-"""
+"""A plain log (CSV) into a bag of `odom`, `thruster_wrench` and `joint_states`. Nothing is
+resampled or filtered; an attitude or a position that is not there is made to agree with the
+velocities, and that is said."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
