@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import Prior, first_centre, gain_of, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
+from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.effects import EFFECTS, Acting, compiled
@@ -458,7 +459,7 @@ def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
     return [
         Curves(
             bag.path.name, t, measured, simulated,
-            np.stack([np.interp(t, later, column) for column in fitted.T], axis=1),
+            interpolated(later, fitted, t),
         )
         for bag, (t, measured, simulated), (later, _, fitted) in zip(
             archive.bags, known, found, strict=True

@@ -122,7 +122,7 @@ def measure(
     )
     sensed = sense(_reading(truth, config), config.effects)
     late = t - velocity_delay(config.effects)
-    delayed = np.stack([np.interp(late, t, column) for column in sensed.linear.T], axis=1)
+    delayed = interpolated(t, sensed.linear, late)
     offset = quaternion_from_euler(0.0, 0.0, heading_error(config.effects))
 
     messages: list[tuple[int, str, Message]] = []
