@@ -275,7 +275,7 @@ def _entries(document: Any) -> list[tuple[str, Mapping[str, Any]]]:
     elif "axes" in top:
         groups = [("", _mapping(axis).get("terms")) for axis in _mapping(top["axes"]).values()]
     return [
-        # a coefficient of an effect is called as in a fit
+        # named as in a fit
         (name if name[:1].isupper() else f"{prefix}{name}", entry)
         for prefix, group in groups
         for name, entry in _mapping(group).items()

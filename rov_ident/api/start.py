@@ -94,8 +94,8 @@ def init(
     Parameters
     ----------
     record
-        Path of what tells of it: a bag (topics, frames, rates, mounting from ``/tf_static``), a log
-        of ArduSub or PX4 (thrusters and their directions, battery), or a URDF or SDFormat model.
+        Path of a bag (gives topics, frames, rates, mounting from ``/tf_static``), a log of ArduSub
+        or PX4 (thrusters and their directions, battery), or a URDF or SDFormat model.
     vehicle
         Name of a shipped vehicle to start from: one of `VEHICLES`.
     progress

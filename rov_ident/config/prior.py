@@ -51,7 +51,7 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
     nuisance = config.nuisance_std
     spread = np.array([nuisance.get(key, p.typical) for key, p in zip(keys, more)])
     mean = np.array([config.effects[name][own] for name, own in keys])
-    # three standard deviations for what is only supposed: beyond, the supposition is wrong
+    # what is only assumed is bounded: further off, the assumption itself is wrong
     reach = np.array([_REACH * nuisance.get(key, np.inf) for key in keys])
     k, none = len(more), np.full(len(chosen), np.inf)
     return Prior(
@@ -66,7 +66,7 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
     )
 
 
-_REACH = 3.0  # of 1000 normally distributed supposals, three are further off
+_REACH = 3.0  # of 1000 normal deviates, three are further off
 _CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 

@@ -19,10 +19,8 @@ whether a number is finite: ``x - x`` may be taken for zero. ``inlined`` is also
 function with a single caller: numba optimises whatever a kernel calls once more with each kernel.
 
 numba compiles a cached function again when its own file changes, but not when a function it calls
-or a constant of another module changes. The cache therefore lies in a folder that is named after
-the source of the whole package and of installed effects, and the versions of all that makes the
-machine code: a kernel of another version is never run, and a new version does not disturb one that
-is running.
+or a constant of another module does. The folder of the cache is therefore named after the source of
+the whole package and of installed effects, and the versions of all that makes the machine code.
 """
 
 import contextlib

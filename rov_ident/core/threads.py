@@ -1,8 +1,7 @@
 """One thread for BLAS.
 
-The matrices here are 30 x 30, over which a second thread only waits, at full load, on a computer
-that is shared with a pilot's. Our own programs limit their process; as a library we limit only our
-own calls and leave the process as it was.
+The matrices here are 30 x 30, over which a second thread only waits, at full load. Our own programs
+limit their process; as a library we limit only our own calls.
 """
 
 import os

@@ -98,7 +98,7 @@ def parse(text: str) -> Any:
 
 
 def parse_file(path: Path) -> Any:
-    """The same of a file in UTF-8."""
+    """The data in a YAML file in UTF-8; raises UserError alike."""
     try:
         return parse(read_input(path, LARGEST_FILE).decode())
     except OSError as error:

@@ -1,8 +1,7 @@
 """Whether model and data agree, so that an interval means what it says.
 
-An estimator finds the values that suit the data best, however badly that is. These tests ask what a
-wrong model or a lying sensor does to a good fit ("Does the model explain the data?" in
-docs/live.md has the study that their limits are from).
+An estimator finds the values that suit the data best, however badly that is; these tests ask how
+badly. "Does the model explain the data?" in docs/live.md has the study that limits are from.
 """
 
 from collections.abc import Iterable, Mapping

@@ -4,9 +4,8 @@
 Velocity and position are the EKF's (`XKF1`, `LOCAL_POSITION_NED`), the attitude is its quaternion
 or what the autopilot reports, rates and specific force are the first IMU's. The pulses to the
 thrusters (`RCOU`, `SERVO_OUTPUT_RAW`) become a wrench by the configuration's `thrusters`, at the
-battery's measured voltage. All of it is in ArduPilot's axes, forward-starboard-down and
-north-east-down, and stamped with the time since the autopilot's start plus one second (no stamp is
-zero). Nothing is resampled but attitude and rates: they are brought to the times of the velocity.
+battery's measured voltage. Axes are forward-starboard-down and north-east-down, stamps count from
+the autopilot's start, plus a second. Attitude and rates are interpolated to the velocity's times.
 
 Which way a thruster pushes, and on which output it is, the autopilot knows better than a file: its
 parameters (`FRAME_CONFIG`, `MOT_n_DIRECTION`, `SERVOn_FUNCTION`) overrule the configuration, and a

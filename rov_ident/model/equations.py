@@ -10,17 +10,14 @@ In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 
     extended = [1, nu, |nu|, min(nu, 0), u^2, inputs]
     g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
 
-The inputs are fin angles and the propeller's speed: what they make is part of d, so that their
-coefficients are parameters like any other. A vehicle without such coefficients has none.
+The inputs are fin angles and the propeller's speed: what they make is part of d.
 
 ``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, with
 the centre of gravity anywhere, off-diagonal terms included, and does no work by construction.
 
-The same few functions serve every use: :func:`generalized_force` evaluates ``C nu - d`` for a
-bundle of states side by side ("lanes": one for simulation and for a row of the regressor, many
-for sigma points, so that the compiler can use vector instructions), :func:`columns` gives the same
-forces per unit of each coefficient (the regressor), and the forward dynamics solve the inverse
-ones.
+:func:`generalized_force` gives ``C nu - d`` for states side by side ("lanes": one in simulation;
+many, of sigma points, become vector instructions), :func:`columns` gives the same forces per
+unit of each coefficient (the regressor), and the forward dynamics solve the inverse ones.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,7 @@
 """`controller_bridge`: converged coefficients into the parameters of a running controller.
 
-It sends a set when something in it has left the dead band, not more often than `period`, and in
-approval mode not before somebody said so. A set is sent as a whole or not at all, and read back: a
-controller that took a part of it gets back what it had.
+A set is sent when something in it has left the dead band, not more often than `period`, and in
+approval mode once it is approved; and it is read back: one taken in part is undone.
 """
 
 import threading

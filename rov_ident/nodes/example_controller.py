@@ -1,8 +1,7 @@
 """`example_controller`: velocity control with the coefficients that an estimator has found.
 
 Computed torque, ``tau = M (nu_ref_dot + gain (nu_ref - nu)) + C nu + D nu + g``, with a reference
-that follows `cmd_vel` as a first-order lag. A start for a controller of your own: what is worth
-keeping is how it treats coefficients, silence and numbers that are none.
+that follows `cmd_vel` as a first-order lag: a start for a controller of your own.
 """
 
 import math

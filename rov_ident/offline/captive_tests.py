@@ -11,9 +11,8 @@ alone makes that standard error large by itself; a term that is clearly seen the
 Intervals allow for noise that grows with the force: heteroscedastic covariance HC3 (MacKinnon and
 White 1985), Student's distribution.
 
-Steady forces hold the Coriolis forces of the added mass too (Munk's moment and its kind). A model
-that has them from its added mass must not count them twice: with ``added_mass`` they are taken off
-before the fit.
+Steady forces hold the Coriolis forces of the added mass too (Munk's moment and its kind): with
+``added_mass`` they are taken off before the fit, so that a model does not count them twice.
 """
 
 import math
@@ -668,8 +667,8 @@ def with_hull(config: Config, hull: Mapping[str, float]) -> Config:
 
 
 def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
-    """The configuration with the fitted coefficients in the place of all that the table could have
-    told. Raises UserError if the values make no passive hull."""
+    """The configuration with the fitted coefficients in place of all that the table could
+    determine. Raises UserError if the values make no passive hull."""
     values = dict(config.model.values)
     for f in fits.values():
         for name in (*f.pool, *f.aliases):

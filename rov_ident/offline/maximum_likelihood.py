@@ -283,13 +283,10 @@ def maximise(
     effects: Array | None = None,
     first_noise: Noise | None = None,
 ) -> Likelihood:
-    """The coefficients of largest likelihood, from ``model``'s values on, and those of the
-    parameters of ``effects`` (p,); None: as configured. ``first_noise``: the
-    levels to begin with; None: those of several that explain the data best.
-
-    ``precision`` (n,) is that of the prior about the configured values, of coefficients and then of
-    the parameters of effects in the samples' columns; ``process``: whether the wrench has errors,
-    else pure output error.
+    """The estimates of largest likelihood, starting from the values of ``model`` and those of
+    ``effects`` (p,) (None: as configured). ``precision`` (n,) is the prior's, of coefficients and
+    then of parameters of effects. ``process``: the wrench has errors, else pure output error.
+    ``first_noise``: the levels to begin with; None: the best of several.
 
     Raises UserError if the model cannot be simulated.
     """

@@ -101,7 +101,7 @@ _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU'
 _BRIEF = 0.1  # s; a rate that comes and goes within it may have lasted shorter than its samples
 _GROWTH = 0.2  # of the variance with each refusal: a filter that refuses for seconds is wrong
 _AVERAGE = 0.05  # weight of one NIS in the test ratio, that of the last twenty
-_LARGEST_NIS = 1e3  # an outlier counts for no more in it than makes it stand out
+_LARGEST_NIS = 1e3  # the most that one outlier counts for in it
 
 
 def _settings(config: Config) -> NDArray[np.void]:

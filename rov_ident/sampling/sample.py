@@ -54,7 +54,7 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
 
 
 def believed(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """Samples (k,) of SAMPLE without those from before the last one with which all begins anew."""
+    """Samples (k,) of SAMPLE from the last one on that gives up all before it (``anew``)."""
     anew = np.flatnonzero(samples["anew"])
     return samples[anew[-1] :] if len(anew) else samples
 

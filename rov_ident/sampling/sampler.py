@@ -1,9 +1,8 @@
 """From messages to samples: one clock, one set of axes, one filter for every channel.
 
 Topics come at their own rates and phases. A :class:`Sampler` waits until every topic has reached an
-instant (or is ``grace`` seconds behind), then emits one sample for it. The instants are those of
-the IMU messages while there is an IMU, else those of the odometry. Everything is decided by the
-stamps, never by arrival, so that a bag gives the same samples live, replayed and offline.
+instant (or is ``grace`` seconds behind), then emits one sample for it, by the stamps alone. The
+instants are those of the IMU messages while there is an IMU, else those of the odometry.
 
 What a sample holds, and why (docs/samples.md has the measurements):
 

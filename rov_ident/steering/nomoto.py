@@ -86,12 +86,11 @@ def fit(
 def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:
     """Output error of the order that the runs themselves choose.
 
-    Each run is cut in parts of equal length. Each part but the first and the last is left out in
-    turn, from all runs at once, and predicted by what is fitted to the rest: the model runs through
-    it, so that no state is fitted to it. (Before the first and after the last part kept, the
-    course of a vehicle without course stability would be a matter of the state, not of the order.)
-    The second order is chosen if its mean squared error is less by more than
-    one standard error of the difference over the parts (Breiman et al. 1984, sec. 3.4.3).
+    Each run is cut in parts of equal length. Each part is left out in turn, from all runs at once,
+    and predicted by a fit to the rest, which runs through it; not so the first and the last, where
+    the course of an unstable vehicle depends on the state rather than the order. The second order
+    is chosen if its mean squared error is less by more than one standard error of the difference
+    over the parts (Breiman et al. 1984, sec. 3.4.3).
     """
     models: dict[int, Nomoto] = {}
     for order in ORDERS:

@@ -129,7 +129,7 @@ def from_csv(path: Path) -> Zigzag:
 
 
 def _angle(table: CsvTable, name: str, blank: bool) -> Array:
-    """The column `name_rad` or `name_deg` in radians, its unit held against its values."""
+    """The column `name_rad` or `name_deg` in radians; its unit is checked against its values."""
     found = [f"{name}_{unit}" for unit in ("rad", "deg") if f"{name}_{unit}" in table.cells]
     if not found:
         hint = f"say its unit by renaming it {name}_rad or {name}_deg" if name in table.cells else (
