@@ -128,10 +128,6 @@ def init(
             _of_model(path, found, vehicle)
         else:
             _of_bag(path, found)
-    return _written(found)
-
-
-def _written(found: _Found) -> Draft:
     text = annotated(found.parameters, found.remarks, _HEAD)
     unknown = tuple(re.findall(r"^ *(\w+): *# UNKNOWN", text, re.MULTILINE))
     if not unknown:  # what is drafted can be read

@@ -153,7 +153,9 @@ def propose(
     now = predicted_information(bags, config) if bags is not None else np.zeros((n, n))
     velocity = bags is None or not any(bags.each(is_without_velocity))
     before = prospects(config, now)
-    size = _sizes(config)
+    # what a standard deviation is compared with: the value, or a share of what matters
+    prior = prior_of(config)
+    size = np.maximum(np.abs(prior.mean), 0.2 * typical(config.dynamics)[prior.estimated])
     relative = np.array([p.std for p in before]) / size
     vehicles = _vehicles(config, now)
     candidates, left_out, predicted = [], [], []
@@ -187,12 +189,6 @@ def propose(
         config, candidates[best], worst, before, after, tuple(sorted(others, key=lambda o: o[1])),
         tuple(left_out), tuple(candidates),
     )  # fmt: skip
-
-
-def _sizes(config: Config) -> Array:
-    """What a standard deviation is compared with (n,): the value, or a share of what matters."""
-    prior, model = prior_of(config), config.dynamics
-    return np.maximum(np.abs(prior.mean), 0.2 * typical(model)[prior.estimated])
 
 
 def _vehicles(config: Config, information: Array) -> list[Config]:

@@ -137,7 +137,10 @@ class Player(Node):  # type: ignore[misc]
         for role, raw in messages:
             if rate > 0.0:
                 began = began or (time.monotonic(), raw.log_time)
-                self._spin_until(began[0] + (raw.log_time - began[1]) * 1e-9 / rate)
+                end = began[0] + (raw.log_time - began[1]) * 1e-9 / rate
+                while (left := end - time.monotonic()) > 0.0:
+                    self._executor.spin_once(timeout_sec=min(left, 0.5))
+                    self._check()
             self._wait(partial(self._all_took, self._sent - WINDOW + 1), "to take messages")
             self._tick(raw.log_time)
             self._inputs[role].publish(raw.data)
@@ -164,11 +167,6 @@ class Player(Node):  # type: ignore[misc]
 
     def _has_report(self, estimator: str, stamp: int) -> bool:
         return estimator in self.reports and self.reports[estimator].stamp == stamp
-
-    def _spin_until(self, end: float) -> None:
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.5))
-            self._check()
 
     def _wait(self, ready: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
         end = time.monotonic() + patience
