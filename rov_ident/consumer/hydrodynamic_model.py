@@ -64,7 +64,7 @@ class HydrodynamicModel:
 
     def take(self, message: Any, now: float) -> Taken:
         """Take up what is good in a message; never raises for what is in it. An earlier stamp than
-        the last is refused while the stream is fresh; after that its source has begun anew (a bag
+        the last is refused while the stream is fresh; after that its source has restarted (a bag
         that loops)."""
         stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
         if self._stamp is not None and stamp < self._stamp and self.fresh(now):
@@ -76,7 +76,7 @@ class HydrodynamicModel:
         names = [status.name for status in message.status]
         for status in message.status:
             if "." in status.name:
-                continue  # a parameter of an effect: no matter of these matrices
+                continue  # a parameter of an effect is not in these matrices
             try:
                 if names.count(status.name) > 1:
                     raise ValueError("given twice")

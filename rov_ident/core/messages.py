@@ -99,7 +99,7 @@ def fault(message: Message) -> str:
     if message.stamp >= LAST_STAMP:
         return "stamp at the end of time"
     if isinstance(message, Joints):
-        return ""  # what is not finite in it may be a joint that nobody asked for
+        return ""  # a joint that nobody uses may be not finite
     if isinstance(message, Odometry):
         p, q, v, w = message.position, message.orientation, message.linear, message.angular
         if not 0.5 < q.dot(q) < 2.0:  # NaN too

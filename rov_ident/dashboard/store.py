@@ -107,7 +107,7 @@ class Store:
         self._now = now
         self._lock = threading.Lock()
         self._estimators: dict[str, Estimator] = {}
-        self._bridges: dict[str, Status] = {}  # what goes on to controllers
+        self._bridges: dict[str, Status] = {}  # what is sent to controllers
 
     def add(self, name: str) -> None:
         """An estimator exists, even if it has not published yet."""

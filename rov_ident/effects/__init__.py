@@ -34,7 +34,7 @@ from rov_ident.model.equations import RigidBody, add_current
 
 def _of_others(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
     """Effects that installed packages bring, by the names of their entry points. UserError if one
-    is none, or has a name that is taken."""
+    is invalid, or its name is taken."""
     names: dict[str, str] = dict.fromkeys(taken, "rov_ident")
     for package, point in plugins.installed():
         effect, name = plugins.loaded(package, point), point.name

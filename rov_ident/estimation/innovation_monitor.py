@@ -13,7 +13,7 @@ standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mea
 * *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
   average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
-  it was the wrench: the velocity is lost, and begun anew from the measurement.
+  it was the wrench: the velocity is lost, and restarts from the measurement.
 """
 
 import numpy as np

@@ -174,7 +174,7 @@ class Check(Shown):
 
 def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     """Look at a bag; ``tell`` is called with what is being done, and what share of it is. UserError
-    if it cannot be read, or has not the messages that it takes to look at anything."""
+    if it cannot be read, or lacks the messages that are needed."""
     say = tell or (lambda what, share=None: None)
     record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
     say("looking at its messages")

@@ -3,11 +3,11 @@
 One rule for every number of a message, in the spirit of Hampel's filter (Hampel 1974; Pearson
 2002), but for signals that step. A number is *supported* if a neighbour is near: the one before,
 the one after, or both those two messages away (a command that alternates). Near is within
-``GATE`` times the usual distance to the nearest neighbour, of late. A number without support is
+``GATE`` times the usual distance, recently, to the nearest neighbour. A number without support is
 
 * an outlier where what was before comes again: that takes its place;
-* else something at a step, and nobody can know whether the step was there or one message later. It
-  is clipped to the range of its neighbours, and its variance is their mean squared distance.
+* else something at a step, which may be one message late. It is clipped to the range of its
+  neighbours, and its variance is their mean squared distance.
 
 A step or a ramp has support on one side, or lies between both, and passes as it came.
 """

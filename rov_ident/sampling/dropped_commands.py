@@ -12,7 +12,7 @@ import numpy as np
 
 from rov_ident.core.messages import Array
 
-SILENCE = 3.0  # longest intervals of late without a command: it acts no longer (docs/samples.md)
+SILENCE = 3.0  # longest recent intervals without a command: it acts no longer (docs/samples.md)
 _AVERAGE = 0.05  # weight of one interval in the averages: those of the last twenty
 _SHORTEN = 0.3  # weight of an interval that is shorter than the period: gaps only make it longer
 # The thresholds below: of 10 to 25 % dropped at random all intervals are read rightly, and none is
@@ -34,7 +34,7 @@ class CommandPeriod:
         self.longest = self.threshold = math.inf
         self._intervals: deque[float] = deque(maxlen=_WINDOW)  # s
         self._period = 0.0  # s; between those that are sent
-        self._regularity = 0.0  # share of the intervals, of late, that were one period
+        self._regularity = 0.0  # share of the recent intervals that were one period
         self._regular = False
 
     def update(self, interval: float) -> None:

@@ -1,4 +1,4 @@
-"""Odometry whose linear velocities are older than its stamp, put right before it is queued: the
+"""Odometry whose linear velocities are older than its stamp, corrected before it is queued: the
 message becomes one of the time at which they were true, with the pose and rates around it."""
 
 from collections import deque

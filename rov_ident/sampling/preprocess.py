@@ -1,8 +1,8 @@
 """From the log of a sea trial to what a fit can use: polarity, outliers, smoothing, cutting, and
 several sources of depth fused into one (Zhao et al. 2018, sec. 3).
 
-In the axes and units of the log. Lever arms are no matter of the log: ``odometry.position`` and
-``imu.position`` of the configuration take them off.
+In the axes and units of the log. Lever arms are corrected later, by
+``odometry.position`` and ``imu.position`` of the configuration.
 """
 
 from collections.abc import Mapping

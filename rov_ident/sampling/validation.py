@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from rov_ident.core.messages import Joints, Message, Odometry, fault
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
-"""Counted where stamps begin anew: a bag that starts over, another computer."""
+"""Counted where stamps restart: a bag that starts over, another computer."""
 NEW_FRAME = "frame: another has the majority, buffers restarted"
-"""Counted where a topic goes on in another frame."""
+"""Counted where a topic continues in another frame."""
 RESTARTS = (NEW_CLOCK, NEW_FRAME)
 REPEATED = 2e3
 """The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""
