@@ -226,13 +226,10 @@ def respond(
     return out if rows is None else out[rows]
 
 
-def predict(
-    model: Nomoto, run: Zigzag, rudder: Zigzag | None = None, window: float | None = None
-) -> tuple[Array, float]:
+def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[Array, float]:
     """The heading (n,) that the model predicts for a run, its first state fitted; and the RMSE.
 
-    ``rudder`` is the same run with more rows, if there is one; ``window`` [s] lets the first state
-    know only so much of the run, instead of all of it. As in the fit, a rudder that jumps
+    ``rudder`` is the same run with more rows, if there is one. As in the fit, a rudder that jumps
     has the instants of its jumps fitted, each within its step.
 
     Raises UserError if the run has another kind of input than those of the fit.
@@ -250,11 +247,7 @@ def predict(
         fine = dataclasses.replace(
             run, t=both, heading=heading, rudder=np.interp(both, rudder.t, rudder.rudder)
         )
-    start = fine
-    if window is not None:
-        seen = np.where(fine.t <= fine.t[0] + window, fine.heading, np.nan)
-        start = dataclasses.replace(fine, heading=seen)
-    first, shares = first_state(model.order, model.nonlinear, model.theta, start)
+    first, shares = first_state(model.order, model.nonlinear, model.theta, fine)
     heading = respond(model.order, model.nonlinear, model.theta, fine, first, shares)
     if len(fine.t) > len(run.t):
         heading = heading[np.searchsorted(fine.t, run.t)]
