@@ -1,5 +1,8 @@
 """The parameter file of nodes and commands: its keys, and how it is read, checked and written.
-Knows the model and the effects; a new key is one field in `schema`."""
+
+Knows the model and the effects; nothing of messages, bags or ROS. A new key is one field in
+`schema`.
+"""
 
 from rov_ident.config.reading import checked, from_parameters, load, thruster_signal
 from rov_ident.config.schema import (

@@ -1,5 +1,7 @@
 """Who uses the coefficients: controllers in Python, parameters of other nodes, other simulators.
-Estimates or configurations are given in others' terms; nothing is identified."""
+
+Takes estimates or configurations and gives them in others' terms; identifies nothing.
+"""
 
 from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel, Taken
 

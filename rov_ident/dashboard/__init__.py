@@ -1,2 +1,4 @@
-"""The live page: what it shows (`store`, which `nodes/watch_node.py` fills), and how it is served
-to this computer alone (`server`)."""
+"""The live page: what it shows (`store`), and how it is served to this computer alone (`server`).
+
+No ROS here: `nodes/watch_node.py` fills the store.
+"""

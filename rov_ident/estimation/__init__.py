@@ -1,2 +1,4 @@
-"""The recursive estimators, live or over a bag: RLS and UKF as `init`, `step` and `fold`. What a
-node runs; nothing here needs all the data at once."""
+"""The recursive estimators: RLS and UKF as `init`, `step` and `fold`, live or over a bag.
+
+What a node runs. Nothing here needs all the data at once.
+"""

@@ -1,2 +1,4 @@
-"""Is a bag good enough, and which manoeuvre should come next? By the identification above, without
-an estimator of its own."""
+"""Is a bag good enough, and which manoeuvre should come next?
+
+Uses the identification above, and has no estimator of its own.
+"""

@@ -1,2 +1,4 @@
-"""The equations of motion, once, the grammar of their coefficients, and what scales them; no
-configuration, no data, no estimator."""
+"""The equations of motion, once, and the grammar of their coefficients.
+
+Only equations and what scales them; no configuration, no data, no estimator.
+"""

@@ -1,2 +1,4 @@
-"""Identification from what needs all data at once, or from data that are no dive: batch least
-squares, instruments, maximum likelihood, tables."""
+"""Identification from whole records: batch least squares, instruments, maximum likelihood, tables.
+
+What needs all the data at once, or data that are no dive.
+"""

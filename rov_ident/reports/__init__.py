@@ -1,2 +1,5 @@
-"""Results and how they are shown: tables, pictures, HTML pages, notebooks. The only room that knows
-matplotlib; what a certain result says about itself stands in its own room."""
+"""Results and how they are shown: tables, pictures, HTML pages, notebooks, from plain arrays.
+
+The only room that knows matplotlib. What a certain result says about itself (its table, picture
+and page) stands in the room of that result.
+"""

@@ -1,2 +1,4 @@
-"""Open-loop simulation, manoeuvres, and sensors that measure a simulated motion: the model of a
-configuration moves, without samples and estimators."""
+"""Open-loop simulation, manoeuvres, and sensors that measure a simulated motion.
+
+Moves the model of a configuration; knows no samples and no estimator.
+"""

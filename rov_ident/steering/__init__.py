@@ -1,2 +1,4 @@
-"""Vehicles that steer: zigzags of heading and rudder, Nomoto's models, autopilots of simulated
-vehicles with fins."""
+"""Vehicles that steer: zigzags, Nomoto's models, autopilots.
+
+Heading and rudder only, or simulated vehicles with fins.
+"""
