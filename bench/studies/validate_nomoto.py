@@ -181,6 +181,14 @@ def _relative(run: Zigzag, method: str, k: float, t: float) -> tuple[float, floa
     return 100.0 * (found[0] / k - 1.0), 100.0 * (found[1] / t - 1.0)
 
 
+def _from_start(model: Nomoto, run: Zigzag, window: float) -> float:
+    """RMSE [rad] of a prediction whose first state is fitted to the first ``window`` s alone."""
+    fine, what = run.cornered(), (model.order, model.nonlinear, model.theta)
+    seen = replace(fine, heading=np.where(fine.t <= fine.t[0] + window, fine.heading, np.nan))
+    heading = nomoto_model.respond(*what, fine, *nomoto_model.first_state(*what, seen))
+    return nomoto_model.rmse(fine.heading - heading)
+
+
 def measured() -> None:
     """KVLCC2, model of 7 m: fitted to two zigzags, the third predicted."""
     if not DATA.is_dir():
@@ -192,10 +200,8 @@ def measured() -> None:
         for order in (1, 2):
             for nonlinear in (False, True):
                 model = nomoto.fit([runs[a] for a in fitted], order, nonlinear)
-                of_run, of_start = (
-                    np.degrees(nomoto_model.predict(model, runs[judged], window=w)[1])
-                    for w in (None, 20.0)
-                )
+                of_run = np.degrees(nomoto_model.predict(model, runs[judged])[1])
+                of_start = np.degrees(_from_start(model, runs[judged], 20.0))
                 rows.append([" + ".join(f"{a}/5" for a in fitted), f"{judged}/5", str(order),
                              "Norrbin" if nonlinear else "linear", f"{np.degrees(model.rmse):.2f}",
                              f"{of_run:.2f}", f"{of_start:.2f}"])  # fmt: skip

@@ -15,12 +15,10 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
-from rov_ident.reports.result import NORMAL, Result, Shown
+from rov_ident.reports.result import NORMAL, Figure, Result, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from rov_ident.api.identification import Identification
     from rov_ident.discrepancy.explain import Explanation
 
@@ -45,12 +43,9 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Comparison(Shown):
-    """What two results say of the same coefficients: all arrays (n,) in the order of ``names``.
-
-    ``deviations`` is the difference over its standard deviation, from the standard deviations of
-    both as if their errors were independent; NaN where neither result has one. ``only_a`` and
-    ``only_b`` are names that one of them lacks.
-    """
+    """What two results say of the same coefficients: arrays (n,) in the order of ``names``.
+    ``deviations`` takes the errors of both as independent; NaN where neither has a standard
+    deviation. ``only_a`` and ``only_b`` are names that the other lacks."""
 
     labels: tuple[str, str]
     names: tuple[str, ...]
@@ -136,7 +131,7 @@ class Comparison(Shown):
             return Table(f"{a} against {b}", head, rows, text=(3,))
         return Table(f"{a} against {b}", head, rows, text=(5, 8))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """Both values with their 95 % intervals, relative to the first."""
         from rov_ident.reports import plots
 
@@ -160,7 +155,7 @@ class Comparison(Shown):
         document = {"a": self.labels[0], "b": self.labels[1], "coefficients": entries}
         others = ("changed", "only_a", "only_b", "sentence", "notes")
         document |= {key: getattr(self, key) for key in others}
-        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+        return as_json(document)
 
 
 def _written(value: float, std: float) -> tuple[str, str]:
@@ -240,10 +235,7 @@ def _of_config(config: Config, label: str) -> Estimates:
 
 
 def _of_document(document: Any, label: str) -> Estimates:
-    """The numbers in the JSON of a result.
-
-    Raises UserError if there are none.
-    """
+    """The numbers in the JSON of a result. Raises UserError if there are none."""
     if isinstance(document, Mapping) and isinstance(document.get("fit"), Mapping):
         document = document["fit"]  # of identify
     found: dict[str, tuple[str, float, float]] = {}
@@ -283,7 +275,7 @@ def _entries(document: Any) -> list[tuple[str, Mapping[str, Any]]]:
     elif "axes" in top:
         groups = [("", _mapping(axis).get("terms")) for axis in _mapping(top["axes"]).values()]
     return [
-        # a coefficient of an effect is called as in a fit
+        # named as in a fit
         (name if name[:1].isupper() else f"{prefix}{name}", entry)
         for prefix, group in groups
         for name, entry in _mapping(group).items()

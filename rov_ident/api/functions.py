@@ -203,7 +203,9 @@ def fit(
     if prior_from is not None:
         given, table = with_prior(given, Path(prior_from))
     paths, say = _several(bags), progress or _silent
-    settings = Settings(_stages(channels), prior, weighted, process)
+    groups = [channels] if isinstance(channels, str) else channels or ()
+    stages = tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
+    settings = Settings(stages, prior, weighted, process)
     with contextlib.ExitStack() as stack:
         if live:
             records = [read(path, given, progress) for path in paths]
@@ -249,10 +251,8 @@ def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fi
 
 
 def _check(many: archive.Archive, config: Config) -> None:
-    """UserError where the data are too few, or so wrong that no fit makes sense of them.
-
-    k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed.
-    """
+    """UserError where the data are too few (k samples show k - 1 changes of velocity on each axis),
+    or so wrong that no fit makes sense of them."""
     chosen = (c.row for c in config.model.coefficients if c.name in config.estimate)
     unknowns = max(Counter(chosen).values(), default=0)
     if many.samples - 1 <= unknowns:
@@ -281,12 +281,6 @@ def _opened(
         say(f"read {name}", done / total)
 
     return archive.opened(paths, config, jobs, dask, told)
-
-
-def _stages(channels: str | Sequence[str] | None) -> tuple[tuple[str, ...], ...]:
-    """Groups of axes to fit one after the other."""
-    groups = [channels] if isinstance(channels, str) else channels or ()
-    return tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
 
 
 def axes(channels: str) -> NDArray[np.bool_]:

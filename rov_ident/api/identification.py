@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,13 +34,10 @@ from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
-from rov_ident.reports.result import Shown
+from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_without_velocity
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 _UNEXPLAINED = "Without linear velocity it cannot be told what the model lacks."
@@ -167,7 +164,7 @@ class Identification(Shown):
         }
         return Tables((self.fit.numbers("coefficients", columns), errors))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The coefficients relative to the configured ones, and the motion."""
         return self.fit.plot()
 
@@ -182,7 +179,7 @@ class Identification(Shown):
             "fit": json.loads(self.fit.to_json()),
             "explain": json.loads(self.explanation.to_json()) if self.explanation else None,
         }
-        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+        return as_json(document)
 
     def page(self) -> str:
         """One report: the answer, the coefficients, what to do, then the evidence."""

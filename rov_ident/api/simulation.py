@@ -1,11 +1,10 @@
 """Open-loop simulation, of a manoeuvre or beside a bag."""
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from rov_ident.core.messages import Array, Message
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.effects import compiled
 from rov_ident.io.write_messages import write_messages
-from rov_ident.reports.result import Shown
+from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table
 from rov_ident.sampling.records import (
     HORIZON,
@@ -30,9 +29,6 @@ from rov_ident.sampling.records import (
 )
 from rov_ident.simulation.virtual_sensors import Dive, Suite, dive, measure, odometry_of
 from rov_ident.steering import autopilot
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 _POINTS = 2000  # of a curve in a picture
@@ -90,7 +86,7 @@ class Simulation(Shown):
         head = ["", "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit"]
         return Table(f"open-loop simulation against {self.name}", head, rows, text=(4,))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The six velocities, simulated and measured."""
         from rov_ident.reports import plots
 
@@ -113,7 +109,7 @@ class Simulation(Shown):
                 for i in self._chosen
             }
             result = {"bag": self.name, "horizon_s": HORIZON, "velocities": velocities}
-        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+        return as_json(result)
 
     def _writers(self) -> dict[str, Callable[[Path], None]]:
         return super()._writers() | {".mcap": lambda path: write_messages(path, self.messages)}

@@ -94,8 +94,8 @@ def init(
     Parameters
     ----------
     record
-        Path of what tells of it: a bag (topics, frames, rates, mounting from ``/tf_static``), a log
-        of ArduSub or PX4 (thrusters and their directions, battery), or a URDF or SDFormat model.
+        Path of a bag (gives topics, frames, rates, mounting from ``/tf_static``), a log of ArduSub
+        or PX4 (thrusters and their directions, battery), or a URDF or SDFormat model.
     vehicle
         Name of a shipped vehicle to start from: one of `VEHICLES`.
     progress
@@ -128,10 +128,6 @@ def init(
             _of_model(path, found, vehicle)
         else:
             _of_bag(path, found)
-    return _written(found)
-
-
-def _written(found: _Found) -> Draft:
     text = annotated(found.parameters, found.remarks, _HEAD)
     unknown = tuple(re.findall(r"^ *(\w+): *# UNKNOWN", text, re.MULTILINE))
     if not unknown:  # what is drafted can be read

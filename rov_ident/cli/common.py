@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import json
 import math
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from rich.text import Text
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output, write_file
+from rov_ident.reports.result import as_json
 
 if TYPE_CHECKING:
     from rov_ident.api.functions import Progress
@@ -179,7 +179,7 @@ def check_outputs(
 def write_json(path: Path | None, result: Mapping[str, object]) -> None:
     """The machine-readable result of a command, where it is wanted."""
     if path:
-        write_file(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+        write_file(path, as_json(result))
 
 
 def write_result(

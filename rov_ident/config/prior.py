@@ -31,12 +31,9 @@ class Prior:
 
 
 def prior_of(config: Config, effects: bool = False) -> Prior:
-    """The prior that a configuration states, of its coefficients or of all that it estimates.
-
-    The standard deviation of a coefficient is relative to its value, but not less than a share of
-    what such a term would weigh at working speed: a published zero means "not known", not "exactly
-    zero".
-    """
+    """The prior that a configuration states, of its coefficients or of all that it estimates. A
+    standard deviation is relative to the value, but at least a share of what such a term would
+    weigh at working speed: a published zero means "not known"."""
     model = config.dynamics
     index = [model.names.index(name) for name in config.estimate]
     scale = typical(model)
@@ -54,7 +51,7 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
     nuisance = config.nuisance_std
     spread = np.array([nuisance.get(key, p.typical) for key, p in zip(keys, more)])
     mean = np.array([config.effects[name][own] for name, own in keys])
-    # three standard deviations for what is only supposed: beyond, the supposition is wrong
+    # what is only assumed is bounded: further off, the assumption itself is wrong
     reach = np.array([_REACH * nuisance.get(key, np.inf) for key in keys])
     k, none = len(more), np.full(len(chosen), np.inf)
     return Prior(
@@ -69,17 +66,15 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
     )
 
 
-_REACH = 3.0  # of 1000 normally distributed supposals, three are further off
+_REACH = 3.0  # of 1000 normal deviates, three are further off
 _CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
 def first_centre(config: Config) -> dict[str, float]:
-    """The values of effects' parameters, by name, about which samples are linear at first.
-
-    Those configured; but a lag that may be there is taken as half a standard deviation: from none
-    at all, the columns of samples lead to none ("Times" in docs/live.md).
-    """
+    """The values of effects' parameters, by name, about which samples are linear at first: those
+    configured, but for a lag that may be there half a standard deviation, as the columns of no lag
+    at all lead nowhere ("Times" in docs/live.md)."""
     prior = prior_of(config, effects=True)
     centre = {}
     for name, mean, std, lower in zip(prior.names, prior.mean, prior.std, prior.lower, strict=True):
@@ -90,11 +85,8 @@ def first_centre(config: Config) -> dict[str, float]:
 
 
 def drift_of(config: Config, names: tuple[str, ...]) -> Array:
-    """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's.
-
-    Only that of a current: it turns, and differs from place to place, unless the file says that it
-    is known (``current_std: 0``).
-    """
+    """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's:
+    only of a current, which turns and differs from place to place, unless ``current_std`` is 0."""
     drifting = {".".join(key) for key in config.nuisance_std if key[0] == "ocean_current"}
     return np.array([1.0 / _CURRENT_TIME if name in drifting else 0.0 for name in names])
 
@@ -126,15 +118,13 @@ def rigid_body_covariance(
     rows = np.array([[source.get(name, 0.0) for name in names] for source in sources])
     if gain is not None:
         rows = rows @ gain.T
-    covariance: Array = rows.T @ rows
-    return covariance
+    return rows.T @ rows
 
 
 def gain_of(covariance: Array, std: Array) -> Array:
     """The share (n, n) of the data in an estimate: I - P P0^-1, P (n, n) after them and P0 the
     prior's, diagonal with ``std`` (n,)."""
-    share: Array = np.eye(len(std)) - covariance / std**2
-    return share
+    return np.eye(len(std)) - covariance / std**2
 
 
 THRUST_SCALE = "thrust_scale.scale"

@@ -1,7 +1,5 @@
-"""For controllers: the model matrices, kept up to date from `~/coefficients`.
-
-No middleware: a message is anything with the fields of diagnostic_msgs/DiagnosticArray.
-"""
+"""For controllers: the model matrices, kept up to date from `~/coefficients`. A message is anything
+with the fields of diagnostic_msgs/DiagnosticArray."""
 
 import math
 import os
@@ -23,10 +21,8 @@ _SECOND = 1_000_000_000  # ns
 
 @dataclass(frozen=True)
 class Taken:
-    """What became of one message.
-
-    ``values`` are the coefficients taken up, ``refused`` says of each other one why it keeps its
-    last good value. Where ``reason`` is not empty, the message was refused as a whole.
+    """What became of one message: ``values`` are the coefficients taken up, ``refused`` says why
+    each other keeps its last good value, ``reason`` why the whole message was refused, if it was.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -67,11 +63,9 @@ class HydrodynamicModel:
         self._renewed = -math.inf  # s, on the caller's clock
 
     def take(self, message: Any, now: float) -> Taken:
-        """Take up what is good in a message; never raises for what is in it.
-
-        A stamp before the last one is refused while the stream is fresh. Once it is not, its
-        source has begun anew (a bag that loops, a simulation reset) and any stamp is accepted.
-        """
+        """Take up what is good in a message; never raises for what is in it. An earlier stamp than
+        the last is refused while the stream is fresh; after that its source has restarted (a bag
+        that loops)."""
         stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
         if self._stamp is not None and stamp < self._stamp and self.fresh(now):
             late = (self._stamp - stamp) / _SECOND
@@ -82,7 +76,7 @@ class HydrodynamicModel:
         names = [status.name for status in message.status]
         for status in message.status:
             if "." in status.name:
-                continue  # a parameter of an effect: no matter of these matrices
+                continue  # a parameter of an effect is not in these matrices
             try:
                 if names.count(status.name) > 1:
                     raise ValueError("given twice")
@@ -108,10 +102,7 @@ class HydrodynamicModel:
 
     def fresh(self, now: float) -> bool:
         """Whether the estimator is at work: heard within ``hold_after``, and not itself stale.
-
-        Otherwise the last good set goes on being used. Whoever may not rely on old coefficients
-        asks here.
-        """
+        Otherwise the last good set goes on being used."""
         return 0.0 <= now - self._renewed <= self.hold_after
 
     def _read(self, status: Any) -> tuple[Level, float]:

@@ -1,8 +1,5 @@
-"""Child processes, whose code is where this process has its own: never in the current folder.
-
-Python looks there first when it is told what to run by `-m` or `-c`, and so does numba for its
-settings; but a folder of somebody's records may hold a `yaml.py`.
-"""
+"""Child processes that never look for code in the current folder, as Python does for `-m` and `-c`,
+and numba for its settings: a folder of somebody's records may hold a `yaml.py`."""
 
 import os
 import subprocess
@@ -25,10 +22,8 @@ _CACHES = "_CACHE_DIR"  # how the names of compilers' own folders end
 def start(
     *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
 ) -> "subprocess.Popen[Any]":
-    """Python with these arguments, in a neutral folder; ``options`` are those of Popen.
-
-    An interrupt from the terminal does not reach it.
-    """
+    """Python with these arguments, in a neutral folder, where no interrupt from the terminal
+    reaches it; ``options`` are those of Popen."""
     variables = os.environ | _SAFE | dict(environment or {})
     for name, value in variables.items():
         if name in _PATHS or name.endswith(_CACHES):  # relative: those of another folder
@@ -43,9 +38,10 @@ def start(
 
 
 @contextmanager
-def safe_workers() -> Iterator[None]:
-    """The same for processes that a pool of workers starts within this context."""
-    added = {name: value for name, value in _SAFE.items() if name not in os.environ}
+def environment(ours: Mapping[str, str] = _SAFE) -> Iterator[None]:
+    """Set what of ``ours`` is not set, within this context; by default what makes the processes
+    safe that a pool of workers starts."""
+    added = {name: value for name, value in ours.items() if name not in os.environ}
     os.environ.update(added)
     try:
         yield

@@ -36,9 +36,7 @@ AnyMessage = TypeVar("AnyMessage", bound=Odometry | Imu | Wrench | Joints)
 @dataclass(frozen=True)
 class FrameDefaults:
     """The axes of a message whose frame ids do not tell (parameters `frames.body`, `.world`).
-
-    Raises UserError: a name that is not one of `flu`, `frd` (body) or `enu`, `ned` (world).
-    """
+    Raises UserError for a name other than `flu`, `frd` (body), `enu`, `ned` (world)."""
 
     body: str = "flu"
     world: str = "enu"
@@ -102,12 +100,9 @@ def quaternion_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> 
 
 
 def quaternion_to_euler(q: ArrayLike) -> Array:
-    """Roll, pitch, yaw (rad), (..., 3), of quaternions (..., 4) of any length but zero.
-
-    Half the sum and half the difference of roll and yaw are polar angles of quaternion
-    components, so that precision holds up to pitch +-90 degrees, where only one of them exists
-    and the other is taken as zero.
-    """
+    """Roll, pitch, yaw (rad), (..., 3), of quaternions (..., 4) of any length but zero. Half the
+    sum and difference of roll and yaw are polar angles of quaternion components, so that precision
+    holds up to pitch +-90 degrees, where the one that does not exist is taken as zero."""
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
     half_sum = np.arctan2(x + z, w - y)
     half_difference = np.arctan2(x - z, w + y)
@@ -152,22 +147,16 @@ def acceleration_of_arm(omega: Array, omega_dot: Array, arm: Array | Sequence[fl
 
 
 def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyMessage:
-    """A message on the wire as the core wants it: body FRD, world NED.
-
-    A frame id ending in `_frd`, `_fsd` or `_ned` decides, else `defaults`. Of an Odometry
-    the world is `frame_id` and the body `child_frame_id`; of an Imu or Wrench the body is
-    `frame_id` and the world the default one. Frame ids are kept: they name the axes on the wire.
-    Variances belong to axes without direction, so no sign touches them.
-    """
+    """A message on the wire as the core wants it: body FRD, world NED. A frame id ending in `_frd`,
+    `_fsd` or `_ned` decides, else `defaults`: of an Odometry `frame_id` (world) and
+    `child_frame_id` (body), of an Imu or Wrench `frame_id` (body; the world is the default one).
+    Frame ids are kept: they name the axes on the wire. Variances have no signs to turn."""
     return _turned(message, defaults, _TURNS)
 
 
 def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> AnyMessage:
-    """The inverse of `to_core(message, FrameDefaults(body, world))`: FRD/NED onto the wire.
-
-    The frame ids of the message decide in the same way, so that a message is never written with
-    axes that its frame ids deny.
-    """
+    """The inverse of `to_core(message, FrameDefaults(body, world))`: FRD/NED onto the wire. Here,
+    too, the frame ids decide, so that no message has axes that its frame ids deny."""
     return _turned(message, FrameDefaults(body, world), _TURNS_BACK)
 
 

@@ -6,6 +6,9 @@ one that crosses a library of C++ aborts the process.
 
 import os
 import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
@@ -22,11 +25,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 def end_at_once(status: int | None = None) -> None:
-    """Have an interrupt end the process with this status; None: its own, saying so.
-
-    For a program that has nothing to tidy up yet, or no longer: files are written whole or not at
-    all, and compilers end with their parent.
-    """
+    """Have an interrupt end the process with this status (None: its own, saying so): for a program
+    that has nothing to tidy up, as files are written whole or not at all and compilers end with
+    their parent."""
 
     def end(number: int, _: FrameType | None) -> None:
         if status is not None:
@@ -57,6 +58,21 @@ def raise_interrupts() -> None:
 
     for number in INTERRUPTS:
         signal.signal(number, interrupt)
+
+
+@contextmanager
+def noted_interrupts() -> Iterator[list[int]]:
+    """The numbers of the interrupts that have come within the block, which do nothing else."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
+        yield noted
+        return
+    before = {n: signal.signal(n, lambda number, _: noted.append(number)) for n in INTERRUPTS}
+    try:
+        yield noted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _end(number: int) -> None:

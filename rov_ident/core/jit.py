@@ -19,10 +19,8 @@ whether a number is finite: ``x - x`` may be taken for zero. ``inlined`` is also
 function with a single caller: numba optimises whatever a kernel calls once more with each kernel.
 
 numba compiles a cached function again when its own file changes, but not when a function it calls
-or a constant of another module changes. The cache therefore lies in a folder that is named after
-the source of the whole package and of installed effects, and the versions of all that makes the
-machine code: a kernel of another version is never run, and a new version does not disturb one that
-is running.
+or a constant of another module does. The folder of the cache is therefore named after the source of
+the whole package and of installed effects, and the versions of all that makes the machine code.
 """
 
 import contextlib
@@ -83,8 +81,7 @@ numba.config.CACHE_DIR = str(CACHE)
 
 def _decorator(**options: Any) -> Callable[[F], F]:
     def compiled(function: F) -> F:
-        dispatcher: F = numba.njit(error_model="numpy", **options)(function)
-        return dispatcher
+        return numba.njit(error_model="numpy", **options)(function)
 
     return compiled
 
@@ -104,13 +101,10 @@ inlined = _decorator(inline="always")
 
 
 def only_run() -> None:
-    """Set numba up for a process that runs what others have compiled: 30 MB less, and faster.
-
-    To be called before the first kernel is. Otherwise scipy's linear algebra is loaded in case a
-    kernel with products of matrices has to be compiled, and the helpers that numba compiles for
-    itself at each start are optimised, though only newly compiled kernels would use them. Kernels
-    without such products can still be compiled afterwards.
-    """
+    """Set numba up, before the first kernel is called, for a process that runs what others have
+    compiled: 30 MB less, and faster. scipy's linear algebra, which only compiling products of
+    matrices takes, is not loaded, and the helpers that numba compiles at each start are not
+    optimised."""
     blas, level = "scipy.linalg.cython_blas", numba.config.OPT
     try:
         sys.modules.setdefault(blas, None)  # type: ignore[arg-type]  # None: its import fails
@@ -124,11 +118,8 @@ def only_run() -> None:
 
 
 def interpret() -> None:
-    """Run kernels as the Python functions they are: a thousandth of the speed, but at once.
-
-    Until :func:`stop_interpreting`, and everywhere in this process. numpy's numbers raise nothing
-    when divided by zero, as in compiled code; Python's own would.
-    """
+    """Run kernels, everywhere in this process, as the Python functions they are: a thousandth of
+    the speed, but at once. numpy's numbers divide by zero without raising, as in compiled code."""
     CPUDispatcher.__call__ = lambda self, *arguments: self.py_func(*arguments)
     np.seterr(all="ignore")
 
@@ -168,10 +159,8 @@ class Compiler:
         return self._mark.exists()
 
     def start(self) -> None:
-        """Compile in another process, without waiting; not after :meth:`stop`.
-
-        The process ends with this one, however this one ends: the pipe between them is closed then.
-        """
+        """Compile in another process, without waiting; not after :meth:`stop`. It ends with this
+        one, however this one ends: the pipe between them is closed then."""
         command = ["-c", _AS_CHILD, self._exercise.__module__, self._exercise.__name__]
         cache = {"NUMBA_CACHE_DIR": str(CACHE)}  # it may be a temporary folder of this process
         with self._lock:

@@ -20,8 +20,7 @@ def unit_diagonal(matrix: Array) -> tuple[Array, Array]:
 
 
 def _size(matrix: Array) -> Array:
-    size: Array = np.sqrt(np.maximum(np.diag(matrix), _NOTHING))
-    return size
+    return np.sqrt(np.maximum(np.diag(matrix), _NOTHING))
 
 
 def scaled_solve(
@@ -43,30 +42,25 @@ def scaled_solve(
 
 
 def scaled_inverse(matrix: Array, rcond: float = 1e-15) -> Array:
-    """Pseudo-inverse (n, n) of a symmetric, positive semi-definite matrix.
-
-    Directions with eigenvalues below ``rcond`` of the largest, after scaling, are left out (1e-15:
-    those that are zero but for rounding).
+    """Pseudo-inverse (n, n) of a symmetric, positive semi-definite matrix, without directions whose
+    eigenvalues are, after scaling, below ``rcond`` of the largest (1e-15: zero but for rounding).
     """
     scale = 1.0 / _size(matrix)
     scale = np.outer(scale, scale)
-    inverse: Array = np.linalg.pinv(matrix * scale, hermitian=True, rcond=rcond) * scale
-    return inverse
+    return np.linalg.pinv(matrix * scale, hermitian=True, rcond=rcond) * scale
 
 
 def sandwich(inverse: Array, scatter: Array) -> Array:
     """Covariance (n, n) of an estimate whose score has the covariance ``scatter``, by the inverse
     of its normal matrix (Huber 1967)."""
-    covariance: Array = inverse @ scatter @ inverse.T
-    return covariance
+    return inverse @ scatter @ inverse.T
 
 
 def widened(covariance: Array, variance: Array) -> Array:
     """The covariance (n, n) with the same correlations and no variance below ``variance`` (n,)."""
     own = np.maximum(np.diag(covariance), 1e-300)  # zero over zero
     factor = np.sqrt(np.maximum(variance / own, 1.0))
-    wide: Array = covariance * np.outer(factor, factor)
-    return wide
+    return covariance * np.outer(factor, factor)
 
 
 def interpolated(t: Array, y: Array, at: Array) -> Array:

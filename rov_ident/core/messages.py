@@ -1,9 +1,5 @@
-"""The input messages, and what else they are made from, free of middleware.
-
-The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
-forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
-the estimators through one path.
-"""
+"""The input messages, and what else they are made from, free of middleware: as on the wire (ROS
+axes) and, of the same types, after ``frames.to_core`` (FRD, NED)."""
 
 from typing import NamedTuple
 
@@ -103,7 +99,7 @@ def fault(message: Message) -> str:
     if message.stamp >= LAST_STAMP:
         return "stamp at the end of time"
     if isinstance(message, Joints):
-        return ""  # what is not finite in it may be a joint that nobody asked for
+        return ""  # a joint that nobody uses may be not finite
     if isinstance(message, Odometry):
         p, q, v, w = message.position, message.orientation, message.linear, message.angular
         if not 0.5 < q.dot(q) < 2.0:  # NaN too

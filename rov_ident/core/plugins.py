@@ -1,8 +1,5 @@
-"""What installed packages bring to this one, through entry points of :data:`GROUP`.
-
-Only what is installed counts: a package that lies in the current folder is not looked at, wherever
-Python itself would look, as that may be a folder of somebody's records.
-"""
+"""What installed packages bring to this one, through entry points of :data:`GROUP`. A package in
+the current folder, which may be one of somebody's records, is not looked at."""
 
 import os
 import re

@@ -1,8 +1,7 @@
 """One thread for BLAS.
 
-The matrices here are 30 x 30, over which a second thread only waits, at full load, on a computer
-that is shared with a pilot's. Our own programs limit their process; as a library we limit only our
-own calls and leave the process as it was.
+The matrices here are 30 x 30, over which a second thread only waits, at full load. Our own programs
+limit their process; as a library we limit only our own calls.
 """
 
 import os
@@ -17,10 +16,8 @@ _VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def limit_process() -> None:
-    """Give this process and its children one thread for BLAS: for programs, never at an import.
-
-    Best called before numpy is loaded: its BLAS then starts no other thread at all.
-    """
+    """Give this process and its children one thread for BLAS: for programs, never at an import;
+    best before numpy is loaded, whose BLAS then starts no other thread."""
     for name in _VARIABLES:
         os.environ.setdefault(name, "1")
     if "numpy" in sys.modules:
@@ -29,11 +26,8 @@ def limit_process() -> None:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread within this context (or decorated function), then restore it.
-
-    The limit holds for the process, so that calls in several threads share one: the first sets it
-    and the last restores it.
-    """
+    """Limit BLAS to one thread within this context (or decorated function). The limit holds for the
+    process: of calls in several threads the first sets it and the last restores it."""
     global _inside, _limits
     with _lock:
         if _inside == 0:

@@ -1,8 +1,5 @@
-"""YAML as ROS reads and writes it: the only module that reads any.
-
-What is read is plain data of a sensible size: mappings, lists, text, numbers, true, false and null.
-The parameter files of ROS 2 know no more.
-"""
+"""YAML as ROS reads and writes it, and the only module that reads any: plain data of a sensible
+size, mappings, lists, text, numbers, true, false and null."""
 
 import re
 from collections.abc import Hashable
@@ -87,10 +84,8 @@ Dumper.add_representer(
 
 
 def parse(text: str) -> Any:
-    """The plain data that a YAML text holds.
-
-    Raises UserError: half a sentence, to be put behind the name of the file.
-    """
+    """The plain data that a YAML text holds. Raises UserError: half a sentence, to be put behind
+    the name of the file."""
     try:
         return yaml.load(text, _Loader)  # nosec B506
     except yaml.YAMLError as error:
@@ -103,7 +98,7 @@ def parse(text: str) -> Any:
 
 
 def parse_file(path: Path) -> Any:
-    """The same of a file in UTF-8."""
+    """The data in a YAML file in UTF-8; raises UserError alike."""
     try:
         return parse(read_input(path, LARGEST_FILE).decode())
     except OSError as error:

@@ -1,7 +1,5 @@
-"""What every estimator has published, and which part of it a page has not seen yet.
-
-A store is filled by one thread and read by others.
-"""
+"""What every estimator has published, and which part of it a page has not seen yet. A store is
+filled by one thread and read by others."""
 
 import math
 import threading
@@ -29,10 +27,8 @@ Mark = tuple[int, int]
 
 
 class Series:
-    """Rows in the order of time, at most ``size``: older ones thin out, or go if ``sliding``.
-
-    Where rows that a reader has are no longer those of the series, its epoch is another.
-    """
+    """Rows in the order of time, at most ``size``: older ones thin out, or go if ``sliding``. Where
+    rows that a reader has are no longer those of the series, its epoch is another."""
 
     def __init__(self, size: int, sliding: bool = False) -> None:
         self._size, self._sliding = size, sliding
@@ -111,7 +107,7 @@ class Store:
         self._now = now
         self._lock = threading.Lock()
         self._estimators: dict[str, Estimator] = {}
-        self._bridges: dict[str, Status] = {}  # what goes on to controllers
+        self._bridges: dict[str, Status] = {}  # what is sent to controllers
 
     def add(self, name: str) -> None:
         """An estimator exists, even if it has not published yet."""
@@ -200,10 +196,8 @@ class Store:
             }
 
     def changes(self, marks: Mapping[str, Sequence[Mark]] | None = None) -> tuple[Any, Any]:
-        """The present state, with what is new since ``marks``; and the marks for the next call.
-
-        The state is plain data for JSON: no number that is not finite.
-        """
+        """The present state as data for JSON, without numbers that are not finite, with what is new
+        since ``marks``; and the marks for the next call."""
         marks = marks or {}
         with self._lock:
             now = self._now()

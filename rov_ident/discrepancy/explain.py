@@ -188,7 +188,7 @@ def explain(
     _add_term(search, judge, retuned, model)
     if search.config is not config:
         std = sensor_choice.noise_std(streams, search.config.effects[NOISE])
-        of_sensors.append(noise_finding(search, judge, model.final, config, std))
+        of_sensors.append(noise_finding(judge, model.final, config, std))
     given = Hypothesis(config, {})
     as_recorded = Judge(WindowedProblem(recorded[0], to_judge))
     baseline = as_recorded.summed(given)

@@ -205,9 +205,7 @@ def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
     return changed
 
 
-def noise_finding(
-    search: Search, judge: Judge, final: Fitted, given: Config, std: Mapping[str, float]
-) -> Finding:
+def noise_finding(judge: Judge, final: Fitted, given: Config, std: Mapping[str, float]) -> Finding:
     """The noise of the wrench's reading, which the configuration of the model ``final`` has: judged
     against the same model with the readings as they are in the configuration ``given``."""
     name, h = NOISE, final.hypothesis

@@ -34,7 +34,7 @@ from rov_ident.model.equations import RigidBody, add_current
 
 def _of_others(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
     """Effects that installed packages bring, by the names of their entry points. UserError if one
-    is none, or has a name that is taken."""
+    is invalid, or its name is taken."""
     names: dict[str, str] = dict.fromkeys(taken, "rov_ident")
     for package, point in plugins.installed():
         effect, name = plugins.loaded(package, point), point.name
@@ -198,8 +198,7 @@ def reading_noise(effects: Values) -> Array:
     """Standard deviations (6,) of what is read of the wrench beside the command [N, N m]."""
     parts = ((EFFECTS[name].noise, values) for name, values in effects.items())
     squares = [noise(**values) ** 2 for noise, values in parts if noise is not None]
-    std: Array = np.sqrt(np.sum([np.zeros(6), *squares], axis=0))
-    return std
+    return np.sqrt(np.sum([np.zeros(6), *squares], axis=0))
 
 
 def of_the_vehicle(effects: Values) -> Values:
@@ -218,13 +217,10 @@ def parameter(effect: str, name: str) -> EffectParameter:
 
 
 def estimable(name: str) -> dict[str, float | None]:
-    """The parameters of an effect that an estimator can follow while the vehicle moves.
-
-    With each of them the value at which it is better left alone unless asked for: the null of a
-    parameter of one axis or fin, of which an effect has several, and of a limit; None for others.
-    An onset, a frequency and a phase are not among them, nor what shows in no velocity (the sampler
-    finds the biases of an IMU itself), nor the noise of a reading.
-    """
+    """The parameters of an effect that an estimator can follow while the vehicle moves, each with
+    the value at which it is left alone unless asked for: the null of a limit and of a parameter of
+    one axis or fin; None for others. Not an onset, a frequency, a phase, nor what shows in no
+    velocity (the biases of an IMU, which the sampler finds; the noise of a reading)."""
     effect = EFFECTS[name]
     if effect.heading or effect.noise:
         return {}

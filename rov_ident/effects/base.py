@@ -25,7 +25,7 @@ An effect says what it does by exactly one of these, each in the file of the eff
 ``steer``
     A kernel ``steer(p, state, dt, inputs)``: on entry ``inputs`` (2, 4) holds what was read of
     :data:`rov_ident.model.coefficients.INPUTS`, the means over ``dt`` and the values at its end; on
-    return the same of what acts; with no ``dt`` the fins begin anew. ``state``
+    return the same of what acts; with no ``dt`` the fins restart. ``state``
     (:data:`STEER_MEMORY`,) is the effect's own, as of ``act``.
 ``sense``
     ``sense(reading, **parameters) -> reading`` and its inverse ``correct``: what the sensors give

@@ -1,7 +1,5 @@
-"""The vehicle is heavier in water than configured: ``delta`` along world z, at the CB.
-
-World z points down (NED), so that a positive delta is buoyancy lost: ``B - delta``.
-"""
+"""The vehicle is heavier in water than configured: ``delta`` along world z, which points down
+(NED), at the CB: ``B - delta``."""
 
 import dataclasses
 

@@ -1,7 +1,5 @@
-"""Water that moves steadily and without rotation; the equations of motion say what that does.
-
-See :func:`rov_ident.model.equations.add_current`.
-"""
+"""Water that moves steadily and without rotation; :func:`rov_ident.model.equations.add_current`
+says what that does."""
 
 import numpy as np
 

@@ -7,9 +7,8 @@ A checkpoint is one file::
     {"format": 1, "estimator": ..., "configuration": ..., "structure": ..., "stamp": ...}\n
     the arrays of OnlineEstimator.memory(), one after the other, as they are in memory
 
-Nothing in the file is run or decides how much is read. It is taken only by the same estimator of
-the same configuration (but for what may change while a node runs) whose state has the same
-structure. It is written beside its place, synced and renamed: there is always a whole one.
+Nothing in the file is run or decides how much is read. Only the same estimator of the same
+configuration (but for what may change while a node runs) takes it. There is always a whole one.
 """
 
 import contextlib
@@ -59,9 +58,7 @@ def packed(memory: Memory, identity: dict[str, Any]) -> bytes:
 
 def restore(online: OnlineEstimator, data: bytes) -> None:
     """Have an estimator go on from a checkpoint's contents; it stays as it is where that fails.
-
-    Raises UserError if the bytes are damaged, or of another estimator, configuration or version.
-    """
+    Raises UserError: the bytes are damaged, or of another estimator, configuration or version."""
     if not data.startswith(_MAGIC) or len(data) > LARGEST:
         raise UserError("it is no checkpoint, or its beginning is lost")
     checksum, _, body = data[len(_MAGIC) :].partition(b"\n")
@@ -90,12 +87,8 @@ def restore(online: OnlineEstimator, data: bytes) -> None:
 
 
 def read(online: OnlineEstimator, path: Path) -> bool:
-    """Have an estimator go on from a file; False where there is none.
-
-    A file that is refused is put aside, under its name with ``.refused`` behind it.
-
-    Raises UserError, one sentence that names the file and why it cannot be used.
-    """
+    """Have an estimator go on from a file; False where there is none. A file that is refused is put
+    aside, under its name with ``.refused`` behind it. Raises UserError that names it and why."""
     try:
         with open_input(path) as stream:
             data = stream.read(LARGEST + 1)

@@ -1,8 +1,7 @@
 """Whether model and data agree, so that an interval means what it says.
 
-An estimator finds the values that suit the data best, however badly that is. These tests ask what a
-wrong model or a lying sensor does to a good fit ("Does the model explain the data?" in
-docs/live.md has the study that their limits are from).
+An estimator finds the values that suit the data best, however badly that is; these tests ask how
+badly. "Does the model explain the data?" in docs/live.md has the study that limits are from.
 """
 
 from collections.abc import Iterable, Mapping
@@ -56,11 +55,9 @@ class Consistency:
         return all(test.passed for test in self.tests)
 
     def widened(self, covariance: Array, prior: Array) -> Array:
-        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``.
-
-        Where a test fails, errors are taken to be as many times larger as its value is than its
-        limit; but what the file says remains.
-        """
+        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``:
+        where a test fails, errors are as many times larger as its value is than its limit, up to
+        the prior's."""
         factor = max([1.0, *(test.value / test.limit for test in self.tests)])
         variance = np.diag(covariance)
         return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, prior**2)))

@@ -13,7 +13,7 @@ standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mea
 * *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
   average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
-  it was the wrench: the velocity is lost, and begun anew from the measurement.
+  it was the wrench: the velocity is lost, and restarts from the measurement.
 """
 
 import numpy as np
@@ -112,10 +112,8 @@ def has_changed(m, threshold):
 
 @inlined
 def lost(monitor, first, outlier):
-    """Whether the linear (first = 0) or angular velocity (3) is lost, after one more measurement.
-
-    ``outlier``: whether that is refused, as one of its components is an outlier.
-    """
+    """Whether the linear (first = 0) or angular velocity (3) is lost, after one more measurement,
+    which is refused where one of its components is an ``outlier``."""
     m = monitor[first]
     m.outliers = m.outliers + 1 if outlier else 0
     return m.outliers >= _LOST

@@ -58,8 +58,7 @@ class ReferenceUkf:
         mass = self.model.with_theta(theta).mass_matrix
         mass = mass + raised(mass, self.task.lightest)
         force = force_of_one(self.model.structure, mass, theta, nu, self._row["inputs"][0])
-        nu_dot: Array = np.linalg.solve(mass, tau - force - self.model.restoring_force(down))
-        return nu_dot
+        return np.linalg.solve(mass, tau - force - self.model.restoring_force(down))
 
     def _restart(self) -> None:
         """Begin from the measured velocity; the coefficients stay."""
@@ -137,10 +136,8 @@ class ReferenceUkf:
 
 
 def raised(mass: Array, least: Array) -> Array:
-    """Diagonal (6, 6) by which the pivots of a mass matrix become at least ``least`` (6,).
-
-    As in a modified Cholesky factorisation: pivot by pivot, each after the ones before it.
-    """
+    """Diagonal (6, 6) by which the pivots of a mass matrix become at least ``least`` (6,), one
+    after the other, as in a modified Cholesky factorisation."""
     left, added = mass.copy(), np.zeros((6, 6))
     for i in range(6):
         added[i, i] = max(least[i] - left[i, i], 0.0)
@@ -152,11 +149,9 @@ def raised(mass: Array, least: Array) -> Array:
 def compare(
     config: Config, samples: NDArray[np.void], tell: Callable[[float], None] = lambda share: None
 ) -> dict[str, Any]:
-    """Both filters over samples (k,) of SAMPLE, as JSON has it; effects' parameters are held.
-
-    Standard deviations are those of the filters, without what coloured residuals add. ``tell`` is
-    given the share that is done. A sample takes filterpy some milliseconds.
-    """
+    """Both filters over samples (k,) of SAMPLE, as JSON has it; effects' parameters are held. Their
+    own standard deviations, without what coloured residuals add. ``tell`` is given the share that
+    is done."""
     config = config.with_effects_held
     task = ukf.problem(config)
     state = ukf.init(task)

@@ -1,10 +1,6 @@
-"""Closed-loop manoeuvres: a controller follows alternating set points.
-
-The thrusters then go from limit to limit (Zhao et al. 2018); the vehicle stays where it is safe.
-
-Open-loop square waves identify best, but nobody knows where they end. A position and heading
-controller whose set points jump back and forth gives nearly the same wrench, bounded in space.
-"""
+"""Closed-loop manoeuvres: a position and heading controller whose set points jump back and forth
+takes the thrusters from limit to limit (Zhao et al. 2018), as open-loop square waves do, but stays
+where it is safe."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -43,8 +39,7 @@ class Limits:
     @property
     def half(self) -> Array:
         """Half the sides (3,) less a margin."""
-        half: Array = 0.5 * np.array(self.tank) - _MARGIN
-        return half
+        return 0.5 * np.array(self.tank) - _MARGIN
 
 
 @dataclass(frozen=True)
@@ -62,8 +57,7 @@ class AlternatingTargets:
     def target(self, t: float) -> Array:
         """Position [m] and heading [rad] (4,) aimed at."""
         sides = np.floor(t / np.array(self.period)) % 2 == 0
-        target: Array = np.where(sides, 1.0, -1.0) * np.array(self.amplitude)
-        return target
+        return np.where(sides, 1.0, -1.0) * np.array(self.amplitude)
 
     def scaled(self, factor: float) -> "AlternatingTargets":
         amplitude, torque = (tuple(factor * x for x in of) for of in (self.amplitude, self.torque))

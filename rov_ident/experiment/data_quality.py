@@ -5,12 +5,10 @@ squares fit with all that is estimated by default says whether a model can expla
 the configuration lacks, and how well each coefficient is known after it.
 """
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,14 +36,11 @@ from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import fit_batch
 from rov_ident.offline.fit import IDENTIFIABLE, SCALE, Fit, fit_online, thrust_or_mass
 from rov_ident.offline.maximum_likelihood import inverse_of
-from rov_ident.reports.result import NORMAL, Shown
+from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import blanked, is_without_velocity
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Tell = Callable[..., None]
 
@@ -139,7 +134,7 @@ class Check(Shown):
             parts.append(self.quick.numbers("a quick fit", columns))
         return Tables(tuple(parts))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """How well each coefficient is known, now and after a fit."""
         from rov_ident.experiment.report import check_picture
 
@@ -175,12 +170,12 @@ class Check(Shown):
             "coefficients": coefficients,
             "consistency": None if self.quick is None else self.quick.consistency.to_dict(),
         }
-        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+        return as_json(document)
 
 
 def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     """Look at a bag; ``tell`` is called with what is being done, and what share of it is. UserError
-    if it cannot be read, or has not the messages that it takes to look at anything."""
+    if it cannot be read, or lacks the messages that are needed."""
     say = tell or (lambda what, share=None: None)
     record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
     say("looking at its messages")

@@ -6,11 +6,9 @@ adds is predicted along its simulated motion, and the one after which the worst 
 best is proposed.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,15 +25,12 @@ from rov_ident.model.equations import Array
 from rov_ident.offline.archive import Archive
 from rov_ident.offline.batch_fit import predicted_information
 from rov_ident.offline.maximum_likelihood import LIKELY, assumed, inverse_of, one_pass
-from rov_ident.reports.result import NORMAL, Shown
+from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
 from rov_ident.sampling.records import samples_of
 from rov_ident.sampling.smoothing import smoothed
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity
 from rov_ident.simulation.virtual_sensors import Dive, Suite
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["Limits", "Proposal", "propose"]
 
@@ -101,7 +96,7 @@ class Proposal(Shown):
         head = ["", "configured", f"{PLUS_MINUS} now", f"{PLUS_MINUS} after it", "unit"]
         return Table("what the manoeuvre would tell", head, rows, text=(4,))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """How well each coefficient is known, now and after the manoeuvre."""
         from rov_ident.experiment.report import plan_picture
 
@@ -130,7 +125,7 @@ class Proposal(Shown):
             ],
             "left_out": list(self.left_out),
         }
-        return json.dumps(document, indent=2, allow_nan=False) + "\n"
+        return as_json(document)
 
     def _writers(self) -> dict[str, Callable[[Path], None]]:
         def messages(path: Path) -> None:
@@ -158,7 +153,9 @@ def propose(
     now = predicted_information(bags, config) if bags is not None else np.zeros((n, n))
     velocity = bags is None or not any(bags.each(is_without_velocity))
     before = prospects(config, now)
-    size = _sizes(config)
+    # what a standard deviation is compared with: the value, or a share of what matters
+    prior = prior_of(config)
+    size = np.maximum(np.abs(prior.mean), 0.2 * typical(config.dynamics)[prior.estimated])
     relative = np.array([p.std for p in before]) / size
     vehicles = _vehicles(config, now)
     candidates, left_out, predicted = [], [], []
@@ -167,11 +164,11 @@ def propose(
             left_out.append(f"{one.name}: without a velocity sensor surge and sway have to rest")
             continue
         tell(one.name)
-        found = _safe(config, vehicles, one, duration, limits)
+        found = _safe(vehicles, one, duration, limits)
         if found is None:
             left_out.append(f"{one.name}: not safe within the limits, however small")
             continue
-        information = _information(config, *found, duration, limits, velocity)
+        information = _information(config, found[0], duration, limits, velocity)
         std = np.array([p.std for p in prospects(config, now + information)])
         candidates.append(Candidate(*found, information, duration, limits))
         predicted.append(std / size)
@@ -194,13 +191,6 @@ def propose(
     )  # fmt: skip
 
 
-def _sizes(config: Config) -> Array:
-    """What a standard deviation is compared with (n,): the value, or a share of what matters."""
-    prior, model = prior_of(config), config.dynamics
-    size: Array = np.maximum(np.abs(prior.mean), 0.2 * typical(model)[prior.estimated])
-    return size
-
-
 def _vehicles(config: Config, information: Array) -> list[Config]:
     """The configured vehicle and some that what is known allows."""
     prior = prior_of(config)
@@ -218,7 +208,7 @@ def _vehicles(config: Config, information: Array) -> list[Config]:
 
 
 def _safe(
-    config: Config, vehicles: list[Config], one: AlternatingTargets, duration: float, limits: Limits
+    vehicles: list[Config], one: AlternatingTargets, duration: float, limits: Limits
 ) -> tuple[AlternatingTargets, Flight] | None:
     """The manoeuvre as large as is safe with every vehicle."""
     factor = 1.0
@@ -236,9 +226,8 @@ def _safe(
 
 
 def _information(
-    config: Config, one: AlternatingTargets, flight: Flight, duration: float, limits: Limits,
-    velocity: bool,
-) -> Array:  # fmt: skip
+    config: Config, one: AlternatingTargets, duration: float, limits: Limits, velocity: bool
+) -> Array:
     run = closed_loop_manoeuvres.dive(config, one, duration, limits, Suite())
     samples = smoothed(np.concatenate(list(samples_of(config, run, velocity))))
     estimated, noise = prior_of(config).estimated, assumed(config, LIKELY)

@@ -4,9 +4,8 @@
 Velocity and position are the EKF's (`XKF1`, `LOCAL_POSITION_NED`), the attitude is its quaternion
 or what the autopilot reports, rates and specific force are the first IMU's. The pulses to the
 thrusters (`RCOU`, `SERVO_OUTPUT_RAW`) become a wrench by the configuration's `thrusters`, at the
-battery's measured voltage. All of it is in ArduPilot's axes, forward-starboard-down and
-north-east-down, and stamped with the time since the autopilot's start plus one second (no stamp is
-zero). Nothing is resampled but attitude and rates: they are brought to the times of the velocity.
+battery's measured voltage. Axes are forward-starboard-down and north-east-down, stamps count from
+the autopilot's start, plus a second. Attitude and rates are interpolated to the velocity's times.
 
 Which way a thruster pushes, and on which output it is, the autopilot knows better than a file: its
 parameters (`FRAME_CONFIG`, `MOT_n_DIRECTION`, `SERVOn_FUNCTION`) overrule the configuration, and a
@@ -260,7 +259,6 @@ def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
 
 
 _Row = tuple[int, str, Message]
-_ROLES = (ODOMETRY, IMU, WRENCH)
 
 
 def _ns(t: int) -> int:
@@ -323,8 +321,7 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
 def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
     i = bisect_right(times, t)
     if i and times[i - 1] == t:
-        found: Array = quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
-        return found
+        return quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
     if i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP:
         return None
     share = (t - times[i - 1]) / (times[i] - times[i - 1])
@@ -333,10 +330,8 @@ def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
 
 
 def read_log(path: Path, progress: Callable[[float], None] = lambda share: None) -> Log:
-    """What a log says.
-
-    Raises UserError: it cannot be read, is no log, or what reads it is not installed.
-    """
+    """What a log says. Raises UserError: it cannot be read, is no log, or what reads it is not
+    installed."""
     if path.suffix.lower() == ".ulg":
         from rov_ident.io.px4_log import read_ulog
 

@@ -1,8 +1,6 @@
-"""A plain log (CSV) into a bag of the topics `odom`, `thruster_wrench` and `joint_states`.
-
-Nothing is resampled or filtered. What the log does not tell (an attitude, a position) is filled in
-so that it agrees with the velocities, and said in the report.
-"""
+"""A plain log (CSV) into a bag of `odom`, `thruster_wrench` and `joint_states`. Nothing is
+resampled or filtered; an attitude or a position that is not there is made to agree with the
+velocities, and that is said."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -179,10 +177,8 @@ def _bin_widths(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def parse_columns(items: Sequence[str]) -> dict[str, str]:
-    """The columns of `--map`: each item is `name=heading`, or a YAML file of such pairs.
-
-    Raises UserError: neither of the two.
-    """
+    """The columns of `--map`: each item is `name=heading`, or a YAML file of such pairs. Raises
+    UserError: neither of the two."""
     columns: dict[str, str] = {}
     for item in items:
         name, equals, heading = item.partition("=")
@@ -228,10 +224,8 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
 
 
 def _wrapped(quaternion: Array) -> NDArray[np.bool_]:
-    """Rows whose attitude jumps away and back at once.
-
-    A log that averages Euler angles over a bin turns +179 and -179 degrees into 0.
-    """
+    """Rows whose attitude jumps away and back at once, as where a log averages Euler angles of +179
+    and -179 degrees over a bin."""
     step = _angle_between(quaternion[1:], quaternion[:-1])
     bridge = _angle_between(quaternion[2:], quaternion[:-2])
     jump = np.minimum(step[1:], step[:-1])
@@ -354,16 +348,10 @@ class _Log:
 
     def check_angles(self) -> None:
         """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates."""
-        for name in _FINS:
+        for name in (*_FINS, *_ANGLES):
             angle = self.data.get(name, np.zeros(1))
-            if (large := np.flatnonzero(np.abs(angle) > _LARGEST_FIN)).size:
-                raise UserError(
-                    f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
-                    "looks like degrees: convert it to rad, or name it in --degrees."
-                )
-        for name in _ANGLES:
-            angle = self.data.get(name, np.zeros(1))
-            large = np.flatnonzero(np.abs(angle) > 2.0 * np.pi)
+            most = _LARGEST_FIN if name in _FINS else 2.0 * np.pi
+            large = np.flatnonzero(np.abs(angle) > most)
             if not large.size:
                 continue
             turned = np.linalg.norm(self.matrix(_VELOCITIES[3:]), axis=1)

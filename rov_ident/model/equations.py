@@ -10,17 +10,14 @@ In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 
     extended = [1, nu, |nu|, min(nu, 0), u^2, inputs]
     g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
 
-The inputs are fin angles and the propeller's speed: what they make is part of d, so that their
-coefficients are parameters like any other. A vehicle without such coefficients has none.
+The inputs are fin angles and the propeller's speed: what they make is part of d.
 
 ``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, with
 the centre of gravity anywhere, off-diagonal terms included, and does no work by construction.
 
-The same few functions serve every use: :func:`generalized_force` evaluates ``C nu - d`` for a
-bundle of states side by side ("lanes": one for simulation and for a row of the regressor, many
-for sigma points, so that the compiler can use vector instructions), :func:`columns` gives the same
-forces per unit of each coefficient (the regressor), and the forward dynamics solve the inverse
-ones.
+:func:`generalized_force` gives ``C nu - d`` for states side by side ("lanes": one in simulation;
+many, of sigma points, become vector instructions), :func:`columns` gives the same forces per
+unit of each coefficient (the regressor), and the forward dynamics solve the inverse ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -138,19 +135,15 @@ class Model:
         return Structure(*(column.astype(np.int64) for table in tables for column in table))
 
     def with_theta(self, theta: Array) -> "Model":
-        """The same structure with another parameter vector (m,).
-
-        Raises UserError if it has another length.
-        """
+        """The same structure with another parameter vector (m,). Raises UserError for another
+        length."""
         if np.shape(theta) != self.theta.shape:
             raise UserError(f"theta needs shape {self.theta.shape}, not {np.shape(theta)}")
         return replace(self, theta=_vector(theta))
 
     def with_values(self, values: Mapping[str, float]) -> "Model":
-        """The same structure with some coefficients replaced by name.
-
-        Raises UserError if the model has no such coefficient.
-        """
+        """The same structure with some coefficients replaced by name. Raises UserError if the model
+        has no such coefficient."""
         theta = self.theta.copy()
         for name, value in values.items():
             if name not in self.names:
@@ -173,10 +166,7 @@ class Model:
 
     def _force(self, nu: Array, inputs: Array | None) -> Array:
         given = np.zeros(len(INPUTS)) if inputs is None else _vector(inputs)
-        force: Array = force_of_one(
-            self.structure, self.mass_matrix, self.theta, _vector(nu), given
-        )
-        return force
+        return force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu), given)
 
     @property
     def mass_matrix(self) -> Array:
@@ -297,10 +287,8 @@ def skew(a: Sequence[float] | Array) -> Array:
 
 @inlined
 def extend(lanes, nu, extended):
-    """[1, nu, |nu|, min(nu, 0), u^2], the first rows of extended, from nu (6, lanes).
-
-    The others are those of the inputs, which change more slowly: :func:`extend_inputs`.
-    """
+    """[1, nu, |nu|, min(nu, 0), u^2], the first rows of extended, from nu (6, lanes);
+    :func:`extend_inputs` fills the others."""
     for k in range(lanes):
         extended[ONE, k] = 1.0
         extended[SQUARE, k] = nu[0, k] * nu[0, k]
@@ -322,10 +310,8 @@ def _extend_input(lanes, which, x, extended):
 
 @inlined
 def extend_inputs(lanes, structure, inputs, extended):
-    """The rows of the inputs (4,) in extended (EXTENDED_SIZE, lanes), of those that terms use.
-
-    They stay there while velocities change.
-    """
+    """The rows of the inputs (4,) in extended (EXTENDED_SIZE, lanes), of those that terms use; they
+    stay there while velocities change."""
     for i in range(len(structure.inputs)):
         _extend_input(lanes, structure.inputs[i], inputs[structure.inputs[i]], extended)
 
@@ -440,10 +426,8 @@ def columns(structure, nu, momentum, force, extended):
 
 @lean
 def in_motion(structure, moving, out):
-    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,).
-
-    An input has no noise to speak of: where it is zero, its columns are.
-    """
+    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,). An
+    input has hardly any noise: where it is zero, its columns are."""
     first = len(structure.mass_row)
     for c in range(first):
         out[c] = moving[structure.mass_row[c]] != 0 and moving[structure.mass_column[c]] != 0
@@ -511,10 +495,7 @@ def add_current(structure, added_mass, theta, nu, water, s, out):
 
 @kernel
 def force_of_one(structure, mass, theta, nu, inputs):
-    """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,), inputs (4,).
-
-    The result is (6,).
-    """
+    """:func:`generalized_force` (6,) of one state: mass (6, 6), theta (n,), nu (6,), inputs (4,)"""
     h = np.empty((6, 1))
     extended = np.empty((EXTENDED_SIZE, 1))
     extend_inputs(1, structure, inputs, extended)

@@ -50,9 +50,7 @@ def knows(voltage: float) -> bool:
 @cache
 def t200(voltage: float) -> Array:
     """Thrust [N] of a T200 (801,) at the pulses 1100, 1101 ... 1900 us; linear in the voltage.
-
-    Raises UserError if the voltage is outside the table.
-    """
+    Raises UserError if the voltage is outside the table."""
     known = sorted(CURVES)
     if not knows(voltage):
         raise UserError(
@@ -62,16 +60,14 @@ def t200(voltage: float) -> Array:
     after = max(1, int(np.searchsorted(known, voltage)))
     low, high = known[after - 1], known[after]
     share = (voltage - low) / (high - low)
-    thrust: Array = KILOGRAM_FORCE * ((1.0 - share) * _curve(low) + share * _curve(high))
-    return thrust
+    return KILOGRAM_FORCE * ((1.0 - share) * _curve(low) + share * _curve(high))
 
 
 def _curve(voltage: float) -> Array:
     from scipy.interpolate import PchipInterpolator  # here: it takes its time to import
 
     rows = CURVES[voltage]
-    curve: Array = PchipInterpolator(list(rows), list(rows.values()))(_PULSES)
-    return curve
+    return PchipInterpolator(list(rows), list(rows.values()))(_PULSES)
 
 
 def allocation(position: Array, direction: Array) -> Array:
@@ -81,10 +77,8 @@ def allocation(position: Array, direction: Array) -> Array:
 
 
 class Allocator:
-    """Commands of thrusters into wrenches, forward-starboard-down about the body origin.
-
-    ``signal`` is FORCE, PWM or NORMALIZED.
-    """
+    """Commands of thrusters (``signal``: FORCE, PWM or NORMALIZED) into wrenches about the body
+    origin, forward-starboard-down."""
 
     def __init__(self, config: Geometry, signal: str) -> None:
         self.matrix = matrix(config)
@@ -93,17 +87,12 @@ class Allocator:
         self._channels = np.array(channels, dtype=int) - 1
 
     def wrench(self, commands: Sequence[float] | Array, voltage: float | None = None) -> Array:
-        """The wrench (6,) [N, N m] of an array of commands (k,).
-
-        ``voltage`` [V] in place of the configured one.
-
-        Raises ValueError: in words, if there are too few commands, or one that cannot be.
-        """
+        """The wrench (6,) [N, N m] of an array of commands (k,), at ``voltage`` [V]. Raises
+        ValueError: in words, if there are too few commands, or one that cannot be."""
         commands, needed = np.asarray(commands, dtype=float), self._channels.max() + 1
         if len(commands) < needed:
             raise ValueError(f"an array of {len(commands)} values, but thrusters needs {needed}")
-        tau: Array = self.matrix @ self._forces(commands[self._channels], voltage)
-        return tau
+        return self.matrix @ self._forces(commands[self._channels], voltage)
 
     def _forces(self, commands: Array, voltage: float | None) -> Array:
         if not np.isfinite(commands).all():
@@ -129,10 +118,8 @@ class Allocator:
 
 
 def matrix(config: Geometry) -> Array:
-    """The allocation B (6, n) that the configuration gives.
-
-    Raises UserError if it gives none, two, or one of the wrong size.
-    """
+    """The allocation B (6, n) that the configuration gives. Raises UserError if it gives none, two,
+    or one of the wrong size."""
     position, direction, given = config.position, config.direction, config.allocation
     if given and (position or direction):
         raise UserError(
@@ -157,10 +144,7 @@ def matrix(config: Geometry) -> Array:
 
 
 def check(config: Geometry, signal: str) -> None:
-    """Refuse what could not be used later.
-
-    Raises UserError: one sentence naming the key.
-    """
+    """Raises UserError, one sentence naming the key, for what could not be used later."""
     if not (config.allocation or config.position or config.direction):
         raise UserError(
             "thrusters has no allocation: give thrusters.position and thrusters.direction, or "

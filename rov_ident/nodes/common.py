@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import rclpy
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -34,14 +35,12 @@ except ImportError:
 __all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "GuardedNode", "live", "subscribed"]
 
 AnyNode = TypeVar("AnyNode", bound=Node)
+_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class GuardedNode(Node):  # type: ignore[misc]
-    """A node that outlives what its callbacks raise, those of rclpy's own services included.
-
-    ``faults`` counts them by name; the log has them, too. Where ``outlives`` is False they end the
-    process.
-    """
+    """A node that outlives what its callbacks raise, those of rclpy's own services included, unless
+    ``outlives`` is False; ``faults`` counts them by name, the log has them, too."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.faults: Counter[str] = Counter()
@@ -64,22 +63,14 @@ class GuardedNode(Node):  # type: ignore[misc]
         guarded = self._guarded(topic, callback)
         return super().create_subscription(type_, topic, guarded, *arguments, **options)
 
-    def create_timer(
-        self, period: float, callback: Callable[..., Any], *arguments: Any, **options: Any
-    ) -> Any:
-        guarded = self._guarded("timer", callback)
-        return super().create_timer(period, guarded, *arguments, **options)
+    def create_timer(self, period: float, callback: Callable[..., Any], group: Any = None) -> Any:
+        """On the steady clock, so that a node under `use_sim_time` works without `/clock`."""
+        return super().create_timer(period, self._guarded("timer", callback), group, _STEADY)
 
     def create_service(
-        self,
-        type_: Any,
-        service: str,
-        callback: Callable[..., Any],
-        *arguments: Any,
-        **options: Any,
+        self, type_: Any, service: str, callback: Callable[..., Any], **options: Any
     ) -> Any:
-        guarded = self._guarded(service, callback)
-        return super().create_service(type_, service, guarded, *arguments, **options)
+        return super().create_service(type_, service, self._guarded(service, callback), **options)
 
     def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(callback)  # rclpy looks at its arguments
@@ -113,10 +104,8 @@ STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def subscribed(inputs: Inputs) -> dict[str, tuple[str, type]]:
-    """The relative topic and the message class of every role of the configured inputs.
-
-    Raises UserError if a package of messages is not installed.
-    """
+    """The relative topic and the message class of every role of the configured inputs. Raises
+    UserError if a package of messages is not installed."""
     found = {}
     for role, (topic, type_name) in sources(inputs).items():
         package, _, name = type_name.partition("/")
@@ -138,14 +127,12 @@ def live(
     begin: Callable[[AnyNode, threading.Event], None] = lambda node, interrupted: None,
     leave: Callable[[AnyNode], None] = lambda node: None,
 ) -> int:
-    """A node's whole life, until interrupted or shut down by itself, as the program's exit status.
-
-    It is 0 then, and 2 with one sentence where the user can correct what is wrong. ``own`` are the
-    node's parameters that are no part of a configuration. ``begin`` is called once the node is up
-    and starts its threads (one that is being started when an interrupt is raised would keep the
-    process for ever); it is given an event that is set by an interrupt, which does not end it.
-    ``leave`` is called once the node no longer hears anything, but may still publish.
-    """
+    """A node's whole life as the program's exit status: 0 when it is interrupted or ends by itself,
+    2 with one sentence where the user can correct what is wrong. ``own`` are the node's parameters
+    that are no part of a configuration. ``begin`` is called once the node is up, to start its
+    threads (one being started when an interrupt is raised would keep the process for ever), with an
+    event that an interrupt sets. ``leave`` is called once the node hears nothing any more, but may
+    still publish."""
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # open, so that the last messages can be published.
     end_at_once(0)

@@ -1,8 +1,7 @@
 """`controller_bridge`: converged coefficients into the parameters of a running controller.
 
-It sends a set when something in it has left the dead band, not more often than `period`, and in
-approval mode not before somebody said so. A set is sent as a whole or not at all, and read back: a
-controller that took a part of it gets back what it had.
+A set is sent, whole or not at all, when something in it has left the dead band, at most once in a
+`period`, in approval mode once it is approved; it is read back, and undone where taken in part.
 """
 
 import threading
@@ -15,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
@@ -122,9 +120,8 @@ class ControllerBridge(GuardedNode):
         self.create_service(Trigger, "~/approve", self._approve, callback_group=looks)
         self.create_service(Trigger, "~/revert", self._revert, callback_group=looks)
         self.create_service(SetBool, "~/enable", self._enable, callback_group=looks)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_LOOK_PERIOD, self._look, looks, clock=steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers, clock=steady)
+        self.create_timer(_LOOK_PERIOD, self._look, looks)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers)
         parameters.follow(self, partial(parameters.own, self, _OWN), self._take_parameters)
 
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:
@@ -210,10 +207,8 @@ class ControllerBridge(GuardedNode):
         self._settle(reason)
 
     def _settle(self, reason: str = "") -> None:
-        """Check whether the last set was accepted, and undo it if it was accepted only in part.
-
-        Raises UserError unless it was accepted; if the controller does not answer, call it again.
-        """
+        """Check whether the last set was accepted; undo what was accepted only in part. Raises
+        UserError unless it was accepted; if the controller does not answer, call it again."""
         if self._open is None:
             return
         self._wait_for_answer(reason)

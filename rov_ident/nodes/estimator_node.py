@@ -1,8 +1,4 @@
-"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish.
-
-Nothing here computes a coefficient. Timers run on the steady clock, so that a node under
-`use_sim_time` works where nothing publishes `/clock`; a sample's time is its stamp in any case.
-"""
+"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish."""
 
 import os
 import sys
@@ -17,7 +13,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, UInt64
@@ -119,14 +114,11 @@ class EstimatorNode(GuardedNode):
             self._acknowledge = self.create_publisher(UInt64, "~/received", STREAM)
             self.create_service(Trigger, "~/flush", self._flush)
 
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._publish_timer = self.create_timer(
-            1.0 / config.publish_rate, self._publish_in_time, clock=self._steady
-        )
-        self.create_timer(_SILENCE_PERIOD, self._check_inputs, clock=self._steady)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, clock=self._steady)
+        self._publish_timer = self.create_timer(1.0 / config.publish_rate, self._publish_in_time)
+        self.create_timer(_SILENCE_PERIOD, self._check_inputs)
+        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose)
         if self._keeper is not None:
-            self.create_timer(_CHECKPOINT_PERIOD, self._keep, clock=self._steady)
+            self.create_timer(_CHECKPOINT_PERIOD, self._keep)
         parameters.follow(
             self, partial(parameters.changed, self, _OWN_NAMES), self._take_parameters
         )
@@ -367,9 +359,7 @@ class EstimatorNode(GuardedNode):
         # Only settings can change while running: the state remains valid.
         self._online.configure(config)
         self.destroy_timer(self._publish_timer)
-        self._publish_timer = self.create_timer(
-            1.0 / self._config.publish_rate, self._publish_in_time, clock=self._steady
-        )
+        self._publish_timer = self.create_timer(1.0 / config.publish_rate, self._publish_in_time)
 
 
 def main(kind: Kind) -> int:

@@ -1,8 +1,7 @@
 """`example_controller`: velocity control with the coefficients that an estimator has found.
 
 Computed torque, ``tau = M (nu_ref_dot + gain (nu_ref - nu)) + C nu + D nu + g``, with a reference
-that follows `cmd_vel` as a first-order lag. A start for a controller of your own: what is worth
-keeping is how it treats coefficients, silence and numbers that are none.
+that follows `cmd_vel` as a first-order lag: a start for a controller of your own.
 """
 
 import math
@@ -13,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, WrenchStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
@@ -69,8 +67,7 @@ class ExampleController(GuardedNode):
         self.create_subscription(DiagnosticArray, "coefficients", self._take, LATCHED)
         self.create_subscription(Twist, "cmd_vel", self._obey, _LATEST)
         self.create_subscription(Odometry, "odom", self._measure, _LATEST, raw=True)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / _RATE, self._control, clock=steady)
+        self.create_timer(1.0 / _RATE, self._control)
 
     def _own_parameter(self, name: str, value: Array) -> Array:
         if self.has_parameter(name):

@@ -38,20 +38,15 @@ _OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
 
 
 def apart(namespace: str) -> list[str]:
-    """The arguments of a node that talks to nobody outside a namespace, not even by global names.
-
-    A namespace rather than a DDS partition or domain: every middleware has it, and as many as
-    anybody needs.
-    """
+    """The arguments of a node that talks to nobody outside a namespace, not even by global names;
+    unlike DDS partitions and domains, every middleware has any number of these."""
     rules = [f"__ns:={namespace}", *(f"{topic}:={namespace}{topic}" for topic in _GLOBAL)]
     return ["--ros-args", *(word for rule in rules for word in ("-r", rule))]
 
 
 class Player(Node):  # type: ignore[misc]
     """Plays one bag into the nodes ``{estimator}_node`` of a namespace, which is theirs alone.
-
-    ``check`` is called while waiting; it raises if there is nothing left to wait for.
-    """
+    ``check``, called while waiting, raises if there is nothing left to wait for."""
 
     def __init__(
         self,
@@ -137,14 +132,15 @@ class Player(Node):  # type: ignore[misc]
 
     def play(self, messages: Iterable[tuple[str, RawMessage]], rate: float) -> int:
         """Play (role, message) at the recorded speed times ``rate``; 0: as fast as the nodes can.
-
-        Returns how many messages every node has taken: all of them.
-        """
+        Returns how many messages every node has taken: all of them."""
         began: tuple[float, int] | None = None
         for role, raw in messages:
             if rate > 0.0:
                 began = began or (time.monotonic(), raw.log_time)
-                self._spin_until(began[0] + (raw.log_time - began[1]) * 1e-9 / rate)
+                end = began[0] + (raw.log_time - began[1]) * 1e-9 / rate
+                while (left := end - time.monotonic()) > 0.0:
+                    self._executor.spin_once(timeout_sec=min(left, 0.5))
+                    self._check()
             self._wait(partial(self._all_took, self._sent - WINDOW + 1), "to take messages")
             self._tick(raw.log_time)
             self._inputs[role].publish(raw.data)
@@ -171,11 +167,6 @@ class Player(Node):  # type: ignore[misc]
 
     def _has_report(self, estimator: str, stamp: int) -> bool:
         return estimator in self.reports and self.reports[estimator].stamp == stamp
-
-    def _spin_until(self, end: float) -> None:
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.5))
-            self._check()
 
     def _wait(self, ready: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
         end = time.monotonic() + patience

@@ -8,8 +8,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from rov_ident.config import Qos
 from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output
-from rov_ident.core.interrupts import INTERRUPTS, Interrupted
+from rov_ident.core.interrupts import Interrupted, noted_interrupts
 from rov_ident.estimation.online import ESTIMATORS, Report
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -90,10 +90,11 @@ def replay(
             configuration.dump(settings, parameters)
             nodes.append(stack.enter_context(_Process(name, parameters, namespace)))
 
-        raise_interrupt = stack.enter_context(_noted_interrupts())
+        interrupts = stack.enter_context(noted_interrupts())
 
         def check() -> None:
-            raise_interrupt()
+            if interrupts:  # raised within a callback of rclpy's it would be lost
+                raise Interrupted(interrupts[0])
             for node in nodes:
                 node.check()
 
@@ -120,44 +121,13 @@ def replay(
         )
 
 
-@contextmanager
-def _noted_interrupts() -> Iterator[Callable[[], None]]:
-    """A function that raises Interrupted if there was an interrupt: within a callback of rclpy's it
-    would be lost."""
-    noted: list[int] = []
-
-    def raise_interrupt() -> None:
-        if noted:
-            raise Interrupted(noted[0])
-
-    if threading.current_thread() is not threading.main_thread():  # only that one is interrupted
-        yield raise_interrupt
-        return
-    before = {
-        number: signal.signal(number, lambda number, _: noted.append(number))
-        for number in INTERRUPTS
-    }
-    try:
-        yield raise_interrupt
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def _on_this_computer() -> Iterator[None]:
+def _on_this_computer() -> AbstractContextManager[None]:
     """Keep DDS on this computer, discovery and ports, unless the environment says otherwise."""
     ours = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST":
         # Fast DDS would still accept whatever arrives at its ports from elsewhere.
         ours["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(_LOOPBACK)
-    added = {name: value for name, value in ours.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
+    return children.environment(ours)
 
 
 class _Process:

@@ -10,7 +10,6 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -31,11 +30,8 @@ _BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class WatchNode(GuardedNode):
-    """Subscribes to all that estimators publish and puts it into a store.
-
-    An estimator is known by its topic: ``NAME/coefficients``, a DiagnosticArray that someone
-    publishes.
-    """
+    """Subscribes to all that estimators publish and puts it into a store. An estimator is known by
+    its topic: ``NAME/coefficients``, a DiagnosticArray that someone publishes."""
 
     def __init__(self, store: Store, name: str, context: Context) -> None:
         super().__init__(name, context=context)
@@ -43,8 +39,7 @@ class WatchNode(GuardedNode):
         self._known: set[str] = set()
         take = self._take_diagnostics
         self.create_subscription(DiagnosticArray, "/diagnostics", take, _BEST_EFFORT, raw=True)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_SEARCH_PERIOD, self._search, clock=steady)
+        self.create_timer(_SEARCH_PERIOD, self._search)
 
     def _search(self) -> None:
         """Subscribe to the estimators that are new."""
@@ -98,9 +93,7 @@ def watching(
     store: Store, name: str, arguments: Sequence[str] | None = ()
 ) -> Iterator[tuple[WatchNode, Any]]:
     """A node that fills the store, and the executor to spin it with, within the block.
-
-    ``arguments`` are ROS's own; None: those of the program. Interrupts are left to the caller.
-    """
+    ``arguments`` are ROS's own (None: the program's). Interrupts are left to the caller."""
     context = Context()
     try:
         given = None if arguments is None else list(arguments)  # rclpy takes no other sequence

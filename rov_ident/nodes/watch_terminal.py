@@ -2,8 +2,6 @@
 
 import json
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -17,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.interrupts import INTERRUPTS
+from rov_ident.core.interrupts import noted_interrupts
 from rov_ident.core.states import Level
 from rov_ident.dashboard.store import GONE, Estimator, Store, plain
 from rov_ident.estimation.online import Report
@@ -37,14 +35,14 @@ _COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Le
 
 def watch(as_json: bool, out: Console, err: Console) -> None:
     """Until interrupted: a live table on ``err``, which stays there, or JSON lines on ``out``."""
-    with _hearing() as (store, spin, ended), ExitStack() as stack:
+    with _hearing() as (store, spin, interrupts), ExitStack() as stack:
         live = None
         if not as_json:
             live = Live(console=err, auto_refresh=False, vertical_overflow="crop")
             stack.enter_context(live)
             live.update(_picture({}, out), refresh=True)
         shown: dict[str, int] = {}  # by estimator, the identity of the last report
-        while not ended.is_set():
+        while not interrupts:
             spin(1.0 / _REFRESH)
             heard = store.reports
             if live is not None:
@@ -57,13 +55,11 @@ def watch(as_json: bool, out: Console, err: Console) -> None:
 
 
 def watch_once(patience: float, as_json: bool, out: Console) -> None:
-    """Print what all estimators publish now: one table, or one line of JSON.
-
-    Raises UserError if none is heard within ``patience`` [s].
-    """
-    with _hearing() as (store, spin, ended):
+    """Print what all estimators publish now: one table, or one line of JSON. Raises UserError if
+    none is heard within ``patience`` [s]."""
+    with _hearing() as (store, spin, interrupts):
         end, known, since = time.monotonic() + patience, store.known, time.monotonic()
-        while time.monotonic() < end and not ended.is_set():
+        while time.monotonic() < end and not interrupts:
             spin(0.1)
             before, known = known, store.known
             if known != before:
@@ -71,7 +67,7 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
             elif known and all(known.values()) and time.monotonic() - since > _SETTLING:
                 break
         heard = store.reports
-        if not heard and not ended.is_set():
+        if not heard and not interrupts:
             raise UserError(
                 f"no estimator was heard within {patience:g} s: start rls_node or ukf_node, and "
                 "use its ROS_DOMAIN_ID here"
@@ -83,23 +79,17 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
 
 
 @contextmanager
-def _hearing() -> Iterator[tuple[Store, Callable[[float], None], threading.Event]]:
-    """The store, a function that listens for some seconds, and an event set by an interrupt."""
-    ended = threading.Event()
+def _hearing() -> Iterator[tuple[Store, Callable[[float], None], list[int]]]:
+    """The store, a function that listens for some seconds, and the interrupts there were."""
     store = Store(time.monotonic)
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in INTERRUPTS}
-    try:
-        with watching(store, "rov_ident_watch") as (_, executor):
+    with noted_interrupts() as interrupts, watching(store, "rov_ident_watch") as (_, executor):
 
-            def spin(seconds: float) -> None:
-                end = time.monotonic() + seconds
-                while (left := end - time.monotonic()) > 0.0 and not ended.is_set():
-                    executor.spin_once(timeout_sec=min(left, 0.1))
+        def spin(seconds: float) -> None:
+            end = time.monotonic() + seconds
+            while (left := end - time.monotonic()) > 0.0 and not interrupts:
+                executor.spin_once(timeout_sec=min(left, 0.1))
 
-            yield store, spin, ended
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        yield store, spin, interrupts
 
 
 def _print_json(heard: Heard, out: Console) -> None:

@@ -1,9 +1,6 @@
-"""Many bags as one fit: each is read once, and every pass maps a function over all of them.
-
-What a pass gives are sums over samples, so that the passes of single bags add up to that of the
-archive. They are added in the order of the bags, wherever they were computed: in this process, in
-several, or on a Dask cluster, and the result is the same.
-"""
+"""Many bags as one fit: each is read once, and every pass maps a function over all of them. The
+sums that it gives are added in the order of the bags, so that one process, several and a Dask
+cluster have the same result."""
 
 import contextlib
 import os
@@ -22,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.core.children import safe_workers
+from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.threads import limit_process
 from rov_ident.sampling.records import Record, read_record
@@ -95,9 +92,7 @@ def opened(
     progress: Progress | None = None,
 ) -> Iterator[Archive]:
     """Read bags, in ``jobs`` processes or on a Dask cluster at the address ``dask`` ("local").
-
-    Raises UserError if no bag can be read, or the cluster cannot be reached.
-    """
+    Raises UserError if no bag can be read, or the cluster cannot be reached."""
 
     def told(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True)):
@@ -106,7 +101,7 @@ def opened(
                 progress(path.name, i + 1, len(paths))
 
     if dask:
-        with safe_workers(), _cluster(dask, jobs) as client:
+        with children.environment(), _cluster(dask, jobs) as client:
 
             def on_dask(config: Config, columns: bool = False) -> Archive:
                 read = _on_dask(client, paths, config, columns)
@@ -116,7 +111,7 @@ def opened(
     elif jobs > 1 and len(paths) > 1:
         # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
         with (
-            safe_workers(),
+            children.environment(),
             tempfile.TemporaryDirectory(prefix="rov_ident-") as folder,
             ProcessPoolExecutor(min(jobs, len(paths)), get_context("spawn"), limit_process) as pool,
         ):

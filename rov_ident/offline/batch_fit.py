@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import Prior, first_centre, gain_of, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
+from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.effects import EFFECTS, Acting, compiled
@@ -56,13 +57,10 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Settings:
-    """How a fit is made.
-
-    ``stages``: channels, fitted one group after the other; none: all together. ``prior``: whether
-    what the configuration says of the coefficients counts as one more measurement. ``weighted``:
-    least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
-    errors of the wrench. ``readings``: at most so often bags are read for parameters of effects.
-    """
+    """How a fit is made. ``stages``: channels, one group after the other; none: all together.
+    ``prior``: the configured values count as one more measurement. ``weighted``: least squares
+    weighs each axis by its residual. ``process``: maximum likelihood allows for errors of the
+    wrench. ``readings``: how often bags may be read for parameters of effects."""
 
     stages: tuple[tuple[str, ...], ...] = ()
     prior: bool = True
@@ -88,11 +86,8 @@ def fit_batch(
     settings: Settings | None = None,
     say: Say | None = None,
 ) -> Fit:
-    """Fit an archive.
-
-    Raises UserError if there is no such estimator, a channel has no coefficient to estimate, or the
-    configured model cannot be simulated.
-    """
+    """Fit an archive. Raises UserError if there is no such estimator, a channel has no coefficient
+    to estimate, or the configured model cannot be simulated."""
     if kind not in KINDS:
         raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
     settings = settings or Settings()
@@ -139,10 +134,7 @@ def fit_batch(
     tell("open loop, fitted")
     judged = _as_read_by(archive, config, now)
     after = open_loop_rmse(judged, now)
-    learnt = [i for i, state in enumerate(states.values()) if state is not State.HELD]
-    chance = by_chance(
-        judged, now, [prior.names[i] for i in learnt], covariance[np.ix_(learnt, learnt)]
-    )
+    chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
     consistency = consistency_of(config, prior, values, unexplained)
     consistency = consistency.with_open_loop(before, after, chance)
     if unmeasured:
@@ -179,11 +171,8 @@ def fit_batch(
 def _relinearised(
     archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Say
 ) -> tuple[Archive, _Stage]:
-    """A fit with parameters of effects, and the archive as they have it.
-
-    Samples are linear in these about the values with which they were made: the bags are read anew
-    until the estimate stays where they were.
-    """
+    """A fit with parameters of effects, and the archive as they have it: samples are linear in
+    these about some values, and the bags are read anew until the estimate stays there."""
     first = len(config.estimate)
     found: _Stage | None = None
     centre, model = first_centre(config), config.model
@@ -217,10 +206,8 @@ def _stage(
     say: Say,
     before: _Stage | None = None,
 ) -> _Stage | None:
-    """Fit some channels; None, and a note, where there is nothing to do.
-
-    Maximum likelihood begins with what was found ``before``, where there is that.
-    """
+    """Fit some channels, maximum likelihood beginning with what was found ``before``; None, and a
+    note, where there is nothing to do."""
     free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
     # an added mass belongs to both axes that it couples
@@ -440,8 +427,7 @@ def predicted_information(
 
 def _mean_square_wrench(samples: Samples) -> Array:
     """(6,) over the samples."""
-    mean: Array = np.mean(samples["wrench"] ** 2, axis=0)
-    return mean
+    return np.mean(samples["wrench"] ** 2, axis=0)
 
 
 def _range(samples: Samples) -> tuple[Array, Array]:
@@ -473,7 +459,7 @@ def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
     return [
         Curves(
             bag.path.name, t, measured, simulated,
-            np.stack([np.interp(t, later, column) for column in fitted.T], axis=1),
+            interpolated(later, fitted, t),
         )
         for bag, (t, measured, simulated), (later, _, fitted) in zip(
             archive.bags, known, found, strict=True

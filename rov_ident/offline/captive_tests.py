@@ -11,12 +11,10 @@ alone makes that standard error large by itself; a term that is clearly seen the
 Intervals allow for noise that grows with the force: heteroscedastic covariance HC3 (MacKinnon and
 White 1985), Student's distribution.
 
-Steady forces hold the Coriolis forces of the added mass too (Munk's moment and its kind). A model
-that has them from its added mass must not count them twice: with ``added_mass`` they are taken off
-before the fit.
+Steady forces hold the Coriolis forces of the added mass too (Munk's moment and its kind): with
+``added_mass`` they are taken off before the fit, so that a model does not count them twice.
 """
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -34,7 +32,7 @@ from rov_ident.io.csv_table import CsvTable, read_csv
 from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, parse
 from rov_ident.model.equations import Model, build, coriolis, extended_states
 from rov_ident.model.fins import CROSS, X
-from rov_ident.reports.result import Result, provenance
+from rov_ident.reports.result import Result, as_json, provenance
 from rov_ident.reports.table import PLUS_MINUS, Table
 
 _FIN_COLUMNS = {
@@ -96,10 +94,8 @@ class AxisFit(Result):
 
 
 def parse_nondimensional(text: str) -> dict[str, float]:
-    """`rho=1000,L=7,T=0.46` as numbers.
-
-    Raises UserError: another form, a missing rho or L, or a value that is not positive.
-    """
+    """`rho=1000,L=7,T=0.46` as numbers. Raises UserError: another form, a missing rho or L, or a
+    value that is not positive."""
     values = {}
     for part in text.split(","):
         name, _, number = (piece.strip() for piece in part.partition("="))
@@ -140,9 +136,9 @@ def read_table(
     table = read_csv(path)
     if len(table.lines) > _MOST_ROWS:
         raise UserError(f"{path} has {len(table.lines)} rows: thin it to {_MOST_ROWS}")
-    reader = _Reader(table, dict(columns or {}), nondimensional is not None)
+    reader = _Reader(table, dict(columns or {}))
     notes: list[str] = []
-    nu, speed = _states(reader, drift, notes)
+    nu, speed = _states(reader, drift)
     fins = _fins(reader)
     reader.refuse_likely()
     forces = _forces(reader, speed, nondimensional)
@@ -163,8 +159,8 @@ def read_table(
 class _Reader:
     """Columns in our names, remembering which headings were used."""
 
-    def __init__(self, table: CsvTable, columns: dict[str, str], primes: bool) -> None:
-        self.table, self.columns, self.primes = table, columns, primes
+    def __init__(self, table: CsvTable, columns: dict[str, str]) -> None:
+        self.table, self.columns = table, columns
         self.used: set[str] = set()
         self.has_flow = False
         for name, heading in columns.items():
@@ -210,11 +206,8 @@ class _Reader:
         return values if unit == "rad" else np.radians(values)
 
     def refuse_likely(self) -> None:
-        """Once states and fins are read.
-
-        Raises UserError if a heading that was not used looks like a speed or an angle that varies
-        and is not given otherwise: without it the forces would be laid to something else.
-        """
+        """Raises UserError if a heading that states and fins have not used looks like a speed or an
+        angle that varies and is not given otherwise: the forces would be laid to something else."""
         for heading in self.table.cells:
             if heading in self.used or self._is_constant(heading):
                 continue
@@ -278,7 +271,7 @@ def _likely(heading: str) -> str:
     return f"{name}_{known}" if angular else name
 
 
-def _states(reader: _Reader, drift: str, notes: list[str]) -> tuple[Array, Array]:
+def _states(reader: _Reader, drift: str) -> tuple[Array, Array]:
     """nu (n, 6) and the speed (n,)."""
     n, path = len(reader.table.lines), reader.table.path
     direct = {name: x for name in VELOCITIES if (x := reader.column(name)) is not None}
@@ -425,8 +418,7 @@ def column(name: str, nu: Array, fins: Mapping[str, Array]) -> Array:
         return np.ones(len(nu))
     c, inputs = parse(name), [fins.get(x, np.zeros(len(nu))) for x in INPUT_LETTERS]
     extended = extended_states(np.ascontiguousarray(nu), np.ascontiguousarray(np.array(inputs).T))
-    column: Array = extended[:, c.left] * extended[:, c.right]
-    return column
+    return extended[:, c.left] * extended[:, c.right]
 
 
 def unit(name: str) -> str:
@@ -437,12 +429,8 @@ def unit(name: str) -> str:
 
 
 def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit]:
-    """A structure and its values for every axis of the table.
-
-    With ``added_mass`` the Coriolis forces of that model's added mass are taken off first.
-
-    Raises UserError if an axis has too few conditions for any structure.
-    """
+    """A structure and its values for every axis, with ``added_mass`` after the Coriolis forces of
+    that model's added mass are taken off. Raises UserError if an axis has too few conditions."""
     munk = np.zeros_like(table.nu)  # C_A(nu) nu
     if added_mass is not None:
         momentum = table.nu @ added_mass.added_mass
@@ -616,9 +604,7 @@ def to_json(
     coriolis_taken_off: bool = False,
 ) -> str:
     """The result as JSON; ``covariance`` and ``left_out`` of an axis are in the order of its terms.
-
-    ``coriolis_taken_off``: whether the terms are free of the Coriolis forces of the added mass.
-    """
+    ``coriolis_taken_off``: whether terms are free of the added mass's Coriolis forces."""
     axes = {
         axis: {
             "terms": f.entries(),
@@ -639,7 +625,7 @@ def to_json(
         "coriolis_taken_off": coriolis_taken_off,
         "notes": list(notes),
     }
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    return as_json(document)
 
 
 def headline(fits: Mapping[str, AxisFit]) -> Table:
@@ -681,11 +667,8 @@ def with_hull(config: Config, hull: Mapping[str, float]) -> Config:
 
 
 def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
-    """The configuration with the fitted coefficients in the place of all that the table could have
-    told (the axes' terms it excites).
-
-    Raises UserError if the values make no passive hull.
-    """
+    """The configuration with the fitted coefficients in place of all that the table could
+    determine. Raises UserError if the values make no passive hull."""
     values = dict(config.model.values)
     for f in fits.values():
         for name in (*f.pool, *f.aliases):

@@ -10,7 +10,6 @@ Fitted by output error: u is simulated from the shaft speed n, run by run, each 
 starting speed, and compared with the measured one.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.io.csv_table import read_csv
 from rov_ident.model.equations import Array
-from rov_ident.reports.result import Result
+from rov_ident.reports.result import Result, as_json
 
 _UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
 
@@ -50,15 +49,12 @@ class CoastDown(Result):
             "speed_rmse_mps": self.rmse,
             "provenance": self.provenance,
         }
-        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+        return as_json(result)
 
 
 def read_run(path: Path, columns: Mapping[str, str]) -> tuple[Run, str]:
     """A run from a CSV file with the columns `t_s`, `n` and `u`, or as ``columns`` calls them, and
-    the file's sha256.
-
-    Raises UserError if it is no such file.
-    """
+    the file's sha256. Raises UserError if it is no such file."""
     if unknown := sorted(set(columns) - {"t_s", "n", "u"}):
         raise UserError(f"`{unknown[0]}` cannot be mapped: use one of t_s n u")
     table = read_csv(path)
@@ -79,10 +75,8 @@ def fit_coast_downs(
     added_mass: float | None = None,
     bollard: tuple[float, float] | None = None,
 ) -> CoastDown:
-    """Fit step-up and coast-down runs.
-
-    ``added_mass``: X_udot [kg], not positive; or ``bollard``: a shaft speed and the thrust [N] at
-    rest there. One of the two.
+    """Fit step-up and coast-down runs, by ``added_mass``: X_udot [kg], not positive; or by
+    ``bollard``: a shaft speed and the thrust [N] at rest there.
 
     Raises UserError if the scale is not given, or the runs lack thrust, coasting, or speed.
     """

@@ -1,10 +1,9 @@
 """Offline fits, all with one type of result."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +19,9 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
 from rov_ident.offline import archive
 from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
-from rov_ident.reports.result import Result, Shown, provenance
+from rov_ident.reports.result import Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, Record, numbers, read_record
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
@@ -159,7 +155,7 @@ class Fit(Shown, Result):
             parts.append(Table(title, head, rows))
         return parts[0] if len(parts) == 1 else Tables(tuple(parts))
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The coefficients relative to the configured ones, and the motion simulated with both."""
         from rov_ident.reports import plots
 
@@ -217,7 +213,7 @@ class Fit(Shown, Result):
             **self.more,
             "provenance": self.provenance,
         }
-        return json.dumps(result, indent=2, allow_nan=False) + "\n"
+        return as_json(result)
 
 
 def falls(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
@@ -265,10 +261,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         records = [read_record(record.path, found) for record in records]
     judged = archive.of_records(records)
     after = open_loop_rmse(judged, found)
-    learnt = [i for i, state in enumerate(states) if state is not State.HELD]
-    chance = by_chance(
-        judged, found, [report.names[i] for i in learnt], report.covariance[np.ix_(learnt, learnt)]
-    )
+    chance = by_chance(judged, found, report.names, report.covariance, states)
     assert report.consistency is not None
     predicts = Consistency(()).with_open_loop(before, after, chance)
     consistency = Consistency(report.consistency.tests + predicts.tests)

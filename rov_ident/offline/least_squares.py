@@ -44,10 +44,8 @@ _KNOWN = 3.0  # information over that of the prior at which a direction counts a
 
 
 class Moments(NamedTuple):
-    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,).
-
-    In prior standard deviations about the prior's mean.
-    """
+    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,), in
+    prior standard deviations about the prior's mean."""
 
     sums: Array
     rows: Array
@@ -63,11 +61,9 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """values and covariance of the estimated coefficients, in their units.
-
-    ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
-    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
-    """
+    """values and covariance of the estimated coefficients, in their units; ``information`` (n, n):
+    weighted Phi' Phi in prior standard deviations, neighbours in time counting once; ``noise`` (6,)
+    the residual's standard deviation by axis [N, N m]."""
 
     values: Array
     covariance: Array
@@ -107,8 +103,7 @@ def solve(
     def residual(moments: Moments, x: Array) -> Array:
         tail = np.append(-x, 1.0)
         squares = np.einsum("i,kij,j->k", tail, moments.sums, tail)
-        std: Array = np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
-        return std
+        return np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
 
     say("least squares")
     moments = total(each(moments_of, batch))
@@ -188,10 +183,8 @@ def _scatter(score, fade, total, lagged):
 
 @inlined
 def add_scatter(score, fade, total, lagged):
-    """Add to total (n, n) the products of a score (n,) with itself and with those before it.
-
-    ``lagged`` (n,) is the sum of these, which fades by the factor ``fade`` from one to the next.
-    """
+    """Add to total (n, n) the products of a score (n,) with itself and with those before it, whose
+    sum ``lagged`` (n,) fades by the factor ``fade`` from one to the next."""
     n = len(lagged)
     for i in range(n):
         lagged[i] *= fade
@@ -220,12 +213,10 @@ class Combination:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Which coefficients, or combinations of them, the data identify.
-
-    ``combinations``: identifiable. ``unidentified``: coefficients of which only a combination with
-    others, or nothing at all (``unexcited``), is known. ``condition``: of the regressor, its
-    columns of unit length; ``collinear``: pairs of columns with the cosine between them.
-    """
+    """Which coefficients, or ``combinations`` of them, the data identify. ``unidentified``: of
+    which only a combination, or nothing at all (``unexcited``), is known. ``condition``: of the
+    regressor, its columns of unit length; ``collinear``: pairs of columns with the cosine between
+    them."""
 
     combinations: tuple[Combination, ...]
     unidentified: tuple[str, ...]

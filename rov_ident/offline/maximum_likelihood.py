@@ -76,14 +76,11 @@ LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of it
 
 @dataclass(frozen=True)
 class Noise:
-    """What the residuals are made of.
-
-    ``measurement`` (6,) multiplies the variances that the samples state; ``floor`` (6,) is the
-    density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
-    relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
-    ``restoring`` (6, 3) [N, N m] times the unit vector down is the wrench of weight, which has the
-    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact.
-    """
+    """What the residuals are made of: ``measurement`` (6,) multiplies the stated variances;
+    ``floor`` (6,) is the density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's
+    standard deviation relative to itself, lasting ``correlation_time`` s, or as long as a message;
+    ``restoring`` (6, 3) [N, N m] times down is the wrench of weight, with the error of the measured
+    attitude (zeros: exact)."""
 
     measurement: Array
     floor: Array
@@ -96,15 +93,12 @@ class Noise:
         lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
         variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
         turned = np.square(np.cross(self.restoring, samples["down"][:, None])).sum(axis=2)
-        density: Array = self.floor + lasting * variance + samples["tilt"][:, None] * turned
-        return density
+        return self.floor + lasting * variance + samples["tilt"][:, None] * turned
 
 
 def assumed(config: Config, least: float = _SMALLEST) -> Noise:
-    """The noise that a configuration states.
-
-    ``least``: that of the wrench where there is none, relative to the axis's authority.
-    """
+    """The noise that a configuration states, the wrench's no less than ``least`` of the axis's
+    authority."""
     w = config.wrench
     smallest = least * authority(config.dynamics)
     floor = np.maximum(np.array(w.floor_std), smallest) ** 2 * w.correlation_time
@@ -238,10 +232,8 @@ def noise_slope(
     process: bool,
     effects: Array = _NONE,
 ) -> tuple[Array, Array]:
-    """Fisher information (13, 13) and half the likelihood's gradient (13,) about the logarithms.
-
-    Without ``process`` only the measurements' are looked at.
-    """
+    """Fisher information (13, 13) and half the likelihood's gradient (13,) about the logarithms;
+    without ``process`` only of the measurements'."""
     samples = samples[:_NOISE_SAMPLES]
     levels = _levels(noise)
     base = innovations(samples, model, noise, free, _GATE, effects)
@@ -268,10 +260,8 @@ def noise_slope(
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
-
-    ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
-    """
+    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n); ``bound``
+    (n, n), the Cramer-Rao bound, prior included; ``total``, the sums of the last pass."""
 
     values: Array
     covariance: Array
@@ -293,13 +283,10 @@ def maximise(
     effects: Array | None = None,
     first_noise: Noise | None = None,
 ) -> Likelihood:
-    """The coefficients of largest likelihood, from ``model``'s values on, and those of the
-    parameters of ``effects`` (p,); None: as configured. ``first_noise``: the
-    levels to begin with; None: those of several that explain the data best.
-
-    ``precision`` (n,) is that of the prior about the configured values, of coefficients and then of
-    the parameters of effects in the samples' columns; ``process``: whether the wrench has errors,
-    else pure output error.
+    """The estimates of largest likelihood, starting from the values of ``model`` and those of
+    ``effects`` (p,) (None: as configured). ``precision`` (n,) is the prior's, of coefficients and
+    then of parameters of effects. ``process``: the wrench has errors, else pure output error.
+    ``first_noise``: the levels to begin with; None: the best of several.
 
     Raises UserError if the model cannot be simulated.
     """
@@ -415,10 +402,8 @@ def _noise_levels(
 
 
 def inverse_of(information: Array) -> Array:
-    """Inverse of an information matrix, scaled to a unit diagonal meanwhile.
-
-    Raises UserError if it is not finite, as the model could not be simulated.
-    """
+    """Inverse of an information matrix, scaled to a unit diagonal meanwhile. Raises UserError if it
+    is not finite, as the model could not be simulated."""
     if not np.isfinite(information).all():
         raise UserError(
             "the simulation diverges along this motion: check the signs and sizes of the "

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.messages import Array
+from rov_ident.core.states import State
 from rov_ident.effects import EFFECTS, Acting, compiled
 from rov_ident.model.equations import Model
 from rov_ident.offline.archive import Archive, Samples
@@ -26,12 +27,21 @@ def open_loop_rmse(
     return rmse
 
 
-def by_chance(archive: Archive, fitted: Config, names: Sequence[str], covariance: Array) -> Array:
+def by_chance(
+    archive: Archive,
+    fitted: Config,
+    names: Sequence[str],
+    covariance: Array,
+    states: Sequence[State],
+) -> Array:
     """RMS (6,) of what the errors of a fit do to the open-loop simulation, if they are as stated.
 
-    ``names`` (n,) and covariance (n, n) of what was fitted. Parameters of effects on the input and
-    on sensors change what was read, not how it is simulated: the others are taken given these.
+    ``names`` (n,), covariance (n, n) and ``states`` (n,) of what was fitted; what is held has no
+    errors of the fit. Parameters of effects on the input and on sensors change what was read, not
+    how it is simulated: the others are taken given these.
     """
+    learnt = [i for i, state in enumerate(states) if state is not State.HELD]
+    names, covariance = [names[i] for i in learnt], covariance[np.ix_(learnt, learnt)]
     simulated = np.array([not _is_read(name) for name in names], dtype=bool)
     mixed = covariance[np.ix_(simulated, ~simulated)]
     known = np.linalg.pinv(covariance[np.ix_(~simulated, ~simulated)], hermitian=True)

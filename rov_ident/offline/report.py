@@ -63,12 +63,7 @@ def _rmse(errors: Sequence[Array]) -> Array:
     joined = np.concatenate(errors)
     known = np.isfinite(joined).any(axis=0)  # without a velocity sensor u, v, w are not
     joined = joined[np.isfinite(joined[:, known]).all(axis=1)]
-    rmse: Array = np.sqrt(np.mean(joined**2, axis=0)) if len(joined) else np.full(6, np.nan)
-    return rmse
-
-
-def _unit(i: int) -> str:
-    return "m/s" if i < 3 else "rad/s"
+    return np.sqrt(np.mean(joined**2, axis=0)) if len(joined) else np.full(6, np.nan)
 
 
 def _bars(before: Array, after: Array, key: str) -> str:

@@ -1,13 +1,14 @@
 """What every identification gives, whatever its method: named numbers, their covariance, and from
 which data they come; and what every result of a command can do: table, picture, file, JSON."""
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -17,16 +18,15 @@ from rov_ident.core.messages import Array
 from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    import matplotlib.figure
 
+Figure: TypeAlias = "matplotlib.figure.Figure"
 NORMAL = 1.959964  # half of a 95 % interval, in standard deviations
 
 
 class Shown(ABC):
-    """A result that shows itself; in a notebook as the last value of a cell.
-
-    ``str(result)`` is its table.
-    """
+    """A result that shows itself; ``str(result)`` is its table, in a notebook it is the last value
+    of a cell."""
 
     notes: tuple[str, ...] = ()
     """What was refused or is doubtful, in words."""
@@ -41,7 +41,7 @@ class Shown(ABC):
         """The result as a table of text: print it."""
 
     @abstractmethod
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The result as a picture, a figure of matplotlib that is not registered with pyplot."""
 
     @abstractmethod
@@ -114,11 +114,8 @@ class Shown(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Arrays are (n,) in the order of ``names``, covariance (n, n).
-
-    ``quantile``: half of the 95 % interval in standard deviations, more than NORMAL where few data
-    left few degrees of freedom.
-    """
+    """Arrays are (n,) in the order of ``names``, covariance (n, n). ``quantile``: half of the 95 %
+    interval in standard deviations, NORMAL unless few data left few degrees of freedom."""
 
     estimator: str
     names: tuple[str, ...]
@@ -164,6 +161,11 @@ class Result:
         for column in more.values():
             rows = [[*row, cell] for row, cell in zip(rows, column, strict=True)]
         return Table(title, ["", "value", PLUS_MINUS, "unit", *more], rows, text=(3, 3 + len(more)))
+
+
+def as_json(document: Mapping[str, Any]) -> str:
+    """A result as text for machines. Raises ValueError for a number that is not finite."""
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 def provenance(files: Iterable[tuple[str, str]], **more: str) -> dict[str, Any]:

@@ -3,11 +3,11 @@
 One rule for every number of a message, in the spirit of Hampel's filter (Hampel 1974; Pearson
 2002), but for signals that step. A number is *supported* if a neighbour is near: the one before,
 the one after, or both those two messages away (a command that alternates). Near is within
-``GATE`` times the usual distance to the nearest neighbour, of late. A number without support is
+``GATE`` times the usual distance, recently, to the nearest neighbour. A number without support is
 
 * an outlier where what was before comes again: that takes its place;
-* else something at a step, and nobody can know whether the step was there or one message later. It
-  is clipped to the range of its neighbours, and its variance is their mean squared distance.
+* else something at a step, which may be one message late. It is clipped to the range of its
+  neighbours, and its variance is their mean squared distance.
 
 A step or a ramp has support on one side, or lies between both, and passes as it came.
 """
@@ -79,11 +79,9 @@ class Despiker:
         self._usual = {IMU: np.zeros(6), WRENCH: np.zeros(6)}  # mean square distances
 
     def judge(self, role: str, queue: deque[Waiting]) -> tuple[Array, bool, Array]:
-        """Judge the first message of a queue by the two behind it.
-
-        Its values (6,) without outliers, each corrected by itself, as a step of another axis is not
-        to come late for it; whether there was one; and the variances (6,) of what may be wrong.
-        """
+        """Judge the first message of a queue by the two behind it. Its values (6,) without
+        outliers, each corrected by itself; whether there was one; the variances (6,) of what may be
+        wrong."""
         past, values = self._past.get(role), queue[0].values
         found, variance = False, np.zeros(6)
         if past is None:

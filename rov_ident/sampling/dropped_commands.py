@@ -12,7 +12,7 @@ import numpy as np
 
 from rov_ident.core.messages import Array
 
-SILENCE = 3.0  # longest intervals of late without a command: it acts no longer (docs/samples.md)
+SILENCE = 3.0  # longest recent intervals without a command: it acts no longer (docs/samples.md)
 _AVERAGE = 0.05  # weight of one interval in the averages: those of the last twenty
 _SHORTEN = 0.3  # weight of an interval that is shorter than the period: gaps only make it longer
 # The thresholds below: of 10 to 25 % dropped at random all intervals are read rightly, and none is
@@ -25,19 +25,16 @@ _MOST_DROPPED = 9  # commands in a row; a longer silence is one that was meant
 
 
 class CommandPeriod:
-    """The time between the commands of a publisher.
-
-    ``mean`` [s] is that between commands as they come, without gaps; ``longest`` [s] the longest of
-    the last 50. Only within an interval above ``threshold`` [s] may a command have been dropped; it
-    is infinite while the publisher is not regular.
-    """
+    """The time between the commands of a publisher. ``mean`` [s]: as they come, without gaps;
+    ``longest`` [s] of the last 50; ``threshold`` [s]: only above it a command may have been
+    dropped, infinite while the publisher is not regular."""
 
     def __init__(self) -> None:
         self.mean = 0.0
         self.longest = self.threshold = math.inf
         self._intervals: deque[float] = deque(maxlen=_WINDOW)  # s
         self._period = 0.0  # s; between those that are sent
-        self._regularity = 0.0  # share of the intervals, of late, that were one period
+        self._regularity = 0.0  # share of the recent intervals that were one period
         self._regular = False
 
     def update(self, interval: float) -> None:
@@ -70,10 +67,8 @@ class CommandPeriod:
 def estimated(
     begin: float, before: Array, end: float, after: Array, count: int
 ) -> list[tuple[float, Array, Array]]:
-    """Time [s], mean and variance (6,) of each of ``count`` commands between two that came.
-
-    As if the command had gone from ``before`` (6,) to ``after`` (6,) in one step, at any of them
-    with the same probability.
+    """Time [s], mean and variance (6,) of each of ``count`` commands between two that came, as if
+    the command had gone from ``before`` (6,) to ``after`` (6,) in one step, at any of them alike.
     """
     change, commands = after - before, []
     for j in range(1, count + 1):

@@ -40,7 +40,7 @@ STATE = record(
         ("turned", "f8"),  # rad2: variance of what the noise of the rates has turned it by since
         ("tilt", "f8"),  # rad2 s: variance density of its error, where that lasts a second
         ("v", "f8", (3,)),  # m/s over ground, at the origin
-        ("power", "f8", (6,)),  # mean square of nu, of late
+        ("power", "f8", (6,)),  # recent mean square of nu
         ("rate", "f8", (3,)),  # rad/s, bias removed
         ("rate_change", "f8", (3,)),  # rad/s; of that over the last interval
         ("interval", "f8"),  # s; its length
@@ -101,7 +101,7 @@ _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU'
 _BRIEF = 0.1  # s; a rate that comes and goes within it may have lasted shorter than its samples
 _GROWTH = 0.2  # of the variance with each refusal: a filter that refuses for seconds is wrong
 _AVERAGE = 0.05  # weight of one NIS in the test ratio, that of the last twenty
-_LARGEST_NIS = 1e3  # an outlier counts for no more in it than makes it stand out
+_LARGEST_NIS = 1e3  # the most that one outlier counts for in it
 
 
 def _settings(config: Config) -> NDArray[np.void]:
@@ -189,7 +189,7 @@ class KinematicFilter:
 
         ``wrench`` are mean, slope and doubt, each (6,); ``odometry`` was measured ``age`` seconds
         before the sample. Returns whether the odometry was taken, whether the motion is known,
-        whether all begins anew, and whether the IMU has stopped.
+        whether everything restarts, and whether the IMU has stopped.
         """
         into = self._into
         into["has_odometry"][0] = odometry is not None
@@ -298,7 +298,7 @@ def _predict_attitude(k, s, rate, dt, has_imu, gyro_variance):
     if has_imu:
         k.attitude_variance += dt * (dt * k.gyro_bias_variance - 2.0 * k.attitude_gyro_bias)
         k.attitude_gyro_bias -= dt * k.gyro_bias_variance
-        # A rate that came and went between two messages lasted nobody knows how long.
+        # A rate that came and went between two messages lasted for an unknown time.
         span = dt + k.interval
         for i in range(3):
             change = rate[i] - k.rate[i]
@@ -312,10 +312,8 @@ def _predict_attitude(k, s, rate, dt, has_imu, gyro_variance):
 
 @inlined
 def _correct_attitude(k, s, q):
-    """Correct by the measured attitude q (4,); whether it is believed, and whether all begins anew.
-
-    A heading that is set anew is believed when it stays, but it is no bias of the gyro.
-    """
+    """Correct by the measured attitude q (4,); whether it is believed (also a heading that is set
+    anew, when it stays, but as no bias of the gyro), and whether everything restarts."""
     total = k.attitude_variance + s.attitude_variance
     gain = k.attitude_variance / total
     # vector part of conj(k.q) * q: half the rotation from one to the other
@@ -455,10 +453,8 @@ def _correct_gyro_bias(k, s, rate, m, share, r_angular, gyro_variance):
 def fuse(
     state, settings, measured, sample, t, dt, restart, hold, wrench, wrench_slope, wrench_doubt
 ):  # fmt: skip
-    """One instant of the filter; fills the sample (1,).
-
-    Returns whether the odometry was taken, whether the motion is known, and whether it begins anew.
-    Arguments are records (1,) of STATE, _SETTINGS and _MEASURED.
+    """One instant of the filter, by records (1,) of STATE, _SETTINGS and _MEASURED; fills the
+    sample (1,). Returns whether the odometry was taken, the motion is known, everything restarts.
     """
     k, s, m, out = state[0], settings[0], measured[0], sample[0]
     out.t, out.dt, out.restart, out.hold = t, dt, restart, hold

@@ -1,8 +1,5 @@
-"""Odometry whose linear velocities are older than its stamp, put right before it is queued.
-
-The velocities keep their values: the message is one of the earlier time at which they were true,
-with the pose and the angular velocities that the messages around that time had.
-"""
+"""Odometry whose linear velocities are older than its stamp, corrected before it is queued: the
+message becomes one of the time at which they were true, with the pose and rates around it."""
 
 from collections import deque
 
@@ -61,5 +58,4 @@ def _attitude(before: Odometry, after: Odometry, since: float, until: float) -> 
     if forward @ backward < 0.0:
         backward = -backward
     q = _between(forward, backward, share)
-    out: Array = q / np.linalg.norm(q)
-    return out
+    return q / np.linalg.norm(q)

@@ -1,8 +1,8 @@
 """From the log of a sea trial to what a fit can use: polarity, outliers, smoothing, cutting, and
 several sources of depth fused into one (Zhao et al. 2018, sec. 3).
 
-In the axes and units of the log. Lever arms are no matter of the log: ``odometry.position`` and
-``imu.position`` of the configuration take them off.
+In the axes and units of the log. Lever arms are corrected later, by
+``odometry.position`` and ``imu.position`` of the configuration.
 """
 
 from collections.abc import Mapping
@@ -23,13 +23,11 @@ _DRIVEN = 0.1  # of the most on an axis or of a fin; what holds a vehicle in pla
 
 @dataclass(frozen=True)
 class Preparation:
-    """What is done to a log, in this order; nothing by default.
-
-    ``polarity``: columns that were recorded with the opposite sign. ``depth``: columns that measure
-    `z`, with the standard deviations [m] of their noise and of their common error. ``smooth``: the
-    corner [Hz] of a filter without lag on the velocities. ``cut``: from when to when [s] in the
-    log's time. ``cut_idle``: what is kept [s] before and after the vehicle is driven.
-    """
+    """What is done to a log, in this order; nothing by default. ``polarity``: columns recorded with
+    the opposite sign. ``depth``: columns that measure `z`, with the standard deviations [m] of
+    their noise and of their common error. ``smooth``: corner [Hz] of a filter without lag on the
+    velocities. ``cut``: from when to when [s]. ``cut_idle``: what is kept [s] around what is
+    driven."""
 
     polarity: tuple[str, ...] = ()
     despike: bool = False
@@ -42,11 +40,8 @@ class Preparation:
         self, data: Mapping[str, Array], depths: Mapping[str, Array]
     ) -> tuple[dict[str, Array], NDArray[np.bool_], list[str]]:
         """The columns (n,) of a log prepared, the rows (n,) to keep, and in words what was done.
-
-        ``depths`` are the columns named in ``depth``, NaN where they are empty.
-
-        Raises UserError if the log has no such column, or nothing of it would be left.
-        """
+        ``depths``: columns named in ``depth``, NaN where empty. Raises UserError if a column is not
+        there, or nothing would be left."""
         data, notes, t = dict(data), [], data["t_s"]
         for name in self.polarity:
             if name not in data or name == "t_s":
@@ -124,8 +119,7 @@ def smoothed(x: Array, period: float, corner: float) -> Array:
     width = 2 * half + 1
     if len(x) < width:
         raise UserError(f"{len(x)} rows are too few to smooth at {corner:g} Hz: {width} are needed")
-    out: Array = savgol_filter(x, width, 3)
-    return out
+    return savgol_filter(x, width, 3)
 
 
 def dynamic_stretch(t: Array, drives: Array, margin: float) -> tuple[float, float]:
@@ -146,11 +140,8 @@ def dynamic_stretch(t: Array, drives: Array, margin: float) -> tuple[float, floa
 
 @dataclass(frozen=True)
 class Source:
-    """Measurements of one quantity: ``z`` (N,) at ``t`` (N,) s with noise ``std``.
-
-    ``bias_std``: how far all of them may be off together; the one with the smallest decides where
-    zero is.
-    """
+    """Measurements of one quantity: ``z`` (N,) at ``t`` (N,) s with noise ``std``, all off together
+    by ``bias_std``; the source with the smallest decides where zero is."""
 
     name: str
     t: Array

@@ -1,8 +1,5 @@
-"""A bag as its raw messages in arrays: what the search for a discrepancy works on.
-
-The estimators see samples, in which odometry and IMU are already blended. Whether one sensor
-contradicts another shows only before that.
-"""
+"""A bag as its raw messages in arrays, for the search for a discrepancy: whether one sensor
+contradicts another shows only before samples blend them."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -56,13 +53,9 @@ class Streams:
 
     @property
     def guided(self) -> NDArray[np.bool_]:
-        """Axes (6,) whose velocity a simulation can only take as measured.
-
-        Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
-        computed, without. What turns the vehicle is then unknown, unless fins do that are heard.
-        A velocity that never changes was not measured: a record in the plane holds zeros for the
-        rest.
-        """
+        """Axes (6,) whose velocity a simulation can only take as measured: a wrench without any
+        moment was not recorded whole, and unless fins are heard, what turns the vehicle is unknown;
+        a velocity that never changes was not measured."""
         unknown: NDArray[np.bool_] = np.repeat(
             [False, not (self.demand[:, 3:].any() or self.inputs[:, :3].any())], 3
         )
@@ -74,10 +67,8 @@ class Streams:
 
 
 def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
-    """Arrays from messages as they are on the wire; what cannot be used is left out.
-
-    Raises UserError if odometry or wrench are missing.
-    """
+    """Arrays from messages as they are on the wire; what cannot be used is left out. Raises
+    UserError if odometry or wrench are missing."""
     taken, counts = _taken(messages, config)
     imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
     odometry = _driven(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
@@ -133,10 +124,8 @@ def _driven(
 
 
 def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, Array]:
-    """Times (I,) and inputs (I, 4); one that a message lacks goes on as before.
-
-    Raises UserError if one never comes.
-    """
+    """Times (I,) and inputs (I, 4); one that a message lacks goes on as before. Raises UserError if
+    one never comes."""
     t, x = np.array([t for t, _ in taken]), np.zeros((len(taken), len(INPUTS)))
     for name, given in config.inputs.joints.items():
         values = [value_of(given, message) for _, message in taken]
@@ -154,10 +143,8 @@ def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, A
 def _taken(
     messages: Iterable[tuple[str, Message]], config: Config
 ) -> tuple[dict[str, list[tuple[float, Any]]], Counter[str]]:
-    """Time [s] and message in core axes of all that the estimators would take, and what is refused.
-
-    Velocities that have not been measured again are refused here.
-    """
+    """Time [s] and message in core axes of all that the estimators would take; what is refused,
+    also velocities that have not been measured again."""
     validation, origin, latest = Validation(), None, 0
     taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: [], DRIVE: []}
     for role, message in messages:
@@ -185,11 +172,8 @@ def _taken(
 def _despiked(
     role: str, taken: list[tuple[float, Any]], config: Config, counts: Counter[str]
 ) -> list[tuple[float, Any]]:
-    """The messages without one or two in a row that hold what no others do.
-
-    Live, an outlier is what jumps there and back; here the whole bag tells what is usual, and a
-    controller that chatters keeps its commands.
-    """
+    """The messages without one or two in a row that hold what no others do. Live, an outlier jumps
+    there and back; here the whole bag tells what is usual."""
     if len(taken) < 2:
         return taken
     x = np.array([measured_values(m) for _, m in taken])

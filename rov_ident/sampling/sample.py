@@ -17,7 +17,7 @@ SAMPLE = record(
     [
         ("t", "f8"),  # s since the first message
         ("dt", "f8"),  # s since the previous sample
-        ("restart", "?"),  # the interval before this sample is not known: filters begin anew
+        ("restart", "?"),  # the interval before this sample is not known: filters restart
         ("anew", "?"),  # the samples before were wrong, too: what they taught is given up
         ("measured", "?"),  # an odometry message belongs to this sample
         ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
@@ -33,7 +33,7 @@ SAMPLE = record(
         ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
         # fins and shafts: mean over dt, and at t; zeros where none is configured
         ("inputs", "f8", (2, len(INPUTS))),
-        ("hold", "f8"),  # s: how long a command acts, of late; 0: not known yet
+        ("hold", "f8"),  # s: how long a command acts, recently; 0: not known yet
         ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
         ("surroundings_slope", "f8", (6,)),
         ("odometry", "f8", (6,)),  # as nu; NaN: not measured
@@ -54,7 +54,7 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
 
 
 def believed(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """Samples (k,) of SAMPLE without those from before the last one with which all begins anew."""
+    """Samples (k,) of SAMPLE from the last one on that gives up all before it (``anew``)."""
     anew = np.flatnonzero(samples["anew"])
     return samples[anew[-1] :] if len(anew) else samples
 
@@ -94,10 +94,8 @@ def one_sample(size: int) -> tuple[NDArray[np.void], NDArray[np.void], Array]:
 
 
 def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
-    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size).
-
-    Six rows of the wrench, six of the measured velocity, and the values that they are about.
-    """
+    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size), six
+    rows of the wrench, six of the measured velocity, the values that they are about."""
     if samples.dtype == SAMPLE:
         return samples, NO_SIDES
     size = (samples.dtype.itemsize - SAMPLE.itemsize) // 104

@@ -1,9 +1,8 @@
 """From messages to samples: one clock, one set of axes, one filter for every channel.
 
 Topics come at their own rates and phases. A :class:`Sampler` waits until every topic has reached an
-instant (or is ``grace`` seconds behind), then emits one sample for it. The instants are those of
-the IMU messages while there is an IMU, else those of the odometry. Everything is decided by the
-stamps, never by arrival, so that a bag gives the same samples live, replayed and offline.
+instant (or is ``grace`` seconds behind), then emits one sample for it, by the stamps alone. The
+instants are those of the IMU messages while there is an IMU, else those of the odometry.
 
 What a sample holds, and why (docs/samples.md has the measurements):
 
@@ -188,11 +187,9 @@ class Sampler:
         return samples[0] if len(samples) == 1 else joined(samples)
 
     def _is_unknown(self, t: float, dt: float) -> bool:
-        """Whether nobody knows how much time the interval dt [s] before t [s] took.
-
-        If no topic has said anything for long, either all messages were lost, or the clock of their
-        stamps was stepped. To bridge it would take the motion of one for that of the other.
-        """
+        """Whether nobody knows how much time the interval dt [s] before t [s] took: after a silence
+        of all topics messages may be lost, or the clock of their stamps may have stepped, which
+        must not be bridged."""
         usual = self._usual or dt
         change = min(dt, _SILENCE * usual) - usual
         self._usual = usual + (_SHORTEN if change < 0.0 else _LENGTHEN) * change

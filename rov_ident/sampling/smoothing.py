@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core.frames import quaternion_multiply
 from rov_ident.core.jit import kernel
+from rov_ident.core.linalg import interpolated
 from rov_ident.core.quaternions import rotation, turned
 from rov_ident.model.equations import Array
 from rov_ident.sampling.sample import stretches
@@ -63,7 +64,7 @@ def _smooth(part: NDArray[np.void]) -> None:
         if cost < best:
             error, best = level, cost
     t = part["t"]
-    error = np.stack([np.interp(t, t[seen], column) for column in error.T], axis=1)
+    error = interpolated(t[seen], error, t)
     down = np.empty((len(part), 3))
     _turn(ahead, error, part["orientation"], down)
     part["down"] = down
@@ -78,8 +79,7 @@ def _rotation_vector(q: Array, reference: Array) -> Array:
     vector = np.where(real[:, None] < 0.0, -vector, vector)
     size = np.linalg.norm(vector, axis=1)
     angle = 2.0 * np.arctan2(size, np.abs(real))
-    turn: Array = vector * (angle / np.maximum(size, 1e-12))[:, None]
-    return turn
+    return vector * (angle / np.maximum(size, 1e-12))[:, None]
 
 
 @kernel

@@ -1,7 +1,5 @@
-"""Which messages are refused, and why: fields, frames and stamps; each refusal is counted by name.
-
-Bad data never raises. Whatever is refused leaves everything as it was.
-"""
+"""Which messages are refused, and why: fields, frames and stamps. Bad data never raises; each
+refusal is counted by name and leaves everything as it was."""
 
 import math
 from collections import Counter
@@ -10,9 +8,9 @@ from collections.abc import Mapping
 from rov_ident.core.messages import Joints, Message, Odometry, fault
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
-"""Counted where stamps begin anew: a bag that starts over, another computer."""
+"""Counted where stamps restart: a bag that starts over, another computer."""
 NEW_FRAME = "frame: another has the majority, buffers restarted"
-"""Counted where a topic goes on in another frame."""
+"""Counted where a topic continues in another frame."""
 RESTARTS = (NEW_CLOCK, NEW_FRAME)
 REPEATED = 2e3
 """The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""
@@ -29,10 +27,8 @@ _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_
 
 
 class Validation:
-    """Judges messages as they are on the wire, one after another.
-
-    ``counts`` holds, by name, how many were refused; the sampler adds those that were taken.
-    """
+    """Judges messages as they are on the wire, one after another. ``counts`` holds, by name, how
+    many were refused; the sampler adds those that were taken."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -57,10 +53,8 @@ class Validation:
         return self._frame_ids.get(role, ("",))[-1]
 
     def judge(self, role: str, message: Message) -> str:
-        """Why a message is refused, after counting it; empty if it is taken.
-
-        One of :data:`RESTARTS` if it is the first to be taken of another clock, or in other frames.
-        """
+        """Why a message is refused, after counting it; empty if it is taken. One of
+        :data:`RESTARTS` if it is the first to be taken of another clock, or in other frames."""
         reason = self._fault(role, message) or self._stamp_fault(role, message.stamp)
         if not reason:
             self._last_stamp[role] = message.stamp
@@ -119,11 +113,9 @@ class Validation:
         return NEW_CLOCK if abs(since) < _AGREEMENT else "stamp jumps"
 
     def marked(self, message: Odometry) -> Odometry:
-        """The message, its velocity marked by its variance if it has not been measured again.
-
-        That is so if it repeats the last one to the last digit: its sensor has lost the ground, or
-        is slower than its messages. Where velocities are rounded to a grid it may be by chance.
-        """
+        """The message, its velocity marked by its variance if it repeats the last one to the last
+        digit: its sensor is slower, or has lost the ground. Where velocities are rounded to a grid
+        it may be chance."""
         velocity, before = message.linear.tobytes(), self._velocity
         self._velocity = velocity
         if velocity == before:

@@ -146,7 +146,7 @@ _SCRATCH = record(
         ("end", "f8", (13,)),  # of a step
         ("thrust", "f8", (6,)),  # wrench of the thrusters
         ("push", "f8", (6,)),  # and of effects
-        ("pace", "f8", (6,)),  # of the components that are not free, whatever it takes
+        ("guide_nu_dot", "f8", (6,)),  # of the components that are not free
         ("nu", "f8", (6, 1)),
         ("h", "f8", (6, 1)),
         ("extended", "f8", (EXTENDED_SIZE, 1)),
@@ -175,7 +175,7 @@ def _derivative(structure, theta, restoring, guided, s, rate):
     if guided:
         for i in range(6):
             for j in range(6):
-                h[i, 0] -= s.mass[i, j, 0] * s.pace[j]
+                h[i, 0] -= s.mass[i, j, 0] * s.guide_nu_dot[j]
     rate[0] = a[0] * u + a[1] * v + a[2] * w
     rate[1] = b[0] * u + b[1] * v + b[2] * w
     rate[2] = c[0] * u + c[1] * v + c[2] * w
@@ -186,7 +186,7 @@ def _derivative(structure, theta, restoring, guided, s, rate):
     rate[6] = 0.5 * (q0 * r + q1 * q - q2 * p)
     nu_dot = symmetric_product(s.inverse, six(h, 0), 0)
     for i in range(6):
-        rate[7 + i] = nu_dot[i] + s.pace[i]
+        rate[7 + i] = nu_dot[i] + s.guide_nu_dot[i]
 
 
 @lean
@@ -215,8 +215,8 @@ def _simulate(
         for j in range(6):
             if not free[j]:
                 state[7 + j] = guide[i, j]
-                if not last:  # at the last instant the pace of the last interval goes on
-                    s.pace[j] = (guide[i + 1, j] - guide[i, j]) / span
+                if not last:  # at the last instant the last interval's nu_dot continues
+                    s.guide_nu_dot[j] = (guide[i + 1, j] - guide[i, j]) / span
                 if j >= 3:
                     for k in range(4):
                         state[3 + k] = attitude[i, k]

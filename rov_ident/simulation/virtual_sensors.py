@@ -49,11 +49,9 @@ START = 1_000_000_000  # ns; stamp of the first instant: zero would read as "no 
 
 @dataclass(frozen=True)
 class Suite:
-    """Rates in Hz (an ``imu_rate`` of zero: no IMU), noise as standard deviations of one sample.
-
-    ``wrench_std`` is relative to the wrench. ``delay`` (s) and ``jitter`` (s, standard deviation of
-    it) put off the arrival of a message, never its stamp; ``drop`` is the share of messages lost.
-    """
+    """Rates in Hz (an ``imu_rate`` of zero: no IMU), noise as standard deviations of one sample, of
+    the wrench relative. ``delay`` (s) and its standard deviation ``jitter`` put off the arrival of
+    a message, never its stamp; ``drop`` is the share lost."""
 
     odometry_rate: float = 20.0
     imu_rate: float = 100.0
@@ -81,10 +79,8 @@ class Suite:
 
 @dataclass(frozen=True)
 class Dive:
-    """A simulated dive: the true motion at all instants, and the messages in order of arrival.
-
-    ``messages`` holds (arrival [ns], role, message), in ROS axes.
-    """
+    """A simulated dive: the true motion at all instants, and ``messages``: (arrival [ns], role,
+    message), in ROS axes and in order of arrival."""
 
     truth: Trajectory
     demand: Array  # (N, 6), held from each instant of the truth to the next
@@ -95,10 +91,8 @@ def dive(
     config: Config, name: str = "steps", duration: float = 180.0, suite: Suite | None = None,
     seed: int = 0,
 ) -> Dive:  # fmt: skip
-    """Drive the configured vehicle through a manoeuvre and measure it.
-
-    Raises UserError if there is no such manoeuvre, or the simulation diverges.
-    """
+    """Drive the configured vehicle through a manoeuvre and measure it. Raises UserError if there is
+    no such manoeuvre, or the simulation diverges."""
     suite = suite or Suite()
     rng = np.random.default_rng(seed)
     demand_t = np.arange(0.0, duration, 1.0 / suite.wrench_rate)
@@ -111,10 +105,8 @@ def measure(
     rng: np.random.Generator, inputs: Array | None = None, start: Array | None = None,
 ) -> Dive:  # fmt: skip
     """Simulate under a wrench demanded from each of ``demand_t`` (K,) to the next, and measure.
-
-    ``inputs`` (K, 4) at these instants change in straight lines; left out, fins and propeller are
-    at zero. ``start`` (6,) is the velocity at first, at rest by default.
-    """
+    ``inputs`` (K, 4) change in straight lines (zero if left out); ``start`` (6,) is the first
+    velocity."""
     inputs = np.zeros((len(demand_t), len(INPUTS))) if inputs is None else inputs
     # Every topic starts at a phase of its own, as real drivers do.
     odometry_t = _clock(suite.odometry_rate, duration, rng)
@@ -130,7 +122,7 @@ def measure(
     )
     sensed = sense(_reading(truth, config), config.effects)
     late = t - velocity_delay(config.effects)
-    delayed = np.stack([np.interp(late, t, column) for column in sensed.linear.T], axis=1)
+    delayed = interpolated(t, sensed.linear, late)
     offset = quaternion_from_euler(0.0, 0.0, heading_error(config.effects))
 
     messages: list[tuple[int, str, Message]] = []

@@ -45,11 +45,8 @@ class Servo:
 
 @dataclass(frozen=True)
 class Run:
-    """t (n,), position (n, 3), angles (n, 3) roll pitch yaw, nu (n, 6), fins {letter: (n,)}.
-
-    ``thrust`` (n,) [N] acts from each instant to the next, or the propeller turns at
-    ``revolutions`` (n,) [1/s].
-    """
+    """t (n,), position (n, 3), angles (n, 3) roll pitch yaw, nu (n, 6), fins {letter: (n,)};
+    ``thrust`` (n,) [N] held to the next instant, or the propeller's ``revolutions`` (n,) [1/s]."""
 
     t: Array
     position: Array
@@ -76,7 +73,6 @@ def steer(
     speed: float,
     servo: Servo = Servo(),
     step: float = 0.02,
-    depth: float = 0.0,
     speeds: Callable[[float], float] | None = None,
 ) -> Run:
     """Run a law for ``duration`` [s] from straight level motion at ``speed`` [m/s].
@@ -93,7 +89,7 @@ def steer(
             "(stern planes) to coefficients"
         )
     n = round(duration / step) + 1
-    position, orientation = np.array([0.0, 0.0, depth]), np.array([1.0, 0.0, 0.0, 0.0])
+    position, orientation = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     nu, surge = np.eye(6)[0] * speed, np.eye(6)[0]
     angles = np.zeros(3)
     fins = dict.fromkeys("sra", 0.0)
@@ -135,10 +131,8 @@ _STEEPEST = float(np.radians(25.0))  # pitch on the way to a depth
 
 
 def to_depth(target: float, sign: float) -> Law:
-    """Stern planes to a depth [m]: the error asks for a pitch, the pitch for an angle.
-
-    ``sign`` is that of M_uuds: negative, a positive angle turns the nose down.
-    """
+    """Stern planes to a depth [m]: the error asks for a pitch, the pitch for an angle. ``sign`` is
+    that of M_uuds: negative, a positive angle turns the nose down."""
 
     def law(now: Now) -> dict[str, float]:
         wanted = np.clip(0.2 * (now.position[2] - target), -_STEEPEST, _STEEPEST)

@@ -86,12 +86,11 @@ def fit(
 def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:
     """Output error of the order that the runs themselves choose.
 
-    Each run is cut in parts of equal length. Each part but the first and the last is left out in
-    turn, from all runs at once, and predicted by what is fitted to the rest: the model runs through
-    it, so that no state is fitted to it. (Before the first and after the last part kept, the
-    course of a vehicle without course stability would be a matter of the state, not of the order.)
-    The second order is chosen if its mean squared error is less by more than
-    one standard error of the difference over the parts (Breiman et al. 1984, sec. 3.4.3).
+    Each run is cut in parts of equal length. Each part is left out in turn, from all runs at once,
+    and predicted by a fit to the rest, which runs through it; not so the first and the last, where
+    the course of an unstable vehicle depends on the state rather than the order. The second order
+    is chosen if its mean squared error is less by more than one standard error of the difference
+    over the parts (Breiman et al. 1984, sec. 3.4.3).
     """
     models: dict[int, Nomoto] = {}
     for order in ORDERS:
@@ -163,10 +162,8 @@ def others(
 
 
 def check(run: Zigzag) -> None:
-    """Whether a run can tell anything about the model.
-
-    Raises UserError: too few headings, or a rudder or heading that never moves.
-    """
+    """Raises UserError for a run that tells nothing: too few headings, or a rudder or heading that
+    never moves."""
     known = run.heading[run.known]
     if len(known) < _MIN_SAMPLES:
         raise UserError(
@@ -181,10 +178,8 @@ def check(run: Zigzag) -> None:
 
 
 def dense(run: Zigzag, method: str, step: float | None = None) -> Zigzag:
-    """The run with a heading at every row, or where all rows have one, at every ``step`` [s].
-
-    The default step is a fifth of the heading's. The rudder keeps what is known of it: rows
-    between headings as they are, else straight lines.
+    """The run with a heading at every row, or where all rows have one, at every ``step`` [s] (a
+    fifth of the heading's). The rudder keeps what is known of it, with straight lines between rows.
     """
     known, t, fine = run.known, run.t, run.cornered()
     if step is not None or known.all():

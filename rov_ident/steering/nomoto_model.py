@@ -15,7 +15,6 @@ infinite or negative)::
 """
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -26,7 +25,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
 from rov_ident.core.messages import Array
 from rov_ident.core.runge_kutta import NODES, runge_kutta
-from rov_ident.reports.result import NORMAL, Result
+from rov_ident.reports.result import NORMAL, Result, as_json
 from rov_ident.steering.zigzag import Zigzag
 
 STEP = 0.05  # s, largest of the integration
@@ -151,7 +150,7 @@ def to_json(model: Nomoto, validation: float | None = None, diverges: bool = Fal
         }
     if validation is not None:
         document["validation"] = {"heading_rmse_rad": validation, "diverges": diverges}
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    return as_json(document)
 
 
 @kernel
@@ -227,13 +226,10 @@ def respond(
     return out if rows is None else out[rows]
 
 
-def predict(
-    model: Nomoto, run: Zigzag, rudder: Zigzag | None = None, window: float | None = None
-) -> tuple[Array, float]:
+def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[Array, float]:
     """The heading (n,) that the model predicts for a run, its first state fitted; and the RMSE.
 
-    ``rudder`` is the same run with more rows, if there is one; ``window`` [s] lets the first state
-    know only so much of the run, instead of all of it. As in the fit, a rudder that jumps
+    ``rudder`` is the same run with more rows, if there is one. As in the fit, a rudder that jumps
     has the instants of its jumps fitted, each within its step.
 
     Raises UserError if the run has another kind of input than those of the fit.
@@ -251,11 +247,7 @@ def predict(
         fine = dataclasses.replace(
             run, t=both, heading=heading, rudder=np.interp(both, rudder.t, rudder.rudder)
         )
-    start = fine
-    if window is not None:
-        seen = np.where(fine.t <= fine.t[0] + window, fine.heading, np.nan)
-        start = dataclasses.replace(fine, heading=seen)
-    first, shares = first_state(model.order, model.nonlinear, model.theta, start)
+    first, shares = first_state(model.order, model.nonlinear, model.theta, fine)
     heading = respond(model.order, model.nonlinear, model.theta, fine, first, shares)
     if len(fine.t) > len(run.t):
         heading = heading[np.searchsorted(fine.t, run.t)]

@@ -101,13 +101,9 @@ class Zigzag:
 
 
 def read(path: Path, config: Config | None = None) -> Zigzag:
-    """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
-
-    ``config`` says which types and axes a bag has that are not the usual ones.
-
-    Raises UserError if it cannot be read, lacks a column or topic, or is in other units than it
-    says.
-    """
+    """A run from a bag (``config``: its types and axes, where they are not the usual ones) or else
+    a CSV file. Raises UserError if it cannot be read, lacks a column or topic, or is in other units
+    than it says."""
     is_bag = path.is_dir() or path.suffix == ".mcap"
     return from_bag(path, config) if is_bag else from_csv(path)
 
@@ -133,7 +129,7 @@ def from_csv(path: Path) -> Zigzag:
 
 
 def _angle(table: CsvTable, name: str, blank: bool) -> Array:
-    """The column `name_rad` or `name_deg` in radians, its unit held against its values."""
+    """The column `name_rad` or `name_deg` in radians; its unit is checked against its values."""
     found = [f"{name}_{unit}" for unit in ("rad", "deg") if f"{name}_{unit}" in table.cells]
     if not found:
         hint = f"say its unit by renaming it {name}_rad or {name}_deg" if name in table.cells else (

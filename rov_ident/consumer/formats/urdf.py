@@ -47,10 +47,8 @@ class _Joint(NamedTuple):
 
 
 def read(text: str, base: Config | None = None) -> Read:
-    """Parameters of the robot; what it does not hold is that of ``base``.
-
-    Raises UserError if it is no URDF, has no mass, or nothing says the coefficients.
-    """
+    """Parameters of the robot; what it does not hold is that of ``base``. Raises UserError if it is
+    no URDF, has no mass, or nothing says the coefficients."""
     if "${" in text or "<xacro:" in text:
         raise UserError("is a xacro file: expand it first, with `xacro FILE > robot.urdf`")
     robot = xml_root(text, "URDF")
@@ -62,7 +60,9 @@ def read(text: str, base: Config | None = None) -> Read:
     if moving := [j.name for j in joints if j.kind != "fixed" and not _THRUSTER.search(j.name)]:
         notes.append(f"joints that move are taken at their zero: {', '.join(moving)}")
 
-    coefficients = _plugin(robot, notes)
+    named = ((p, p.get("name", "") + p.get("filename", "")) for p in robot.iter("plugin"))
+    plugins = (plugin for plugin, name in named if "hydrodynamics" in name.lower())
+    coefficients = next((damping(plugin, notes) for plugin in plugins), {})
     if not coefficients and base is None:
         raise UserError("holds no hydrodynamics: give --config with the coefficients to start from")
     parameters: dict[str, Any] = to_parameters(base) if base else {}
@@ -162,14 +162,6 @@ def _rigid_body(
         d = at - cog
         inertia += tensor + mass * (d @ d * np.eye(3) - np.outer(d, d))
     return total, cog, inertia
-
-
-def _plugin(robot: ET.Element, notes: list[str]) -> dict[str, float]:
-    """Coefficients of a hydrodynamics plugin, if there is one."""
-    for plugin in robot.iter("plugin"):
-        if "hydrodynamics" in (plugin.get("name", "") + plugin.get("filename", "")).lower():
-            return damping(plugin, notes)
-    return {}
 
 
 def _mount(parameters: dict[str, Any], places: Mapping[str, _Place], notes: list[str]) -> None:
