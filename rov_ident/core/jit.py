@@ -22,7 +22,9 @@ numba compiles a cached function again when its own file changes, but not when a
 or a constant of another module changes. The cache therefore lies in a folder that is named after
 the source of the whole package and of installed effects, and the versions of all that makes the
 machine code: a kernel of another version is never run, and a new version does not disturb one that
-is running.
+is running. It is named after the place of the package, too: numba keeps kernels by the path of
+their source, so that a second copy of the same version would find that all is compiled (the mark of
+a :class:`Compiler`), but none of its own kernels, and compile them within a live node.
 """
 
 import contextlib
@@ -51,7 +53,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 def _cache_folder() -> Path:
     """A writable folder for these exact kernels; ``ROV_IDENT_CACHE`` overrides its root."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(str(_PACKAGE.absolute()).encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
     for source in plugins.sources():
