@@ -7,6 +7,7 @@ import resource
 import numpy as np
 import pytest
 from std_srvs.srv import Trigger
+from tiers import more
 
 from bench import HEAVY
 from bench.simulators.live import Dive, end_node, start_connected, start_node, until_said
@@ -208,7 +209,7 @@ def test_a_path_has_one_writer(heavy, learnt, tmp_path):
 # ------------------------------------------------------------------ nodes
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["rls", *more("ukf")])
 def test_a_node_killed_goes_on_within_a_second(domain, heavy, tmp_path, kind):
     """kill -9 at random times; what comes back is what an unbroken estimator had at that stamp."""
     dive = Dive(sensors.dive(heavy, duration=20.0, seed=4).messages)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from program import run, run_alone
+from tiers import more
 
 from bench import HEAVY, ROOT
 from rov_ident import config as configuration
@@ -79,7 +80,7 @@ def test_simulation_of_a_bag_is_compared_with_it(tmp_path, bag):
 # ------------------------------------------------------------------ fit
 
 
-@pytest.mark.parametrize("estimator", ["rls", "ukf"])
+@pytest.mark.parametrize("estimator", ["rls", *more("ukf")])
 def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator):
     given = configuration.load(HEAVY)
     off = given.with_model(given.model.with_theta(1.3 * given.model.theta))

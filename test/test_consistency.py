@@ -95,7 +95,8 @@ PILOTED = {
 @pytest.mark.parametrize(
     ("case", "kind", "seed"),
     [
-        *itertools.product(PILOTED, ("rls", "ukf"), (1,)),
+        *((case, "ukf" if i % 2 else "rls", 1) for i, case in enumerate(PILOTED)),
+        *more(*((case, "rls" if i % 2 else "ukf", 1) for i, case in enumerate(PILOTED))),
         *more(*itertools.product(PILOTED, ("rls", "ukf"), (2, 3))),
     ],
 )

@@ -11,6 +11,7 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 from textbook import finned, steered_dive
+from tiers import more
 
 from rov_ident import config as configuration
 from rov_ident import effects
@@ -267,8 +268,14 @@ def test_a_configuration_with_the_effect_is_written_and_read_again(effect, heavy
     np.testing.assert_array_equal(again.dynamics.body.restoring, config.dynamics.body.restoring)
 
 
-@pytest.mark.parametrize("estimator", [rls, ukf], ids=["rls", "ukf"])
-@every_parametric
+@pytest.mark.parametrize(
+    ("effect", "estimator"),
+    [
+        *((e, (rls, ukf)[i % 2]) for i, e in enumerate(WITH_PARAMETERS)),
+        *more(*((e, (ukf, rls)[i % 2]) for i, e in enumerate(WITH_PARAMETERS))),
+    ],
+    ids=lambda value: value.name if isinstance(value, Effect) else value.__name__.split(".")[-1],
+)
 def test_coefficients_are_found_whatever_acts_besides(effect, estimator, mounted):
     """From a configuration off by up to 50 %, the effect known: as well as without it."""
     values = {effect.name: typical(effect, np.random.default_rng(1))}

@@ -26,9 +26,9 @@ def dives(tmp_path_factory):
     """Two dives, the second the shorter one, and one at rest."""
     folder = tmp_path_factory.mktemp("dives")
     for name, manoeuvre, duration in (
-        ("long", "steps", 60.0),
-        ("short", "steps", 40.0),
-        ("rest", "rest", 30.0),
+        ("long", "steps", 45.0),
+        ("short", "steps", 30.0),
+        ("rest", "rest", 20.0),
     ):
         made = ri.simulate(VEHICLE, manoeuvre=manoeuvre, duration=duration, seed=len(name))
         made.save(folder / f"{name}.mcap")

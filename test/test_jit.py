@@ -74,16 +74,17 @@ _WHERE = "from rov_ident.core import jit; print(jit.__file__); print(jit.CACHE)"
 @pytest.fixture
 def package(tmp_path):
     """A copy of the package, and the function that tells the folder of its compiled kernels."""
-    copy = tmp_path / "rov_ident"
+    copy = tmp_path / "one" / "rov_ident"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    ours = kept | {"PYTHONPATH": str(tmp_path), "ROV_IDENT_CACHE": str(tmp_path / "cache")}
+    ours = kept | {"ROV_IDENT_CACHE": str(tmp_path / "cache")}
 
-    def folder(before=""):
+    def folder(before="", copy=copy):
         command = [sys.executable, "-c", before + _WHERE]
         done = subprocess.run(
-            command, cwd=tmp_path, env=ours, capture_output=True, text=True, check=True
-        )
+            command, cwd=tmp_path, env=ours | {"PYTHONPATH": str(copy.parent)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
         where, cache = done.stdout.split()
         assert Path(where).is_relative_to(copy)
         return cache
@@ -103,6 +104,14 @@ def test_no_stale_kernel_can_run(package):
     for library in ("numba", "numpy"):
         seen.append(folder(f"import {library}; {library}.__version__ += '.1'; "))
     assert len(set(seen)) == len(seen)
+
+
+def test_a_second_copy_of_the_same_version_has_kernels_of_its_own(package):
+    """numba keeps them by path: the mark of the first copy would promise what is not there."""
+    copy, folder = package
+    another = copy.parents[1] / "two" / "rov_ident"
+    shutil.copytree(copy, another)
+    assert folder(copy=another) != folder()
 
 
 # ------------------------------------------------------------------ numba
@@ -166,7 +175,7 @@ def test_a_compiler_that_is_stopped_ends_and_starts_no_more(cache):
     while job.poll() is None and job._process is None:
         time.sleep(0.01)
     job.stop()
-    waiting.join(10.0)
+    waiting.join(120.0)
     assert results == [False]
     job.start()
     assert job.poll() is not None

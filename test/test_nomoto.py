@@ -375,7 +375,7 @@ def test_second_order_is_never_worse_than_first(remus):
 
 
 @pytest.mark.skipif(not KVLCC2.is_dir(), reason="the measured zigzags are not here")
-@pytest.mark.parametrize("fitted, judged, limit", [((10, 25), 20, 2.5), ((10, 20), 25, 3.0)])
+@pytest.mark.parametrize("fitted, judged, limit", [((10, 25), 20, 2.5), *more(((10, 20), 25, 3.0))])
 @pytest.mark.parametrize("order", [1, 2])
 def test_measured_zigzags_are_predicted(fitted, judged, limit, order):
     runs = {a: read(KVLCC2 / f"hsva_Z_{a}_05.csv") for a in (10, 20, 25)}

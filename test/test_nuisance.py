@@ -88,7 +88,7 @@ def test_what_the_file_does_not_know_is_found(case, seed, kind):
     assert without > 1.5 * median
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, *more(2)])
 def test_rls_under_a_pilot_is_not_surer_than_it_is_right(seed):
     """The pilot's sticks leave roll and pitch alone, so little tells thrust from mass and weight.
 
@@ -101,7 +101,7 @@ def test_rls_under_a_pilot_is_not_surer_than_it_is_right(seed):
     assert np.mean(np.abs(sigmas) < 2.0) > 0.75
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, *more(4)])
 def test_nothing_tells_the_thrust_of_a_vehicle_without_weight(seed):
     """In water as heavy as it is, righting itself from no tilt, a vehicle moves alike with thrust,
     mass and all coefficients k times as large: what is known of the scale is what was known."""
@@ -218,8 +218,9 @@ def test_a_current_that_turns_is_followed(kind):
         assert report.std[i] < 0.02
 
 
-@pytest.mark.parametrize("kind", ["rls", "ukf"])
-@pytest.mark.parametrize("seed", [11, *more(12)])
+@pytest.mark.parametrize(
+    ("seed", "kind"), [(11, "rls"), *more((11, "ukf"), (12, "rls"), (12, "ukf"))]
+)
 def test_pilots_show_no_delay_where_there_is_none(seed, kind):
     """Noise of measured velocities in the column of the delay once drew it to its bound."""
     rng = np.random.default_rng(seed)

@@ -147,7 +147,7 @@ _BOTH = [(effect, kind) for effect in TRUTH for kind in ("rls", "ukf")]
 
 @pytest.mark.parametrize(
     ("effect", "kind"),
-    [*(_BOTH[i] if i % 8 in (0, 3) else more(_BOTH[i])[0] for i in range(len(_BOTH)))],
+    [*(_BOTH[i] if i % 12 in (0, 5) else more(_BOTH[i])[0] for i in range(len(_BOTH)))],
 )
 def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
     """Configured 20 to 40 % off, the coefficients 8 %; three standard deviations at most.

@@ -40,7 +40,7 @@ def play(online, messages):
 
 @pytest.mark.parametrize(
     "effect, axes",
-    [("quadratic_damping", "XY"), ("constant_force", "XYZ"), ("thruster_deadband", "NY")],
+    [("quadratic_damping", "XY"), *more(("constant_force", "XYZ"), ("thruster_deadband", "NY"))],
 )
 def test_what_is_missing_is_named(effect, axes):
     case = hidden.draw(200, (effect,), 0.5, conditions=hidden.Conditions(duration=90.0))
@@ -59,7 +59,7 @@ def test_the_plain_words():
     assert "residual in surge follows |u|u: quadratic damping missing?" in sentences
 
 
-@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("kind", ["rls", *more("ukf")])  # both have the same monitor
 def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
     case = hidden.draw(102, conditions=hidden.Conditions(duration=150.0))
     assert not any(play(watching(case.config, kind), case.messages))

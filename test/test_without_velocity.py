@@ -144,7 +144,13 @@ def dive(folder, driving, seed, seconds):
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory):
     """Heave and all rotations driven, surge and sway at rest."""
-    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 40.0)
+    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 30.0)
+
+
+@pytest.fixture(scope="module")
+def identified(turning):
+    bag, file, _ = turning
+    return ri.identify(bag, file)
 
 
 def sigmas(fit, theta):
@@ -154,9 +160,9 @@ def sigmas(fit, theta):
     return dict(zip(theta, off.tolist(), strict=True))
 
 
-def test_heave_and_turns_are_told_surge_and_sway_are_not(turning):
-    bag, file, theta = turning
-    fit = ri.fit(bag, file)
+def test_heave_and_turns_are_told_surge_and_sway_are_not(turning, identified):
+    *_, theta = turning
+    fit = identified.fit
     prior = prior_of(fit.given, effects=True)
     for name, off in sigmas(fit, theta).items():
         i = fit.names.index(name)
@@ -196,14 +202,13 @@ def test_where_surge_and_sway_are_driven_nothing_is_sure(tmp_path):
     assert max(abs(x) for x in sigmas(fit, theta).values()) < 4.0
 
 
-def test_check_and_identify_go_the_same_way(turning, tmp_path, capsys):
-    bag, file, _ = turning
-    assert main(["check", str(bag), "--config", str(file)]) == 0
-    shown = capsys.readouterr().out
-    assert "velocity not measured" in shown and "fit for identification" in shown
+def test_check_and_identify_go_the_same_way(identified, tmp_path):
+    (checked,) = identified.checks
+    assert checked.fit and "velocity not measured" in str(checked)
     out = tmp_path / "out"
-    assert main(["identify", str(bag), "--config", str(file), "--out", str(out)]) == 0
-    shown = " ".join("".join(capsys.readouterr()).split())
+    identified.save(out)
+    shown = [identified.sentence, str(identified), *identified.notes, *identified.advice]
+    shown = " ".join(" ".join(shown).split())
     assert "Without linear velocity it cannot be told what the model lacks" in shown
     assert "cannot be told and keep the prior's intervals" in shown
     assert "while surge and sway rest" in shown

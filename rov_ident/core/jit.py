@@ -20,7 +20,10 @@ function with a single caller: numba optimises whatever a kernel calls once more
 
 numba compiles a cached function again when its own file changes, but not when a function it calls
 or a constant of another module does. The folder of the cache is therefore named after the source of
-the whole package and of installed effects, and the versions of all that makes the machine code.
+the whole package and of installed effects, and the versions of all that makes the machine code; and
+after the place of the package, as numba keeps kernels by the path of their source: a second copy of
+the same version would find that all is compiled (the mark of a :class:`Compiler`), but none of its
+own kernels, and compile them within a live node.
 """
 
 import contextlib
@@ -49,7 +52,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 def _cache_folder() -> Path:
     """A writable folder for these exact kernels; ``ROV_IDENT_CACHE`` overrides its root."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(str(_PACKAGE.absolute()).encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
     for source in plugins.sources():

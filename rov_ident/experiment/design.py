@@ -28,6 +28,7 @@ from rov_ident.offline.maximum_likelihood import LIKELY, assumed, inverse_of, on
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
 from rov_ident.sampling.records import samples_of
+from rov_ident.sampling.sample import joined
 from rov_ident.sampling.smoothing import smoothed
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity
 from rov_ident.simulation.virtual_sensors import Dive, Suite
@@ -229,6 +230,6 @@ def _information(
     config: Config, one: AlternatingTargets, duration: float, limits: Limits, velocity: bool
 ) -> Array:
     run = closed_loop_manoeuvres.dive(config, one, duration, limits, Suite())
-    samples = smoothed(np.concatenate(list(samples_of(config, run, velocity))))
+    samples = smoothed(joined(list(samples_of(config, run, velocity))))
     estimated, noise = prior_of(config).estimated, assumed(config, LIKELY)
     return one_pass(samples, config.dynamics, estimated, noise).information

@@ -22,6 +22,7 @@ unit of each coefficient (the regressor), and the forward dynamics solve the inv
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -125,7 +126,7 @@ class Model:
         """The coefficients of inputs by name."""
         return {c.name: self.values[c.name] for c in self.coefficients if c.inputs}
 
-    @property
+    @cached_property
     def structure(self) -> Structure:
         mass = [(c.row, c.column) for c in self.coefficients if c.is_added_mass]
         terms = [(c.row, c.left, c.right) for c in self.coefficients if not c.is_added_mass]
