@@ -33,7 +33,9 @@ coloured: the covariance of the accumulated score stands between two inverse inf
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from itertools import count
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,12 +63,15 @@ from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.least_squares import add_scatter
 from rov_ident.sampling.sample import NO_SIDES, parts
 
+T = TypeVar("T")
+
 _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; an innovation further off is an outlier
 _NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
 _ITERATIONS = 25
 _DOUBTFUL = 0.03  # of the axis's authority, lasting a second: what may be unexplained at first
 _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first level to the least
+_NEAR = 0.05  # squared standard deviations of noise levels from the most likely ones
 _SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better than a hundredth
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
@@ -255,6 +260,18 @@ def noise_slope(
     return information, gradient
 
 
+def noise_cost(
+    samples: Samples, model: Model, noise: Noise, free: NDArray[np.bool_], effects: Array = _NONE
+) -> float:
+    """Of innovations, twice the negative logarithm of their likelihood; an outlier is worth its
+    gate."""
+    found = innovations(samples[:_NOISE_SAMPLES], model, noise, free, _GATE, effects)
+    keep = np.isfinite(found.e)
+    outliers = np.count_nonzero(np.isfinite(found.s) & ~keep)
+    e, s = found.e[keep], found.s[keep]
+    return float(np.sum(e**2 / s + np.log(s)) + outliers * _GATE**2)
+
+
 # ------------------------------------------------------------------ the estimate
 
 
@@ -325,9 +342,15 @@ def maximise(
             cost += found.outliers * gate**2
         return found, cost if np.isfinite(cost) else np.inf
 
+    looks = count(1)
+
+    def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
+        say(f"step {next(looks)}")
+        return at.score + precision * (mean - theta), at.information + np.diag(precision)
+
     nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
-    theta, count, converged = np.append(model.theta[estimated[own]], effects), 0, False
-    settled, at, enough = theta, nothing, 1e-6 * len(theta)
+    theta, at, steps = np.append(model.theta[estimated[own]], effects), nothing, 0
+    settled, converged, enough, bounds = theta, False, 1e-6 * len(theta), (prior.lower, prior.upper)
     for stage, gate in enumerate((np.inf, _GATE, _GATE, _GATE)):
         far = theta - settled
         if stage >= 2 and far @ at.information @ far < 0.1 * len(theta):
@@ -343,62 +366,77 @@ def maximise(
         costs = [look(theta, _GATE, level)[1] for level in levels]
         noise = levels[int(np.argmin(costs))]
         starts = [noise, *starts[:1]] if stage == 0 else [noise]
-        at, cost = look(theta, gate, noise)
-        converged = True
-        for _ in range(_ITERATIONS):
-            say(f"step {count + 1}")
-            slope = at.score + precision * (mean - theta)
-            # a parameter at its bound that the data would have beyond it stays there
-            held = ((theta <= prior.lower) & (slope < 0.0)) | (
-                (theta >= prior.upper) & (slope > 0.0)
-            )
-            slope[held] = 0.0
-            information = at.information + np.diag(precision)
-            information[held] = information[:, held] = 0.0
-            information[held, held] = 1.0
-            change = inverse_of(information) @ slope
-            if slope @ change < enough:
-                break
-            factor = 1.0
-            while factor > 1e-3:
-                moved = np.clip(theta + factor * change, prior.lower, prior.upper)
-                found, there = look(moved, gate, noise)
-                if there < cost:
-                    break
-                factor *= 0.5
-            else:
-                break
-            count += 1
-            theta, at, gained, cost = moved, found, cost - there, there
-            if gained < enough:
-                break
-        else:
-            converged = False
+        there = partial(look, gate=gate, noise=noise)
+        theta, at, more, converged = minimise(theta, bounds, there, slope_of, enough, _ITERATIONS)
+        steps += more
     bound = inverse_of(at.information + np.diag(precision))
     # From few data the scatter is itself uncertain: never thinner than the bound.
     covariance = widened(sandwich(bound, at.scatter + np.diag(precision)), np.diag(bound))
-    return Likelihood(theta, covariance, bound, noise, at, count, converged)
+    return Likelihood(theta, covariance, bound, noise, at, steps, converged)
 
 
 def _noise_levels(
     each: Mapper, model: Model, noise: Noise, free: NDArray[np.bool_], process: bool, effects: Array
 ) -> Noise:
-    levels = start = _levels(noise) if process else np.zeros(13)
+    """The most likely levels, begun from those of ``noise``."""
+    start = _levels(noise) if process else np.zeros(13)
     least = np.full(13, np.log(_SUREST))
     least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
     least[12] = np.log(1e-10)
-    for _ in range(_NOISE_ITERATIONS):
-        slopes = each(
-            noise_slope, model, _at_levels(noise, levels, process), free, process, effects
-        )
-        information = sum(s[0] for s in slopes) + np.eye(13) / _KNOWN**2
+
+    def look(levels: Array) -> tuple[Noise, float]:
+        there = _at_levels(noise, levels, process)
+        off = np.sum((levels - start) ** 2) / _KNOWN**2
+        return there, float(sum(each(noise_cost, model, there, free, effects)) + off)
+
+    def slope_of(levels: Array, there: Noise) -> tuple[Array, Array]:
+        slopes = each(noise_slope, model, there, free, process, effects)
         gradient = sum(s[1] for s in slopes) - (levels - start) / _KNOWN**2
-        change = np.clip(np.linalg.solve(information, gradient), -1.5, 1.5)
-        moved = np.maximum(levels + change, least)
-        change, levels = moved - levels, moved
-        if np.abs(change).max() < 0.05:
-            break
-    return _at_levels(noise, levels, process)
+        return gradient, sum(s[0] for s in slopes) + np.eye(13) / _KNOWN**2
+
+    highest = np.full(13, np.inf)
+    return minimise(start, (least, highest), look, slope_of, _NEAR, _NOISE_ITERATIONS, 1.5)[1]
+
+
+def minimise(
+    x: Array,
+    bounds: tuple[Array, Array],
+    look: Callable[[Array], tuple[T, float]],
+    slope_of: Callable[[Array, T], tuple[Array, Array]],
+    enough: float,
+    most: int,
+    longest: float = np.inf,
+) -> tuple[Array, T, int, bool]:
+    """Minimise a cost, twice the negative logarithm of a likelihood, from ``x`` (n,) on.
+
+    Newton's method between ``bounds``, with steps that are at most ``longest`` in each component,
+    and halved until the cost falls. ``look`` gives what is known at a place, and its cost;
+    ``slope_of`` minus half the gradient (n,) and half the curvature (n, n) there. It ends where a
+    step gains less than ``enough``: the squared distance from the least, in standard deviations.
+    Returns the place, what is known at it, the number of steps, and whether that was the end.
+    """
+    (lower, upper), (at, cost), steps = bounds, look(x), 0
+    while steps < most:
+        slope, curvature = slope_of(x, at)
+        # what the data would have beyond its bound stays there
+        held = ((x <= lower) & (slope < 0.0)) | ((x >= upper) & (slope > 0.0))
+        slope[held] = 0.0
+        curvature[held] = curvature[:, held] = 0.0
+        curvature[held, held] = 1.0
+        change = np.clip(inverse_of(curvature) @ slope, -longest, longest)
+        if slope @ change < enough:
+            return x, at, steps, True
+        factor, gained = 1.0, -1.0
+        while factor > 1e-3 and not gained > 0.0:
+            moved = np.clip(x + factor * change, lower, upper)
+            found, there = look(moved)
+            factor, gained = 0.5 * factor, cost - there
+        if not gained > 0.0:
+            return x, at, steps, True
+        x, at, cost, steps = moved, found, there, steps + 1
+        if gained < enough:
+            return x, at, steps, True
+    return x, at, steps, False
 
 
 def inverse_of(information: Array) -> Array:
