@@ -361,15 +361,21 @@ class Monitor:
         self._demands = self._demands[first:]
         return rows, told
 
-    def look(self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float]) -> None:
-        """Judge a window by the coefficients as they are now, when there is time for it."""
-        self._run(self._judge, *window, values)
+    def look(
+        self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], possible: bool
+    ) -> None:
+        """Judge a window by the coefficients as they are now, when there is time for it.
+
+        Nothing is named unless they are ``possible``: what is left over where thrust, trim or
+        current are taken for what they cannot be is not what the model lacks.
+        """
+        self._run(self._judge, *window, values, possible)
 
     def _judge(
-        self, samples: NDArray[np.void], demands: Array, values: Mapping[str, float]
+        self, samples: NDArray[np.void], demands: Array, values: Mapping[str, float], possible: bool
     ) -> None:
         self._state = step(self._task, self._state, samples, demands, values)
-        self.suspicions = suspicions(self._task, self._state)
+        self.suspicions = suspicions(self._task, self._state) if possible else []
 
 
 def _latest(demands: list[tuple[float, Array]], t: float) -> list[tuple[float, Array]]:

@@ -20,6 +20,7 @@ from rov_ident.model.coefficients import AXES
 from rov_ident.sampling.records import VELOCITIES
 
 CAUSE = "rov-ident explain looks for the cause"
+_PRIOR = "prior of "  # begins the name of such a test
 _SUPPOSED = (
     2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
 )
@@ -53,6 +54,11 @@ class Consistency:
     @property
     def consistent(self) -> bool:
         return all(test.passed for test in self.tests)
+
+    @property
+    def possible(self) -> bool:
+        """Whether what no vehicle's file knows is within what the configuration supposes of it."""
+        return all(test.passed for test in self.tests if test.name.startswith(_PRIOR))
 
     def widened(self, covariance: Array, prior: Array) -> Array:
         """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``:
@@ -149,7 +155,7 @@ def consistency_of(
         off = abs(values[i] - prior.mean[i]) / prior.std[i]
         tests.append(
             Test(
-                f"prior of {name}", float(off), _SUPPOSED,
+                f"{_PRIOR}{name}", float(off), _SUPPOSED,
                 f"the data ask for {name} = {values[i]:.3g} {prior.units[i]}, which the "
                 f"configuration takes for impossible ({prior.mean[i]:.3g} ± {prior.std[i]:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",

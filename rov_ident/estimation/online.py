@@ -116,7 +116,9 @@ class Monitor(Protocol):
     def take(
         self, samples: NDArray[np.void], commands: list[tuple[float, Array]]
     ) -> tuple[NDArray[np.void], Array] | None: ...
-    def look(self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float]) -> None: ...
+    def look(
+        self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], possible: bool
+    ) -> None: ...
 
 
 class OnlineEstimator:
@@ -245,7 +247,9 @@ class OnlineEstimator:
         if self.monitor is not None and self.sampler.commands is not None:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:
-                self.monitor.look(window, self.report().by_name)
+                report = self.report()
+                possible = report.consistency is None or report.consistency.possible
+                self.monitor.look(window, report.by_name, possible)
         return info
 
     def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
