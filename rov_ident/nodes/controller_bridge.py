@@ -1,7 +1,7 @@
 """`controller_bridge`: converged coefficients into the parameters of a running controller.
 
-A set is sent, whole or not at all, when something in it has left the dead band, at most once in a
-`period`, in approval mode once it is approved; it is read back, and undone where taken in part.
+A set is sent when something in it has left the dead band, not more often than `period`, and in
+approval mode once it is approved; and it is read back: one taken in part is undone.
 """
 
 import threading
