@@ -147,10 +147,13 @@ def acceleration_of_arm(omega: Array, omega_dot: Array, arm: Array | Sequence[fl
 
 
 def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyMessage:
-    """A message on the wire as the core wants it: body FRD, world NED. A frame id ending in `_frd`,
-    `_fsd` or `_ned` decides, else `defaults`: of an Odometry `frame_id` (world) and
-    `child_frame_id` (body), of an Imu or Wrench `frame_id` (body). Frame ids are kept: they name
-    the axes on the wire. Variances know no signs."""
+    """A message on the wire as the core wants it: body FRD, world NED.
+
+    A frame id ending in `_frd`, `_fsd` or `_ned` decides, else `defaults`. Of an Odometry
+    the world is `frame_id` and the body `child_frame_id`; of an Imu or Wrench the body is
+    `frame_id` and the world the default one. Frame ids are kept: they name the axes on the wire.
+    Variances belong to axes without direction, so no sign touches them.
+    """
     return _turned(message, defaults, _TURNS)
 
 

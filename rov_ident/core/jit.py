@@ -104,10 +104,13 @@ inlined = _decorator(inline="always")
 
 
 def only_run() -> None:
-    """Set numba up, before the first kernel is called, for a process that runs what others have
-    compiled: 30 MB less, and faster. scipy's linear algebra, which only compiling products of
-    matrices takes, is not loaded, and the helpers that numba compiles at each start are not
-    optimised."""
+    """Set numba up for a process that runs what others have compiled: 30 MB less, and faster.
+
+    To be called before the first kernel is. Otherwise scipy's linear algebra is loaded in case a
+    kernel with products of matrices has to be compiled, and the helpers that numba compiles for
+    itself at each start are optimised, though only newly compiled kernels would use them. Kernels
+    without such products can still be compiled afterwards.
+    """
     blas, level = "scipy.linalg.cython_blas", numba.config.OPT
     try:
         sys.modules.setdefault(blas, None)  # type: ignore[arg-type]  # None: its import fails

@@ -84,8 +84,11 @@ def _rows(items: Sequence[Any]) -> list[Sequence[Any]]:
 
 def foxglove(config: Config, namespace: str = "") -> str:
     """A layout to import: tabs of plots, one plot a coefficient, and the health of the nodes.
-    Series are over the time of reception, as the stamps of a bag that is played are far from a live
-    connection's clock; one plot of a tab has its legend open."""
+
+    Series are over the time of reception: the stamps of a bag that is played into the nodes are far
+    from the clock of a live connection, and so would be the plot. One plot of a tab has its legend
+    open, which covers a good part of a small one.
+    """
     template = json.loads((files("rov_ident.dashboard") / "foxglove.json").read_text("utf-8"))
     nodes, layout = _nodes(namespace), template["layout"]
     panels, tabs = layout["configById"], []
@@ -178,8 +181,11 @@ def _fill(tab: ElementTree.Element, plots: dict[str, list[Curve]]) -> None:
 
 
 def _expect(tab: ElementTree.Element, curves: Iterable[str]) -> None:
-    """Names the curves of a tab where PlotJuggler 3 looks for those to await from a stream: one
-    splitter deep. A splitter without a direction is looked through, but not shown."""
+    """Names the curves of a tab where PlotJuggler 3 looks for those to await from a stream.
+
+    It looks one splitter deep, and drops from plots further down what has not been received by
+    then. A splitter without a direction is looked through, but not shown.
+    """
     hidden = _add(_add(tab, "Container"), "DockSplitter", orientation="", count="0", sizes="")
     plot = _add(_add(hidden, "DockArea"), "plot", mode="TimeSeries")
     for curve in curves:

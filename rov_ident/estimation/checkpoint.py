@@ -58,7 +58,9 @@ def packed(memory: Memory, identity: dict[str, Any]) -> bytes:
 
 def restore(online: OnlineEstimator, data: bytes) -> None:
     """Have an estimator go on from a checkpoint's contents; it stays as it is where that fails.
-    Raises UserError: the bytes are damaged, or of another estimator, configuration or version."""
+
+    Raises UserError if the bytes are damaged, or of another estimator, configuration or version.
+    """
     if not data.startswith(_MAGIC) or len(data) > LARGEST:
         raise UserError("it is no checkpoint, or its beginning is lost")
     checksum, _, body = data[len(_MAGIC) :].partition(b"\n")
@@ -87,8 +89,12 @@ def restore(online: OnlineEstimator, data: bytes) -> None:
 
 
 def read(online: OnlineEstimator, path: Path) -> bool:
-    """Have an estimator go on from a file; False where there is none. A file that is refused is put
-    aside, under its name with ``.refused`` behind it. Raises UserError that names it and why."""
+    """Have an estimator go on from a file; False where there is none.
+
+    A file that is refused is put aside, under its name with ``.refused`` behind it.
+
+    Raises UserError, one sentence that names the file and why it cannot be used.
+    """
     try:
         with open_input(path) as stream:
             data = stream.read(LARGEST + 1)

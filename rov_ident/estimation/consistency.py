@@ -61,9 +61,11 @@ class Consistency:
         return all(test.passed for test in self.tests if test.name.startswith(_PRIOR))
 
     def widened(self, covariance: Array, prior: Array) -> Array:
-        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``:
-        where a test fails, errors are as many times larger as its value is than its limit, up to
-        the prior's."""
+        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``.
+
+        Where a test fails, errors are taken to be as many times larger as its value is than its
+        limit; but what the file says remains.
+        """
         factor = max([1.0, *(test.value / test.limit for test in self.tests)])
         variance = np.diag(covariance)
         return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, prior**2)))

@@ -112,8 +112,10 @@ def has_changed(m, threshold):
 
 @inlined
 def lost(monitor, first, outlier):
-    """Whether the linear (first = 0) or angular velocity (3) is lost, after one more measurement,
-    which is refused where one of its components is an ``outlier``."""
+    """Whether the linear (first = 0) or angular velocity (3) is lost, after one more measurement.
+
+    ``outlier``: whether that is refused, as one of its components is an outlier.
+    """
     m = monitor[first]
     m.outliers = m.outliers + 1 if outlier else 0
     return m.outliers >= _LOST

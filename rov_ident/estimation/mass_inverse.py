@@ -46,7 +46,9 @@ def _transposed(a):
 @inlined
 def _inverse(a, least):
     """Of a symmetric 3 x 3 matrix, its pivots raised to ``least``; what that adds to its diagonal.
-    ``A + E = L D L'`` with L's entries l, m (first column) and n."""
+
+    ``A + E = L D L'`` with L's entries l, m (first column) and n.
+    """
     d = a[0][0] if a[0][0] > least[0] else least[0]
     l, m, x = a[0][1] / d, a[0][2] / d, 1.0 / d
     pivot = a[1][1] - l * a[0][1]

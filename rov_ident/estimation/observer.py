@@ -57,8 +57,11 @@ def take_inputs(structure, inputs, s):
 
 @inlined
 def linearised_step(structure, theta, one_theta, nu, late, dt, s):
-    """One step from nu (6,), beginning ``late`` seconds after mid-interval, linearised in its third
-    stage, which is in its middle; theta (m, LANES), one_theta (m, 1); s is a record of OBSERVER."""
+    """One step from nu (6,), beginning ``late`` seconds after mid-interval, and its linearisation.
+
+    theta (m, LANES) and one_theta (m, 1) are the coefficients; s is a record of OBSERVER. The third
+    stage is in the middle of the step: there the motion is linearised.
+    """
     for i in range(6):
         s.one_nu[i, 0] = nu[i]
         s.end[i] = nu[i]
@@ -164,9 +167,11 @@ def advance_covariance(transition, noise, dt, p, product):
 
 @inlined
 def correct(x, p, sensitivity, row, cross, total, innovation):
-    """Take in one measurement: x (k,), its covariance p (k, k) and sensitivity (k, n); ``cross``
-    (k,) is the covariance of x with the ``innovation``, whose variance is ``total``, ``row`` (n,)
-    the sensitivity of its prediction."""
+    """Take in one measurement: x (k,), its covariance p (k, k) and sensitivity (k, n).
+
+    ``cross`` (k,) is the covariance of x with the ``innovation``, whose variance is ``total``, and
+    ``row`` (n,) how the prediction of the measurement changes with the coefficients.
+    """
     for a in range(len(x)):
         gain = cross[a] / total
         x[a] += gain * innovation

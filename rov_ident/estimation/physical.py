@@ -76,9 +76,11 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
 
 
 def _multipliers(p: Array, excess: Array) -> Array:
-    """The x (k,) >= 0 that minimises ``x' p x / 2 - x' excess``, p (k, k) positive semi-definite,
-    by active sets (Lawson and Hanson 1974, ch. 23); scipy's takes 35 MB and a third of a second to
-    import."""
+    """The x (k,) >= 0 that minimises ``x' p x / 2 - x' excess``, p (k, k) positive semi-definite.
+
+    By active sets (Lawson and Hanson 1974, ch. 23). scipy's takes a node 35 MB and a third of a
+    second to import, in the middle of a dive.
+    """
     p = p + 1e-12 * np.eye(len(p))
     x, free = np.zeros(len(p)), np.zeros(len(p), dtype=bool)
     for _ in range(3 * len(p)):
@@ -102,9 +104,11 @@ def _multipliers(p: Array, excess: Array) -> Array:
 
 
 def _signs(model: Model, prior: Prior) -> tuple[Array, Array]:
-    """Rows (k, n) and limits (k,) with ``rows @ values <= limit`` for a passive hull: derivatives
-    that are never positive, sums of one-sided derivatives with those of both directions, and
-    bounds."""
+    """Rows (k, n) and limits (k,) with ``rows @ values <= limit`` for a passive hull.
+
+    First each derivative that is never positive, then the sum of each one-sided derivative with
+    that of both directions, and the bounds of the parameters of effects.
+    """
     n = len(prior.names)
     rows, limits = list(np.eye(n)[prior.negative]), [0.0] * int(prior.negative.sum())
     for sign, bounds in ((1.0, prior.upper), (-1.0, -prior.lower)):

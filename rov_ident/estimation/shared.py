@@ -89,8 +89,10 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
 
 @inner
 def begin(info, sample):
-    """Nothing has happened yet to the sample: whether all in it but what is not measured (NaN) is
-    finite."""
+    """Nothing has happened yet to the sample: whether nothing in it would spoil a state.
+
+    NaN where not measured is no harm.
+    """
     info.t = sample.t
     info.forgetting = 1.0
     info.condition = np.nan
@@ -109,8 +111,10 @@ def begin(info, sample):
 
 @inlined
 def measure(sample, z, r):
-    """Measured velocities z (6,), NaN where there is none, and their variances r (6,). A gyro
-    stands in for the odometry's own rates: mostly they are the same gyro."""
+    """Measured velocities z (6,), NaN where there is none, and their variances r (6,).
+
+    Where there is a gyro, the odometry's own rates are not used: mostly they are the same gyro.
+    """
     for i in range(6):
         z[i], r[i] = sample.odometry[i], sample.odometry_variance[i]
         if i >= 3 and np.isfinite(sample.gyro[i - 3]):
@@ -121,8 +125,10 @@ def measure(sample, z, r):
 
 @inlined
 def wrench_of(theta, sample, side, wrench):
-    """wrench (6,) that acts, with the parameters of effects, the last of theta (m, 1), as they are;
-    ``side`` (13, k) of :func:`rov_ident.sampling.sample.parts`."""
+    """wrench (6,) that acts, with the parameters of effects, the last of theta (m, 1), as they are.
+
+    ``side`` (13, k) is how the sample depends on these (:func:`rov_ident.sampling.sample.parts`).
+    """
     k = side.shape[1]
     first = len(theta) - k
     for i in range(6):
@@ -149,8 +155,10 @@ def steps_of(dt):
 
 @inlined
 def add_score(g, lagged, score, since):
-    """Add g (n,) to the covariance (n, n) of the summed score with an exponential lag window (Newey
-    and West 1987), of which ``lagged`` (n,) holds the past; the last g was ``since`` seconds ago.
+    """Add g (n,) to the covariance (n, n) of the summed score, its correlation in time included.
+
+    With an exponential lag window (Newey and West 1987), of which ``lagged`` (n,) holds the past;
+    the last g was ``since`` seconds ago.
     """
     n, decay = len(lagged), np.exp(-since / LAG)
     for a in range(n):

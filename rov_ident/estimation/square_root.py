@@ -27,8 +27,10 @@ def columns_of(n):
 
 @reordered
 def whiten(root, rows, n, count, free, squares):
-    """rows (count, columns) -> [w | -w z], w = phi R^-1; squares[0] (count,) of w: phi P phi';
-    squares[1] is the part of it that the columns after the free ones add."""
+    """rows (count, columns) -> [w | -w z], w = phi R^-1; squares[0] (count,) of w: phi P phi'.
+
+    squares[1] (count,) is the part of it that the columns after the free ones add.
+    """
     columns = root.shape[1]
     for i in range(count):
         rows[i, n], squares[0, i], squares[1, i] = 0.0, 0.0, 0.0
@@ -323,9 +325,11 @@ def _combine(weights, matrix, n, out):
 
 @inner
 def reorder(root, place, spare, rows, line):
-    """root, (n + 2, columns) = [R | z], of the same information with column a where place[a] was:
-    the permuted old rows are stacked, three at a time. Work space: spare (n + 2, columns), rows
-    (12, columns), line (columns,)."""
+    """root, (n + 2, columns) = [R | z], of the same information with column a where place[a] was.
+
+    The old rows, their columns permuted, are stacked below nothing, three at a time. Work space:
+    spare (n + 2, columns), rows (12, columns), line (columns,).
+    """
     n = len(place)
     copy(root, spare)
     for a in range(n):
@@ -354,8 +358,10 @@ def permute(place, x, before):
 
 @reordered
 def cholesky(p, upper, root):
-    """Lower root (size, columns) of p (size, columns), three rows of the upper one at a time, so
-    that a row below is loaded a third as often; False where p is not positive definite."""
+    """Lower root (size, columns) of p (size, columns); False where p is not positive definite.
+
+    Three rows of the upper root at a time, so that a row below is loaded a third as often.
+    """
     size, columns = p.shape
     copy(p, upper)
     for first in range(0, size, 3):

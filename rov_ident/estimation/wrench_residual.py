@@ -47,8 +47,10 @@ def filtered_residual(task, theta, s, filters, sample, restarted, out):
 
 @inner
 def first_order(corner, dt):
-    """a, b0, b1 of ``x = a x + b0 u_before + b1 u_now``, the exact response of corner / (s +
-    corner) to an input that is linear between samples."""
+    """a, b0, b1 of ``x = a x + b0 u_before + b1 u_now``.
+
+    The exact response of corner / (s + corner) to an input that is linear between samples.
+    """
     a = np.exp(-corner * dt)
     b1 = 1.0 - (1.0 - a) / (corner * dt)
     return a, (1.0 - a) - b1, b1

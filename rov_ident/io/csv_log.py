@@ -1,6 +1,8 @@
-"""A plain log (CSV) into a bag of `odom`, `thruster_wrench` and `joint_states`. Nothing is
-resampled or filtered; an attitude or a position that is not there is made to agree with the
-velocities, and that is said."""
+"""A plain log (CSV) into a bag of the topics `odom`, `thruster_wrench` and `joint_states`.
+
+Nothing is resampled or filtered. What the log does not tell (an attitude, a position) is filled in
+so that it agrees with the velocities, and said in the report.
+"""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

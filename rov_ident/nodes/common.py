@@ -127,12 +127,14 @@ def live(
     begin: Callable[[AnyNode, threading.Event], None] = lambda node, interrupted: None,
     leave: Callable[[AnyNode], None] = lambda node: None,
 ) -> int:
-    """A node's whole life as the program's exit status: 0 when it is interrupted or ends by itself,
-    2 with one sentence where the user can correct what is wrong. ``own`` are the node's parameters
-    that are no part of a configuration. ``begin`` is called once the node is up, to start its
-    threads (one being started when an interrupt is raised would keep the process for ever), with an
-    event that an interrupt sets. ``leave`` is called once the node hears nothing any more, but may
-    still publish."""
+    """A node's whole life, until interrupted or shut down by itself, as the program's exit status.
+
+    It is 0 then, and 2 with one sentence where the user can correct what is wrong. ``own`` are the
+    node's parameters that are no part of a configuration. ``begin`` is called once the node is up
+    and starts its threads (one that is being started when an interrupt is raised would keep the
+    process for ever); it is given an event that is set by an interrupt, which does not end it.
+    ``leave`` is called once the node no longer hears anything, but may still publish.
+    """
     # Python's handlers rather than rclpy's: they interrupt compiling, too, and leave the context
     # open, so that the last messages can be published.
     end_at_once(0)

@@ -57,10 +57,13 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Settings:
-    """How a fit is made. ``stages``: channels, one group after the other; none: all together.
-    ``prior``: the configured values count as one more measurement. ``weighted``: least squares
-    weighs each axis by its residual. ``process``: maximum likelihood allows for errors of the
-    wrench. ``readings``: how often bags may be read for parameters of effects."""
+    """How a fit is made.
+
+    ``stages``: channels, fitted one group after the other; none: all together. ``prior``: whether
+    what the configuration says of the coefficients counts as one more measurement. ``weighted``:
+    least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
+    errors of the wrench. ``readings``: at most so often bags are read for parameters of effects.
+    """
 
     stages: tuple[tuple[str, ...], ...] = ()
     prior: bool = True

@@ -213,10 +213,12 @@ class Combination:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Which coefficients, or ``combinations`` of them, the data identify. ``unidentified``: of
-    which only a combination, or nothing at all (``unexcited``), is known. ``condition``: of the
-    regressor, its columns of unit length; ``collinear``: pairs of columns with the cosine between
-    them."""
+    """Which coefficients, or combinations of them, the data identify.
+
+    ``combinations``: identifiable. ``unidentified``: coefficients of which only a combination with
+    others, or nothing at all (``unexcited``), is known. ``condition``: of the regressor, its
+    columns of unit length; ``collinear``: pairs of columns with the cosine between them.
+    """
 
     combinations: tuple[Combination, ...]
     unidentified: tuple[str, ...]

@@ -81,11 +81,14 @@ LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of it
 
 @dataclass(frozen=True)
 class Noise:
-    """What the residuals are made of: ``measurement`` (6,) multiplies the stated variances;
-    ``floor`` (6,) is the density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's
-    standard deviation relative to itself, lasting ``correlation_time`` s, or as long as a message;
-    ``restoring`` (6, 3) [N, N m] times down is the wrench of weight, with the error of the measured
-    attitude (zeros: exact)."""
+    """What the residuals are made of.
+
+    ``measurement`` (6,) multiplies the variances that the samples state; ``floor`` (6,) is the
+    density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
+    relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
+    ``restoring`` (6, 3) [N, N m] times the unit vector down is the wrench of weight, which has the
+    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact.
+    """
 
     measurement: Array
     floor: Array

@@ -25,9 +25,12 @@ _MOST_DROPPED = 9  # commands in a row; a longer silence is one that was meant
 
 
 class CommandPeriod:
-    """The time between the commands of a publisher. ``mean`` [s]: as they come, without gaps;
-    ``longest`` [s] of the last 50; ``threshold`` [s]: only above it a command may have been
-    dropped, infinite while the publisher is not regular."""
+    """The time between the commands of a publisher.
+
+    ``mean`` [s] is that between commands as they come, without gaps; ``longest`` [s] the longest of
+    the last 50. Only within an interval above ``threshold`` [s] may a command have been dropped; it
+    is infinite while the publisher is not regular.
+    """
 
     def __init__(self) -> None:
         self.mean = 0.0

@@ -157,8 +157,10 @@ class EffectJacobians:
         return new
 
     def measure(self, v: Array, omega: Array, has_imu: bool) -> None:
-        """The velocity (3,) and rate (3,) over ground before the next sample: the noise of measured
-        ones would be in column and innovation alike."""
+        """The velocity (3,) and rate (3,) over ground before the next sample.
+
+        Not the measured ones: their noise would be in column and innovation alike.
+        """
         for i, low, high in self._senses:
             given = sense(Reading(v, omega, omega, _ZERO), self.config.effects)
             before, after = correct(given, low), correct(given, high)
@@ -248,8 +250,10 @@ def _acceleration(motion, sample, nu):
 
 @inlined
 def _follow(motion, sample, followed):
-    """v_dot (3,) of a motion of the configured model, drawn to what was measured before;
-    ``followed`` (2, 3), its velocities and those measured, go from the last sample to this."""
+    """v_dot (3,) of a motion of the configured model, drawn to what was measured before.
+
+    ``followed`` (2, 3) are its velocities and those measured, at the sample before; now at this.
+    """
     nu, v_dot = sample.nu.copy(), np.zeros(3)
     for i in range(3):
         if sample.restart or not abs(followed[0, i] - nu[i]) < _ASTRAY:

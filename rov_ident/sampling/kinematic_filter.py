@@ -312,8 +312,10 @@ def _predict_attitude(k, s, rate, dt, has_imu, gyro_variance):
 
 @inlined
 def _correct_attitude(k, s, q):
-    """Correct by the measured attitude q (4,); whether it is believed (also a heading that is set
-    anew, when it stays, but as no bias of the gyro), and whether everything restarts."""
+    """Correct by the measured attitude q (4,); whether it is believed, and whether all begins anew.
+
+    A heading that is set anew is believed when it stays, but it is no bias of the gyro.
+    """
     total = k.attitude_variance + s.attitude_variance
     gain = k.attitude_variance / total
     # vector part of conj(k.q) * q: half the rotation from one to the other
@@ -453,8 +455,10 @@ def _correct_gyro_bias(k, s, rate, m, share, r_angular, gyro_variance):
 def fuse(
     state, settings, measured, sample, t, dt, restart, hold, wrench, wrench_slope, wrench_doubt
 ):  # fmt: skip
-    """One instant of the filter, by records (1,) of STATE, _SETTINGS and _MEASURED; fills the
-    sample (1,). Returns whether the odometry was taken, the motion is known, everything restarts.
+    """One instant of the filter; fills the sample (1,).
+
+    Returns whether the odometry was taken, whether the motion is known, and whether it begins anew.
+    Arguments are records (1,) of STATE, _SETTINGS and _MEASURED.
     """
     k, s, m, out = state[0], settings[0], measured[0], sample[0]
     out.t, out.dt, out.restart, out.hold = t, dt, restart, hold

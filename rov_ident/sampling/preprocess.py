@@ -23,11 +23,13 @@ _DRIVEN = 0.1  # of the most on an axis or of a fin; what holds a vehicle in pla
 
 @dataclass(frozen=True)
 class Preparation:
-    """What is done to a log, in this order; nothing by default. ``polarity``: columns recorded with
-    the opposite sign. ``depth``: columns that measure `z`, with the standard deviations [m] of
-    their noise and of their common error. ``smooth``: corner [Hz] of a filter without lag on the
-    velocities. ``cut``: from when to when [s]. ``cut_idle``: what is kept [s] around what is
-    driven."""
+    """What is done to a log, in this order; nothing by default.
+
+    ``polarity``: columns that were recorded with the opposite sign. ``depth``: columns that measure
+    `z`, with the standard deviations [m] of their noise and of their common error. ``smooth``: the
+    corner [Hz] of a filter without lag on the velocities. ``cut``: from when to when [s] in the
+    log's time. ``cut_idle``: what is kept [s] before and after the vehicle is driven.
+    """
 
     polarity: tuple[str, ...] = ()
     despike: bool = False

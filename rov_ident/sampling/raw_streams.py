@@ -53,9 +53,13 @@ class Streams:
 
     @property
     def guided(self) -> NDArray[np.bool_]:
-        """Axes (6,) whose velocity a simulation can only take as measured: a wrench without any
-        moment was not recorded whole, and unless fins are heard, what turns the vehicle is unknown;
-        a velocity that never changes was not measured."""
+        """Axes (6,) whose velocity a simulation can only take as measured.
+
+        Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
+        computed, without. What turns the vehicle is then unknown, unless fins do that are heard.
+        A velocity that never changes was not measured: a record in the plane holds zeros for the
+        rest.
+        """
         unknown: NDArray[np.bool_] = np.repeat(
             [False, not (self.demand[:, 3:].any() or self.inputs[:, :3].any())], 3
         )

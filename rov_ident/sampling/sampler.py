@@ -187,9 +187,11 @@ class Sampler:
         return samples[0] if len(samples) == 1 else joined(samples)
 
     def _is_unknown(self, t: float, dt: float) -> bool:
-        """Whether nobody knows how much time the interval dt [s] before t [s] took: after a silence
-        of all topics messages may be lost, or the clock of their stamps may have stepped, which
-        must not be bridged."""
+        """Whether nobody knows how much time the interval dt [s] before t [s] took.
+
+        If no topic has said anything for long, either all messages were lost, or the clock of their
+        stamps was stepped. To bridge it would take the motion of one for that of the other.
+        """
         usual = self._usual or dt
         change = min(dt, _SILENCE * usual) - usual
         self._usual = usual + (_SHORTEN if change < 0.0 else _LENGTHEN) * change

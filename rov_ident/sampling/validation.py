@@ -113,9 +113,11 @@ class Validation:
         return NEW_CLOCK if abs(since) < _AGREEMENT else "stamp jumps"
 
     def marked(self, message: Odometry) -> Odometry:
-        """The message, its velocity marked by its variance if it repeats the last one to the last
-        digit: its sensor is slower, or has lost the ground. Where velocities are rounded to a grid
-        it may be chance."""
+        """The message, its velocity marked by its variance if it has not been measured again.
+
+        That is so if it repeats the last one to the last digit: its sensor has lost the ground, or
+        is slower than its messages. Where velocities are rounded to a grid it may be by chance.
+        """
         velocity, before = message.linear.tobytes(), self._velocity
         self._velocity = velocity
         if velocity == before:

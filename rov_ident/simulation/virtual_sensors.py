@@ -49,9 +49,11 @@ START = 1_000_000_000  # ns; stamp of the first instant: zero would read as "no 
 
 @dataclass(frozen=True)
 class Suite:
-    """Rates in Hz (an ``imu_rate`` of zero: no IMU), noise as standard deviations of one sample, of
-    the wrench relative. ``delay`` (s) and its standard deviation ``jitter`` put off the arrival of
-    a message, never its stamp; ``drop`` is the share lost."""
+    """Rates in Hz (an ``imu_rate`` of zero: no IMU), noise as standard deviations of one sample.
+
+    ``wrench_std`` is relative to the wrench. ``delay`` (s) and ``jitter`` (s, standard deviation of
+    it) put off the arrival of a message, never its stamp; ``drop`` is the share of messages lost.
+    """
 
     odometry_rate: float = 20.0
     imu_rate: float = 100.0
