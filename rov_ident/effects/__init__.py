@@ -217,10 +217,13 @@ def parameter(effect: str, name: str) -> EffectParameter:
 
 
 def estimable(name: str) -> dict[str, float | None]:
-    """The parameters of an effect that an estimator can follow while the vehicle moves, each with
-    the value at which it is left alone unless asked for: the null of a limit and of a parameter of
-    one axis or fin; None for others. Not an onset, a frequency, a phase, nor what shows in no
-    velocity (the biases of an IMU, which the sampler finds; the noise of a reading)."""
+    """The parameters of an effect that an estimator can follow while the vehicle moves.
+
+    With each of them the value at which it is better left alone unless asked for: the null of a
+    parameter of one axis or fin, of which an effect has several, and of a limit; None for others.
+    An onset, a frequency and a phase are not among them, nor what shows in no velocity (the sampler
+    finds the biases of an IMU itself), nor the noise of a reading.
+    """
     effect = EFFECTS[name]
     if effect.heading or effect.noise:
         return {}

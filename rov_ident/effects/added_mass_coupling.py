@@ -1,5 +1,8 @@
-"""Added mass off the diagonal: accelerating along one axis pushes along another. One name for each
-entry that port/starboard symmetry allows; its Coriolis terms come with it."""
+"""Added mass off the diagonal: accelerating along one axis pushes along another.
+
+One name for each entry of the symmetric matrix that port/starboard symmetry allows; its Coriolis
+terms come with it.
+"""
 
 from rov_ident.effects.base import Effect
 

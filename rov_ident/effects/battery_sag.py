@@ -1,5 +1,7 @@
-"""The battery runs down: one gain on all thrust, falling evenly from 1 to ``1 - end_loss`` over
-``duration`` seconds from the first message, and then constant."""
+"""The battery runs down: one gain on all thrust, falling evenly from 1 to ``1 - end_loss``.
+
+The loss is reached ``duration`` seconds after the first message, and stays.
+"""
 
 from rov_ident.core.jit import kernel
 from rov_ident.effects.base import Effect, EffectParameter

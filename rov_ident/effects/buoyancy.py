@@ -1,5 +1,7 @@
-"""The vehicle is heavier in water than configured: ``delta`` along world z, which points down
-(NED), at the CB: ``B - delta``."""
+"""The vehicle is heavier in water than configured: ``delta`` along world z, at the CB.
+
+World z points down (NED), so that a positive delta is buoyancy lost: ``B - delta``.
+"""
 
 import dataclasses
 

@@ -1,5 +1,8 @@
-"""Products of velocities beyond those that the mass matrix gives: its added mass may not be that of
-the hull at speed (measured in oscillation, or by strip theory)."""
+"""Products of velocities beyond those that the mass matrix gives.
+
+Where the added mass in M is not that of the hull at speed (measured in oscillation, or by strip
+theory), the Coriolis and Munk terms that follow from it are wrong, too.
+"""
 
 from rov_ident.effects.base import Effect
 

@@ -1,5 +1,8 @@
-"""First-order lag of fins, ``T d(delta)/dt = read - delta``, exact for a reading that changes in a
-straight line during the step. The first reading has acted for long."""
+"""First-order lag between the angles read of fins and those that they have.
+
+``T d(delta)/dt = read - delta``, solved exactly for a reading that changes in a straight line
+during the step. The first reading is taken to have acted for long.
+"""
 
 import math
 

@@ -1,5 +1,8 @@
-"""Forces across the flow: products of the forward velocity with another one, of hull, fins and
-frame as wings, beyond the Munk moments that come from the added mass."""
+"""Forces across the flow: products of the forward velocity with another one.
+
+Hull, fins and frame at an angle to the flow are wings. The Munk moments and the other products that
+come from the added mass are in the equations of motion already; these are beyond them.
+"""
 
 from rov_ident.effects.base import Effect
 

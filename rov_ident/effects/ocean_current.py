@@ -1,5 +1,7 @@
-"""Water that moves steadily and without rotation; :func:`rov_ident.model.equations.add_current`
-says what that does."""
+"""Water that moves steadily and without rotation; the equations of motion say what that does.
+
+See :func:`rov_ident.model.equations.add_current`.
+"""
 
 import numpy as np
 

@@ -1,5 +1,8 @@
-"""Something taken up at ``onset``: its wet weight pulls down at a point of the body, ``mass_wet g``
-along world down and ``r x f``. Its inertia, small beside vehicle and added mass, is left out."""
+"""Something taken up at a time: its wet weight pulls down at a point of the body.
+
+``f = mass_wet g`` along world down and ``r x f``, from ``onset`` on. Its inertia is left out: what
+a small ROV carries has little beside the vehicle and its added mass.
+"""
 
 from rov_ident.core.jit import kernel
 from rov_ident.effects.base import ONSET, Effect, EffectParameter, vector

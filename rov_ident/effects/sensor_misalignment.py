@@ -1,4 +1,7 @@
-"""The velocity sensor is mounted at an angle: it measures ``R' v``, R of roll, pitch and yaw."""
+"""The velocity sensor is mounted at an angle: it measures ``R' v``.
+
+R, from roll, pitch and yaw as those of an attitude, turns sensor axes into body axes.
+"""
 
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
 from rov_ident.effects.base import Effect, EffectParameter, Reading

@@ -1,5 +1,7 @@
-"""The umbilical drags at the point where it is attached, ``f = -k |va| va`` and ``r x f``; ``va = v
-+ omega x r`` is the velocity of that point through the water."""
+"""The umbilical drags at the point where it is attached: ``f = -k |va| va``, and ``r x f``.
+
+``va = v + omega x r`` is the velocity of that point through the water.
+"""
 
 import math
 

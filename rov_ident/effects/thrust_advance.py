@@ -1,5 +1,8 @@
 """Thrust falls with the speed of advance: ``X (1 - k u sign(X))``, and so along Y with v, Z with w.
-Moments are left: of thrusters on either side, which move opposite ways, it cancels to first order.
+
+A propeller that moves through the water towards its thrust meets it faster, and gives less. The
+moments are left as they are: thrusters on either side move opposite ways, which cancels to first
+order.
 """
 
 from rov_ident.core.jit import kernel

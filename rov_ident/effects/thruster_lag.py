@@ -1,5 +1,9 @@
-"""First-order lag between the commanded and the acting wrench, ``T d(acting)/dt = command -
-acting``: the exact mean over a step of held command. The first command has acted for long."""
+"""First-order lag between the commanded and the acting wrench.
+
+``T d(acting)/dt = command - acting``, solved exactly for a command held during the step. The mean
+over the step is returned, so that the impulse is right however long the step is. The first command
+is taken to have acted for long.
+"""
 
 import math
 

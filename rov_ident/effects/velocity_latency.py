@@ -1,5 +1,8 @@
-"""Linear velocities (a filter, a slow link) are older than their stamp: ``linear(stamp) = v(stamp -
-delay)``, in the body axes of then. Pose and angular velocities are those of the stamp."""
+"""Linear velocities are older than their stamp: a filter or a link between sensor and odometry.
+
+``linear(stamp) = v(stamp - delay)``, in the body axes of that time. Pose and angular velocities are
+those of the stamp.
+"""
 
 from rov_ident.effects.base import Effect, EffectParameter
 

@@ -1,5 +1,8 @@
-"""First-order waves at a depth: a force ``f sin(2 pi frequency t + phase)`` at the body origin, in
-a fixed direction of the world, without a moment."""
+"""A sinusoidal force at the body origin, in a fixed direction of the world, without a moment.
+
+``f sin(2 pi frequency t + phase)``: first-order waves at a depth where the vehicle is small beside
+the wavelength.
+"""
 
 import math
 

@@ -330,8 +330,10 @@ def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
 
 
 def read_log(path: Path, progress: Callable[[float], None] = lambda share: None) -> Log:
-    """What a log says. Raises UserError: it cannot be read, is no log, or what reads it is not
-    installed."""
+    """What a log says.
+
+    Raises UserError: it cannot be read, is no log, or what reads it is not installed.
+    """
     if path.suffix.lower() == ".ulg":
         from rov_ident.io.px4_log import read_ulog
 

@@ -165,8 +165,11 @@ class Bag:
         return digest.hexdigest()
 
     def iter_raw(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
-        """The messages of these topics (None: of all) in the order of their log times, then of the
-        file. Only blocks that overlap in time are in memory together."""
+        """The messages of these topics (None: of all) in the order of their log times.
+
+        Messages of equal time come in the order of the file. Only blocks that overlap in time are
+        in memory together.
+        """
         names = set(self.topics if topics is None else topics)
 
         def chosen(file: _File | OtherFile) -> dict[int, tuple[str, str]]:
@@ -231,8 +234,10 @@ def select_topics(
 def read_messages(
     bag: Bag, topics: Mapping[str, str | None]
 ) -> Iterator[tuple[str, Message | None]]:
-    """(role, message) in the order of log times, axes as on the wire; the message is None, for the
-    caller to count, where its bytes cannot be decoded."""
+    """(role, message) in the order of log times, axes as on the wire.
+
+    The message is None where its bytes cannot be decoded, so that the caller can count them.
+    """
     readers = {topic: (role, DECODERS[ROLE_TYPES[role]]) for role, topic in topics.items() if topic}
     for raw in bag.iter_raw(readers):
         role, decode = readers[raw.topic]

@@ -73,15 +73,21 @@ class BagWriter:
         self._broken = False  # the disk is full, or gone
 
     def go_live(self) -> None:
-        """Give the bag its name at once and flush it every second, so that even a killed process
-        leaves a readable, truncated bag. Raises UserError: the disk refuses."""
+        """Gives the bag its name at once, and keeps what is in it from now on, whatever happens.
+
+        It is flushed every second, so that even a killed process leaves a readable, truncated bag.
+
+        Raises UserError: the disk refuses.
+        """
         with self._writing():
             self._part.replace(self.path)
             self._part, self._live = self.path, True
 
     def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
         """Announces a topic; only needed where it is latched (transient local) or may stay empty.
-        Raises UserError: the type is not one of ROS 2 Jazzy's."""
+
+        Raises UserError: the type is not one of ROS 2 Jazzy's.
+        """
         text, type_hash = definition(type_name)
         qos = [_LATCHED_QOS] if latched else []
         with self._writing():
@@ -96,8 +102,10 @@ class BagWriter:
         self._topics[topic] = _WrittenTopic(channel, type_name, type_hash, qos)
 
     def write(self, topic: str, type_name: str, stamp: int, data: bytes) -> None:
-        """Appends a CDR message with this log time (ns, not negative). Raises UserError: the disk
-        is full, or gone; what a live recording has so far can be read."""
+        """Appends a CDR message with this log time (ns, not negative).
+
+        Raises UserError: the disk is full, or gone; what a live recording has so far can be read.
+        """
         if topic not in self._topics:
             self.add_topic(topic, type_name)
         entry = self._topics[topic]

@@ -115,8 +115,10 @@ def decode_odometry(data: bytes) -> Odometry:
 
 
 def decode_imu(data: bytes) -> Imu:
-    """A sensor_msgs/msg/Imu; a first variance of -1, of what the driver does not measure, is passed
-    on."""
+    """A sensor_msgs/msg/Imu.
+
+    A first variance of -1 says that the driver does not measure that quantity; it is passed on.
+    """
     fields = _Fields(data)
     stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(_IMU)
     return Imu(stamp, frame_id, n[:4], n[4:7], n[7:10], n[10:13], n[13:])

@@ -179,8 +179,10 @@ def _bin_widths(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def parse_columns(items: Sequence[str]) -> dict[str, str]:
-    """The columns of `--map`: each item is `name=heading`, or a YAML file of such pairs. Raises
-    UserError: neither of the two."""
+    """The columns of `--map`: each item is `name=heading`, or a YAML file of such pairs.
+
+    Raises UserError: neither of the two.
+    """
     columns: dict[str, str] = {}
     for item in items:
         name, equals, heading = item.partition("=")
@@ -226,8 +228,10 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
 
 
 def _wrapped(quaternion: Array) -> NDArray[np.bool_]:
-    """Rows whose attitude jumps away and back at once, as where a log averages Euler angles of +179
-    and -179 degrees over a bin."""
+    """Rows whose attitude jumps away and back at once.
+
+    A log that averages Euler angles over a bin turns +179 and -179 degrees into 0.
+    """
     step = _angle_between(quaternion[1:], quaternion[:-1])
     bridge = _angle_between(quaternion[2:], quaternion[:-2])
     jump = np.minimum(step[1:], step[:-1])

@@ -27,8 +27,10 @@ class CsvTable:
     sha256: str
 
     def numbers(self, heading: str, blank: bool = False) -> Array:
-        """A column (n,); with ``blank``, empty cells are NaN. Raises UserError: a cell that is not
-        a finite number."""
+        """A column (n,); with ``blank``, empty cells are NaN.
+
+        Raises UserError: a cell that is not a finite number.
+        """
         out = np.empty(len(self.lines))
         for i, text in enumerate(self.cells[heading]):
             if blank and (not text or text.lower() == "nan"):
@@ -47,8 +49,10 @@ class CsvTable:
 
 
 def read_csv(path: Path) -> CsvTable:
-    """A file of comma-separated columns under one line of headings; `#` begins a comment. Raises
-    UserError if it cannot be read, or is no such file."""
+    """A file of comma-separated columns under one line of headings; `#` begins a comment.
+
+    Raises UserError if it cannot be read, or is no such file.
+    """
     rows: list[list[str]] = []
     lines: list[int] = []
     header: list[str] = []

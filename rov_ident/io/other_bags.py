@@ -14,8 +14,10 @@ Topics = dict[int, tuple[str, str]]
 
 
 class OtherFile(ABC):
-    """One file: ``topics`` by channel as (name, type), and how many messages each has. Raises
-    UserError if it cannot be read."""
+    """One file: ``topics`` by channel as (name, type), and how many messages each has.
+
+    Raises UserError if it cannot be read.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -23,8 +23,10 @@ _ARMED = 2  # of vehicle_status.arming_state
 
 
 def read_ulog(path: Path) -> Log:
-    """What a ULog says. Raises UserError: it cannot be read, is no ULog, or pyulog is not
-    installed."""
+    """What a ULog says.
+
+    Raises UserError: it cannot be read, is no ULog, or pyulog is not installed.
+    """
     try:
         from pyulog import ULog
     except ImportError as error:

@@ -112,8 +112,11 @@ def sources(inputs: Inputs) -> dict[str, Source]:
 
 
 class Reader:
-    """Bytes of the configured topics into messages of the core, axes as on the wire. ``counts``, by
-    role and reason, what could not be used; ``on_arrival``: the thrust comes without a stamp."""
+    """Bytes of the configured topics into messages of the core, axes as on the wire.
+
+    ``counts`` holds, by role and reason, what could not be used. ``on_arrival`` tells whether the
+    thrust comes without a stamp.
+    """
 
     def __init__(self, config: Config) -> None:
         self.counts: Counter[str] = Counter()
@@ -220,8 +223,10 @@ class Reader:
 
 
 def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, str]:
-    """The topic of each role that the bag has; given ``roles``, of these alone. Raises UserError if
-    a role is missing, ambiguous or of another type than ``inputs`` says."""
+    """The topic of each role that the bag has; given ``roles``, of these alone.
+
+    Raises UserError if a role is missing, ambiguous or of another type than ``inputs`` says.
+    """
     wanted = vars(config.topics)
     chosen = {}
     for role, (name, type_name) in sources(config.inputs).items():
@@ -271,7 +276,9 @@ def messages(
     bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None = None
 ) -> Iterator[tuple[str, Message]]:
     """(role, message) in the order of log times, axes as on the wire; ``topics`` of :func:`select`.
-    What cannot be used is added to ``counts`` at the end."""
+
+    What cannot be used is added to ``counts`` at the end.
+    """
     for role, message, _ in _read(bag, topics, config, counts):
         yield role, message
 
@@ -279,8 +286,10 @@ def messages(
 def as_played(
     bag: Bag, topics: Mapping[str, str], config: Config
 ) -> Iterator[tuple[str, RawMessage]]:
-    """(role, message as bytes) of the types that the estimators know, whatever the bag's: at
-    another speed, a message without a stamp could not be stamped on arrival."""
+    """(role, message as bytes) of the types that the estimators know, whatever the bag's.
+
+    A message without a stamp could not be stamped on arrival when it is played at another speed.
+    """
     if config.inputs == config.inputs.standard:
         roles = {topic: role for role, topic in topics.items()}
         for raw in bag.iter_raw(roles):

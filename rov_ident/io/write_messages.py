@@ -12,8 +12,10 @@ _TYPES = {**ROLE_TYPES, DRIVE: JOINTS_TYPE}
 
 
 def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]]) -> None:
-    """Write (arrival [ns], role, message in ROS axes) in order of arrival. Raises UserError if the
-    bag cannot be written."""
+    """Write (arrival [ns], role, message in ROS axes) in order of arrival.
+
+    Raises UserError if the bag cannot be written.
+    """
     with BagWriter(path) as writer:
         for arrival, role, message in messages:
             writer.write(f"/{ROLE_NAMES[role]}", _TYPES[role], arrival, encode(message))

@@ -1,5 +1,7 @@
-"""Added mass from dimensions, as coefficients (SNAME signs: negative), about the hull's middle;
-symmetry fore and aft, above and below, leaves the diagonal only."""
+"""Added mass from dimensions, as coefficients (SNAME signs: negative), about the hull's middle.
+
+Fore-aft and top-bottom symmetry leave the diagonal only.
+"""
 
 import math
 
@@ -64,8 +66,10 @@ HULLS = {"cylinder": cylinder, "spheroid": spheroid}
 
 
 def parse_hull(text: str) -> dict[str, float]:
-    """The added mass of `cylinder:L=1.6,R=0.1` or `spheroid:...`, maybe with `rho=`. Raises
-    UserError for another form."""
+    """The added mass of `cylinder:L=1.6,R=0.1` or `spheroid:...`, maybe with `rho=`.
+
+    Raises UserError for another form.
+    """
     kind, _, rest = text.partition(":")
     names = {"L": "length", "R": "radius", "rho": "rho"}
     values: dict[str, float] = {}

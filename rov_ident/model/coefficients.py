@@ -142,7 +142,10 @@ class Coefficient:
 
 @cache
 def parse(name: str) -> Coefficient:
-    """The coefficient called ``name``. Raises UserError if the name is not in the grammar."""
+    """The coefficient called ``name``.
+
+    Raises UserError if the name is not in the grammar.
+    """
     if (driven := parse_input(name)) is not None:
         return driven
     if name in ("T_n", "T_nn", "T_nu", "T_un"):

@@ -136,15 +136,19 @@ class Model:
         return Structure(*(column.astype(np.int64) for table in tables for column in table))
 
     def with_theta(self, theta: Array) -> "Model":
-        """The same structure with another parameter vector (m,). Raises UserError for another
-        length."""
+        """The same structure with another parameter vector (m,).
+
+        Raises UserError if it has another length.
+        """
         if np.shape(theta) != self.theta.shape:
             raise UserError(f"theta needs shape {self.theta.shape}, not {np.shape(theta)}")
         return replace(self, theta=_vector(theta))
 
     def with_values(self, values: Mapping[str, float]) -> "Model":
-        """The same structure with some coefficients replaced by name. Raises UserError if the model
-        has no such coefficient."""
+        """The same structure with some coefficients replaced by name.
+
+        Raises UserError if the model has no such coefficient.
+        """
         theta = self.theta.copy()
         for name, value in values.items():
             if name not in self.names:
@@ -288,8 +292,10 @@ def skew(a: Sequence[float] | Array) -> Array:
 
 @inlined
 def extend(lanes, nu, extended):
-    """[1, nu, |nu|, min(nu, 0), u^2], the first rows of extended, from nu (6, lanes);
-    :func:`extend_inputs` fills the others."""
+    """[1, nu, |nu|, min(nu, 0), u^2], the first rows of extended, from nu (6, lanes).
+
+    The others are those of the inputs, which change more slowly: :func:`extend_inputs`.
+    """
     for k in range(lanes):
         extended[ONE, k] = 1.0
         extended[SQUARE, k] = nu[0, k] * nu[0, k]
@@ -311,8 +317,10 @@ def _extend_input(lanes, which, x, extended):
 
 @inlined
 def extend_inputs(lanes, structure, inputs, extended):
-    """The rows of the inputs (4,) in extended (EXTENDED_SIZE, lanes), of those that terms use; they
-    stay there while velocities change."""
+    """The rows of the inputs (4,) in extended (EXTENDED_SIZE, lanes), of those that terms use.
+
+    They stay there while velocities change.
+    """
     for i in range(len(structure.inputs)):
         _extend_input(lanes, structure.inputs[i], inputs[structure.inputs[i]], extended)
 
@@ -427,8 +435,10 @@ def columns(structure, nu, momentum, force, extended):
 
 @lean
 def in_motion(structure, moving, out):
-    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,). An
-    input has hardly any noise: where it is zero, its columns are."""
+    """out (n,): whether every velocity that a coefficient multiplies is among the moving (6,).
+
+    An input has no noise to speak of: where it is zero, its columns are.
+    """
     first = len(structure.mass_row)
     for c in range(first):
         out[c] = moving[structure.mass_row[c]] != 0 and moving[structure.mass_column[c]] != 0
@@ -496,7 +506,10 @@ def add_current(structure, added_mass, theta, nu, water, s, out):
 
 @kernel
 def force_of_one(structure, mass, theta, nu, inputs):
-    """:func:`generalized_force` (6,) of one state: mass (6, 6), theta (n,), nu (6,), inputs (4,)"""
+    """:func:`generalized_force` for a single state: mass (6, 6), theta (n,), nu (6,), inputs (4,).
+
+    The result is (6,).
+    """
     h = np.empty((6, 1))
     extended = np.empty((EXTENDED_SIZE, 1))
     extend_inputs(1, structure, inputs, extended)

@@ -50,7 +50,9 @@ def knows(voltage: float) -> bool:
 @cache
 def t200(voltage: float) -> Array:
     """Thrust [N] of a T200 (801,) at the pulses 1100, 1101 ... 1900 us; linear in the voltage.
-    Raises UserError if the voltage is outside the table."""
+
+    Raises UserError if the voltage is outside the table.
+    """
     known = sorted(CURVES)
     if not knows(voltage):
         raise UserError(
@@ -77,8 +79,10 @@ def allocation(position: Array, direction: Array) -> Array:
 
 
 class Allocator:
-    """Commands of thrusters (``signal``: FORCE, PWM or NORMALIZED) into wrenches about the body
-    origin, forward-starboard-down."""
+    """Commands of thrusters into wrenches, forward-starboard-down about the body origin.
+
+    ``signal`` is FORCE, PWM or NORMALIZED.
+    """
 
     def __init__(self, config: Geometry, signal: str) -> None:
         self.matrix = matrix(config)
@@ -87,8 +91,12 @@ class Allocator:
         self._channels = np.array(channels, dtype=int) - 1
 
     def wrench(self, commands: Sequence[float] | Array, voltage: float | None = None) -> Array:
-        """The wrench (6,) [N, N m] of an array of commands (k,), at ``voltage`` [V]. Raises
-        ValueError: in words, if there are too few commands, or one that cannot be."""
+        """The wrench (6,) [N, N m] of an array of commands (k,).
+
+        ``voltage`` [V] in place of the configured one.
+
+        Raises ValueError: in words, if there are too few commands, or one that cannot be.
+        """
         commands, needed = np.asarray(commands, dtype=float), self._channels.max() + 1
         if len(commands) < needed:
             raise ValueError(f"an array of {len(commands)} values, but thrusters needs {needed}")
@@ -118,8 +126,10 @@ class Allocator:
 
 
 def matrix(config: Geometry) -> Array:
-    """The allocation B (6, n) that the configuration gives. Raises UserError if it gives none, two,
-    or one of the wrong size."""
+    """The allocation B (6, n) that the configuration gives.
+
+    Raises UserError if it gives none, two, or one of the wrong size.
+    """
     position, direction, given = config.position, config.direction, config.allocation
     if given and (position or direction):
         raise UserError(
@@ -144,7 +154,10 @@ def matrix(config: Geometry) -> Array:
 
 
 def check(config: Geometry, signal: str) -> None:
-    """Raises UserError, one sentence naming the key, for what could not be used later."""
+    """Refuse what could not be used later.
+
+    Raises UserError: one sentence naming the key.
+    """
     if not (config.allocation or config.position or config.direction):
         raise UserError(
             "thrusters has no allocation: give thrusters.position and thrusters.direction, or "

@@ -39,8 +39,11 @@ _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
 class GuardedNode(Node):  # type: ignore[misc]
-    """A node that outlives what its callbacks raise, those of rclpy's own services included, unless
-    ``outlives`` is False; ``faults`` counts them by name, the log has them, too."""
+    """A node that outlives what its callbacks raise, those of rclpy's own services included.
+
+    ``faults`` counts them by name; the log has them, too. Where ``outlives`` is False they end the
+    process.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.faults: Counter[str] = Counter()
@@ -104,8 +107,10 @@ STREAM = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def subscribed(inputs: Inputs) -> dict[str, tuple[str, type]]:
-    """The relative topic and the message class of every role of the configured inputs. Raises
-    UserError if a package of messages is not installed."""
+    """The relative topic and the message class of every role of the configured inputs.
+
+    Raises UserError if a package of messages is not installed.
+    """
     found = {}
     for role, (topic, type_name) in sources(inputs).items():
         package, _, name = type_name.partition("/")

@@ -15,8 +15,11 @@ keep a small computer busy with failing (compiling takes half a minute, docs/spe
 
 
 class CompileState:
-    """The compiler of an estimator in the life of its node, to be made before the first kernel is
-    called: where nothing is compiled yet, kernels are interpreted from then on."""
+    """The compiler of an estimator in the life of its node.
+
+    To be made before the first kernel is called: where nothing is compiled yet, all kernels of this
+    process are interpreted from then on.
+    """
 
     def __init__(self, kind: Kind) -> None:
         only_run()
@@ -43,8 +46,11 @@ class CompileState:
         self._compiler.start()
 
     def switched(self, config: Config, log: Any) -> bool:
-        """Whether this call has gone over from interpreted to compiled kernels, which use the same
-        arrays. A compiler that fails, for want of memory say, is started again."""
+        """Whether this call has gone over from interpreted to compiled kernels.
+
+        What is learnt and all that is under way stay as they are: both use the same arrays. A
+        compiler that fails, for want of memory say, is started again.
+        """
         if not self.interpreting or (status := self._compiler.poll()) is None:
             return False
         if status:

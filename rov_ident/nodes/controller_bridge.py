@@ -207,8 +207,10 @@ class ControllerBridge(GuardedNode):
         self._settle(reason)
 
     def _settle(self, reason: str = "") -> None:
-        """Check whether the last set was accepted; undo what was accepted only in part. Raises
-        UserError unless it was accepted; if the controller does not answer, call it again."""
+        """Check whether the last set was accepted, and undo it if it was accepted only in part.
+
+        Raises UserError unless it was accepted; if the controller does not answer, call it again.
+        """
         if self._open is None:
             return
         self._wait_for_answer(reason)

@@ -69,9 +69,12 @@ def for_json(report: Report) -> dict[str, dict[str, Any]]:
 
 
 def from_diagnostics(message: DiagnosticArray) -> Report:
-    """The report in a message of `~/coefficients`, with variances alone: correlations are on
-    `~/coefficients/covariance`. Raises ValueError if a key is missing, or a number is none or not
-    finite."""
+    """The report in a message of `~/coefficients`.
+
+    Its covariance has the variances alone: the correlations are on `~/coefficients/covariance`.
+
+    Raises ValueError if a key is missing, or a number is not one or not finite.
+    """
     statuses = message.status
     fields = [{pair.key: pair.value for pair in status.values} for status in statuses]
     try:

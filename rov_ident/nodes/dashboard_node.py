@@ -27,7 +27,10 @@ Announce = Callable[[str], None]
 
 
 def dashboard(port: int, announce: Announce) -> None:
-    """Serve the page until interrupted (SIGINT, SIGTERM). Raises UserError if the port is taken."""
+    """Serve the page until interrupted (SIGINT, SIGTERM).
+
+    Raises UserError if the port is taken.
+    """
     _live([], lambda _: port, announce)
 
 

@@ -56,8 +56,10 @@ class Inputs:
 
 
 class Diagnostics:
-    """Publishes `/diagnostics` of a node: inputs, estimation, model, checkpoint. With ``lockstep``
-    silence is not taken for the end of the inputs."""
+    """Publishes `/diagnostics` of a node, a status each for inputs, estimation, model, checkpoint.
+
+    With ``lockstep`` silence is not taken for the end of the inputs.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,7 @@
-"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish."""
+"""What `rls_node` and `ukf_node` share: declare parameters, decode, step, publish.
+
+Nothing here computes a coefficient.
+"""
 
 import os
 import sys

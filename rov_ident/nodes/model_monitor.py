@@ -24,8 +24,10 @@ class ModelMonitor:
         self._compiler: Compiler | None = None
 
     def begin(self) -> "Future[Any]":
-        """Load the monitor in its thread, once another process has compiled it if need be: a thread
-        of this one would hold up samples."""
+        """Load the monitor in its thread, and have it compiled first if need be.
+
+        Another process compiles: a thread of this one would hold up samples.
+        """
         return self._submit(self._load)
 
     def wait_for_loading(self, begun: "Future[Any]", interrupted: threading.Event) -> None:

@@ -25,8 +25,10 @@ _MOST = 20_000  # messages that wait for the rudder: some minutes
 
 
 class NomotoInput:
-    """Brings heading and rudder together by their stamps: a heading waits until a rudder angle as
-    late as it has come; the rudder is linear in between."""
+    """Brings heading and rudder together by their stamps.
+
+    A heading waits until a rudder angle as late as it has come; the rudder is linear in between.
+    """
 
     def __init__(self, node: GuardedNode, config: Config, kind: str, qos: QoSProfile) -> None:
         self._node, self._config, self._kind = node, config, kind

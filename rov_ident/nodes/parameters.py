@@ -27,8 +27,10 @@ _DECLARED = {p.key: p for p in config.VEHICLE_PARAMETERS + config.PARAMETERS}
 
 
 def declare(node: Node, own: Iterable[str]) -> Config:
-    """Check what the node was started with, and declare every parameter but its ``own`` with its
-    description. The node declares its overrides by itself, so that unknown names are refused.
+    """Check what the node was started with, and declare every parameter with its description.
+
+    The node declares its overrides by itself, so that names that nobody knows are seen and
+    refused. Those called in ``own`` are the node's and are left alone.
 
     Raises UserError, one sentence naming the key and what to change.
     """
@@ -63,8 +65,10 @@ def changed(node: Node, own: Iterable[str], changes: Iterable[RosParameter] = ()
 
 
 def declare_own(node: Node, declared: Iterable[config.Parameter]) -> dict[str, Any]:
-    """Declare parameters that are a node's own; their values, checked. Raises UserError, one
-    sentence naming the parameter and what to change."""
+    """Declare parameters that are a node's own; their values, checked.
+
+    Raises UserError, one sentence naming the parameter and what to change.
+    """
     values = {}
     for parameter in declared:
         # Nodes that declare their overrides automatically have it already.

@@ -38,15 +38,20 @@ _OUTPUTS: dict[str, tuple[type, QoSProfile]] = {
 
 
 def apart(namespace: str) -> list[str]:
-    """The arguments of a node that talks to nobody outside a namespace, not even by global names;
-    unlike DDS partitions and domains, every middleware has any number of these."""
+    """The arguments of a node that talks to nobody outside a namespace, not even by global names.
+
+    A namespace rather than a DDS partition or domain: every middleware has it, and as many as
+    anybody needs.
+    """
     rules = [f"__ns:={namespace}", *(f"{topic}:={namespace}{topic}" for topic in _GLOBAL)]
     return ["--ros-args", *(word for rule in rules for word in ("-r", rule))]
 
 
 class Player(Node):  # type: ignore[misc]
     """Plays one bag into the nodes ``{estimator}_node`` of a namespace, which is theirs alone.
-    ``check``, called while waiting, raises if there is nothing left to wait for."""
+
+    ``check`` is called while waiting; it raises if there is nothing left to wait for.
+    """
 
     def __init__(
         self,
@@ -132,7 +137,9 @@ class Player(Node):  # type: ignore[misc]
 
     def play(self, messages: Iterable[tuple[str, RawMessage]], rate: float) -> int:
         """Play (role, message) at the recorded speed times ``rate``; 0: as fast as the nodes can.
-        Returns how many messages every node has taken: all of them."""
+
+        Returns how many messages every node has taken: all of them.
+        """
         began: tuple[float, int] | None = None
         for role, raw in messages:
             if rate > 0.0:

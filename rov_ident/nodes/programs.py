@@ -1,5 +1,8 @@
-"""The nodes as programs that end silently even while modules are loaded, half of a start: a launch
-file that is stopped at once should not show a traceback of each node."""
+"""The nodes as programs, which end silently even if they are interrupted while starting.
+
+Loading modules is half of a start: otherwise a launch file that is stopped at once would fill the
+screen with a traceback of each of its nodes.
+"""
 
 from functools import partial
 from importlib import import_module

@@ -30,8 +30,11 @@ _BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class WatchNode(GuardedNode):
-    """Subscribes to all that estimators publish and puts it into a store. An estimator is known by
-    its topic: ``NAME/coefficients``, a DiagnosticArray that someone publishes."""
+    """Subscribes to all that estimators publish and puts it into a store.
+
+    An estimator is known by its topic: ``NAME/coefficients``, a DiagnosticArray that someone
+    publishes.
+    """
 
     def __init__(self, store: Store, name: str, context: Context) -> None:
         super().__init__(name, context=context)
@@ -93,7 +96,9 @@ def watching(
     store: Store, name: str, arguments: Sequence[str] | None = ()
 ) -> Iterator[tuple[WatchNode, Any]]:
     """A node that fills the store, and the executor to spin it with, within the block.
-    ``arguments`` are ROS's own (None: the program's). Interrupts are left to the caller."""
+
+    ``arguments`` are ROS's own; None: those of the program. Interrupts are left to the caller.
+    """
     context = Context()
     try:
         given = None if arguments is None else list(arguments)  # rclpy takes no other sequence

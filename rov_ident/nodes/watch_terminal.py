@@ -55,8 +55,10 @@ def watch(as_json: bool, out: Console, err: Console) -> None:
 
 
 def watch_once(patience: float, as_json: bool, out: Console) -> None:
-    """Print what all estimators publish now: one table, or one line of JSON. Raises UserError if
-    none is heard within ``patience`` [s]."""
+    """Print what all estimators publish now: one table, or one line of JSON.
+
+    Raises UserError if none is heard within ``patience`` [s].
+    """
     with _hearing() as (store, spin, interrupts):
         end, known, since = time.monotonic() + patience, store.known, time.monotonic()
         while time.monotonic() < end and not interrupts:

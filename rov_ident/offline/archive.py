@@ -1,6 +1,9 @@
-"""Many bags as one fit: each is read once, and every pass maps a function over all of them. The
-sums that it gives are added in the order of the bags, so that one process, several and a Dask
-cluster have the same result."""
+"""Many bags as one fit: each is read once, and every pass maps a function over all of them.
+
+What a pass gives are sums over samples, so that the passes of single bags add up to that of the
+archive. They are added in the order of the bags, wherever they were computed: in this process, in
+several, or on a Dask cluster, and the result is the same.
+"""
 
 import contextlib
 import os
@@ -92,7 +95,9 @@ def opened(
     progress: Progress | None = None,
 ) -> Iterator[Archive]:
     """Read bags, in ``jobs`` processes or on a Dask cluster at the address ``dask`` ("local").
-    Raises UserError if no bag can be read, or the cluster cannot be reached."""
+
+    Raises UserError if no bag can be read, or the cluster cannot be reached.
+    """
 
     def told(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True)):

@@ -89,8 +89,11 @@ def fit_batch(
     settings: Settings | None = None,
     say: Say | None = None,
 ) -> Fit:
-    """Fit an archive. Raises UserError if there is no such estimator, a channel has no coefficient
-    to estimate, or the configured model cannot be simulated."""
+    """Fit an archive.
+
+    Raises UserError if there is no such estimator, a channel has no coefficient to estimate, or the
+    configured model cannot be simulated.
+    """
     if kind not in KINDS:
         raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
     settings = settings or Settings()
@@ -174,8 +177,11 @@ def fit_batch(
 def _relinearised(
     archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Say
 ) -> tuple[Archive, _Stage]:
-    """A fit with parameters of effects, and the archive as they have it: samples are linear in
-    these about some values, and the bags are read anew until the estimate stays there."""
+    """A fit with parameters of effects, and the archive as they have it.
+
+    Samples are linear in these about the values with which they were made: the bags are read anew
+    until the estimate stays where they were.
+    """
     first = len(config.estimate)
     found: _Stage | None = None
     centre, model = first_centre(config), config.model
@@ -209,8 +215,10 @@ def _stage(
     say: Say,
     before: _Stage | None = None,
 ) -> _Stage | None:
-    """Fit some channels, maximum likelihood beginning with what was found ``before``; None, and a
-    note, where there is nothing to do."""
+    """Fit some channels; None, and a note, where there is nothing to do.
+
+    Maximum likelihood begins with what was found ``before``, where there is that.
+    """
     free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
     # an added mass belongs to both axes that it couples

@@ -75,8 +75,11 @@ def with_prior(config: Config, path: Path) -> tuple[Config, dict[str, Any]]:
 def disagreements(
     prior: Mapping[str, tuple[float, float]], names: tuple[str, ...], values: Array, std: Array
 ) -> tuple[str, ...]:
-    """Notes on coefficients whose dive and table (``prior``: mean and std by name) exclude each
-    other. A value moves with the variance that the data remove."""
+    """Notes on coefficients whose dive and table exclude each other.
+
+    ``prior`` has mean and standard deviation by name. From prior to posterior a value moves with
+    the variance that the data remove.
+    """
     notes = []
     for name, value, now in zip(names, values.tolist(), std.tolist(), strict=True):
         mean, before = prior.get(name, (value, math.inf))
@@ -91,8 +94,11 @@ def disagreements(
 
 
 def _axes(document: Any) -> tuple[dict[str, _Axis], bool]:
-    """What the JSON says, and whether Coriolis forces were taken off. Raises UserError for numbers
-    that are no result; LookupError, TypeError, ValueError or AttributeError for another form."""
+    """What the JSON says, and whether Coriolis forces were taken off.
+
+    Raises UserError for numbers that are no result; LookupError, TypeError, ValueError or
+    AttributeError where it has another form.
+    """
     axes = {}
     for axis, part in document["axes"].items():
         names = tuple(part["terms"])

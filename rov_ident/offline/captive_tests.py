@@ -94,8 +94,10 @@ class AxisFit(Result):
 
 
 def parse_nondimensional(text: str) -> dict[str, float]:
-    """`rho=1000,L=7,T=0.46` as numbers. Raises UserError: another form, a missing rho or L, or a
-    value that is not positive."""
+    """`rho=1000,L=7,T=0.46` as numbers.
+
+    Raises UserError: another form, a missing rho or L, or a value that is not positive.
+    """
     values = {}
     for part in text.split(","):
         name, _, number = (piece.strip() for piece in part.partition("="))
@@ -206,8 +208,11 @@ class _Reader:
         return values if unit == "rad" else np.radians(values)
 
     def refuse_likely(self) -> None:
-        """Raises UserError if a heading that states and fins have not used looks like a speed or an
-        angle that varies and is not given otherwise: the forces would be laid to something else."""
+        """Once states and fins are read.
+
+        Raises UserError if a heading that was not used looks like a speed or an angle that varies
+        and is not given otherwise: without it the forces would be laid to something else.
+        """
         for heading in self.table.cells:
             if heading in self.used or self._is_constant(heading):
                 continue
@@ -429,8 +434,12 @@ def unit(name: str) -> str:
 
 
 def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit]:
-    """A structure and its values for every axis, with ``added_mass`` after the Coriolis forces of
-    that model's added mass are taken off. Raises UserError if an axis has too few conditions."""
+    """A structure and its values for every axis of the table.
+
+    With ``added_mass`` the Coriolis forces of that model's added mass are taken off first.
+
+    Raises UserError if an axis has too few conditions for any structure.
+    """
     munk = np.zeros_like(table.nu)  # C_A(nu) nu
     if added_mass is not None:
         momentum = table.nu @ added_mass.added_mass
@@ -604,7 +613,9 @@ def to_json(
     coriolis_taken_off: bool = False,
 ) -> str:
     """The result as JSON; ``covariance`` and ``left_out`` of an axis are in the order of its terms.
-    ``coriolis_taken_off``: whether terms are free of the added mass's Coriolis forces."""
+
+    ``coriolis_taken_off``: whether the terms are free of the Coriolis forces of the added mass.
+    """
     axes = {
         axis: {
             "terms": f.entries(),
@@ -667,8 +678,11 @@ def with_hull(config: Config, hull: Mapping[str, float]) -> Config:
 
 
 def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
-    """The configuration with the fitted coefficients in place of all that the table could
-    determine. Raises UserError if the values make no passive hull."""
+    """The configuration with the fitted coefficients in the place of all that the table could have
+    told (the axes' terms it excites).
+
+    Raises UserError if the values make no passive hull.
+    """
     values = dict(config.model.values)
     for f in fits.values():
         for name in (*f.pool, *f.aliases):

@@ -54,7 +54,10 @@ class CoastDown(Result):
 
 def read_run(path: Path, columns: Mapping[str, str]) -> tuple[Run, str]:
     """A run from a CSV file with the columns `t_s`, `n` and `u`, or as ``columns`` calls them, and
-    the file's sha256. Raises UserError if it is no such file."""
+    the file's sha256.
+
+    Raises UserError if it is no such file.
+    """
     if unknown := sorted(set(columns) - {"t_s", "n", "u"}):
         raise UserError(f"`{unknown[0]}` cannot be mapped: use one of t_s n u")
     table = read_csv(path)
@@ -75,8 +78,10 @@ def fit_coast_downs(
     added_mass: float | None = None,
     bollard: tuple[float, float] | None = None,
 ) -> CoastDown:
-    """Fit step-up and coast-down runs, by ``added_mass``: X_udot [kg], not positive; or by
-    ``bollard``: a shaft speed and the thrust [N] at rest there.
+    """Fit step-up and coast-down runs.
+
+    ``added_mass``: X_udot [kg], not positive; or ``bollard``: a shaft speed and the thrust [N] at
+    rest there. One of the two.
 
     Raises UserError if the scale is not given, or the runs lack thrust, coasting, or speed.
     """

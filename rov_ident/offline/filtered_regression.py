@@ -22,8 +22,11 @@ from rov_ident.model.equations import Array, Structure, columns, coriolis_of, ex
 
 
 class Regression(NamedTuple):
-    """What the rows are made with, in prior standard deviations (``scale`` (n,)) about the prior's
-    mean: corner [rad/s] of the filter; theta (m,), ``estimated`` (n,) indices into it."""
+    """What the rows are made with: about the prior's mean, in prior standard deviations.
+
+    corner [rad/s] of the filter; theta (m,) of all coefficients, ``estimated`` (n,) indices into
+    it, scale (n,) the prior standard deviations.
+    """
 
     corner: float
     structure: Structure

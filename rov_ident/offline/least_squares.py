@@ -44,8 +44,10 @@ _KNOWN = 3.0  # information over that of the prior at which a direction counts a
 
 
 class Moments(NamedTuple):
-    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,), in
-    prior standard deviations about the prior's mean."""
+    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,).
+
+    In prior standard deviations about the prior's mean.
+    """
 
     sums: Array
     rows: Array
@@ -61,9 +63,11 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """values and covariance of the estimated coefficients, in their units; ``information`` (n, n):
-    weighted Phi' Phi in prior standard deviations, neighbours in time counting once; ``noise`` (6,)
-    the residual's standard deviation by axis [N, N m]."""
+    """values and covariance of the estimated coefficients, in their units.
+
+    ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
+    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
+    """
 
     values: Array
     covariance: Array
@@ -183,8 +187,10 @@ def _scatter(score, fade, total, lagged):
 
 @inlined
 def add_scatter(score, fade, total, lagged):
-    """Add to total (n, n) the products of a score (n,) with itself and with those before it, whose
-    sum ``lagged`` (n,) fades by the factor ``fade`` from one to the next."""
+    """Add to total (n, n) the products of a score (n,) with itself and with those before it.
+
+    ``lagged`` (n,) is the sum of these, which fades by the factor ``fade`` from one to the next.
+    """
     n = len(lagged)
     for i in range(n):
         lagged[i] *= fade

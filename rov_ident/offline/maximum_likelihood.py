@@ -105,8 +105,10 @@ class Noise:
 
 
 def assumed(config: Config, least: float = _SMALLEST) -> Noise:
-    """The noise that a configuration states, the wrench's no less than ``least`` of the axis's
-    authority."""
+    """The noise that a configuration states.
+
+    ``least``: that of the wrench where there is none, relative to the axis's authority.
+    """
     w = config.wrench
     smallest = least * authority(config.dynamics)
     floor = np.maximum(np.array(w.floor_std), smallest) ** 2 * w.correlation_time
@@ -240,8 +242,10 @@ def noise_slope(
     process: bool,
     effects: Array = _NONE,
 ) -> tuple[Array, Array]:
-    """Fisher information (13, 13) and half the likelihood's gradient (13,) about the logarithms;
-    without ``process`` only of the measurements'."""
+    """Fisher information (13, 13) and half the likelihood's gradient (13,) about the logarithms.
+
+    Without ``process`` only the measurements' are looked at.
+    """
     samples = samples[:_NOISE_SAMPLES]
     levels = _levels(noise)
     base = innovations(samples, model, noise, free, _GATE, effects)
@@ -280,8 +284,10 @@ def noise_cost(
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n); ``bound``
-    (n, n), the Cramer-Rao bound, prior included; ``total``, the sums of the last pass."""
+    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
+
+    ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
+    """
 
     values: Array
     covariance: Array
@@ -443,8 +449,10 @@ def minimise(
 
 
 def inverse_of(information: Array) -> Array:
-    """Inverse of an information matrix, scaled to a unit diagonal meanwhile. Raises UserError if it
-    is not finite, as the model could not be simulated."""
+    """Inverse of an information matrix, scaled to a unit diagonal meanwhile.
+
+    Raises UserError if it is not finite, as the model could not be simulated.
+    """
     if not np.isfinite(information).all():
         raise UserError(
             "the simulation diverges along this motion: check the signs and sizes of the "

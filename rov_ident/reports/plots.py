@@ -1,5 +1,7 @@
-"""Pictures, each a function of arrays; the only module that knows matplotlib, whose settings are
-the caller's but while we draw."""
+"""Pictures, each a function of arrays; the only module that knows matplotlib.
+
+matplotlib's settings are those of the caller: ours hold only while we draw.
+"""
 
 import json
 import re
@@ -288,8 +290,10 @@ def cloud(x: Array, y: Array, title: str, x_label: str, y_label: str, limit: flo
 
 @styled
 def steps(t: Array, y: Array, title: str, x_label: str, y_label: str) -> Figure:
-    """One panel of what is held from each instant (k,) to the next; thinned to its extremes, and
-    drawn from zero if it is never negative."""
+    """One panel of what is held from each instant (k,) to the next; thinned to its extremes.
+
+    What is never negative is drawn from zero.
+    """
     figure, ax = panel(title, x_label, y_label)
     group = max(1, len(t) // 1500)
     if group > 1:
@@ -416,7 +420,9 @@ _TIME = "time [s]"
 
 def zoomable(figure: matplotlib.figure.Figure, name: str = "") -> str:
     """:func:`to_svg`, and where it shows curves over time the numbers that a page makes charts of.
-    Axes with the same limits in time are zoomed together."""
+
+    Axes with the same limits in time are zoomed together; other pictures stay as they are.
+    """
     drawn = to_svg(figure, name)
     axes = figure.axes
     if not axes or _TIME not in {ax.get_xlabel() for ax in axes}:
@@ -471,8 +477,11 @@ def _named(colour: str) -> str:
 
 @styled
 def to_svg(figure: matplotlib.figure.Figure, name: str = "") -> str:
-    """An svg element without XML head, to stand inside a page. Ink and COLOURS follow the page's
-    style (``color``, ``--colour-0`` ...); ``name`` keeps the ids of several pictures apart."""
+    """An svg element without XML head, to stand inside a page.
+
+    Ink and COLOURS follow the style of the page (``color``, ``--colour-0`` ...). ``name`` keeps
+    the ids of several pictures on one page apart.
+    """
     buffer = BytesIO()
     metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(buffer, format="svg", metadata=metadata, transparent=True)

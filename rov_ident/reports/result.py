@@ -25,8 +25,10 @@ NORMAL = 1.959964  # half of a 95 % interval, in standard deviations
 
 
 class Shown(ABC):
-    """A result that shows itself; ``str(result)`` is its table, in a notebook it is the last value
-    of a cell."""
+    """A result that shows itself; in a notebook as the last value of a cell.
+
+    ``str(result)`` is its table.
+    """
 
     notes: tuple[str, ...] = ()
     """What was refused or is doubtful, in words."""
@@ -114,8 +116,11 @@ class Shown(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Arrays are (n,) in the order of ``names``, covariance (n, n). ``quantile``: half of the 95 %
-    interval in standard deviations, NORMAL unless few data left few degrees of freedom."""
+    """Arrays are (n,) in the order of ``names``, covariance (n, n).
+
+    ``quantile``: half of the 95 % interval in standard deviations, more than NORMAL where few data
+    left few degrees of freedom.
+    """
 
     estimator: str
     names: tuple[str, ...]

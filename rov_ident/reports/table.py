@@ -17,8 +17,11 @@ PLUS_MINUS = "± 95 %"
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of text: ``head`` (n,), ``rows`` (k, n). The first column and those numbered in
-    ``text`` are left-aligned. Print it, or let a notebook show it."""
+    """Cells of text: ``head`` (n,), ``rows`` (k, n).
+
+    The first column and those numbered in ``text`` are left-aligned. Print it, or let a notebook
+    show it.
+    """
 
     title: str
     head: Sequence[str]

@@ -75,7 +75,9 @@ class ActingWrench:
         commands: list[tuple[float, Array]] | None,
     ) -> MeanWrench | None:
         """What acts from ``start`` to ``end`` [s] by the commands in the queue; None if none does.
-        Commands up to ``end`` go from the queue to ``commands``."""
+
+        Commands up to ``end`` are taken from the queue and appended to ``commands``.
+        """
         pieces: list[tuple[float, float, Array, Array]] = []
         now = start
         while (command := self._next(end, queue, despiker)) is not None:
@@ -155,8 +157,10 @@ def _add_piece(share, moment, wrench, doubt, mean, slope, mean_doubt):
 
 @kernel
 def _surround(effects, sample, around):
-    """Add the wrench effects to the sample, in a straight line like the motion; around (6,): theirs
-    at the last sample, then at this."""
+    """Add the wrench effects to the sample; around (6,): theirs at the last sample, then at this.
+
+    In a straight line in between, as the motion is.
+    """
     out, now = sample[0], np.zeros(6)
     to_world = rotation(out.orientation)
     add_wrenches(effects, out.t, out.position, out.nu, to_world, out.wrench, now)

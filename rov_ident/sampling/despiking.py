@@ -79,9 +79,11 @@ class Despiker:
         self._usual = {IMU: np.zeros(6), WRENCH: np.zeros(6)}  # mean square distances
 
     def judge(self, role: str, queue: deque[Waiting]) -> tuple[Array, bool, Array]:
-        """Judge the first message of a queue by the two behind it. Its values (6,) without
-        outliers, each corrected by itself; whether there was one; the variances (6,) of what may be
-        wrong."""
+        """Judge the first message of a queue by the two behind it.
+
+        Its values (6,) without outliers, each corrected by itself, as a step of another axis is not
+        to come late for it; whether there was one; and the variances (6,) of what may be wrong.
+        """
         past, values = self._past.get(role), queue[0].values
         found, variance = False, np.zeros(6)
         if past is None:

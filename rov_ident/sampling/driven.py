@@ -21,8 +21,10 @@ _KEPT = 10.0  # s; of messages while no sample asks for them
 
 
 class Driven:
-    """The inputs that a configuration names, as they come; the others are zero. ``counts`` holds,
-    by reason, what could not be used."""
+    """The inputs that a configuration names, as they come; those that it does not name are zero.
+
+    ``counts`` holds, by reason, what could not be used.
+    """
 
     def __init__(self, config: Config, counts: Counter[str]) -> None:
         self.counts = counts

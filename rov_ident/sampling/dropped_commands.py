@@ -70,8 +70,10 @@ class CommandPeriod:
 def estimated(
     begin: float, before: Array, end: float, after: Array, count: int
 ) -> list[tuple[float, Array, Array]]:
-    """Time [s], mean and variance (6,) of each of ``count`` commands between two that came, as if
-    the command had gone from ``before`` (6,) to ``after`` (6,) in one step, at any of them alike.
+    """Time [s], mean and variance (6,) of each of ``count`` commands between two that came.
+
+    As if the command had gone from ``before`` (6,) to ``after`` (6,) in one step, at any of them
+    with the same probability.
     """
     change, commands = after - before, []
     for j in range(1, count + 1):

@@ -1,5 +1,8 @@
-"""Odometry whose linear velocities are older than its stamp, corrected before it is queued: the
-message becomes one of the time at which they were true, with the pose and rates around it."""
+"""Odometry whose linear velocities are older than its stamp, put right before it is queued.
+
+The velocities keep their values: the message is one of the earlier time at which they were true,
+with the pose and the angular velocities that the messages around that time had.
+"""
 
 from collections import deque
 

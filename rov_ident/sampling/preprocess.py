@@ -42,8 +42,11 @@ class Preparation:
         self, data: Mapping[str, Array], depths: Mapping[str, Array]
     ) -> tuple[dict[str, Array], NDArray[np.bool_], list[str]]:
         """The columns (n,) of a log prepared, the rows (n,) to keep, and in words what was done.
-        ``depths``: columns named in ``depth``, NaN where empty. Raises UserError if a column is not
-        there, or nothing would be left."""
+
+        ``depths`` are the columns named in ``depth``, NaN where they are empty.
+
+        Raises UserError if the log has no such column, or nothing of it would be left.
+        """
         data, notes, t = dict(data), [], data["t_s"]
         for name in self.polarity:
             if name not in data or name == "t_s":
@@ -142,8 +145,11 @@ def dynamic_stretch(t: Array, drives: Array, margin: float) -> tuple[float, floa
 
 @dataclass(frozen=True)
 class Source:
-    """Measurements of one quantity: ``z`` (N,) at ``t`` (N,) s with noise ``std``, all off together
-    by ``bias_std``; the source with the smallest decides where zero is."""
+    """Measurements of one quantity: ``z`` (N,) at ``t`` (N,) s with noise ``std``.
+
+    ``bias_std``: how far all of them may be off together; the one with the smallest decides where
+    zero is.
+    """
 
     name: str
     t: Array

@@ -1,5 +1,7 @@
-"""Messages that wait for those of other topics, which come at their own rates and phases, and the
-instants of the samples. Only stamps decide, never the time of arrival."""
+"""Messages that wait for those of other topics, and the instants of the samples.
+
+Topics come at their own rates and phases. Only stamps decide, never the time of arrival.
+"""
 
 import math
 from collections import deque
@@ -89,8 +91,10 @@ class Queues:
             self._lateness = max(self._lateness, lateness)
 
     def next_instant(self, final: bool) -> Instant | None:
-        """The instant of the next sample; None if a message may still come for it (``final``: none
-        will)."""
+        """The instant of the next sample; None if a message may still come for it.
+
+        ``final``: none will.
+        """
         odometry_t = self.odometry[0].t if self.odometry else math.inf
         imu_t = self.imu[0].t if self.imu else math.inf
         if odometry_t == imu_t == math.inf:

@@ -1,5 +1,8 @@
-"""A bag as its raw messages in arrays, for the search for a discrepancy: whether one sensor
-contradicts another shows only before samples blend them."""
+"""A bag as its raw messages in arrays: what the search for a discrepancy works on.
+
+The estimators see samples, in which odometry and IMU are already blended. Whether one sensor
+contradicts another shows only before that.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -71,8 +74,10 @@ class Streams:
 
 
 def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
-    """Arrays from messages as they are on the wire; what cannot be used is left out. Raises
-    UserError if odometry or wrench are missing."""
+    """Arrays from messages as they are on the wire; what cannot be used is left out.
+
+    Raises UserError if odometry or wrench are missing.
+    """
     taken, counts = _taken(messages, config)
     imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
     odometry = _driven(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
@@ -128,8 +133,10 @@ def _driven(
 
 
 def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, Array]:
-    """Times (I,) and inputs (I, 4); one that a message lacks goes on as before. Raises UserError if
-    one never comes."""
+    """Times (I,) and inputs (I, 4); one that a message lacks goes on as before.
+
+    Raises UserError if one never comes.
+    """
     t, x = np.array([t for t, _ in taken]), np.zeros((len(taken), len(INPUTS)))
     for name, given in config.inputs.joints.items():
         values = [value_of(given, message) for _, message in taken]
@@ -147,8 +154,10 @@ def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, A
 def _taken(
     messages: Iterable[tuple[str, Message]], config: Config
 ) -> tuple[dict[str, list[tuple[float, Any]]], Counter[str]]:
-    """Time [s] and message in core axes of all that the estimators would take; what is refused,
-    also velocities that have not been measured again."""
+    """Time [s] and message in core axes of all that the estimators would take, and what is refused.
+
+    Velocities that have not been measured again are refused here.
+    """
     validation, origin, latest = Validation(), None, 0
     taken: dict[str, list[tuple[float, Any]]] = {ODOMETRY: [], IMU: [], WRENCH: [], DRIVE: []}
     for role, message in messages:
@@ -176,8 +185,11 @@ def _taken(
 def _despiked(
     role: str, taken: list[tuple[float, Any]], config: Config, counts: Counter[str]
 ) -> list[tuple[float, Any]]:
-    """The messages without one or two in a row that hold what no others do. Live, an outlier jumps
-    there and back; here the whole bag tells what is usual."""
+    """The messages without one or two in a row that hold what no others do.
+
+    Live, an outlier is what jumps there and back; here the whole bag tells what is usual, and a
+    controller that chatters keeps its commands.
+    """
     if len(taken) < 2:
         return taken
     x = np.array([measured_values(m) for _, m in taken])

@@ -32,8 +32,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Record:
-    """The samples (k,) of SAMPLE of one bag, in its own time. ``notes`` say in words what was
-    refused or lost; ``sha256`` is of the bag's bytes."""
+    """The samples (k,) of SAMPLE of one bag, in its own time.
+
+    ``notes`` say in words what was refused or lost; ``sha256`` is of the bag's bytes.
+    """
 
     path: Path
     samples: NDArray[np.void]

@@ -94,8 +94,10 @@ def one_sample(size: int) -> tuple[NDArray[np.void], NDArray[np.void], Array]:
 
 
 def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
-    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size), six
-    rows of the wrench, six of the measured velocity, the values that they are about."""
+    """Samples (k,) of SAMPLE, and how they change with parameters of effects: (k, 13, size).
+
+    Six rows of the wrench, six of the measured velocity, and the values that they are about.
+    """
     if samples.dtype == SAMPLE:
         return samples, NO_SIDES
     size = (samples.dtype.itemsize - SAMPLE.itemsize) // 104

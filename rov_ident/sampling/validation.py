@@ -1,5 +1,7 @@
-"""Which messages are refused, and why: fields, frames and stamps. Bad data never raises; each
-refusal is counted by name and leaves everything as it was."""
+"""Which messages are refused, and why: fields, frames and stamps; each refusal is counted by name.
+
+Bad data never raises. Whatever is refused leaves everything as it was.
+"""
 
 import math
 from collections import Counter
@@ -27,8 +29,10 @@ _WORLD_FRAMES = ("map", "odom", "world", "earth", "world_ned", "map_ned", "odom_
 
 
 class Validation:
-    """Judges messages as they are on the wire, one after another. ``counts`` holds, by name, how
-    many were refused; the sampler adds those that were taken."""
+    """Judges messages as they are on the wire, one after another.
+
+    ``counts`` holds, by name, how many were refused; the sampler adds those that were taken.
+    """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -53,8 +57,10 @@ class Validation:
         return self._frame_ids.get(role, ("",))[-1]
 
     def judge(self, role: str, message: Message) -> str:
-        """Why a message is refused, after counting it; empty if it is taken. One of
-        :data:`RESTARTS` if it is the first to be taken of another clock, or in other frames."""
+        """Why a message is refused, after counting it; empty if it is taken.
+
+        One of :data:`RESTARTS` if it is the first to be taken of another clock, or in other frames.
+        """
         reason = self._fault(role, message) or self._stamp_fault(role, message.stamp)
         if not reason:
             self._last_stamp[role] = message.stamp

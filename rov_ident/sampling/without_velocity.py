@@ -127,8 +127,10 @@ class SimulatedVelocity:
         self._lever = np.array(config.odometry.position)
 
     def fill(self, sample: NDArray[np.void], odometry: Odometry | None, age: float) -> None:
-        """Complete a sample (1,) of SAMPLE whose rates, attitude and wrench are known;
-        ``odometry``, in core axes, was measured ``age`` [s] before."""
+        """Complete a sample (1,) of SAMPLE whose rates, attitude and wrench are known.
+
+        ``odometry``, in core axes, was measured ``age`` [s] before.
+        """
         if sample["restart"][0]:
             self.v[:] = 0.0
         else:

@@ -77,8 +77,10 @@ MANOEUVRES: dict[str, Callable[[Model, Array, np.random.Generator], Array]] = {
 
 
 def manoeuvre(name: str, model: Model, t: Array, rng: np.random.Generator) -> Array:
-    """The wrench (N, 6) of a named manoeuvre. Raises UserError for a name that is not in
-    :data:`MANOEUVRES`."""
+    """The wrench (N, 6) of a named manoeuvre.
+
+    Raises UserError for a name that is not in :data:`MANOEUVRES`.
+    """
     if name not in MANOEUVRES:
         raise UserError(f"there is no manoeuvre '{name}': choose one of {', '.join(MANOEUVRES)}")
     return MANOEUVRES[name](model, t, rng)

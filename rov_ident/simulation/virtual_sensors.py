@@ -81,8 +81,10 @@ class Suite:
 
 @dataclass(frozen=True)
 class Dive:
-    """A simulated dive: the true motion at all instants, and ``messages``: (arrival [ns], role,
-    message), in ROS axes and in order of arrival."""
+    """A simulated dive: the true motion at all instants, and the messages in order of arrival.
+
+    ``messages`` holds (arrival [ns], role, message), in ROS axes.
+    """
 
     truth: Trajectory
     demand: Array  # (N, 6), held from each instant of the truth to the next
@@ -93,8 +95,10 @@ def dive(
     config: Config, name: str = "steps", duration: float = 180.0, suite: Suite | None = None,
     seed: int = 0,
 ) -> Dive:  # fmt: skip
-    """Drive the configured vehicle through a manoeuvre and measure it. Raises UserError if there is
-    no such manoeuvre, or the simulation diverges."""
+    """Drive the configured vehicle through a manoeuvre and measure it.
+
+    Raises UserError if there is no such manoeuvre, or the simulation diverges.
+    """
     suite = suite or Suite()
     rng = np.random.default_rng(seed)
     demand_t = np.arange(0.0, duration, 1.0 / suite.wrench_rate)
@@ -107,8 +111,10 @@ def measure(
     rng: np.random.Generator, inputs: Array | None = None, start: Array | None = None,
 ) -> Dive:  # fmt: skip
     """Simulate under a wrench demanded from each of ``demand_t`` (K,) to the next, and measure.
-    ``inputs`` (K, 4) change in straight lines (zero if left out); ``start`` (6,) is the first
-    velocity."""
+
+    ``inputs`` (K, 4) at these instants change in straight lines; left out, fins and propeller are
+    at zero. ``start`` (6,) is the velocity at first, at rest by default.
+    """
     inputs = np.zeros((len(demand_t), len(INPUTS))) if inputs is None else inputs
     # Every topic starts at a phase of its own, as real drivers do.
     odometry_t = _clock(suite.odometry_rate, duration, rng)

@@ -45,8 +45,11 @@ class Servo:
 
 @dataclass(frozen=True)
 class Run:
-    """t (n,), position (n, 3), angles (n, 3) roll pitch yaw, nu (n, 6), fins {letter: (n,)};
-    ``thrust`` (n,) [N] held to the next instant, or the propeller's ``revolutions`` (n,) [1/s]."""
+    """t (n,), position (n, 3), angles (n, 3) roll pitch yaw, nu (n, 6), fins {letter: (n,)}.
+
+    ``thrust`` (n,) [N] acts from each instant to the next, or the propeller turns at
+    ``revolutions`` (n,) [1/s].
+    """
 
     t: Array
     position: Array
@@ -131,8 +134,10 @@ _STEEPEST = float(np.radians(25.0))  # pitch on the way to a depth
 
 
 def to_depth(target: float, sign: float) -> Law:
-    """Stern planes to a depth [m]: the error asks for a pitch, the pitch for an angle. ``sign`` is
-    that of M_uuds: negative, a positive angle turns the nose down."""
+    """Stern planes to a depth [m]: the error asks for a pitch, the pitch for an angle.
+
+    ``sign`` is that of M_uuds: negative, a positive angle turns the nose down.
+    """
 
     def law(now: Now) -> dict[str, float]:
         wanted = np.clip(0.2 * (now.position[2] - target), -_STEEPEST, _STEEPEST)

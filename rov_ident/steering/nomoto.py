@@ -162,8 +162,10 @@ def others(
 
 
 def check(run: Zigzag) -> None:
-    """Raises UserError for a run that tells nothing: too few headings, or a rudder or heading that
-    never moves."""
+    """Whether a run can tell anything about the model.
+
+    Raises UserError: too few headings, or a rudder or heading that never moves.
+    """
     known = run.heading[run.known]
     if len(known) < _MIN_SAMPLES:
         raise UserError(
@@ -178,8 +180,10 @@ def check(run: Zigzag) -> None:
 
 
 def dense(run: Zigzag, method: str, step: float | None = None) -> Zigzag:
-    """The run with a heading at every row, or where all rows have one, at every ``step`` [s] (a
-    fifth of the heading's). The rudder keeps what is known of it, with straight lines between rows.
+    """The run with a heading at every row, or where all rows have one, at every ``step`` [s].
+
+    The default step is a fifth of the heading's. The rudder keeps what is known of it: rows
+    between headings as they are, else straight lines.
     """
     known, t, fine = run.known, run.t, run.cornered()
     if step is not None or known.all():

@@ -50,7 +50,10 @@ class KandT:
 
 class _Recursion:
     """Least squares in units of the corner: theta = a0/c, b0/c^2, b0 delta_0/c^2, two transients.
-    Of the rows, taken every half of 1/c and correlated over 4/c, eight count for one."""
+
+    A row is taken every half of 1/c. Rows are correlated over 4/c, the integral of the filter's
+    autocorrelation, so that eight count for one.
+    """
 
     def __init__(self, corner: float) -> None:
         self.c = corner

@@ -101,9 +101,13 @@ class Zigzag:
 
 
 def read(path: Path, config: Config | None = None) -> Zigzag:
-    """A run from a bag (``config``: its types and axes, where they are not the usual ones) or else
-    a CSV file. Raises UserError if it cannot be read, lacks a column or topic, or is in other units
-    than it says."""
+    """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
+
+    ``config`` says which types and axes a bag has that are not the usual ones.
+
+    Raises UserError if it cannot be read, lacks a column or topic, or is in other units than it
+    says.
+    """
     is_bag = path.is_dir() or path.suffix == ".mcap"
     return from_bag(path, config) if is_bag else from_csv(path)
 
