@@ -43,9 +43,12 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Comparison(Shown):
-    """What two results say of the same coefficients: arrays (n,) in the order of ``names``.
-    ``deviations`` takes the errors of both as independent; NaN where neither has a standard
-    deviation. ``only_a`` and ``only_b`` are names that the other lacks."""
+    """What two results say of the same coefficients: all arrays (n,) in the order of ``names``.
+
+    ``deviations`` is the difference over its standard deviation, from the standard deviations of
+    both as if their errors were independent; NaN where neither result has one. ``only_a`` and
+    ``only_b`` are names that one of them lacks.
+    """
 
     labels: tuple[str, str]
     names: tuple[str, ...]
@@ -235,7 +238,10 @@ def _of_config(config: Config, label: str) -> Estimates:
 
 
 def _of_document(document: Any, label: str) -> Estimates:
-    """The numbers in the JSON of a result. Raises UserError if there are none."""
+    """The numbers in the JSON of a result.
+
+    Raises UserError if there are none.
+    """
     if isinstance(document, Mapping) and isinstance(document.get("fit"), Mapping):
         document = document["fit"]  # of identify
     found: dict[str, tuple[str, float, float]] = {}

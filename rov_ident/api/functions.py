@@ -251,8 +251,10 @@ def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fi
 
 
 def _check(many: archive.Archive, config: Config) -> None:
-    """UserError where the data are too few (k samples show k - 1 changes of velocity on each axis),
-    or so wrong that no fit makes sense of them."""
+    """UserError where the data are too few, or so wrong that no fit makes sense of them.
+
+    k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed.
+    """
     chosen = (c.row for c in config.model.coefficients if c.name in config.estimate)
     unknowns = max(Counter(chosen).values(), default=0)
     if many.samples - 1 <= unknowns:

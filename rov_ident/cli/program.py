@@ -1,5 +1,7 @@
-"""The command ``rov-ident``. Standard output carries results, standard error everything else; exit
-status 0 done, 2 the user can mend it, 1 a fault of ours, 130 and 143 interrupted."""
+"""The command ``rov-ident``: standard output carries results, standard error everything else.
+
+Exit status: 0 done, 2 the user can mend it, 1 a fault of ours, 130 and 143 interrupted.
+"""
 
 import argparse
 import os

@@ -31,9 +31,12 @@ class Prior:
 
 
 def prior_of(config: Config, effects: bool = False) -> Prior:
-    """The prior that a configuration states, of its coefficients or of all that it estimates. A
-    standard deviation is relative to the value, but at least a share of what such a term would
-    weigh at working speed: a published zero means "not known"."""
+    """The prior that a configuration states, of its coefficients or of all that it estimates.
+
+    The standard deviation of a coefficient is relative to its value, but not less than a share of
+    what such a term would weigh at working speed: a published zero means "not known", not "exactly
+    zero".
+    """
     model = config.dynamics
     index = [model.names.index(name) for name in config.estimate]
     scale = typical(model)
@@ -72,9 +75,11 @@ _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
 def first_centre(config: Config) -> dict[str, float]:
-    """The values of effects' parameters, by name, about which samples are linear at first: those
-    configured, but for a lag that may be there half a standard deviation, as the columns of no lag
-    at all lead nowhere ("Times" in docs/live.md)."""
+    """The values of effects' parameters, by name, about which samples are linear at first.
+
+    Those configured; but a lag that may be there is taken as half a standard deviation: from none
+    at all, the columns of samples lead to none ("Times" in docs/live.md).
+    """
     prior = prior_of(config, effects=True)
     centre = {}
     for name, mean, std, lower in zip(prior.names, prior.mean, prior.std, prior.lower, strict=True):
@@ -85,8 +90,11 @@ def first_centre(config: Config) -> dict[str, float]:
 
 
 def drift_of(config: Config, names: tuple[str, ...]) -> Array:
-    """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's:
-    only of a current, which turns and differs from place to place, unless ``current_std`` is 0."""
+    """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's.
+
+    Only that of a current: it turns, and differs from place to place, unless the file says that it
+    is known (``current_std: 0``).
+    """
     drifting = {".".join(key) for key in config.nuisance_std if key[0] == "ocean_current"}
     return np.array([1.0 / _CURRENT_TIME if name in drifting else 0.0 for name in names])
 

@@ -71,8 +71,10 @@ def load(
 
 
 def from_parameters(parameters: Mapping[str, Any]) -> Config:
-    """The configuration of nested mappings, dotted names, or a mixture of both. Raises UserError:
-    one sentence naming the key and what to change."""
+    """The configuration of nested mappings, dotted names, or a mixture of both.
+
+    Raises UserError: one sentence naming the key and what to change.
+    """
     values = unflatten(parameters)
     for own in _ROS_OWN:
         values.pop(own, None)
@@ -115,7 +117,9 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
 
 def unflatten(parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Nested mappings from dotted names: ``{"rls.gate": 5.0}`` gives ``{"rls": {"gate": 5.0}}``.
-    Raises UserError if a name is given twice, or both as a value and as a section."""
+
+    Raises UserError if a name is given twice, or both as a value and as a section.
+    """
     nested: dict[str, Any] = {}
     for path, value in _leaves(parameters):
         section = nested

@@ -1,9 +1,11 @@
-"""The parameter file of nodes and commands, as frozen dataclasses. Every key is declared once, as a
-field with :func:`option`; reading, checking, writing, the ROS parameters and the documentation
-follow from that.
+"""The parameter file of nodes and commands, as frozen dataclasses.
 
-Vectors in the file are in the axes of ``vehicle.frame``, those of a :class:`Config`, coefficients
-(SNAME) and effects always forward-starboard-down.
+Every key is declared once, as a field with :func:`option`: its type, default, unit, bounds and
+meaning. Reading, checking, writing, the declaration of ROS parameters and the documentation all
+follow from the declarations, so that a new key is one new field.
+
+Vectors in the file are in the axes of ``vehicle.frame``; a :class:`Config` holds them in
+forward-starboard-down. Coefficients (SNAME) and effects are forward-starboard-down in the file too.
 """
 
 import dataclasses
@@ -491,8 +493,10 @@ class Config:
 
     @property
     def with_nuisance(self) -> "Config":
-        """The same, with what no vehicle's file knows among the parameters to estimate; an effect
-        that the file gives is left to what `estimate` says of it."""
+        """The same, with what no vehicle's file knows among the parameters to estimate.
+
+        An effect that the file gives is left to what it says of it under `estimate`.
+        """
         added = [key for key in self.nuisance_std if key[0] not in self.effects]
         effects = {name: {p.name: p.null for p in EFFECTS[name].parameters} for name, _ in added}
         return dataclasses.replace(
@@ -516,8 +520,11 @@ class Config:
         return dataclasses.replace(self, estimate_effects=())
 
     def with_values(self, values: Mapping[str, float]) -> "Config":
-        """The same with other values of coefficients and of parameters of its effects, by names
-        such as thruster_lag.time_constant. Raises UserError for a name that it has not."""
+        """The same with other values of coefficients, and of parameters of its effects by names
+        such as thruster_lag.time_constant.
+
+        Raises UserError if there is no such coefficient or parameter.
+        """
         effects = {name: dict(own) for name, own in self.effects.items()}
         for key, value in values.items():
             effect, _, name = key.partition(".")

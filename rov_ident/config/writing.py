@@ -23,8 +23,10 @@ DIAGONAL = tuple(
 
 
 def to_parameters(config: Config) -> dict[str, Any]:
-    """Nested plain values from which :func:`from_parameters` makes the same configuration; settings
-    at their defaults are left out."""
+    """Nested plain values from which :func:`from_parameters` makes the same configuration.
+
+    Settings at their defaults are left out.
+    """
     body = config.model.body
     inertia = body.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     vehicle = {
@@ -50,9 +52,12 @@ def to_parameters(config: Config) -> dict[str, Any]:
 
 
 def dump(config: Config, path: str | os.PathLike[str], comment: str = "") -> None:
-    """Write a parameter file that :func:`load` reads as the same configuration, to the last bit,
-    with ``comment`` above. It appears whole or not at all. Raises UserError if it cannot be
-    written."""
+    """Write a parameter file that :func:`load` reads as the same configuration, to the last bit.
+
+    ``comment`` goes above the parameters. The file appears whole or not at all.
+
+    Raises UserError if the file cannot be written.
+    """
     document = {"/**": {"ros__parameters": to_parameters(config)}}
     text = "".join(f"# {line}\n" for line in comment.splitlines())
     text += yaml.dump(document, Dumper=Dumper, sort_keys=False, width=1000)

@@ -1,5 +1,7 @@
-"""For controllers: the model matrices, kept up to date from `~/coefficients`. A message is anything
-with the fields of diagnostic_msgs/DiagnosticArray."""
+"""For controllers: the model matrices, kept up to date from `~/coefficients`.
+
+No middleware: a message is anything with the fields of diagnostic_msgs/DiagnosticArray.
+"""
 
 import math
 import os
@@ -21,8 +23,10 @@ _SECOND = 1_000_000_000  # ns
 
 @dataclass(frozen=True)
 class Taken:
-    """What became of one message: ``values`` are the coefficients taken up, ``refused`` says why
-    each other keeps its last good value, ``reason`` why the whole message was refused, if it was.
+    """What became of one message.
+
+    ``values`` are the coefficients taken up, ``refused`` says of each other one why it keeps its
+    last good value. Where ``reason`` is not empty, the message was refused as a whole.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -63,9 +67,11 @@ class HydrodynamicModel:
         self._renewed = -math.inf  # s, on the caller's clock
 
     def take(self, message: Any, now: float) -> Taken:
-        """Take up what is good in a message; never raises for what is in it. An earlier stamp than
-        the last is refused while the stream is fresh; after that its source has restarted (a bag
-        that loops)."""
+        """Take up what is good in a message; never raises for what is in it.
+
+        A stamp before the last one is refused while the stream is fresh. Once it is not, its
+        source has begun anew (a bag that loops, a simulation reset) and any stamp is accepted.
+        """
         stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
         if self._stamp is not None and stamp < self._stamp and self.fresh(now):
             late = (self._stamp - stamp) / _SECOND
@@ -102,7 +108,10 @@ class HydrodynamicModel:
 
     def fresh(self, now: float) -> bool:
         """Whether the estimator is at work: heard within ``hold_after``, and not itself stale.
-        Otherwise the last good set goes on being used."""
+
+        Otherwise the last good set goes on being used. Whoever may not rely on old coefficients
+        asks here.
+        """
         return 0.0 <= now - self._renewed <= self.hold_after
 
     def _read(self, status: Any) -> tuple[Level, float]:

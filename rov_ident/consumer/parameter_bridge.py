@@ -1,5 +1,7 @@
-"""Where the coefficients are among the parameters of a controller (a mapping of names to numbers or
-tuples of numbers), and when to change them."""
+"""Where the coefficients are among the parameters of a controller, and when to change them.
+
+No ROS here: a controller's parameters are a mapping of names to numbers or tuples of numbers.
+"""
 
 import math
 import re
@@ -103,8 +105,11 @@ def _target(name: str, place: str) -> Target:
 
 
 def read(targets: Iterable[Target], parameters: Values) -> dict[str, float]:
-    """The coefficients that a controller has. Raises UserError if a parameter is a list where a
-    number is expected, or the other way round, or too short, or not finite."""
+    """The coefficients that a controller has.
+
+    Raises UserError if a parameter is a list where a number is expected, or the other way round, or
+    too short, or not finite.
+    """
     held = {}
     for target in targets:
         value, place = parameters[target.parameter], f"{target.parameter} of the controller"
@@ -152,9 +157,11 @@ def changes(
     band_std: float,
     band_percent: float,
 ) -> Sequence[Change]:
-    """All that differs (a set is physical as a whole), if any of it by more than the dead band, the
-    larger of ``band_std`` standard deviations and ``band_percent`` of what the controller has;
-    otherwise nothing."""
+    """All that differs, if any of it by more than the dead band; otherwise nothing.
+
+    The dead band is the larger of ``band_std`` standard deviations and ``band_percent`` of what
+    the controller has. All or nothing, for a set is physical as a whole.
+    """
     differing = [Change(n, held[n], x, std[n]) for n, x in wanted.items() if x != held[n]]
     beyond = any(
         abs(c.wanted - c.held) > max(band_std * c.std, 0.01 * band_percent * abs(c.held))

@@ -1,5 +1,8 @@
-"""Child processes that never look for code in the current folder, as Python does for `-m` and `-c`,
-and numba for its settings: a folder of somebody's records may hold a `yaml.py`."""
+"""Child processes, whose code is where this process has its own: never in the current folder.
+
+Python looks there first when it is told what to run by `-m` or `-c`, and so does numba for its
+settings; but a folder of somebody's records may hold a `yaml.py`.
+"""
 
 import os
 import subprocess
@@ -22,8 +25,10 @@ _CACHES = "_CACHE_DIR"  # how the names of compilers' own folders end
 def start(
     *arguments: str, environment: Mapping[str, str] | None = None, **options: Any
 ) -> "subprocess.Popen[Any]":
-    """Python with these arguments, in a neutral folder, where no interrupt from the terminal
-    reaches it; ``options`` are those of Popen."""
+    """Python with these arguments, in a neutral folder; ``options`` are those of Popen.
+
+    An interrupt from the terminal does not reach it.
+    """
     variables = os.environ | _SAFE | dict(environment or {})
     for name, value in variables.items():
         if name in _PATHS or name.endswith(_CACHES):  # relative: those of another folder

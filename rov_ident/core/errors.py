@@ -4,8 +4,10 @@ _LONGEST = 2000  # characters
 
 
 class UserError(Exception):
-    """Wrong use or unusable input: one sentence naming the thing and the change. The command line
-    makes it exit status 2; bad data *in a stream* never raises it."""
+    """Wrong use or unusable input: the message is one sentence naming the thing and the change.
+
+    The command line turns it into exit status 2; bad data *in a stream* never raises it.
+    """
 
     def __str__(self) -> str:
         sentence = super().__str__()  # which may quote a file: its middle goes beyond a screen

@@ -29,8 +29,10 @@ VEHICLES = ("bluerov2", "bluerov2_heavy", "remus100")
 
 
 def shipped(name: str) -> Path:
-    """A file that comes with the project: beside the package, or where it was installed. Raises
-    UserError if it is in neither place."""
+    """A file that comes with the project: beside the package, or where it was installed.
+
+    Raises UserError if it is in neither place.
+    """
     for folder in _FOLDERS:
         if (folder / name).exists():
             return folder / name
@@ -54,8 +56,10 @@ def check_output(path: Place, inputs: Iterable[Place | None] = (), bag: bool = F
 
 
 def open_input(path: Place) -> IO[bytes]:
-    """A regular file for reading; a pipe, for whose writer one would wait, and a device are none.
-    Raises OSError, whose ``strerror`` says in words why it cannot be read."""
+    """A regular file for reading. A pipe, for whose writer one would wait, and a device are none.
+
+    Raises OSError, whose ``strerror`` says in words why it cannot be read.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except ValueError as error:
@@ -79,7 +83,9 @@ def read_input(path: Place, largest: int) -> bytes:
 
 def write_file(path: Place, content: str | bytes) -> None:
     """Write a file whole or not at all, text in UTF-8; its folder is made where there is none.
-    Raises UserError if it cannot be written there."""
+
+    Raises UserError if it cannot be written there.
+    """
     check_output(path)
     try:
         replace_file(path, content.encode() if isinstance(content, str) else content)
@@ -88,8 +94,10 @@ def write_file(path: Place, content: str | bytes) -> None:
 
 
 def replace_file(path: Place, content: bytes) -> None:
-    """Put a file in its place, in one piece, so that it outlives a loss of power. Raises OSError;
-    what was there before then still is."""
+    """Put a file in its place, in one piece, so that it outlives a loss of power.
+
+    Raises OSError; what was there before then still is.
+    """
     place = Path(os.path.realpath(path))  # a link stays one
     place.parent.mkdir(parents=True, exist_ok=True)
     part = part_of(place)
@@ -111,8 +119,10 @@ def replace_file(path: Place, content: bytes) -> None:
 
 
 def lock(path: Place) -> IO[bytes]:
-    """A file beside ``path`` that is locked until it is closed, or its process ends. Raises
-    BlockingIOError if another process or thread has it, OSError if there can be none."""
+    """A file beside ``path`` that is locked until it is closed, or its process ends.
+
+    Raises BlockingIOError if another process or thread has it, OSError if there can be none.
+    """
     place = Path(os.path.realpath(path))
     place.parent.mkdir(parents=True, exist_ok=True)
     stream = place.with_name(f".{_digest(place)}.lock").open("ab")
@@ -125,8 +135,10 @@ def lock(path: Place) -> IO[bytes]:
 
 
 def part_of(path: Path) -> Path:
-    """A hidden name in the same folder, which nobody else uses, for a file in the making; what a
-    process that was killed has left of this file goes."""
+    """A hidden name in the same folder, which nobody else uses, for a file in the making.
+
+    What a process that was killed has left of this file goes.
+    """
     name = _digest(path)
     for old in path.parent.glob(f".{name}.*.part"):
         with contextlib.suppress(OSError, ValueError):

@@ -36,7 +36,9 @@ AnyMessage = TypeVar("AnyMessage", bound=Odometry | Imu | Wrench | Joints)
 @dataclass(frozen=True)
 class FrameDefaults:
     """The axes of a message whose frame ids do not tell (parameters `frames.body`, `.world`).
-    Raises UserError for a name other than `flu`, `frd` (body), `enu`, `ned` (world)."""
+
+    Raises UserError: a name that is not one of `flu`, `frd` (body) or `enu`, `ned` (world).
+    """
 
     body: str = "flu"
     world: str = "enu"
@@ -100,9 +102,12 @@ def quaternion_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> 
 
 
 def quaternion_to_euler(q: ArrayLike) -> Array:
-    """Roll, pitch, yaw (rad), (..., 3), of quaternions (..., 4) of any length but zero. Half the
-    sum and difference of roll and yaw are polar angles of quaternion components, so that precision
-    holds up to pitch +-90 degrees, where the one that does not exist is taken as zero."""
+    """Roll, pitch, yaw (rad), (..., 3), of quaternions (..., 4) of any length but zero.
+
+    Half the sum and half the difference of roll and yaw are polar angles of quaternion
+    components, so that precision holds up to pitch +-90 degrees, where only one of them exists
+    and the other is taken as zero.
+    """
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
     half_sum = np.arctan2(x + z, w - y)
     half_difference = np.arctan2(x - z, w + y)
@@ -158,8 +163,11 @@ def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyM
 
 
 def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> AnyMessage:
-    """The inverse of `to_core(message, FrameDefaults(body, world))`: FRD/NED onto the wire. Here,
-    too, the frame ids decide, so that no message has axes that its frame ids deny."""
+    """The inverse of `to_core(message, FrameDefaults(body, world))`: FRD/NED onto the wire.
+
+    The frame ids of the message decide in the same way, so that a message is never written with
+    axes that its frame ids deny.
+    """
     return _turned(message, FrameDefaults(body, world), _TURNS_BACK)
 
 

@@ -25,9 +25,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 def end_at_once(status: int | None = None) -> None:
-    """Have an interrupt end the process with this status (None: its own, saying so): for a program
-    that has nothing to tidy up, as files are written whole or not at all and compilers end with
-    their parent."""
+    """Have an interrupt end the process with this status; None: its own, saying so.
+
+    For a program that has nothing to tidy up yet, or no longer: files are written whole or not at
+    all, and compilers end with their parent.
+    """
 
     def end(number: int, _: FrameType | None) -> None:
         if status is not None:

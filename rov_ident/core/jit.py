@@ -124,8 +124,11 @@ def only_run() -> None:
 
 
 def interpret() -> None:
-    """Run kernels, everywhere in this process, as the Python functions they are: a thousandth of
-    the speed, but at once. numpy's numbers divide by zero without raising, as in compiled code."""
+    """Run kernels as the Python functions they are: a thousandth of the speed, but at once.
+
+    Until :func:`stop_interpreting`, and everywhere in this process. numpy's numbers raise nothing
+    when divided by zero, as in compiled code; Python's own would.
+    """
     CPUDispatcher.__call__ = lambda self, *arguments: self.py_func(*arguments)
     np.seterr(all="ignore")
 
@@ -165,8 +168,10 @@ class Compiler:
         return self._mark.exists()
 
     def start(self) -> None:
-        """Compile in another process, without waiting; not after :meth:`stop`. It ends with this
-        one, however this one ends: the pipe between them is closed then."""
+        """Compile in another process, without waiting; not after :meth:`stop`.
+
+        The process ends with this one, however this one ends: the pipe between them is closed then.
+        """
         command = ["-c", _AS_CHILD, self._exercise.__module__, self._exercise.__name__]
         cache = {"NUMBA_CACHE_DIR": str(CACHE)}  # it may be a temporary folder of this process
         with self._lock:

@@ -42,8 +42,10 @@ def scaled_solve(
 
 
 def scaled_inverse(matrix: Array, rcond: float = 1e-15) -> Array:
-    """Pseudo-inverse (n, n) of a symmetric, positive semi-definite matrix, without directions whose
-    eigenvalues are, after scaling, below ``rcond`` of the largest (1e-15: zero but for rounding).
+    """Pseudo-inverse (n, n) of a symmetric, positive semi-definite matrix.
+
+    Directions with eigenvalues below ``rcond`` of the largest, after scaling, are left out (1e-15:
+    those that are zero but for rounding).
     """
     scale = 1.0 / _size(matrix)
     scale = np.outer(scale, scale)

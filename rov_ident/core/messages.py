@@ -1,5 +1,9 @@
-"""The input messages, and what else they are made from, free of middleware: as on the wire (ROS
-axes) and, of the same types, after ``frames.to_core`` (FRD, NED)."""
+"""The input messages, and what else they are made from, free of middleware.
+
+The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
+forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
+the estimators through one path.
+"""
 
 from typing import NamedTuple
 

@@ -1,5 +1,8 @@
-"""What installed packages bring to this one, through entry points of :data:`GROUP`. A package in
-the current folder, which may be one of somebody's records, is not looked at."""
+"""What installed packages bring to this one, through entry points of :data:`GROUP`.
+
+Only what is installed counts: a package that lies in the current folder is not looked at, wherever
+Python itself would look, as that may be a folder of somebody's records.
+"""
 
 import os
 import re

@@ -1,5 +1,7 @@
-"""The states of a coefficient, and what makes it one of them: nodes, fits, checks, tables and pages
-all take their words from here (docs/glossary.md)."""
+"""The states of a coefficient, with one word for each, and what makes it one of them.
+
+Nodes, fits, checks, tables and pages all take their words from here (docs/glossary.md).
+"""
 
 import enum
 

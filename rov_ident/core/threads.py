@@ -16,8 +16,10 @@ _VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def limit_process() -> None:
-    """Give this process and its children one thread for BLAS: for programs, never at an import;
-    best before numpy is loaded, whose BLAS then starts no other thread."""
+    """Give this process and its children one thread for BLAS: for programs, never at an import.
+
+    Best called before numpy is loaded: its BLAS then starts no other thread at all.
+    """
     for name in _VARIABLES:
         os.environ.setdefault(name, "1")
     if "numpy" in sys.modules:
@@ -26,8 +28,11 @@ def limit_process() -> None:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread within this context (or decorated function). The limit holds for the
-    process: of calls in several threads the first sets it and the last restores it."""
+    """Limit BLAS to one thread within this context (or decorated function), then restore it.
+
+    The limit holds for the process, so that calls in several threads share one: the first sets it
+    and the last restores it.
+    """
     global _inside, _limits
     with _lock:
         if _inside == 0:

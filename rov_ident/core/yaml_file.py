@@ -1,5 +1,8 @@
-"""YAML as ROS reads and writes it, and the only module that reads any: plain data of a sensible
-size, mappings, lists, text, numbers, true, false and null."""
+"""YAML as ROS reads and writes it: the only module that reads any.
+
+What is read is plain data of a sensible size: mappings, lists, text, numbers, true, false and null.
+The parameter files of ROS 2 know no more.
+"""
 
 import re
 from collections.abc import Hashable
@@ -84,8 +87,10 @@ Dumper.add_representer(
 
 
 def parse(text: str) -> Any:
-    """The plain data that a YAML text holds. Raises UserError: half a sentence, to be put behind
-    the name of the file."""
+    """The plain data that a YAML text holds.
+
+    Raises UserError: half a sentence, to be put behind the name of the file.
+    """
     try:
         return yaml.load(text, _Loader)  # nosec B506
     except yaml.YAMLError as error:

@@ -59,7 +59,9 @@ def application(store: Store, port: int) -> web.Application:
 
 def _guard(port: int) -> Any:
     """Middleware that answers only requests to this computer by its name, of our own origin.
-    Browsers give the origin of every web socket; programs need not."""
+
+    Browsers give the origin of every web socket; programs need not.
+    """
     hosts = {f"{name}:{port}" for name in NAMES}
     origins = {f"http://{host}" for host in hosts}
 

@@ -1,5 +1,7 @@
-"""What every estimator has published, and which part of it a page has not seen yet. A store is
-filled by one thread and read by others."""
+"""What every estimator has published, and which part of it a page has not seen yet.
+
+A store is filled by one thread and read by others.
+"""
 
 import math
 import threading
@@ -27,8 +29,10 @@ Mark = tuple[int, int]
 
 
 class Series:
-    """Rows in the order of time, at most ``size``: older ones thin out, or go if ``sliding``. Where
-    rows that a reader has are no longer those of the series, its epoch is another."""
+    """Rows in the order of time, at most ``size``: older ones thin out, or go if ``sliding``.
+
+    Where rows that a reader has are no longer those of the series, its epoch is another.
+    """
 
     def __init__(self, size: int, sliding: bool = False) -> None:
         self._size, self._sliding = size, sliding
@@ -196,8 +200,10 @@ class Store:
             }
 
     def changes(self, marks: Mapping[str, Sequence[Mark]] | None = None) -> tuple[Any, Any]:
-        """The present state as data for JSON, without numbers that are not finite, with what is new
-        since ``marks``; and the marks for the next call."""
+        """The present state, with what is new since ``marks``; and the marks for the next call.
+
+        The state is plain data for JSON: no number that is not finite.
+        """
         marks = marks or {}
         with self._lock:
             now = self._now()

@@ -1,6 +1,10 @@
-"""Closed-loop manoeuvres: a position and heading controller whose set points jump back and forth
-takes the thrusters from limit to limit (Zhao et al. 2018), as open-loop square waves do, but stays
-where it is safe."""
+"""Closed-loop manoeuvres: a controller follows alternating set points.
+
+The thrusters then go from limit to limit (Zhao et al. 2018); the vehicle stays where it is safe.
+
+Open-loop square waves identify best, but nobody knows where they end. A position and heading
+controller whose set points jump back and forth gives nearly the same wrench, bounded in space.
+"""
 
 from dataclasses import dataclass
 from typing import Any

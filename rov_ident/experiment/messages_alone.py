@@ -1,5 +1,7 @@
-"""What the messages of a bag alone say: rates, pauses, axes, signs, delays. Axes and signs can be
-so wrong that no fit makes sense of them."""
+"""What the messages of a bag alone say: rates, pauses, axes, signs, delays.
+
+Axes, and signs of the wrench against the motion, can be so wrong that no fit makes sense of them.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -156,9 +158,11 @@ def _correlated(
 
 
 def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
-    """What wrench and motion, samples (k,) of SAMPLE, filtered alike, say of each other. A wrench
-    against the motion on most of the axes that are driven is hopeless: its sign is wrong, as no
-    controller that holds a place in waves would have it."""
+    """What wrench and motion, samples (k,) of SAMPLE, filtered alike, say of each other.
+
+    A controller that holds a place in waves pushes against the motion, too, but hardly on most of
+    the axes that are driven: that is a wrong sign, and hopeless.
+    """
     if samples["inputs"].any():
         return []  # fins and propellers drive it, too: the wrench alone does not say where it goes
     task = regression(config, _CORNER)

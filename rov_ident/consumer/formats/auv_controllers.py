@@ -1,6 +1,8 @@
-"""The `hydrodynamics` parameters of auv_controllers (ROS 2): a diagonal model with SNAME signs,
-forward-starboard-down, its inertia about the body origin without the coupling of a centre of
-gravity off the origin."""
+"""The `hydrodynamics` parameters of auv_controllers (ROS 2), body axes forward-starboard-down.
+
+Its model (package `hydrodynamics`) is diagonal, with SNAME signs, and its inertia is about the body
+origin without the coupling of a centre of gravity off the origin.
+"""
 
 import numpy as np
 import yaml
@@ -64,8 +66,10 @@ def write(config: Config) -> Written:
 
 
 def read(text: str) -> Read:
-    """The first ``hydrodynamics`` section of a parameter file. Raises UserError if there is none,
-    or one of its keys is missing or of the wrong length."""
+    """The first ``hydrodynamics`` section of a parameter file.
+
+    Raises UserError if there is none, or one of its keys is missing or of the wrong length.
+    """
     section = _find(parse(text))
     if section is None:
         raise UserError("has no section `hydrodynamics`: give a parameter file of auv_controllers")

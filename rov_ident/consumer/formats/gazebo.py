@@ -128,8 +128,11 @@ def _text(parent: ET.Element, tag: str, *numbers: float) -> None:
 
 
 def read(text: str) -> Read:
-    """The model that has the hydrodynamics plugin, in a model or world file. Raises UserError if it
-    is not SDFormat, has no such plugin, or its link lacks mass or inertia."""
+    """The model that has the hydrodynamics plugin, in a model or world file.
+
+    Raises UserError if the file is not SDFormat, has no such plugin, or its link lacks mass or
+    inertia.
+    """
     root = xml_root(text, "SDFormat file")
     for model in root.iter("model"):
         for plugin in model.findall("plugin"):

@@ -47,8 +47,10 @@ class _Joint(NamedTuple):
 
 
 def read(text: str, base: Config | None = None) -> Read:
-    """Parameters of the robot; what it does not hold is that of ``base``. Raises UserError if it is
-    no URDF, has no mass, or nothing says the coefficients."""
+    """Parameters of the robot; what it does not hold is that of ``base``.
+
+    Raises UserError if it is no URDF, has no mass, or nothing says the coefficients.
+    """
     if "${" in text or "<xacro:" in text:
         raise UserError("is a xacro file: expand it first, with `xacro FILE > robot.urdf`")
     robot = xml_root(text, "URDF")
