@@ -1,4 +1,4 @@
-"""What every room may use: errors, messages, axes, quaternions, files, compiled kernels, results.
+"""What every room may use: errors, messages, axes, quaternions, files, compiled kernels.
 
 Knows nothing of vehicles, configurations or ROS. No room is imported from here.
 """
