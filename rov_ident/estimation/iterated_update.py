@@ -16,10 +16,12 @@ from rov_ident.core.jit import interpreting
 from rov_ident.core.messages import Array
 from rov_ident.estimation import rls
 from rov_ident.estimation.shared import Problem
+from rov_ident.sampling.sample import joined
 
 # s after the beginning of a window, which ends with the last; doubled, so that at most twice as
 # many samples are folded again as come in. "Looking back" has the study.
 _TIMES = (7.5, 15.0, 30.0)
+_PASSES = 4  # two are enough where it ends at all
 _MOVED = 1.0  # standard deviations, by which an estimate may be off in any case
 
 
@@ -56,14 +58,25 @@ class IteratedUpdate:
     def look_back(self, task: Problem, state: rls.State) -> rls.State:
         """The state with the window's samples folded about its estimate, if that has moved.
 
-        Not while kernels are interpreted, when it would take minutes.
+        Repeated until rows and the estimate that follows from them agree; where they never do, too
+        little is known yet, and the state stays. So it does while kernels are interpreted, when all
+        this would take minutes.
         """
-        solution, std = rls.solution_of(task, state)
-        moved = np.abs(solution - self._about) > _MOVED * std
-        if interpreting() or not self._samples or not moved.any():
+        about, std = rls.solution_of(task, state)
+        if interpreting() or not self._samples or not _moved(about, self._about, std):
             return state
-        again = rls.fold_about(task, self._before, np.concatenate(self._samples), solution)
-        if again is None:
-            return state
-        self._about = solution
-        return again
+        samples = joined(self._samples)
+        for _ in range(_PASSES):
+            again = rls.fold_about(task, self._before, samples, about)
+            if again is None:
+                break
+            solution, std = rls.solution_of(task, again)
+            if not _moved(solution, about, std):
+                self._about = about
+                return again
+            about = solution
+        return state
+
+
+def _moved(a: Array, b: Array, std: Array) -> bool:
+    return bool((np.abs(a - b) > _MOVED * std).any())

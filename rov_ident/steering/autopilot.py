@@ -76,6 +76,7 @@ def steer(
     speed: float,
     servo: Servo = Servo(),
     step: float = 0.02,
+    depth: float = 0.0,
     speeds: Callable[[float], float] | None = None,
 ) -> Run:
     """Run a law for ``duration`` [s] from straight level motion at ``speed`` [m/s].
@@ -92,7 +93,7 @@ def steer(
             "(stern planes) to coefficients"
         )
     n = round(duration / step) + 1
-    position, orientation = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    position, orientation = np.array([0.0, 0.0, depth]), np.array([1.0, 0.0, 0.0, 0.0])
     nu, surge = np.eye(6)[0] * speed, np.eye(6)[0]
     angles = np.zeros(3)
     fins = dict.fromkeys("sra", 0.0)
