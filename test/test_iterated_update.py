@@ -112,3 +112,16 @@ def test_a_window_is_folded_about_one_estimate_and_given_up(dived):
             rest = rest[count:]
     assert 0 < again < 2 * len(samples)
     assert most <= 1.1 * 30.0 / np.median(samples["dt"])
+
+
+def test_while_disabled_nothing_is_looked_back_on(dived):
+    estimator, samples, _ = dived
+    one = OnlineEstimator(estimator.config, "rls")
+    one._fold(samples[:700])  # 7 s: the first look is due after 7.5
+    one.enabled = False
+    before = one.state
+    one.flush()
+    assert one.state is before
+    one.enabled = True
+    one.flush()
+    assert one.state is not before

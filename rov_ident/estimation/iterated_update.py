@@ -18,8 +18,8 @@ from rov_ident.estimation import rls
 from rov_ident.estimation.shared import Problem
 from rov_ident.sampling.sample import joined
 
-# s after the beginning of a window, which ends with the last; doubled, so that at most twice as
-# many samples are folded again as come in. "Looking back" has the study.
+# s after the beginning of a window, which ends with the last; doubled, so that a pass folds at most
+# twice as many samples again as come in. "Looking back" has the study.
 _TIMES = (7.5, 15.0, 30.0)
 _PASSES = 4  # two are enough where it ends at all
 _MOVED = 1.0  # standard deviations, by which an estimate may be off in any case

@@ -217,7 +217,7 @@ class OnlineEstimator:
     def flush(self) -> NDArray[np.void]:
         """The input has ended or stopped: use what still waits for a late topic."""
         info = self.take(self.sampler.flush())
-        if self._update:
+        if self._update and self._enabled:
             self._state = self._update.look_back(self._task, self._state)
         return info
 
