@@ -13,60 +13,12 @@ is not correlated with what contradicts it (the conditional score of Stefanski, 
 
 import numpy as np
 
-from rov_ident.model.equations import Array
+from rov_ident.core.messages import Array
 
 DRAWS = 12  # of the noise: their scatter is then known to a fifth
 SMALL = 0.1  # times the noise by which the thrust is differentiated, as it may have kinks
-_BLOCK = 50  # commands in which noise is measured, to a fifth
 _HALF = 12  # readings to either side of which the mean is taken: half a block in all
 _LARGEST = 3.0  # standard deviations of noise, of which 0.3 % is larger
-_OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
-RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
-_AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
-_AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
-
-
-def resting_noise(demand: Array) -> Array:
-    """Standard deviation (6,) of readings (K, 6) of the wrench where commands rest: that of the
-    quietest blocks, 13 % below what :func:`resting` finds (docs/explain-bench.md is of this one).
-    """
-    if len(demand) < _BLOCK + 2:
-        return np.zeros(6)
-    std: Array = np.quantile(_medians(demand, _BLOCK), RESTING, axis=0)
-    return _OF_MEDIAN * std
-
-
-def _medians(demand: Array, size: int) -> Array:
-    """Median (B, 6) of the second differences of readings (K, 6) in each block: a command that
-    moves evenly adds nothing to these, steps that are few add little to their median."""
-    second = np.diff(demand, 2, axis=0) / np.sqrt(6.0)
-    blocks = len(second) // size
-    cut = second[: blocks * size].reshape(blocks, size, 6)
-    out: Array = np.median(np.abs(cut), axis=1)
-    return out
-
-
-def scatter(demand: Array, relative: float = 0.0) -> Array:
-    """Standard deviation (B, 6) of the noise of readings (K, 6) in each block. NaN where a noise
-    ``relative`` to the wrench, which is known of, makes as much by chance."""
-    size = min(_BLOCK, max(len(demand) - 2, 1))
-    std = _OF_MEDIAN * _medians(demand, size)
-    level = demand[: len(std) * size].reshape(len(std), size, 6)
-    known = relative * np.sqrt(np.mean(level**2, axis=1))
-    std[(std > 0.0) & (std <= _AS_LOUD * known)] = np.nan
-    return std
-
-
-def resting(std: Array) -> Array:
-    """The standard deviation (6,) in those of the blocks (B, 6) in which commands rest: the mean
-    of all that are as quiet as chance makes them beside the quietest ones; zero where too few tell.
-    """
-    out = np.zeros(6)
-    for i, column in enumerate(std.T):
-        own = column[np.isfinite(column)]
-        if len(own) and len(own) >= RESTING * len(column):
-            out[i] = own[own <= _AS_QUIET * np.quantile(own, RESTING)].mean()
-    return out
 
 
 def jitter(demand: Array, std: Array) -> Array:

@@ -21,13 +21,13 @@ from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key
 from rov_ident.discrepancy.output_error import Fitted, fit
-from rov_ident.discrepancy.reading_noise import RESTING
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
+from rov_ident.sampling.reading_noise import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 _YAW = (MOUNTING, "yaw")

@@ -29,12 +29,13 @@ from rov_ident.discrepancy.multiple_shooting import (
     thrust,
     wrenches,
 )
-from rov_ident.discrepancy.reading_noise import SMALL, draws, resting_noise
+from rov_ident.discrepancy.reading_noise import SMALL, draws
 from rov_ident.effects import EFFECTS, compiled, steered
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS, parse
 from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
+from rov_ident.sampling.reading_noise import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
 MAX_STEP = 0.05  # s; of integration, where odometry is slower

@@ -24,8 +24,9 @@ from rov_ident.core.linalg import scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.linearisation import Linearisation, MoreNoise, linearise
-from rov_ident.discrepancy.reading_noise import jitter, resting, scatter
+from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.sampling.reading_noise import resting, scatter
 
 _BLOCKS = 180  # of readings, in which their noise is measured: three minutes at 50 Hz
 _KEPT = 35.0 / 36.0  # of what is known about trembling, from one window to the next: three minutes

@@ -18,8 +18,8 @@ from rov_ident.config import Config
 from rov_ident.core.messages import Array
 from rov_ident.core.runge_kutta import NODES, WEIGHTS
 from rov_ident.estimation import ukf
-from rov_ident.estimation.shared import RELEARNING_TIME, Problem, steps_of
-from rov_ident.model.equations import force_of_one, in_motion
+from rov_ident.estimation.shared import RELEARNING_TIME, Problem, learnt, steps_of
+from rov_ident.model.equations import force_of_one
 
 
 class ReferenceUkf:
@@ -48,7 +48,7 @@ class ReferenceUkf:
         for part in (slice(0, 3), slice(3, 6)):
             if not np.isfinite(z[part] + r[part]).all() or info["nis"][part].max() > gate:
                 z[part] = np.nan
-        self._update(z, r)
+        self._update(z, r, before.monitor["density"])
         if not after.p[:6, 6:].any():  # after outliers in a row
             self._restart()
         self._walk(after)
@@ -88,11 +88,16 @@ class ReferenceUkf:
             nu = nu + h * total
         return np.concatenate([nu, x[6:]])
 
+    def _inverse_mass(self) -> Array:
+        """(6, 6), at the estimate."""
+        mass = self.model.with_theta(self._theta(self.filter.x[6:])).mass_matrix
+        inverse: Array = np.linalg.inv(mass + raised(mass, self.task.lightest))
+        return inverse
+
     def _noise(self, density: Array) -> Array:
         """Q (6 + n, 6 + n) of the unknown forces, and ``density`` (6,) of unknown acceleration."""
         wrench, row = self.config.wrench, self._row
-        mass = self.model.with_theta(self._theta(self.filter.x[6:])).mass_matrix
-        inverse = np.linalg.inv(mass + raised(mass, self.task.lightest))
+        inverse = self._inverse_mass()
         strength = (wrench.relative_std * row["wrench"]) ** 2 + np.square(wrench.floor_std)
         lasting = max(wrench.correlation_time, row["hold"])
         strength = lasting * (strength + row["wrench_doubt"])
@@ -103,8 +108,12 @@ class ReferenceUkf:
         q[:6, :6] = (forces + np.diag(density)) * row["dt"]
         return q
 
-    def _update(self, z: Array, r: Array) -> None:
-        """Take in what is measured (not NaN) of z (6,), with variances r (6,)."""
+    def _update(self, z: Array, r: Array, density: Array) -> None:
+        """Take in what is measured (not NaN) of z (6,), with variances r (6,).
+
+        ``density`` (6,) is that of unknown acceleration.
+        """
+        row = self._row
         measured = np.flatnonzero(np.isfinite(z))
         if not len(measured):
             return
@@ -112,8 +121,8 @@ class ReferenceUkf:
         self.filter._dim_z = len(measured)
         self.filter.update(z[measured], R=np.diag(r[measured]), hx=lambda x: x[measured])
         # What does not show in the motion is only considered (Schmidt 1966).
-        moves = np.ones(len(self.task.theta), dtype=bool)
-        in_motion(self.task.structure, self._row["moving"], moves)
+        moves, shown = np.ones(len(self.task.theta), dtype=bool), np.zeros((2, 6), dtype=np.uint8)
+        learnt(self.task, row["moving"], row, density, self._inverse_mass(), shown, moves)
         held = 6 + np.flatnonzero(~moves[self.task.estimated])
         self.filter.x[held] = x[held]
         self.filter.P[np.ix_(held, held)] = p[np.ix_(held, held)]

@@ -79,6 +79,7 @@ from rov_ident.estimation.shared import (
     add_score,
     begin,
     drive_sides,
+    learnt,
     measure,
     problem_of,
     steps_of,
@@ -98,7 +99,7 @@ from rov_ident.estimation.square_root import (
     whiten,
 )
 from rov_ident.estimation.wrench_residual import filtered_residual
-from rov_ident.model.equations import add_added_mass, in_motion, momentum_columns
+from rov_ident.model.equations import add_added_mass, momentum_columns
 from rov_ident.sampling.sample import parts
 
 USED, RESTARTED, WAITING, GATED, NOT_FINITE, UNPREDICTABLE = range(6)
@@ -322,8 +323,8 @@ _SCRATCH = record(
 
 Work = namedtuple(
     "Work",
-    "theta one_theta estimated scale place moves moving momentum of_rate of_motion change gradient "
-    "line sensitivity drive direct root inverse score spare rows basis lost scratch",
+    "theta one_theta estimated scale place moves moving shown momentum of_rate of_motion change "
+    "gradient line sensitivity drive direct root inverse score spare rows basis lost scratch",
 )
 """Scratch for all samples of a fold."""
 
@@ -340,6 +341,7 @@ def _work(task, state):
         np.empty(n, dtype=np.int64),  # where each column was
         np.empty(m, dtype=np.bool_),
         np.empty(6, dtype=np.uint8),
+        np.empty((2, 6), dtype=np.uint8),
         np.empty((6, m)),  # per unit of each coefficient
         np.empty((6, m)),
         np.empty((6, m)),
@@ -568,9 +570,8 @@ def _judge_motion(task, state, work, sample):
         surely = state.nu[i] ** 2 - _NOISE_PEAK * state.p[i, i]
         c.peak[i] = max(c.peak[i] * decay, surely)
         work.moving[i] = 1 if c.peak[i] > _MOVING * r else 0
-    in_motion(task.structure, work.moving, work.moves)
-    for e in range(len(task.structure.mass_row) + len(task.structure.row), len(task.theta)):
-        work.moves[e] = True
+    density, inverse = state.monitor.density, work.scratch[0].inverse
+    learnt(task, work.moving, sample, density, inverse, work.shown, work.moves)
     free, sorted_already = 0, True
     for a in range(len(work.estimated)):
         if work.moves[work.estimated[a]]:

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.config.prior import THRUST_SCALE, drift_of, moves_with_thrust, prior_of, theta_of
-from rov_ident.core.jit import inlined, inner, record
+from rov_ident.core.jit import inlined, inner, lean, record
 from rov_ident.core.messages import Array
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, parameter
 from rov_ident.estimation.process_noise import process
-from rov_ident.model.equations import Structure
+from rov_ident.model.coefficients import AXES
+from rov_ident.model.equations import Structure, in_motion
 
 MAX_STEP = 0.05  # s; of one step of the prediction
 LIGHTEST = 0.2  # of the rigid body's own inertia: no model that is tried is lighter
@@ -20,6 +21,12 @@ LAG = 4.0  # s; of the window over the score's correlation
 RELEARNING_TIME = 20.0  # s; after a change: coefficients become as uncertain as at first
 WALK_PERIOD = 1.0  # s; parameters that change by themselves gain variance this often
 REACH = 10.0  # prior standard deviations, which no coefficient is off; for RLS's observer alone
+
+# of what looks like noise of the reading, below which the vehicle follows it ("Noise of the
+# wrench's reading" in docs/accuracy.md)
+_FOLLOWED = 0.1
+# Effects whose parameters are factors of the thrust, of all axes or of one.
+_FACTORS = ("thrust_scale", "thruster_gain")
 
 INFO = record(
     [
@@ -53,6 +60,7 @@ class Problem(NamedTuple):
     thrust: int  # index of thrust_scale.scale among the estimated; -1: it is not
     per_thrust: NDArray[np.bool_]  # (n,) what is proportional to the thrust in the same motion
     absolute: NDArray[np.bool_]  # (k,) parameters of effects that are none of the thrust
+    scaled: NDArray[np.bool_]  # (k, 6) parameters of effects that are factors of these components
     lightest: Array  # (6,) least pivots of a mass matrix: no hull with added mass is touched
 
 
@@ -66,6 +74,11 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
     names, mean = prior.names, dict(zip(prior.names, prior.mean, strict=True))
     thrust = names.index(THRUST_SCALE) if mean.get(THRUST_SCALE, 0.0) > 0.0 else -1
     per_thrust = [thrust >= 0 and moves_with_thrust(name) for name in names]
+    scaled = np.zeros((len(config.estimate_effects), 6), dtype=bool)
+    for k, (effect, own) in enumerate(config.estimate_effects):
+        if effect in _FACTORS:
+            axis = parameter(effect, own).axis
+            scaled[k, AXES.index(axis) if axis else slice(None)] = True
     absolute = [EFFECTS[effect].act is None for effect, _ in config.estimate_effects]
     return Problem(
         values,
@@ -83,8 +96,32 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         thrust,
         np.array(per_thrust, dtype=bool),
         np.array(absolute, dtype=bool),
+        scaled,
         LIGHTEST * np.diag(np.linalg.cholesky(body.mass_matrix)) ** 2,
     )
+
+
+@lean
+def learnt(task, moving, sample, density, inverse, shown, moves):
+    """moves (m,): which of theta a motion teaches. Work space: shown (2, 6).
+
+    A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor,
+    and on which the wrench is far above the noise of its reading; a factor of the thrust if all
+    axes are that it is for. What looks like noise may be a command that trembles, which the vehicle
+    follows: then the unexplained acceleration, of ``density`` (6,) [(m/s2)^2/Hz, (rad/s2)^2/Hz], is
+    far below it. ``inverse`` (6, 6) is that of the mass matrix.
+    """
+    for i in range(6):
+        noise = inverse[i, i] ** 2 * sample.reading_noise[i]
+        shown[1, i] = 1 if noise > 0.0 and density[i] > _FOLLOWED * noise else 0
+        shown[0, i] = 0 if shown[1, i] else moving[i]
+    in_motion(task.structure, shown[0], moves)
+    first = len(task.structure.mass_row) + len(task.structure.row)
+    for e in range(first, len(moves)):
+        moves[e] = True
+        for i in range(6):
+            if task.scaled[e - first, i] and shown[1, i]:
+                moves[e] = False
 
 
 @inner

@@ -56,6 +56,7 @@ from rov_ident.estimation.shared import (
     Problem,
     add_score,
     begin,
+    learnt,
     measure,
     problem_of,
     steps_of,
@@ -68,7 +69,6 @@ from rov_ident.model.equations import (
     add_added_mass,
     extend_inputs,
     generalized_force,
-    in_motion,
     symmetric_product,
 )
 from rov_ident.sampling.sample import parts
@@ -186,7 +186,7 @@ _SCRATCH = record(
 )
 
 
-Work = namedtuple("Work", "p upper root moved cross gain block free moves theta mean scratch")
+Work = namedtuple("Work", "p upper root moved cross gain block free moves shown theta mean scratch")
 """Scratch for all samples of a fold. Zeros fill the rows of matrices to a multiple of LANES."""
 
 
@@ -204,6 +204,7 @@ def _work(task, state):
         np.zeros((3, size - 6, columns)),  # for the covariance of the coefficients alone
         np.zeros(columns),  # 1 where a state is estimated, 0 where it is only considered
         np.empty(m, dtype=np.bool_),
+        np.empty((2, 6), dtype=np.uint8),
         np.empty((m, LANES)),
         np.empty((m, 1)),
         np.empty(1, dtype=_SCRATCH),  # in one record, whose parts the compiler knows apart
@@ -251,9 +252,8 @@ def _steps(task, state, work, samples, sides, infos):
                 info.reason = UNPREDICTABLE
                 c.started = False
                 continue
-            in_motion(task.structure, sample.moving, work.moves)
-            for e in range(len(task.theta) - side.shape[1], len(task.theta)):
-                work.moves[e] = True
+            density, inverse = state.monitor.density, work.scratch[0].centre_inverse
+            learnt(task, sample.moving, sample, density, inverse, work.shown, work.moves)
             for i in range(len(state.x)):
                 work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
             _update(task, state, work, sample, side, info)

@@ -20,6 +20,7 @@ from rov_ident.sampling.despiking import Despiker
 from rov_ident.sampling.dropped_commands import SILENCE, CommandPeriod, estimated
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.queues import Waiting
+from rov_ident.sampling.reading_noise import ReadingNoise
 
 _ZERO = np.zeros(6)
 
@@ -42,12 +43,14 @@ class ActingWrench:
     """Takes commands from their queue and says what acts in each interval."""
 
     def __init__(self, config: Config) -> None:
+        self._noise = ReadingNoise()
         self.configure(config)
         self.clear()
 
     def configure(self, config: Config, jacobians: EffectJacobians | None = None) -> None:
         """Take other settings and other values of effects; their memory stays."""
         self._timeout = config.timeout
+        self._noise.relative = config.wrench.relative_std
         self._jacobians = jacobians
         self._effects = compiled(config.effects)
         self._has_inputs = bool(self._effects.inputs.any())
@@ -65,6 +68,11 @@ class ActingWrench:
     def hold(self) -> float:
         """How long [s] a command acts, of late; 0 if that is not known yet."""
         return self._period.mean
+
+    @property
+    def reading_noise(self) -> Array:
+        """Variance density (6,) [N2 s, (N m)2 s] of noise, where the wrench is not far above it."""
+        return self._noise.variance * self.hold
 
     def over(
         self,
@@ -125,7 +133,7 @@ class ActingWrench:
         if at > end or (at == end and held is not None):
             return None
         wrench, _, doubt = despiker.judge(WRENCH, queue)
-        queue.popleft()
+        self._noise.take(at, queue.popleft().values)
         self._estimated.clear()
         if last > -np.inf:
             self._period.update(at - last)

@@ -33,6 +33,9 @@ SAMPLE = record(
         ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
         # fins and shafts: mean over dt, and at t; zeros where none is configured
         ("inputs", "f8", (2, len(INPUTS))),
+        # N2 s, (N m)2 s: variance density of what looks like noise of the wrench's reading; 0 where
+        # the wrench is far above it
+        ("reading_noise", "f8", (6,)),
         ("hold", "f8"),  # s: how long a command acts, recently; 0: not known yet
         ("surroundings", "f8", (6,)),  # part of the wrench: of wrench effects at this motion
         ("surroundings_slope", "f8", (6,)),

@@ -230,6 +230,7 @@ class Sampler:
         if odometry is not None and np.isfinite(odometry.position).all():
             self._position = odometry.position
         sample["position"][0] = self._position
+        sample["reading_noise"][0] = self._acting.reading_noise
         if self._jacobians is not None:
             motion = self.kinematic_filter.state[0]
             self._jacobians.measure(motion["v"], motion["rate"], has_imu=imu is not None)

@@ -1,0 +1,95 @@
+"""Noise of the wrench's reading: how large it is, and where it is too large to learn from.
+
+What is read beside the command moves the predicted vehicle and not the real one. A recursive
+estimator finds the same noise in its innovations and in the sensitivities, which the wrench drives,
+and takes what the vehicle does not follow for a weaker thrust or a heavier vehicle (attenuation:
+Fuller 1987, ch. 1). On an axis that is driven far above the noise that is nothing; elsewhere a
+minute of it outweighs all that the motion tells ("Noise of the wrench's reading" in
+docs/accuracy.md).
+"""
+
+import math
+
+import numpy as np
+
+from rov_ident.core.messages import Array
+
+_BLOCK = 50  # commands in which noise is measured, to a fifth
+_OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
+RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
+_AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
+_AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
+_RECENT = 5.0  # s; over which the power of a component is averaged: a few moves of a stick
+# of that power, which noise may be: the same section has the study
+_SHARE = 0.01
+
+
+def resting_noise(demand: Array) -> Array:
+    """Standard deviation (6,) of readings (K, 6) of the wrench where commands rest: that of the
+    quietest blocks, 13 % below what :func:`resting` finds (docs/explain-bench.md is of this one).
+    """
+    if len(demand) < _BLOCK + 2:
+        return np.zeros(6)
+    std: Array = np.quantile(_medians(demand, _BLOCK), RESTING, axis=0)
+    return _OF_MEDIAN * std
+
+
+def _medians(demand: Array, size: int) -> Array:
+    """Median (B, 6) of the second differences of readings (K, 6) in each block: a command that
+    moves evenly adds nothing to these, steps that are few add little to their median."""
+    second = np.diff(demand, 2, axis=0) / np.sqrt(6.0)
+    blocks = len(second) // size
+    cut = second[: blocks * size].reshape(blocks, size, 6)
+    out: Array = np.median(np.abs(cut), axis=1)
+    return out
+
+
+def scatter(demand: Array, relative: float = 0.0) -> Array:
+    """Standard deviation (B, 6) of the noise of readings (K, 6) in each block. NaN where a noise
+    ``relative`` to the wrench, which is known of, makes as much by chance."""
+    size = min(_BLOCK, max(len(demand) - 2, 1))
+    std = _OF_MEDIAN * _medians(demand, size)
+    level = demand[: len(std) * size].reshape(len(std), size, 6)
+    known = relative * np.sqrt(np.mean(level**2, axis=1))
+    std[(std > 0.0) & (std <= _AS_LOUD * known)] = np.nan
+    return std
+
+
+def resting(std: Array) -> Array:
+    """The standard deviation (6,) in those of the blocks (B, 6) in which commands rest: the mean
+    of all that are as quiet as chance makes them beside the quietest ones; zero where too few tell.
+    """
+    out = np.zeros(6)
+    for i, column in enumerate(std.T):
+        own = column[np.isfinite(column)]
+        if len(own) and len(own) >= RESTING * len(column):
+            out[i] = own[own <= _AS_QUIET * np.quantile(own, RESTING)].mean()
+    return out
+
+
+class ReadingNoise:
+    """Says, as readings come, on which axes noise is not far below the wrench itself.
+
+    ``relative`` is the noise in proportion to the wrench that is known of; ``variance`` (6,) that
+    of what is found beside it, zero where it has less than ``_SHARE`` of the power of late.
+    """
+
+    def __init__(self, relative: float = 0.0) -> None:
+        self.relative = relative
+        self.variance = np.zeros(6)
+        self._power = np.zeros(6)
+        self._t: list[float] = []
+        self._readings: list[Array] = []
+
+    def take(self, t: float, reading: Array) -> None:
+        """The next reading (6,), at t [s]."""
+        self._t.append(t)
+        self._readings.append(reading)
+        if len(self._t) < _BLOCK + 2:
+            return
+        block = np.array(self._readings)
+        share = 1.0 if not self._power.any() else -math.expm1((self._t[0] - t) / _RECENT)
+        self._power += share * (np.mean(block**2, axis=0) - self._power)
+        variance = np.nan_to_num(scatter(block, self.relative)[0]) ** 2
+        self.variance = np.where(variance > _SHARE * self._power, variance, 0.0)
+        self._t, self._readings = [], []
