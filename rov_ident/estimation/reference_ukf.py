@@ -91,8 +91,8 @@ class ReferenceUkf:
     def _inverse_mass(self) -> Array:
         """(6, 6), at the estimate."""
         mass = self.model.with_theta(self._theta(self.filter.x[6:])).mass_matrix
-        inverse: Array = np.linalg.inv(mass + raised(mass, self.task.lightest))
-        return inverse
+        inverse = np.linalg.inv(mass + raised(mass, self.task.lightest))
+        return np.asarray(inverse, dtype=np.float64)
 
     def _noise(self, density: Array) -> Array:
         """Q (6 + n, 6 + n) of the unknown forces, and ``density`` (6,) of unknown acceleration."""

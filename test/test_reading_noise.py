@@ -1,0 +1,80 @@
+"""Noise of the wrench's reading: found, and not learnt from."""
+
+import numpy as np
+import pytest
+
+from bench.simulators import hidden
+from bench.studies.watch import by_default
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.sampling.reading_noise import ReadingNoise
+
+_RATE = 50.0  # Hz
+
+
+def _after(readings: np.ndarray, relative: float = 0.01) -> np.ndarray:
+    noise = ReadingNoise(relative)
+    for k, reading in enumerate(readings):
+        noise.take(k / _RATE, reading)
+    return noise.variance
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_found_where_the_wrench_is_not_far_above_it(seed: int) -> None:
+    """Half of the axes rest, the others are driven by steps of twenty times the noise or more."""
+    rng = np.random.default_rng(seed)
+    std = rng.uniform(0.05, 0.5, 6)
+    driven = rng.permutation(6) < 3
+    steps = np.repeat(rng.uniform(20.0, 60.0, (20, 6)) * rng.choice([-1.0, 1.0], (20, 6)), 50, 0)
+    readings = std * (steps * driven + rng.standard_normal(steps.shape))
+    found = _after(readings)
+    assert (found[driven] == 0.0).all()
+    # fifty readings tell it to a fifth
+    assert np.sqrt(found[~driven]) == pytest.approx(std[~driven], rel=0.6)
+
+
+def test_commands_without_noise_of_their_own_have_none() -> None:
+    """Steps and rests, slow sines, and noise in proportion to the wrench that is known of."""
+    rng, t = np.random.default_rng(0), np.arange(1000) / _RATE
+    steps = np.repeat(rng.uniform(-30.0, 30.0, (20, 6)) * (rng.random((20, 6)) < 0.5), 50, 0)
+    sines = 20.0 * np.sin(2.0 * np.pi * t[:, None] * rng.uniform(0.05, 0.5, 6))
+    for readings in (steps, sines, steps * (1.0 + 0.01 * rng.standard_normal(steps.shape))):
+        assert (_after(readings) == 0.0).all()
+
+
+def _dive(kind: str, seed: int, noise: float, seconds: float = 40.0) -> list[tuple[float, float]]:
+    """Thrust scale and its standard deviation under a pilot, every five seconds; 1 is true."""
+    moments = float(np.random.default_rng(seed).uniform(0.04, 0.08))
+    conditions = hidden.Conditions(
+        seconds, excitation="pilot", reading=(noise * 0.5, noise * moments)
+    )
+    case = hidden.draw(seed, conditions=conditions)
+    online = OnlineEstimator(by_default(case.config), kind)  # type: ignore[arg-type]
+    found, due = [], 5.0
+    for _, role, message in case.messages:
+        online.push(role, message)
+        origin = online.sampler.origin
+        if online.stamp and origin is not None and online.stamp - origin >= due * 1e9:
+            due += 5.0
+            report = online.report()
+            i = report.names.index("thrust_scale.scale")
+            found.append((float(report.values[i]), float(report.std[i])))
+    return found
+
+
+_DIVES = [0, 1, *(pytest.param(seed, marks=pytest.mark.study) for seed in range(2, 12))]
+
+
+@pytest.mark.parametrize("seed", _DIVES)
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_it_is_not_taken_for_a_weaker_thrust(kind: str, seed: int) -> None:
+    """Without the rule RLS and UKF are five standard deviations off in most of these dives."""
+    for value, std in _dive(kind, seed, 1.0):
+        assert abs(value - 1.0) <= 3.0 * std
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
+def test_the_thrust_is_learnt_from_clean_readings(seed: int) -> None:
+    """The autopilot's command trembles with its sensors' noise, which the vehicle follows."""
+    value, std = _dive("rls", seed, 0.0)[-1]
+    assert std < 0.1
+    assert abs(value - 1.0) <= 3.0 * std
