@@ -56,13 +56,11 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
 @pytest.mark.parametrize(
     "name",
     [
-        "thrust_scale",
         "thruster_saturation",
-        "velocity_latency",
-        "heading_offset",
         "coriolis",
         "oblique_damping",
-        *more("thrust_advance", "crossflow"),
+        # the first three are found in a test of their own, too
+        *more("thrust_scale", "velocity_latency", "heading_offset", "thrust_advance", "crossflow"),
     ],
 )
 def test_each_cause_is_named_alone_and_with_its_size(heavy, name, seed):
