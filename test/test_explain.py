@@ -63,9 +63,9 @@ def found_in(name, number, place="a minute"):
     "name",
     [
         "payload",
-        "thruster_lag",
         "sensor_lever_arm",
         *more(
+            "thruster_lag",  # named in test_explain_cli.py, too
             "quadratic_damping",
             "added_mass_coupling",
             "ocean_current",

@@ -170,7 +170,7 @@ def test_noise_of_the_reading_is_named_with_its_size():
 
 @pytest.mark.parametrize("seed", [0, *more(1)])
 def test_a_dead_band_is_found_beside_noise_of_the_reading(seed):
-    conditions = dataclasses.replace(NOISY, excitation="steps")
+    conditions = dataclasses.replace(NOISY, duration=90.0, excitation="steps")
     case = draw(seed, ("thruster_deadband",), 1.0, conditions=conditions)
     findings = explain([streams_of(case)], case.config).findings
     assert findings.effects[0].effect == "thruster_deadband"

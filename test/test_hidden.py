@@ -319,7 +319,7 @@ def test_accelerometer_reads_weight_and_acceleration():
 @pytest.mark.parametrize("family", FAMILIES)
 def test_motion_is_realistic(excitation, family):
     """Nothing tumbles or races; print the typical speeds with -s."""
-    for seed in range(3):
+    for seed in range(2):
         conditions = Conditions(duration=60.0, excitation=excitation, family=family)
         truth = draw(seed, conditions=conditions).truth
         rms = np.sqrt(np.mean(truth.nu**2, axis=0))

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from functools import partial
 
 import pytest
 from program import run
@@ -19,6 +20,12 @@ from rov_ident.offline.batch_fit import validation
 from rov_ident.reports.table import number
 
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch):
+    """What a minute of the next manoeuvre takes to plan, a third of it takes a third of."""
+    monkeypatch.setattr(identification, "plan", partial(ri.plan, duration=20.0))
 
 
 @pytest.fixture(scope="module")
