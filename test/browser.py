@@ -64,7 +64,7 @@ class Page:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    async def until(self, expression, seconds=120.0):
+    async def until(self, expression, seconds=300.0):
         end = time.monotonic() + seconds
         while not (value := await self.evaluate(expression)):
             assert time.monotonic() < end, f"not in time: {expression}"

@@ -156,7 +156,7 @@ def test_a_bag_in_the_folder_one_is_in(tmp_path, bag):
 @pytest.mark.parametrize("arguments", ["coefficients", "completion bash", "completion fish"])
 def test_who_reads_the_head_has_seen_enough(arguments):
     command = f"{sys.executable} -u -m rov_ident {arguments} | head -1; echo ${{PIPESTATUS[0]}}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=240)
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=600)
     assert done.stdout.splitlines()[-1] == "0" and done.stderr == ""
 
 

@@ -1,10 +1,10 @@
-"""A minute of damaged files (`bench/studies/fuzz.py`): each is read, or refused in one sentence."""
+"""Damaged files are read, or refused in one sentence: for twenty seconds (fuzz.py has hours)."""
 
 import pytest
 
 from bench.studies import fuzz
 
-SECONDS = 60.0 / (len(fuzz.READERS) + len(fuzz.COMMANDS))
+SECONDS = 20.0 / (len(fuzz.READERS) + len(fuzz.COMMANDS))
 
 
 @pytest.mark.parametrize("name", fuzz.READERS)
@@ -23,5 +23,5 @@ def test_commands(name):
 def test_a_fault_is_found(monkeypatch):
     """One that only damage leads to."""
     monkeypatch.setitem(fuzz.READERS, "zigzag", lambda path: path.read_text("ascii"))
-    count, faults = fuzz.search("zigzag", fuzz.read, 60.0, 500)
+    count, faults = fuzz.search("zigzag", fuzz.read, 600.0, 500)
     assert count == 500 and any("UnicodeDecodeError" in what for what in faults)

@@ -494,7 +494,7 @@ def command(domain):
     for process in started:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=240)
+            _, said = process.communicate(timeout=600)
             assert "Traceback" not in said
         assert process.returncode == 0
 
@@ -530,9 +530,9 @@ def test_two_vehicles(command):
         asyncio.run(_until_all_are_shown(page, expected, publish))
         lines = command("rov_ident", "watch", "--once", "--json", "--wait", "30")
     table.send_signal(signal.SIGINT)
-    _, shown = table.communicate(timeout=240)
+    _, shown = table.communicate(timeout=600)
     assert all(f"{node} (" in shown for node in NODES)
-    said, _ = lines.communicate(timeout=240)
+    said, _ = lines.communicate(timeout=600)
     state = json.loads(said)["estimators"]
     assert sorted(state) == sorted(NODES)
     for node, report in expected.items():
@@ -594,7 +594,7 @@ def publishing(dives):
 
 
 async def _until_all_are_shown(url, expected, publish):
-    end, published = time.monotonic() + 100.0, False
+    end, published = time.monotonic() + 300.0, False
     async with aiohttp.ClientSession() as session:
         while True:
             await asyncio.sleep(0.2)
@@ -642,7 +642,7 @@ def test_watch_cuts_no_name_and_no_state_in_a_narrow_terminal(kinds):
 def test_watch_hears_nobody(domain):
     ended = subprocess.run(
         [sys.executable, "-m", "rov_ident", "watch", "--once", "--wait", "0.5"],
-        capture_output=True, text=True, timeout=240,
+        capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert ended.returncode == 2 and not ended.stdout
     assert "no estimator was heard within 0.5 s: start rls_node" in ended.stderr
@@ -668,7 +668,7 @@ def test_refused(domain, command, sentence):
         other.listen()
         arguments = [text.format(taken=other.getsockname()[1]) for text in command]
         ended = subprocess.run(
-            [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=240
+            [sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=600
         )
     assert ended.returncode == 2, ended.stderr
     assert sentence in " ".join(ended.stderr.split())

@@ -38,8 +38,8 @@ def test_an_unknown_effect_is_mended_without_a_name(name, seed, strength, tmp_pa
     assert ("empirical", "scale") in again.estimate_effects
 
 
+@pytest.mark.study  # where test_explain*.py find one effect alone, there is no term beside it
 def test_a_cause_that_has_a_name_is_not_hidden():
-    """Neither a named effect nor a clean bag gets a term."""
     case = hidden.draw(3, ("lift",), 0.5, conditions=dataclasses.replace(DIVE, duration=90.0))
     assert "empirical" not in [
         f.effect for f in explain([streams_of(case)], case.config).findings.effects

@@ -10,8 +10,10 @@ from tiers import more
 import rov_ident as ri
 from rov_ident import config as configuration
 from rov_ident.effects import EFFECTS
+from rov_ident.simulation.virtual_sensors import Suite
 
 REMUS = Path(__file__).resolve().parents[1] / "config" / "remus100.yaml"
+LEAN = Suite(odometry_rate=10.0, imu_rate=50.0)
 
 
 def hidden(effect, seed):
@@ -28,7 +30,8 @@ def hidden(effect, seed):
 
 def explained(config, effects, path, seed):
     world = dataclasses.replace(config, effects=effects)
-    ri.simulate(world, manoeuvre="waypoints", duration=180.0, seed=seed).save(path)
+    dive = ri.simulate(world, manoeuvre="waypoints", duration=180.0, seed=seed, sensors=LEAN)
+    dive.save(path)
     return ri.explain(path, config).findings
 
 

@@ -3,9 +3,10 @@
 import dataclasses
 import json
 import re
+from functools import partial
 
 import pytest
-from program import run_alone
+from program import run
 
 import rov_ident as ri
 from bench import ROOT
@@ -21,14 +22,20 @@ from rov_ident.reports.table import number
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
 
 
+@pytest.fixture(autouse=True)
+def _short(monkeypatch):
+    """What a minute of the next manoeuvre takes to plan, a third of it takes a third of."""
+    monkeypatch.setattr(identification, "plan", partial(ri.plan, duration=20.0))
+
+
 @pytest.fixture(scope="module")
 def dives(tmp_path_factory):
     """Two dives, the second the shorter one, and one at rest."""
     folder = tmp_path_factory.mktemp("dives")
     for name, manoeuvre, duration in (
-        ("long", "steps", 45.0),
+        ("long", "steps", 40.0),
         ("short", "steps", 30.0),
-        ("rest", "rest", 20.0),
+        ("rest", "rest", 12.0),
     ):
         made = ri.simulate(VEHICLE, manoeuvre=manoeuvre, duration=duration, seed=len(name))
         made.save(folder / f"{name}.mcap")
@@ -37,7 +44,7 @@ def dives(tmp_path_factory):
 
 def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     paths = [dives / f"{name}.mcap" for name in ("long", "short", "rest")]
-    done = run_alone("identify", *paths, "--config", WRONG, "--out", tmp_path / "found")
+    done = run("identify", *paths, "--config", WRONG, "--out", tmp_path / "found")
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "found" / "result.json").read_text())
     assert result["judge"] == "short.mcap"
@@ -71,7 +78,7 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
 
 def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
     out = tmp_path / "found"
-    done = run_alone("identify", dives / "rest.mcap", "--config", WRONG, "--out", out)
+    done = run("identify", dives / "rest.mcap", "--config", WRONG, "--out", out)
     assert done.returncode == 2
     assert "no dive is fit" in done.stderr and "fly instead: " in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -634,7 +634,7 @@ def node(domain, tmp_path):
         process = start_node("rls", path, "qos.reliability:=reliable")
         vehicle = Publisher(config.load(path))
         started.append((process, vehicle))
-        vehicle.until(vehicle.connected, 120.0)
+        vehicle.until(vehicle.connected)
         vehicle.diagnostics.clear()
         return vehicle, config.load(path)
 
@@ -718,7 +718,7 @@ def test_replay_converts_what_has_no_stamp(domain, tmp_path, by_pulses, referenc
 def test_a_message_package_that_is_not_installed(domain, tmp_path):
     path = live_config(tmp_path, **{"inputs.wrench": "mavros_msgs/RCOut"})
     process = start_node("rls", path)
-    _, said = process.communicate(timeout=240)
+    _, said = process.communicate(timeout=600)
     assert process.returncode == 2
     assert "inputs.wrench is mavros_msgs/RCOut, but mavros_msgs is not installed" in said
 

@@ -30,7 +30,7 @@ PROGRAM = """if True:
 def interrupted_at(module, number, place, function, *arguments):
     program = f"{PROGRAM}\n    sys.exit(program())"
     command = [sys.executable, "-c", program, str(int(number)), module, place, function]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=240)
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=600)
     return done.returncode, done.stderr
 
 
@@ -86,7 +86,7 @@ def test_what_would_be_lost_waits(number):
             except Interrupted as error:
                 print(error.status)
     """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=240)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=600)
     assert done.stdout.split() == [str(128 + number).encode()] * 2
     assert done.stderr == b""
 
@@ -102,6 +102,6 @@ def test_a_file_in_the_making_goes(tmp_path, number):
         os.fsync = lambda _: os.kill(os.getpid(), {number:d})
         write_file({str(tmp_path / "result")!r}, "content")
     """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=240)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=600)
     assert b"Interrupted" in done.stderr
     assert list(tmp_path.iterdir()) == []

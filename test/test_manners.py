@@ -51,7 +51,7 @@ def on_a_terminal(*arguments):
     except OSError:  # the other end is closed
         pass
     os.close(ours)
-    out, _ = process.communicate(timeout=240)
+    out, _ = process.communicate(timeout=600)
     return process.returncode, out.decode(), said.decode()
 
 

@@ -129,7 +129,7 @@ def test_the_truth_is_found_from_afar_within_the_stated_errors(heavy, off, dives
     ratios = []
     for seed in range(dives):
         start = off if seed == 0 else near  # what is stated does not depend on it
-        samples = samples_of(heavy, 60.0, seed=seed)
+        samples = samples_of(heavy, 40.0, seed=seed)
         found = ml.maximise(in_one(samples), start, start.model)
         assert found.converged
         std = np.sqrt(np.diag(found.covariance))

@@ -128,7 +128,7 @@ def test_live_equals_offline(domain, bag, tmp_path):
         publisher = vehicle.node.create_publisher(DiagnosticArray, "/rls_node/coefficients", qos)
         for data in raw:
             publisher.publish(data)
-        heard, _ = listener.communicate(timeout=240)
+        heard, _ = listener.communicate(timeout=600)
     expected = [from_diagnostics(deserialize_message(data, DiagnosticArray)) for data in raw]
     pairs = [pair for r in expected for pair in zip(r.values, r.std, strict=True)]
     np.testing.assert_array_equal(json.loads(heard), pairs)
@@ -138,8 +138,8 @@ def test_pace_without_imu(domain, brief):
     """At twice the speed; a bag without IMU needs no publisher for it from elsewhere."""
     began = []
     result = replay(brief, HEAVY, rate=2.0, on_report=lambda *_: began.append(time.monotonic()))
-    # Five reports a second of the bag. The median: a node that was late at first catches up.
-    assert 0.08 < np.median(np.diff(began)) < 0.2 * slowness()
+    # Five reports a second of the bag, of three seconds: 1.4 s, less what the first was late.
+    assert 0.7 < began[-1] - began[0] < 2.8 * slowness()
     assert_same(result.reports["rls"], offline(brief, "rls"))
     assert Level.STALE not in result.reports["rls"].levels
 
@@ -253,7 +253,7 @@ def test_no_port_is_open_to_the_network(domain, bag, tmp_path):
     process, _ = started(bag, tmp_path / "out.mcap")
     addresses = listening(domain)
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=120)
+    process.communicate(timeout=600)
     assert len(addresses) >= 4  # discovery and data, of the player and of the node
     assert set(addresses) == {"0100007F"}  # 127.0.0.1
 
@@ -264,7 +264,7 @@ def test_no_orphans(domain, bag, tmp_path, number):
     out = tmp_path / "out.mcap"
     process, node = started(bag, out)
     process.send_signal(number)
-    process.communicate(timeout=120)
+    process.communicate(timeout=600)
     assert process.returncode != 0
     end = time.monotonic() + 10.0 * slowness()
     while is_alive(node):

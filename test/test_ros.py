@@ -321,7 +321,7 @@ def test_drivers_of_any_quality(domain):
 
     try:
         for role in ("odom", "imu", "wrench"):
-            vehicle.until(partial(refused, role), 120.0)
+            vehicle.until(partial(refused, role))
     finally:
         vehicle.close()
         status, said = end_node(process)

@@ -75,7 +75,7 @@ def test_jacobian_is_that_of_samples_made_with_other_values(heavy, effect):
     """Wrench and velocity of samples from a bag, by the configuration a little to either side."""
     fins = EFFECTS[effect].steer is not None
     config = having(finned(heavy) if fins else heavy, {effect: GIVEN[effect]})
-    run = steered_dive(config, 15.0, EXACT, 1)
+    run = steered_dive(config, 10.0, EXACT, 1)
     samples = joined(list(samples_of(config, run)))
     _, sides = parts(samples)
     measured = np.isfinite(samples["odometry"][:, 0])

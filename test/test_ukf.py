@@ -52,7 +52,7 @@ def noisy(heavy):
 
 @pytest.fixture(scope="module")
 def dives(heavy):
-    return textbook.prior_and_samples(heavy, range(12), 90.0)
+    return textbook.prior_and_samples(heavy, range(8), 90.0)
 
 
 def wrong_prior(config, seed=5, spread=0.2):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +23,28 @@ ri.explain(sys.argv[1], sys.argv[2])
 
 
 def compile_all(offline=False):
-    """All that a node runs, once for all who ask for it; ``offline``: what fits and explain run."""
+    """All that a node runs, once for all who ask for it; ``offline``: what fits and explain run.
+
+    Two processes at a time, in an order in which neither compiles what the other is at: offline
+    jobs need the kernels of the sampler, which RLS compiles first, and those of the monitor.
+    """
     from rov_ident.core.jit import CACHE
     from rov_ident.discrepancy import monitor
     from rov_ident.estimation.compilation import compiler
 
-    with open(CACHE / "lock", "a") as lock:
+    def ensure(*jobs):
+        assert all(job.ensure() for job in jobs)
+
+    with open(CACHE / "lock", "a") as lock, ThreadPoolExecutor() as threads:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        other, mark = None, CACHE / "offline"
+        estimators = threads.submit(ensure, compiler("rls"), compiler("ukf"))
+        ensure(monitor.compiler())
+        mark = CACHE / "offline"
         if offline and not mark.exists():
             command = [sys.executable, "-c", _OFFLINE, ROOT / "bags" / "demo.mcap", HEAVY]
-            other = subprocess.Popen(command)
-        for job in (compiler("rls"), compiler("ukf"), monitor.compiler()):
-            assert job.ensure()
-        if other is not None:
-            assert other.wait() == 0
+            subprocess.run(command, check=True)
             mark.touch()
+        estimators.result()
 
 
 ROUNDING = 1e-7
@@ -112,7 +119,7 @@ class Vehicle:
         ):
             self.node.create_subscription(type_, topic, heard.append, qos)
 
-    def until(self, ready, seconds=120.0):
+    def until(self, ready, seconds=300.0):
         """Listen until ``ready()``; fails after some seconds."""
         end = time.monotonic() + seconds
         while not ready():
@@ -188,7 +195,7 @@ def end_node(process, number=signal.SIGINT):
     """Its exit status and all that it said."""
     process.send_signal(number)
     try:
-        _, said = process.communicate(timeout=120)
+        _, said = process.communicate(timeout=600)
     except subprocess.TimeoutExpired:
         process.kill()
         raise
@@ -200,7 +207,7 @@ def start_connected(estimator, *options, parameters=HEAVY, **kwargs):
     process = start_node(estimator, parameters, "qos.reliability:=reliable", *options)
     try:
         vehicle = Vehicle(estimator, **kwargs)
-        vehicle.until(vehicle.connected, 120.0)
+        vehicle.until(vehicle.connected)
     except BaseException:
         process.kill()
         raise

@@ -166,7 +166,7 @@ def search(
     end, count = time.monotonic() + seconds, 0
     faults: dict[str, bytes] = {}
     with tempfile.TemporaryDirectory() as folder:
-        while count < most and time.monotonic() < end:
+        while count < len(seeds) or (count < most and time.monotonic() < end):
             source = seeds[count] if count < len(seeds) else chance.choice(seeds)
             data = source.read_bytes()
             if count >= len(seeds):  # the first time each as it is

@@ -155,7 +155,7 @@ class HydrodynamicModel:
     @property
     def M(self) -> Array:
         """(6, 6): rigid body and added mass."""
-        return self._model.mass_matrix
+        return self._model.mass_matrix.copy()  # the caller's own
 
     def C(self, nu: Array) -> Array:
         """(6, 6), skew-symmetric."""

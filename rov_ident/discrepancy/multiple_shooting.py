@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core.jit import copy, inner, record, released
 from rov_ident.core.runge_kutta import NODES, runge_kutta
-from rov_ident.effects import Acting, act, add_surroundings, memory, surroundings
+from rov_ident.effects import Acting, act, add_surroundings, memory, surrounds
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import (
     CURRENT,
@@ -126,7 +126,7 @@ def shoot(
     zeros = [np.zeros(shape) for shape in 2 * [(k, 6)] + 2 * [(k, 6, 6)]]
     motion = Motion(np.full((k + 1, 6), np.nan), *zeros)
     _shoot(
-        *surroundings(eq.acting), eq.structure, eq.mass, eq.added, eq.inverse,
+        eq.acting, eq.structure, eq.mass, eq.added, eq.inverse,
         eq.theta, np.repeat(eq.theta, _LANES, axis=1), eq.restoring, steps, wrench, first, last,
         start, np.zeros(1, _SCRATCH), motion,
     )  # fmt: skip
@@ -162,12 +162,11 @@ def regressors(eq: Equations, steps: Steps, motion: Motion) -> Array:
 
 def wrenches(eq: Equations, steps: Steps, thrust: Array, motion: Motion) -> Array:
     """Wrench effects and current (K, 6) along a motion; ``thrust`` (K, 6) is of the thrusters."""
-    out, (around, current) = np.zeros((len(motion.middle), 6)), surroundings(eq.acting)
-    if around is not None:
-        _wrenches(
-            around, current, eq.structure, eq.added, eq.theta, steps, thrust, motion.middle,
-            np.zeros(1, CURRENT), out,
-        )  # fmt: skip
+    out = np.zeros((len(motion.middle), 6))
+    _wrenches(
+        eq.acting, eq.structure, eq.added, eq.theta, steps, thrust, motion.middle,
+        np.zeros(1, CURRENT), out,
+    )  # fmt: skip
     return out
 
 
@@ -178,13 +177,13 @@ def _thrust(acting, state, t, wrench):
 
 
 @released
-def _wrenches(around, current, structure, added, theta, steps, thrust, nu, scratch, out):
+def _wrenches(acting, structure, added, theta, steps, thrust, nu, scratch, out):
     t, middle, s = steps.t, steps.middle, scratch[0]
-    for k in range(len(nu)):
+    for k in range(len(nu) if surrounds(acting) else 0):
         now = 0.5 * (t[k] + t[k + 1])
         extend_inputs(1, structure, steps.inputs[k], s.extended)
         add_surroundings(
-            around, current, structure, added, theta, now, steps.position[k], nu[k], middle[k],
+            acting, structure, added, theta, now, steps.position[k], nu[k], middle[k],
             thrust[k], s, out[k],
         )  # fmt: skip
 
@@ -218,17 +217,17 @@ _SCRATCH = record(
 
 @inner
 def _acceleration(
-    around, current, structure, added, theta, restoring, t, position, rotation, given, s, out
+    acting, surrounded, structure, added, theta, restoring, t, position, rotation, given, s, out
 ):
     """nu_dot (6,) at s.nu into out, ``given`` on guided axes; s.push (6,) is the thrusters'."""
     for i in range(6):
         s.velocity[i], s.thrust[i] = s.nu[i, 0], s.push[i]
         for j in range(3):
             s.push[i] += restoring[i, j] * rotation[2, j]
-    if around is not None:  # numba leaves this out where it is None
+    if surrounded:
         add_surroundings(
-            around, current, structure, added, theta, t, position, s.velocity, rotation,
-            s.thrust, s.current, s.push,
+            acting, structure, added, theta, t, position, s.velocity, rotation, s.thrust,
+            s.current, s.push,
         )  # fmt: skip
     h = s.h
     generalized_force(1, structure, s.mass, theta, s.nu, h, s.extended)
@@ -245,7 +244,9 @@ def _acceleration(
 
 
 @inner
-def _differentiate(around, current, structure, added, theta, wide, t, position, rotation, s):
+def _differentiate(
+    acting, surrounded, structure, added, theta, wide, t, position, rotation, s
+):  # fmt: skip
     """s.by_velocity (6, 6): the derivative of the wrench on the vehicle by its velocity s.nu. Lane
     j is a little faster along axis j, the last along none; ``wide`` (n, _LANES) is theta in each,
     s.thrust (6,) what the thrusters give.
@@ -256,13 +257,13 @@ def _differentiate(around, current, structure, added, theta, wide, t, position, 
             nearby[i, k] = s.nu[i, 0]
         nearby[i, i] += _NEARBY
     generalized_force(_LANES, structure, s.nearby_mass, wide, nearby, h, s.nearby_extended)
-    if around is not None:
+    if surrounded:
         for k in (0, 1, 2, 3, 4, 5, last):
             for i in range(6):
                 s.velocity[i], s.push[i] = nearby[i, k], 0.0
             add_surroundings(
-                around, current, structure, added, theta, t, position, s.velocity, rotation,
-                s.thrust, s.current, s.push,
+                acting, structure, added, theta, t, position, s.velocity, rotation, s.thrust,
+                s.current, s.push,
             )  # fmt: skip
             for i in range(6):
                 h[i, k] -= s.push[i]
@@ -297,10 +298,10 @@ def _advance(inverse, dt, s, phi, gamma):
 
 @released
 def _shoot(
-    around, current, structure, mass, added, inverse, theta, wide, restoring, steps, wrench, first,
-    last, start, scratch, motion,
+    acting, structure, mass, added, inverse, theta, wide, restoring, steps, wrench, first, last,
+    start, scratch, motion,
 ):  # fmt: skip
-    s = scratch[0]
+    s, surrounded = scratch[0], surrounds(acting)
     for i in range(6):
         for j in range(6):
             s.mass[i, j, 0], s.inverse[i, j, 0] = mass[i, j, 0], inverse[i, j]
@@ -333,7 +334,7 @@ def _shoot(
                 elif stage == 3:
                     rotation = rotations[k + 1]
                 _acceleration(
-                    around, current, structure, added, theta, restoring, t + ahead, position[k],
+                    acting, surrounded, structure, added, theta, restoring, t + ahead, position[k],
                     rotation, given, s, slope[stage],
                 )  # fmt: skip
                 runge_kutta(stage, dt, s.begin, slope[stage], s.nu[:, 0], nu)
@@ -346,11 +347,11 @@ def _shoot(
                 s.push[i] = wrench[0, k, i]
             t += 0.5 * dt
             _acceleration(
-                around, current, structure, added, theta, restoring, t, position[k], middles[k],
+                acting, surrounded, structure, added, theta, restoring, t, position[k], middles[k],
                 given, s, nu_dots[k],
             )  # fmt: skip
             _differentiate(
-                around, current, structure, added, theta, wide, t, position[k], middles[k], s
+                acting, surrounded, structure, added, theta, wide, t, position[k], middles[k], s
             )
             _advance(inverse, dt, s, phi[k], gamma[k])
             if not worst < 50.0:  # no vehicle moves so; NaN too

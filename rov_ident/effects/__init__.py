@@ -288,10 +288,10 @@ def steered(acting, dt, means, ends):
     return out
 
 
-def surroundings(acting: Acting) -> tuple[Acting | None, tuple[float, ...] | None]:
-    """What :func:`add_surroundings` takes; None where that adds nothing."""
-    water = tuple(acting.water.tolist()) if acting.water.any() else None
-    return acting if acting.wrenches.any() or water else None, water
+@inlined
+def surrounds(acting):
+    """Whether :func:`add_surroundings` adds anything: most vehicles have none of it."""
+    return acting.wrenches.any() or acting.water.any()
 
 
 @inlined
@@ -304,23 +304,25 @@ def add_wrenches(acting, t, position, nu, rotation, thrust, out):
 
 @inlined
 def add_surroundings(
-    around, current, structure, added_mass, theta, t, position, nu, rotation, thrust, s, out
-):
+    acting, structure, added_mass, theta, t, position, nu, rotation, thrust, s, out
+):  # fmt: skip
     """Add to out (6,) what wrench effects and moving water do at time t, ``position`` (3,) and nu
     (6,) over ground, while the thrusters give ``thrust`` (6,).
 
-    ``around`` and ``current`` are of :func:`surroundings`; ``structure``, ``added_mass`` (6, 6, 1)
-    and ``theta`` (n, 1) are those of the model; ``rotation`` (3, 3) turns body axes into the world;
-    s is a record of :data:`rov_ident.model.equations.CURRENT`, work space.
+    ``structure``, ``added_mass`` (6, 6, 1) and ``theta`` (n, 1) are those of the model;
+    ``rotation`` (3, 3) turns body axes into the world; s is a record of
+    :data:`rov_ident.model.equations.CURRENT`, work space. There is one version of this for any
+    effects, as each takes ten seconds to compile.
     """
-    if current is None:  # numba leaves out what is not so
-        add_wrenches(around, t, position, nu, rotation, thrust, out)
-    else:
-        north, east, down = current
+    north, east, down = acting.water[0], acting.water[1], acting.water[2]
+    if north != 0.0 or east != 0.0 or down != 0.0:
         water = (
             rotation[0, 0] * north + rotation[1, 0] * east + rotation[2, 0] * down,
             rotation[0, 1] * north + rotation[1, 1] * east + rotation[2, 1] * down,
             rotation[0, 2] * north + rotation[1, 2] * east + rotation[2, 2] * down,
         )
         add_current(structure, added_mass, theta, nu, water, s, out)
-        add_wrenches(around, t, position, s.relative, rotation, thrust, out)
+    else:
+        for i in range(6):
+            s.relative[i] = nu[i]
+    add_wrenches(acting, t, position, s.relative, rotation, thrust, out)

@@ -773,7 +773,8 @@ def _suspect(state, work):
 @inlined
 def _forget(state, work, factor):
     """Constant forgetting: of what the present sensitivities of the free columns see."""
-    w, count, free = work.lost[0], 0, state.scalars[0].free
+    # not a literal 0, for which numba would compile forget, too
+    w, count, free = work.lost[0], np.int64(0), state.scalars[0].free
     for i in range(6):
         size, total = 0.0, state.p[i, i] + work.scratch[0].r[i]
         for k in range(w.shape[1]):

@@ -81,13 +81,13 @@ class RigidBody:
     cob: Array
     inertia: Array
 
-    @property
+    @cached_property
     def mass_matrix(self) -> Array:
         """M_RB (6, 6) about the body origin (Fossen 2021, eq. 3.49)."""
         m, s = self.mass, skew(self.cog)
         return np.block([[m * np.eye(3), -m * s], [m * s, self.inertia - m * s @ s]])
 
-    @property
+    @cached_property
     def restoring(self) -> Array:
         """(6, 3): the gravity and buoyancy wrench is ``restoring @ k``, k the unit vector down."""
         lever = self.weight * self.cog - self.buoyancy * self.cob
@@ -173,12 +173,12 @@ class Model:
         given = np.zeros(len(INPUTS)) if inputs is None else _vector(inputs)
         return force_of_one(self.structure, self.mass_matrix, self.theta, _vector(nu), given)
 
-    @property
+    @cached_property
     def mass_matrix(self) -> Array:
         """M (6, 6): rigid body and added mass."""
         return self.body.mass_matrix + self.added_mass
 
-    @property
+    @cached_property
     def added_mass(self) -> Array:
         """M_A (6, 6)."""
         m = np.zeros((6, 6, 1))

@@ -16,7 +16,7 @@ from itertools import count, repeat
 from multiprocessing import get_context
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,15 +188,26 @@ def _stored(path: Path, config: Config, columns: bool, file: Path) -> Outcome:
     if isinstance(outcome, str):
         return outcome
     np.save(file, outcome[1])
-    return outcome[0], file
+    return outcome[0], _File(file, outcome[1].dtype)
 
 
-def _of_file(file: Path, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    return function(np.load(file, allow_pickle=False), *arguments)
+class _File(NamedTuple):
+    """Samples on disk. A file forgets that they are aligned records, and every kernel would be
+    compiled once more for those that are not."""
+
+    path: Path
+    dtype: np.dtype[np.void]
+
+    def read(self) -> Samples:
+        return np.load(self.path, allow_pickle=False).view(self.dtype)
+
+
+def _of_file(file: _File, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    return function(file.read(), *arguments)
 
 
 def _by_processes(
-    pool: ProcessPoolExecutor, files: Sequence[Path], function: Callable[..., Any], *arguments: Any
+    pool: ProcessPoolExecutor, files: Sequence[_File], function: Callable[..., Any], *arguments: Any
 ) -> list[Any]:
     return list(pool.map(_of_file, files, repeat(function), repeat(arguments)))
 

@@ -11,7 +11,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.jit import inner, lean, record
 from rov_ident.core.quaternions import rotate, rotation_of
 from rov_ident.core.runge_kutta import NODES, runge_kutta
-from rov_ident.effects import Acting, add_surroundings, surroundings
+from rov_ident.effects import Acting, add_surroundings, compiled, surrounds
 from rov_ident.model.coefficients import EXTENDED_SIZE, INPUTS
 from rov_ident.model.equations import (
     CURRENT,
@@ -81,7 +81,7 @@ def simulate(
     inverse = np.zeros((6, 6))
     inverse[np.ix_(free, free)] = np.linalg.inv(model.mass_matrix[np.ix_(free, free)])
     done = _simulate(
-        *((None, None) if effects is None else surroundings(effects)),
+        _NOTHING if effects is None else effects,
         model.structure,
         np.ascontiguousarray(model.added_mass[:, :, None]),
         model.mass_matrix,
@@ -138,6 +138,8 @@ def open_loop(
     return predicted
 
 
+_NOTHING = compiled({})
+
 _SCRATCH = record(
     [
         ("state", "f8", (13,)),  # position, quaternion, nu
@@ -191,8 +193,8 @@ def _derivative(structure, theta, restoring, guided, s, rate):
 
 @lean
 def _simulate(
-    around, current, structure, added_mass, mass, inverse, theta, restoring, t, wrench,
-    wrench_slope, inputs, free, guide, attitude, start, max_step, scratch, out,
+    acting, structure, added_mass, mass, inverse, theta, restoring, t, wrench, wrench_slope,
+    inputs, free, guide, attitude, start, max_step, scratch, out,
 ):  # fmt: skip
     """Classical Runge-Kutta; out (N, 19): position, quaternion, nu, nu_dot.
 
@@ -206,7 +208,7 @@ def _simulate(
             s.mass[i, j, 0], s.inverse[i, j, 0] = mass[i, j], inverse[i, j]
     for j in range(13):
         state[j] = start[j]
-    guided = not free.all()
+    guided, surrounded = not free.all(), surrounds(acting)
     span = 0.0
     for i in range(len(t)):
         last = i + 1 == len(t)
@@ -235,12 +237,12 @@ def _simulate(
                 if len(wrench_slope) > 0:
                     for j in range(6):
                         s.push[j] += (now - 0.5 * span) * wrench_slope[i, j]
-                if around is not None:  # numba leaves this out where it is None
+                if surrounded:
                     for j in range(6):
                         s.velocity[j], s.thrust[j] = stage[7 + j], s.push[j]
                     rotate(stage[3:7], s.rotation)
                     add_surroundings(
-                        around, current, structure, added_mass, theta, t[i] + now, stage[:3],
+                        acting, structure, added_mass, theta, t[i] + now, stage[:3],
                         s.velocity, s.rotation, s.thrust, s.current, s.push,
                     )  # fmt: skip
                 _derivative(structure, theta, restoring, guided, s, slope)

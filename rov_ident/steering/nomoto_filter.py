@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
@@ -78,6 +77,8 @@ def unscented(runs: Sequence[Zigzag], model: Nomoto) -> Nomoto:
 
     Raises UserError if the filter diverges.
     """
+    from scipy.optimize import minimize_scalar  # here: a node does not need it
+
     sizes = np.maximum(np.abs(model.theta), 1e-9)
     sizes[-1] = 0.1 * max(float(np.std(run.rudder)) for run in runs)
     rate = max(float(np.std(np.diff(r.heading[r.known]) / np.diff(r.t[r.known]))) for r in runs)

@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
@@ -270,6 +269,8 @@ def first_state(order: int, nonlinear: bool, theta: Array, run: Zigzag) -> tuple
     Levenberg-Marquardt's damping matters where the model is unstable: a full step from rest may
     lead to a motion that leaves all reason, from where no slope leads back.
     """
+    from scipy.optimize import least_squares  # here: a node does not need it
+
     known, jumps, states = run.known, jumps_of(run), order + 1
     begins = [np.concatenate([[run.heading[known][0]], np.zeros(order), np.full(jumps, 0.5)])]
     if nonlinear:  # also from the linear part's, which cannot run away within the run
