@@ -16,7 +16,7 @@ import numpy as np
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.linearisation import Linearisation, linearise
-from rov_ident.discrepancy.output_error import Fitted, refit
+from rov_ident.discrepancy.output_error import Fitted, refit, solve_bounded, step_limits
 from rov_ident.discrepancy.results import Finding, Residual
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.effects import empirical as effect
@@ -32,7 +32,8 @@ _SURE = 2.5  # standard deviations of the mean gain over windows: by chance in o
 _WHITE = 1.5  # variance inflation of what a fit leaves, 1 where that is white: nothing is missing
 _PLAINER = 0.9  # of what a function of two variables gains one of a single one is preferred
 _FITTED = 3  # functions of one variable, and of two, that are fitted as splines; effort
-_SETTLED = 0.01  # of its weights: a term that changes less follows the motion
+_LEAST_PROGRESS = 0.99  # of the squared residuals; a round that leaves more is the last
+_STEPS = 0.5 ** np.arange(6)  # of a change of all weights, until one leaves less
 _ROUNDS = 8  # in which the shape follows the motion that a fit arrives at; effort
 _FOLDS = 8  # of the cross-validation, each of pairs of windows
 _SMOOTHNESS = 10.0 ** np.arange(-4.0, 3.5, 0.5)  # of the penalty, over the data's own information
@@ -115,23 +116,42 @@ def residual(of: Finding, h: Hypothesis) -> Residual:
 
 
 def _fitted(problem: WindowedProblem, now: Fitted, shape: Shape) -> Fitted | None:
-    """With a term of this shape; its weights follow the motion that the fit arrives at."""
+    """With a term of this shape; its weights follow the motion that the fit arrives at. The other
+    parameters go along with them: what the term takes over, they no longer imitate."""
     best, weights, at = None, np.zeros(len(shape.penalty())), now
     for _ in range(_ROUNDS):
-        weights = weights + _penalised(problem, at, shape, weights)[0]
-        h = Hypothesis(now.hypothesis.config, at.hypothesis.values, {
-            **now.hypothesis.constants, **shape.constants(weights),
-        })  # fmt: skip
-        start = linearise(problem, h, at.linearisation.starts, now.noise)
-        there = start and refit(h.having({SCALE: 1.0}), start)
+        start, weights = _moved(problem, at, shape, weights)
+        there = start and refit(start.hypothesis, start)
         if not there:
             break
-        at, scale = there, there.hypothesis.values[SCALE]
-        best = there if best is None or there.rss < best.rss else best
-        if abs(scale - 1.0) < _SETTLED:
+        if best is not None and there.rss > _LEAST_PROGRESS * best.rss:
             break
-        weights = weights * scale
+        best = at = there
+        weights = weights * there.hypothesis.values[SCALE]
     return best
+
+
+def _moved(
+    problem: WindowedProblem, at: Fitted, shape: Shape, weights: Array
+) -> tuple[Linearisation | None, Array]:
+    """The next weights after those that a fit has, simulated with them; shorter steps where a whole
+    one makes it worse."""
+    change, _ = _penalised(problem, at, shape, weights)
+    h, line = at.hypothesis, at.linearisation
+    keys = [k for k in h.keys if k != SCALE]
+    values = np.array([h.values[k] for k in keys])
+    for factor in _STEPS:
+        moved = values + factor * change[: len(keys)]
+        next_weights = weights + factor * change[len(keys) :]
+        there = Hypothesis(
+            h.config,
+            {**dict(zip(keys, moved.tolist(), strict=True)), SCALE: 1.0},
+            {**h.constants, **shape.constants(next_weights)},
+        )
+        start = linearise(problem, there, line.starts, at.noise)
+        if start is not None and start.rss < at.rss:
+            break
+    return start, next_weights
 
 
 # ------------------------------------------------------------------ variables and functions
@@ -243,8 +263,9 @@ def _basis(problem: WindowedProblem, now: Fitted, shape: Shape) -> Array:
 def _penalised(
     problem: WindowedProblem, now: Fitted, shape: Shape, before: Array | float = 0.0
 ) -> tuple[Array, Array]:
-    """How the weights change from those ``before`` in a fit, and what they take off the squared
-    residuals of each window (W,), both predicted by fits to other windows."""
+    """How the parameters of a fit but for the scale change, and the weights from those ``before``;
+    and what the weights take off the squared residuals of each window (W,), predicted by fits to
+    other windows."""
     line, basis = now.linearisation, _basis(problem, now, shape)
     direction = _direction(problem, shape.axis)
     s = line.sensitivity_to(direction[:, :, None] * basis[:, None, :])
@@ -273,17 +294,24 @@ def _penalised(
                 squares[w] = np.sum((errors[w] - own[w][:, : len(change)] @ change) ** 2)
         return squares
 
-    def change_of(normal: Array, slope: Array, smoothness: float | None) -> Array:
+    lower, upper = step_limits(now.hypothesis, [now.hypothesis.keys[i] for i in kept])
+    free = np.full(n, np.inf)
+
+    def change_of(
+        normal: Array, slope: Array, smoothness: float | None, bounded: bool = False
+    ) -> Array:
         if smoothness is None:
             return _solved(normal[:b, :b], slope[:b])
         whole, right = normal.copy(), slope.copy()
         whole[b:, b:] += smoothness * size * rough
         right[b:] -= smoothness * size * rough @ weights
+        if bounded:
+            return solve_bounded(whole, right, np.append(lower, -free), np.append(upper, free))
         return _solved(whole, right)
 
     tried = [left(x) for x in _SMOOTHNESS]
     best = int(np.argmin([x.sum() for x in tried]))
-    change = change_of(normal, slope, float(_SMOOTHNESS[best]))[b:]
+    change = change_of(normal, slope, float(_SMOOTHNESS[best]), bounded=True)
     return change, left(None) - tried[best]
 
 

@@ -163,7 +163,7 @@ def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -
         linear = linearisation.linear
         value = np.array(list(h.values.values()))
         slope = linear.gradient.sum(axis=0) + prior * (mean - value)
-        change = _solve_bounded(linear.normal + np.diag(prior), slope, *_step_limits(h, h.keys))
+        change = solve_bounded(linear.normal + np.diag(prior), slope, *step_limits(h, h.keys))
         if slope @ change < _TOLERANCE * linear.count:
             return Fitted(h, linearisation, True)
         cost = linearisation.rss + prior @ (mean - value) ** 2
@@ -218,10 +218,10 @@ def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
     normal = linear.normal[np.ix_(at, at)]
     change = np.zeros(len(linear.keys))
     change[moved] = far
-    change[at] = _solve_bounded(
+    change[at] = solve_bounded(
         normal + np.diag(precision(h.at({k: h.values[k] for k in follow}))),
         slope[at] - linear.normal[np.ix_(at, moved)] @ far,
-        *_step_limits(h, follow),
+        *step_limits(h, follow),
     )
     there = h.having({k: h.values[k] + change[i] for k, i in zip(follow, at, strict=True)})
     starts = start.starts_after(change[: len(before.keys)])
@@ -234,7 +234,7 @@ def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
     return min(filter(None, both), key=lambda x: x.rss, default=None)
 
 
-def _step_limits(h: Hypothesis, keys: Sequence[Key]) -> tuple[Array, Array]:
+def step_limits(h: Hypothesis, keys: Sequence[Key]) -> tuple[Array, Array]:
     """How far parameters may move in one step, downwards and upwards."""
     value = np.array([h.values[k] for k in keys])
     lower, upper = np.array([bounds(k)[1:] for k in keys]).reshape(-1, 2).T
@@ -242,7 +242,7 @@ def _step_limits(h: Hypothesis, keys: Sequence[Key]) -> tuple[Array, Array]:
     return np.maximum(lower - value, -limit), np.minimum(upper - value, limit)
 
 
-def _solve_bounded(normal: Array, slope: Array, lower: Array, upper: Array) -> Array:
+def solve_bounded(normal: Array, slope: Array, lower: Array, upper: Array) -> Array:
     """The change that solves ``normal change = slope`` within bounds (active set)."""
     free = np.ones(len(slope), dtype=bool)
     change = np.zeros(len(slope))
