@@ -13,9 +13,9 @@ from rov_ident.discrepancy import extension
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import Judge, split
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
-from rov_ident.discrepancy.reading_noise import resting_noise
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import gather
+from rov_ident.sampling.reading_noise import resting_noise
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
 MINUTE = Conditions(duration=60.0)

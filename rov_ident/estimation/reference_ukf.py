@@ -48,7 +48,7 @@ class ReferenceUkf:
         for part in (slice(0, 3), slice(3, 6)):
             if not np.isfinite(z[part] + r[part]).all() or info["nis"][part].max() > gate:
                 z[part] = np.nan
-        self._update(z, r, before.monitor["density"])
+        self._update(z, r, before.monitor)
         if not after.p[:6, 6:].any():  # after outliers in a row
             self._restart()
         self._walk(after)
@@ -108,10 +108,10 @@ class ReferenceUkf:
         q[:6, :6] = (forces + np.diag(density)) * row["dt"]
         return q
 
-    def _update(self, z: Array, r: Array, density: Array) -> None:
+    def _update(self, z: Array, r: Array, monitor: NDArray[np.void]) -> None:
         """Take in what is measured (not NaN) of z (6,), with variances r (6,).
 
-        ``density`` (6,) is that of unknown acceleration.
+        ``monitor`` (6,) of MONITOR is that of ours.
         """
         row = self._row
         measured = np.flatnonzero(np.isfinite(z))
@@ -121,8 +121,8 @@ class ReferenceUkf:
         self.filter._dim_z = len(measured)
         self.filter.update(z[measured], R=np.diag(r[measured]), hx=lambda x: x[measured])
         # What does not show in the motion is only considered (Schmidt 1966).
-        moves, shown = np.ones(len(self.task.theta), dtype=bool), np.zeros((2, 6), dtype=np.uint8)
-        learnt(self.task, row["moving"], row, density, self._inverse_mass(), shown, moves)
+        moves, noisy = np.ones(len(self.task.theta), dtype=bool), np.zeros(6, dtype=bool)
+        learnt(self.task, row["moving"], row, monitor, self._inverse_mass(), noisy, moves)
         held = 6 + np.flatnonzero(~moves[self.task.estimated])
         self.filter.x[held] = x[held]
         self.filter.P[np.ix_(held, held)] = p[np.ix_(held, held)]

@@ -323,7 +323,7 @@ _SCRATCH = record(
 
 Work = namedtuple(
     "Work",
-    "theta one_theta estimated scale place moves moving shown momentum of_rate of_motion change "
+    "theta one_theta estimated scale place moves moving noisy momentum of_rate of_motion change "
     "gradient line sensitivity drive direct root inverse score spare rows basis lost scratch",
 )
 """Scratch for all samples of a fold."""
@@ -341,7 +341,7 @@ def _work(task, state):
         np.empty(n, dtype=np.int64),  # where each column was
         np.empty(m, dtype=np.bool_),
         np.empty(6, dtype=np.uint8),
-        np.empty((2, 6), dtype=np.uint8),
+        np.empty(6, dtype=np.bool_),
         np.empty((6, m)),  # per unit of each coefficient
         np.empty((6, m)),
         np.empty((6, m)),
@@ -570,8 +570,8 @@ def _judge_motion(task, state, work, sample):
         surely = state.nu[i] ** 2 - _NOISE_PEAK * state.p[i, i]
         c.peak[i] = max(c.peak[i] * decay, surely)
         work.moving[i] = 1 if c.peak[i] > _MOVING * r else 0
-    density, inverse = state.monitor.density, work.scratch[0].inverse
-    learnt(task, work.moving, sample, density, inverse, work.shown, work.moves)
+    inverse = work.scratch[0].inverse
+    learnt(task, work.moving, sample, state.monitor, inverse, work.noisy, work.moves)
     free, sorted_already = 0, True
     for a in range(len(work.estimated)):
         if work.moves[work.estimated[a]]:

@@ -102,25 +102,24 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
 
 
 @lean
-def learnt(task, moving, sample, density, inverse, shown, moves):
-    """moves (m,): which of theta a motion teaches. Work space: shown (2, 6).
+def learnt(task, moving, sample, monitor, inverse, noisy, moves):
+    """moves (m,): which of theta a motion teaches. Work space: noisy (6,).
 
-    A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor,
-    and on which the wrench is far above the noise of its reading; a factor of the thrust if all
-    axes are that it is for. What looks like noise may be a command that trembles, which the vehicle
-    follows: then the unexplained acceleration, of ``density`` (6,) [(m/s2)^2/Hz, (rad/s2)^2/Hz], is
-    far below it. ``inverse`` (6, 6) is that of the mass matrix.
+    A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor;
+    a factor of the thrust if on all axes that it is for the wrench is far above the noise of its
+    reading. What looks like noise may be a command that trembles, which the vehicle follows: then
+    the unexplained acceleration, as ``monitor`` (6,) of MONITOR knows it, is far below it.
+    ``inverse`` (6, 6) is that of the mass matrix.
     """
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
-        shown[1, i] = 1 if noise > 0.0 and density[i] > _FOLLOWED * noise else 0
-        shown[0, i] = 0 if shown[1, i] else moving[i]
-    in_motion(task.structure, shown[0], moves)
+        noisy[i] = noise > 0.0 and monitor[i].density > _FOLLOWED * noise
+    in_motion(task.structure, moving, moves)
     first = len(task.structure.mass_row) + len(task.structure.row)
     for e in range(first, len(moves)):
         moves[e] = True
         for i in range(6):
-            if task.scaled[e - first, i] and shown[1, i]:
+            if task.scaled[e - first, i] and noisy[i]:
                 moves[e] = False
 
 

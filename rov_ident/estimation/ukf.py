@@ -186,7 +186,7 @@ _SCRATCH = record(
 )
 
 
-Work = namedtuple("Work", "p upper root moved cross gain block free moves shown theta mean scratch")
+Work = namedtuple("Work", "p upper root moved cross gain block free moves noisy theta mean scratch")
 """Scratch for all samples of a fold. Zeros fill the rows of matrices to a multiple of LANES."""
 
 
@@ -204,7 +204,7 @@ def _work(task, state):
         np.zeros((3, size - 6, columns)),  # for the covariance of the coefficients alone
         np.zeros(columns),  # 1 where a state is estimated, 0 where it is only considered
         np.empty(m, dtype=np.bool_),
-        np.empty((2, 6), dtype=np.uint8),
+        np.empty(6, dtype=np.bool_),
         np.empty((m, LANES)),
         np.empty((m, 1)),
         np.empty(1, dtype=_SCRATCH),  # in one record, whose parts the compiler knows apart
@@ -252,8 +252,8 @@ def _steps(task, state, work, samples, sides, infos):
                 info.reason = UNPREDICTABLE
                 c.started = False
                 continue
-            density, inverse = state.monitor.density, work.scratch[0].centre_inverse
-            learnt(task, sample.moving, sample, density, inverse, work.shown, work.moves)
+            inverse = work.scratch[0].centre_inverse
+            learnt(task, sample.moving, sample, state.monitor, inverse, work.noisy, work.moves)
             for i in range(len(state.x)):
                 work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
             _update(task, state, work, sample, side, info)

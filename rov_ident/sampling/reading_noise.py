@@ -83,6 +83,8 @@ class ReadingNoise:
 
     def take(self, t: float, reading: Array) -> None:
         """The next reading (6,), at t [s]."""
+        if self._t and t < self._t[-1]:  # the clock was stepped
+            self._t, self._readings = [], []
         self._t.append(t)
         self._readings.append(reading)
         if len(self._t) < _BLOCK + 2:
