@@ -24,7 +24,7 @@ VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in (""
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    """What a minute of the next manoeuvre takes to plan, a third of it takes a third of."""
+    """The next manoeuvre that is planned lasts 20 s, not a minute: a third of the search."""
     monkeypatch.setattr(identification, "plan", partial(ri.plan, duration=20.0))
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from bench.simulators import hidden
 from bench.studies.watch import by_default
-from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.estimation.online import Kind, OnlineEstimator
 from rov_ident.sampling.reading_noise import ReadingNoise
 
 _RATE = 50.0  # Hz
@@ -41,14 +41,14 @@ def test_commands_without_noise_of_their_own_have_none() -> None:
         assert (_after(readings) == 0.0).all()
 
 
-def _dive(kind: str, seed: int, noise: float, seconds: float = 40.0) -> list[tuple[float, float]]:
+def _dive(kind: Kind, seed: int, noise: float, seconds: float = 40.0) -> list[tuple[float, float]]:
     """Thrust scale and its standard deviation under a pilot, every five seconds; 1 is true."""
     moments = float(np.random.default_rng(seed).uniform(0.04, 0.08))
     conditions = hidden.Conditions(
         seconds, excitation="pilot", reading=(noise * 0.5, noise * moments)
     )
     case = hidden.draw(seed, conditions=conditions)
-    online = OnlineEstimator(by_default(case.config), kind)  # type: ignore[arg-type]
+    online = OnlineEstimator(by_default(case.config), kind)
     found, due = [], 5.0
     for _, role, message in case.messages:
         online.push(role, message)
@@ -66,7 +66,7 @@ _DIVES = [0, 1, *(pytest.param(seed, marks=pytest.mark.study) for seed in range(
 
 @pytest.mark.parametrize("seed", _DIVES)
 @pytest.mark.parametrize("kind", ["rls", "ukf"])
-def test_it_is_not_taken_for_a_weaker_thrust(kind: str, seed: int) -> None:
+def test_it_is_not_taken_for_a_weaker_thrust(kind: Kind, seed: int) -> None:
     """Without the rule RLS and UKF are five standard deviations off in most of these dives."""
     for value, std in _dive(kind, seed, 1.0):
         assert abs(value - 1.0) <= 3.0 * std
