@@ -18,13 +18,13 @@ from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.core.whiteness import JUDGED_TIME
-from rov_ident.effects import EFFECTS, parameter
+from rov_ident.effects import parameter
 from rov_ident.estimation import innovation_monitor, rls, ukf
 from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
-from rov_ident.estimation.shared import INFO
+from rov_ident.estimation.shared import INFO, noisy_axes, too_noisy
 from rov_ident.sampling.sample import believed
 from rov_ident.sampling.sampler import Sampler
 
@@ -158,6 +158,7 @@ class OnlineEstimator:
         self._state = self._module.init(self._task)
         self._update = IteratedUpdate(self._state) if self.kind == "rls" else None
         self._last_t = math.nan
+        self._reading_noise = np.zeros(6)  # of the last sample
         self._recalled = 0  # ns: the stamp before the first sample
         # information over the prior's: in the window that is filling, and in the one before
         self._gained = np.zeros((2, len(self.prior.names)))
@@ -236,6 +237,7 @@ class OnlineEstimator:
             samples["restart"][0] = True
             self._paused = False
         info = self._fold(samples)
+        self._reading_noise = samples["reading_noise"][-1]
         self._last_t = float(samples["t"][-1])
         for reason in self._module.REFUSALS:
             if count := int(np.count_nonzero(info["reason"] == reason)):
@@ -313,14 +315,11 @@ class OnlineEstimator:
 
     def _centre(self, values: Mapping[str, float]) -> None:
         """Have samples made with these values of the parameters of effects, all of them, and of
-        coefficients, with which a rigid body is heavier or lighter."""
+        coefficients: with these a rigid body is heavier or lighter."""
         self._centred = self._last_t
         self._about = np.array([values[name] for name in self.config.effect_names])
         if self.config.effect_names:
-            # The rigid body is the estimator's own, and what acts on it all but linear.
-            bodies = {name for name in self.config.effects if EFFECTS[name].body is not None}
-            acting = {n: v for n, v in values.items() if n.partition(".")[0] not in bodies}
-            self.sampler.recentre(self.config.with_values(acting))
+            self.sampler.recentre(self.config.with_values(values))
 
     def memory(self) -> Memory:
         """What is learnt so far, for `checkpoint`. The arrays are not to be changed.
@@ -398,10 +397,11 @@ class OnlineEstimator:
             self._safe, std, covariance = values, raw.std, raw.covariance
         gained = self._gained.sum(axis=0)
         excitation = gained / (1.0 + gained)
+        waiting = self._waiting(values)
         judged = [
             (State.DIVERGED, "diverged: the last good value is held, call reset")
             if diverged
-            else self._judge(i, values, std, raw.values, excitation, consistency.consistent)
+            else self._judge(i, values, std, raw.values, excitation, consistency, waiting.get(i))
             for i in range(len(values))
         ]
         # A bound cuts the interval too: no part of it is physically possible.
@@ -423,6 +423,16 @@ class OnlineEstimator:
             consistency,
         )
 
+    def _waiting(self, values: Array) -> dict[int, str]:
+        """Why factors of the thrust, by their place, are not learnt now, at coefficients values."""
+        if not self._reading_noise.any():
+            return {}
+        coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))
+        mass = self.config.dynamics.with_values(coefficients).mass_matrix
+        noisy = noisy_axes(mass, self._reading_noise, self._state.monitor["density"])
+        factors = enumerate(self._task.scaled & noisy, len(coefficients))
+        return {i: too_noisy(axes) for i, axes in factors if axes.any()}
+
     def _unexplained(self) -> Array:
         """(6,): force that the model lacks over the working wrench, NaN where that is not known."""
         monitor, first = self._state.monitor, self._task.process["first"][0]
@@ -442,16 +452,25 @@ class OnlineEstimator:
         return self.sampler.origin + round(self._last_t * 1e9)
 
     def _judge(
-        self, i: int, values: Array, std: Array, raw: Array, excitation: Array, consistent: bool
+        self,
+        i: int,
+        values: Array,
+        std: Array,
+        raw: Array,
+        excitation: Array,
+        consistency: Consistency,
+        waiting: str | None,
     ) -> tuple[State, str]:
         """The state of a coefficient, and a message that begins with the word for it."""
         if abs(raw[i] - values[i]) > CONTRADICTED * std[i]:
             return State.AT_BOUND, "at bound: held at its physical bound, the data contradict it"
         excited = excitation[i] >= _EXCITED
-        if not consistent and (excited or is_known(values[i], std[i], self.prior.std[i])):
+        if not consistency.consistent and (
+            excited or is_known(values[i], std[i], self.prior.std[i])
+        ):
             return State.CONVERGING, "converging: data and model disagree"
         if is_known(values[i], std[i], self.prior.std[i]):
             return State.CONVERGED, "converged" if excited else "converged: not excited now"
         if excited:
             return State.CONVERGING, "converging"
-        return State.HELD, "held: not excited, the motion does not show it"
+        return State.HELD, f"held: {waiting or 'not excited, the motion does not show it'}"

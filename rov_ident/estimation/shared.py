@@ -24,7 +24,7 @@ REACH = 10.0  # prior standard deviations, which no coefficient is off; for RLS'
 
 # of what looks like noise of the reading, below which the vehicle follows it ("Noise of the
 # wrench's reading" in docs/accuracy.md)
-_FOLLOWED = 0.1
+FOLLOWED = 0.1
 # Effects whose parameters are factors of the thrust, of all axes or of one.
 _FACTORS = ("thrust_scale", "thruster_gain")
 
@@ -74,11 +74,6 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
     names, mean = prior.names, dict(zip(prior.names, prior.mean, strict=True))
     thrust = names.index(THRUST_SCALE) if mean.get(THRUST_SCALE, 0.0) > 0.0 else -1
     per_thrust = [thrust >= 0 and moves_with_thrust(name) for name in names]
-    scaled = np.zeros((len(config.estimate_effects), 6), dtype=bool)
-    for k, (effect, own) in enumerate(config.estimate_effects):
-        if effect in _FACTORS:
-            axis = parameter(effect, own).axis
-            scaled[k, AXES.index(axis) if axis else slice(None)] = True
     absolute = [EFFECTS[effect].act is None for effect, _ in config.estimate_effects]
     return Problem(
         values,
@@ -96,9 +91,35 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         thrust,
         np.array(per_thrust, dtype=bool),
         np.array(absolute, dtype=bool),
-        scaled,
+        factors_of(config),
         LIGHTEST * np.diag(np.linalg.cholesky(body.mass_matrix)) ** 2,
     )
+
+
+def factors_of(config: Config) -> NDArray[np.bool_]:
+    """(k, 6): of which components of the thrust each estimated parameter of effects is a factor."""
+    factors = np.zeros((len(config.estimate_effects), 6), dtype=bool)
+    for k, (effect, own) in enumerate(config.estimate_effects):
+        if effect in _FACTORS:
+            axis = parameter(effect, own).axis
+            factors[k, AXES.index(axis) if axis else slice(None)] = True
+    return factors
+
+
+def too_noisy(axes: NDArray[np.bool_]) -> str:
+    """Why a factor of the thrust is not learnt, and what to do, from the noisy axes (6,)."""
+    names = " ".join(name for name, noisy in zip(AXES, axes, strict=True) if noisy)
+    return (
+        f"noise of the wrench's reading is not far below the wrench on {names}: drive harder "
+        "there, or feed the command instead of what thrusters report"
+    )
+
+
+def noisy_axes(mass: Array, reading_noise: Array, density: Array) -> NDArray[np.bool_]:
+    """(6,) on which axes noise of the wrench's reading forbids to learn a factor of the thrust, as
+    :func:`learnt` decides it; ``mass`` (6, 6), ``density`` (6,) of the monitor."""
+    noise = np.diag(np.linalg.inv(mass)) ** 2 * reading_noise
+    return (noise > 0.0) & (density > FOLLOWED * noise)
 
 
 @lean
@@ -113,7 +134,7 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     """
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
-        noisy[i] = noise > 0.0 and monitor[i].density > _FOLLOWED * noise
+        noisy[i] = noise > 0.0 and monitor[i].density > FOLLOWED * noise
     in_motion(task.structure, moving, moves)
     first = len(task.structure.mass_row) + len(task.structure.row)
     for e in range(first, len(moves)):

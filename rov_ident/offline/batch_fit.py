@@ -18,11 +18,12 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
-from rov_ident.effects import EFFECTS, Acting, compiled
+from rov_ident.effects import Acting, compiled
 from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
+from rov_ident.estimation.shared import too_noisy
 from rov_ident.model.coefficients import MOTIONS, Coefficient
-from rov_ident.model.equations import Model
+from rov_ident.model.equations import Model, RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Samples, total
@@ -187,9 +188,11 @@ def _relinearised(
     centre, model = first_centre(config), config.model
     while True:
         told: list[str] = []
-        acting = {n: v for n, v in centre.items() if EFFECTS[n.partition(".")[0]].body is None}
-        samples = archive.reread(config.with_model(model).with_values(acting), True)
-        found = _stage(samples, config, kind, MOTIONS, settings, told, say, found)
+        about = config.with_model(model).with_values(centre)
+        samples = archive.reread(about, True)
+        found = _stage(
+            samples, config, kind, MOTIONS, settings, told, say, found, about.dynamics.body
+        )
         assert found is not None
         before = np.array(list(centre.values()))
         settings = replace(settings, readings=settings.readings - 1)
@@ -214,10 +217,12 @@ def _stage(
     notes: list[str],
     say: Say,
     before: _Stage | None = None,
+    body: RigidBody | None = None,
 ) -> _Stage | None:
     """Fit some channels; None, and a note, where there is nothing to do.
 
-    Maximum likelihood begins with what was found ``before``, where there is that.
+    Maximum likelihood begins with what was found ``before``, where there is that; ``body`` is the
+    one about which samples are linear (None: as configured).
     """
     free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
@@ -286,7 +291,9 @@ def _stage(
         likelihood = maximum_likelihood.maximise(
             archive.each,
             config,
-            config.dynamics.with_values(dict(zip(names, start.tolist(), strict=False))),
+            replace(config.model, body=body or config.dynamics.body).with_values(
+                dict(zip(names, start.tolist(), strict=False))
+            ),
             free,
             precision / prior.std**2,
             settings.process,
@@ -303,6 +310,9 @@ def _stage(
         more["noise"] = _noise(likelihood, free)
         more["cost"] = likelihood.total.cost
         more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
+        if likelihood.held.any():
+            waiting = ", ".join(n for n, held in zip(names, likelihood.held, strict=True) if held)
+            notes.append(f"{waiting} held: {too_noisy(likelihood.noisy)}")
         if not likelihood.converged:
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None

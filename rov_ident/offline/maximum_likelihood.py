@@ -56,11 +56,19 @@ from rov_ident.estimation.observer import (
     linearised_step,
     take_inputs,
 )
-from rov_ident.estimation.shared import drive_sides, measure, steps_of, wrench_of
+from rov_ident.estimation.shared import (
+    FOLLOWED,
+    drive_sides,
+    factors_of,
+    measure,
+    steps_of,
+    wrench_of,
+)
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.least_squares import add_scatter
+from rov_ident.sampling.reading_noise import SHARE
 from rov_ident.sampling.sample import NO_SIDES, parts
 
 T = TypeVar("T")
@@ -287,6 +295,8 @@ class Likelihood:
     """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
 
     ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
+    ``held`` (n,): factors of the thrust that kept their prior, as noise of the wrench's reading on
+    the axes ``noisy`` (6,) would be taken for a weaker thrust.
     """
 
     values: Array
@@ -294,6 +304,8 @@ class Likelihood:
     bound: Array
     noise: Noise
     total: Pass
+    held: NDArray[np.bool_]
+    noisy: NDArray[np.bool_]
     iterations: int
     converged: bool
 
@@ -352,6 +364,9 @@ def maximise(
         return found, cost if np.isfinite(cost) else np.inf
 
     looks = count(1)
+    readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
+    factors = np.zeros((len(mean), 6), dtype=bool)
+    factors[~own] = factors_of(config)
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
         say(f"step {next(looks)}")
@@ -359,7 +374,7 @@ def maximise(
 
     nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
     theta, at, steps = np.append(model.theta[estimated[own]], effects), nothing, 0
-    settled, converged, enough, bounds = theta, False, 1e-6 * len(theta), (prior.lower, prior.upper)
+    settled, converged, enough = theta, False, 1e-6 * len(theta)
     for stage, gate in enumerate((np.inf, _GATE, _GATE, _GATE)):
         far = theta - settled
         if stage >= 2 and far @ at.information @ far < 0.1 * len(theta):
@@ -375,13 +390,44 @@ def maximise(
         costs = [look(theta, _GATE, level)[1] for level in levels]
         noise = levels[int(np.argmin(costs))]
         starts = [noise, *starts[:1]] if stage == 0 else [noise]
+        # loud, and not a command that trembles, which the vehicle would follow
+        noisy = (readings > SHARE * wrenches) & (samples * noise.floor > FOLLOWED * readings)
+        held = (factors & noisy).any(axis=1) & (precision > 0.0)
+        bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
         there = partial(look, gate=gate, noise=noise)
+        theta = np.clip(theta, *bounds)
         theta, at, more, converged = minimise(theta, bounds, there, slope_of, enough, _ITERATIONS)
         steps += more
-    bound = inverse_of(at.information + np.diag(precision))
+    bound, covariance = _considered(at.information, at.scatter, precision, held)
+    return Likelihood(theta, covariance, bound, noise, at, held, noisy, steps, converged)
+
+
+def _considered(
+    information: Array, scatter: Array, precision: Array, held: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Bound and covariance (n, n) of an estimate in which what is ``held`` (n,) keeps its prior:
+    an error of that moves all others (Schmidt 1966)."""
+    ours = np.ix_(~held, ~held)
+    error = np.eye(len(held))  # by the score of what is estimated, and by errors of what is held
+    error[ours] = inverse_of((information + np.diag(precision))[ours])
+    error[np.ix_(~held, held)] = -error[ours] @ information[np.ix_(~held, held)]
+    found = []
+    for square in (information + np.diag(precision), scatter + np.diag(precision)):
+        square[held] = square[:, held] = 0.0
+        square[held, held] = 1.0 / precision[held]
+        found.append(sandwich(error, square))
+    bound, covariance = found
     # From few data the scatter is itself uncertain: never thinner than the bound.
-    covariance = widened(sandwich(bound, at.scatter + np.diag(precision)), np.diag(bound))
-    return Likelihood(theta, covariance, bound, noise, at, steps, converged)
+    return bound, widened(covariance, np.diag(bound))
+
+
+def _wrench_densities(samples: Samples) -> Array:
+    """Sums (3, 6) of the variance densities of noise of the wrench's reading, where it is loud, and
+    of the wrench itself, and the number of samples."""
+    samples, _ = parts(samples)
+    power = samples["wrench"] ** 2 * samples["hold"][:, None]
+    densities = (samples["reading_noise"], power, np.ones_like(power))
+    return np.array([np.sum(density, axis=0) for density in densities])
 
 
 def _noise_levels(

@@ -10,8 +10,9 @@ motion and the measured velocity become::
 ``J`` (6, k) is the change of the wrench: difference quotients of the input effects, run beside the
 configured ones, of effects on fins in what the configured fins make, and of the wrench effects, at
 the measured motion; of effects on the rigid body
-``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration of the configured model. ``V`` (6, k)
-is the change of the measured velocity: of moving water, and of effects on the velocity sensors.
+``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration of the model as it is estimated, so
+that what the trim does to it is in there. ``V`` (6, k) is the change of the measured velocity: of
+moving water, and of effects on the velocity sensors.
 """
 
 from typing import NamedTuple
@@ -149,11 +150,16 @@ class EffectJacobians:
             self._time += dt
 
     def about(self, config: Config) -> "EffectJacobians":
-        """The same of a configuration with other values of the parameters; what is known stays."""
+        """The same of a configuration with other values of the parameters; what is known stays.
+
+        So do the values that the columns of the rigid body are about, as the estimator's own body
+        stays: these columns are linear, but for the acceleration.
+        """
         new = EffectJacobians(config)
         names = "_memory _around _impulse _time _velocity _followed _steering"
         for name in names.split():
             setattr(new, name, getattr(self, name))
+        new._about[new._bodies] = self._about[self._bodies]
         return new
 
     def measure(self, v: Array, omega: Array, has_imu: bool) -> None:

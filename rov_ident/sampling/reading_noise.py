@@ -21,7 +21,7 @@ _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
 _RECENT = 5.0  # s; over which the power of a component is averaged: a few moves of a stick
 # of that power, which noise may be: the same section has the study
-_SHARE = 0.01
+SHARE = 0.01
 
 
 def resting_noise(demand: Array) -> Array:
@@ -71,7 +71,7 @@ class ReadingNoise:
     """Says, as readings come, on which axes noise is not far below the wrench itself.
 
     ``relative`` is the noise in proportion to the wrench that is known of; ``variance`` (6,) that
-    of what is found beside it, zero where it has less than ``_SHARE`` of the power of late.
+    of what is found beside it, zero where it has less than ``SHARE`` of the power of late.
     """
 
     def __init__(self, relative: float = 0.0) -> None:
@@ -93,5 +93,5 @@ class ReadingNoise:
         share = 1.0 if not self._power.any() else -math.expm1((self._t[0] - t) / _RECENT)
         self._power += share * (np.mean(block**2, axis=0) - self._power)
         variance = np.nan_to_num(scatter(block, self.relative)[0]) ** 2
-        self.variance = np.where(variance > _SHARE * self._power, variance, 0.0)
+        self.variance = np.where(variance > SHARE * self._power, variance, 0.0)
         self._t, self._readings = [], []
