@@ -22,13 +22,13 @@ def noisy(heavy):
 
 
 @numba.njit
-def watched(monitor, constants, i, innovations, moving):
+def watched(monitor, constants, i, innovations, moving, considered=0.0):
     """Normalised innovations of axis i, twenty a second; how many were outliers."""
     count = 0
     for e in innovations:
         monitor[i].since = 0.05
         monitor[i].acting = 10.0 * monitor[i].density
-        count += watch(monitor[i], constants[0], i, 1.5, moving, moving, 5.0, e)
+        count += watch(monitor[i], constants[0], i, 1.5, moving, moving, 5.0, e, considered)
     return count
 
 
@@ -63,6 +63,23 @@ def test_white_innovations_are_no_change_and_no_outliers(heavy):
     assert watched(monitor, constants, 1, white, True) == 0
     assert monitor["nis"][1] == pytest.approx(1.0, abs=0.6)
     assert monitor["density"][1] < constants["first"][0, 1]
+
+
+def test_the_error_of_what_is_only_considered_is_no_noise(heavy):
+    """It is the same in all innovations of a filter that does not learn it: their correlation with
+    it is known, and so is the power of their sums."""
+    constants, rng, powers = process(heavy), np.random.default_rng(5), []
+    correlation = 0.4
+    for known in (correlation, 0.0):
+        found = []
+        for error in rng.standard_normal(100):
+            monitor = first_monitor(constants)
+            white = np.sqrt(1.0 - correlation**2) * rng.standard_normal(40 * 20)
+            watched(monitor, constants, 5, white + correlation * error, True, known)
+            found.append(monitor["power"][5])
+        powers.append(np.mean(found))
+    # a sum with fading memory holds 10 white ones, and of the error 20, squared: 0.84 + 0.16 x 40
+    assert powers == pytest.approx([1.0, 7.2], rel=0.3)
 
 
 def test_what_lasts_a_second_in_motion_is_told_from_noise(heavy):

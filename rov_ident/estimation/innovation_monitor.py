@@ -38,7 +38,8 @@ MONITOR = record(
         ("density", "f8"),  # of the unexplained acceleration, (m/s2)^2/Hz or (rad/s2)^2/Hz
         ("acting", "f8"),  # the same with the noise of the wrench: set by the estimator; 0: unknown
         ("summed", "f8"),  # normalised innovations added up with fading memory
-        ("expected", "f8"),  # variance of that
+        ("expected", "f8"),  # variance of that, of white ones
+        ("lasting", "f8"),  # standard deviation of that for what is considered, not estimated
         ("since", "f8"),  # s since this velocity was measured: counted by the estimator
         ("seen", "f8"),  # s of innovations so far
         ("driven", "f8"),  # s in which this velocity moved, of these
@@ -65,11 +66,12 @@ def interrupt(m):
     """After a gap the sum of innovations begins anew; density and NIS stay."""
     m.summed = 0.0
     m.expected = 0.0
+    m.lasting = 0.0
     m.since = 0.0
 
 
 @inlined
-def watch(m, process, i, room, moving, own, gate, innovation):
+def watch(m, process, i, room, moving, own, gate, innovation, considered):
     """Take in a normalised innovation of axis i; whether it is an outlier.
 
     ``moving`` says whether any velocity is, ``own`` whether that of this axis is.
@@ -78,6 +80,9 @@ def watch(m, process, i, room, moving, own, gate, innovation):
     Noise that is added by chance does not go below the floor by chance: the less room, the more
     information is lost to that, and the better the intervals where the model is wrong. Where no
     velocity is ``moving`` (on the ground, on deck), what holds the vehicle says nothing of a dive.
+
+    ``considered`` is the correlation of the innovation with the error of what is considered and not
+    estimated. That stays the same, so its share of successive innovations adds up, not its square.
     """
     nis = innovation * innovation
     # a single kick counts for no more than LARGEST: what has changed shows again and again
@@ -91,10 +96,12 @@ def watch(m, process, i, room, moving, own, gate, innovation):
         m.driven += m.since if own else 0.0
         m.summed = keep * m.summed + min(max(innovation, -LARGEST), LARGEST)
         m.expected = keep * keep * m.expected + 1.0
+        m.lasting = keep * m.lasting + considered
+        expected = m.expected + m.lasting * m.lasting
         if m.seen > TIME and m.driven > _LESSON:
             m.judged += m.since
-            m.power = averaged(m.power, m.judged, m.since, m.summed, m.expected)
-        excess = min(m.summed * m.summed / m.expected, STEADY) - room
+            m.power = averaged(m.power, m.judged, m.since, m.summed, expected)
+        excess = min(m.summed * m.summed / expected, STEADY) - room
         blend = min(m.since / min(FIRST_TIME + 0.25 * m.seen, TIME), _FASTEST)
         density = max(m.density + blend * excess * m.acting, process.floor[i])
         m.density = min(density, process.largest[i])

@@ -646,7 +646,7 @@ def _update(task, state, work, sample, side, info):
             count += 1
             measured, info.nis[i] = True, e * e
             own = work.moving[i] != 0
-            outlier |= watch(state.monitor[i], task.process[0], i, _ROOM, moving, own, gate, e)
+            outlier |= watch(state.monitor[i], task.process[0], i, _ROOM, moving, own, gate, e, 0.0)
         if measured:
             anew |= lost(state.monitor, first, outlier)
         if outlier:

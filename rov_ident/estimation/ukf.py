@@ -459,12 +459,18 @@ def _update(task, state, work, sample, side, out):
         outlier = False
         for i in range(first, first + 3):
             predicted, spread = _seen(task, x, p, side, i)
-            innovation = (z[i] - predicted) / np.sqrt(spread + r[i])
+            spread += r[i]
+            innovation = (z[i] - predicted) / np.sqrt(spread)
+            considered = 0.0
+            for j in range(6 + len(task.scale) - side.shape[1], len(x)):
+                if work.free[j] == 0.0:
+                    considered += p[i, j] * p[i, j] / (p[j, j] * spread)
             out.nis[i] = innovation**2
             own = sample.moving[i] != 0
             outlier |= watch(
-                state.monitor[i], task.process[0], i, _ROOM, moving, own, s.gate, innovation
-            )
+                state.monitor[i], task.process[0], i, _ROOM, moving, own, s.gate, innovation,
+                np.sqrt(considered),
+            )  # fmt: skip
         anew |= lost(state.monitor, first, outlier)
         if outlier:
             out.reason = GATED

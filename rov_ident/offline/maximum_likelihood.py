@@ -295,8 +295,8 @@ class Likelihood:
     """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
 
     ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
-    ``held`` (n,): factors of the thrust that kept their prior, as noise of the wrench's reading on
-    the axes ``noisy`` (6,) would be taken for a weaker thrust.
+    ``held`` (n,): what kept its prior, as the axes ``noisy`` (6,) would teach it noise of the
+    wrench's reading: their coefficients, and factors of the thrust there.
     """
 
     values: Array
@@ -365,8 +365,7 @@ def maximise(
 
     looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
-    factors = np.zeros((len(mean), 6), dtype=bool)
-    factors[~own] = factors_of(config)
+    taught = np.vstack([_rows(model.structure)[estimated[own]], factors_of(config)])
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
         say(f"step {next(looks)}")
@@ -392,7 +391,7 @@ def maximise(
         starts = [noise, *starts[:1]] if stage == 0 else [noise]
         # loud, and not a command that trembles, which the vehicle would follow
         noisy = (readings > SHARE * wrenches) & (samples * noise.floor > FOLLOWED * readings)
-        held = (factors & noisy).any(axis=1) & (precision > 0.0)
+        held = (taught & noisy).any(axis=1) & (precision > 0.0)
         bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
         there = partial(look, gate=gate, noise=noise)
         theta = np.clip(theta, *bounds)
@@ -400,6 +399,15 @@ def maximise(
         steps += more
     bound, covariance = _considered(at.information, at.scatter, precision, held)
     return Likelihood(theta, covariance, bound, noise, at, held, noisy, steps, converged)
+
+
+def _rows(structure: Structure) -> NDArray[np.bool_]:
+    """(m, 6): the axes that each of theta acts on."""
+    rows = np.concatenate([structure.mass_row, structure.row])
+    out = np.zeros((len(rows), 6), dtype=bool)
+    out[np.arange(len(rows)), rows] = True
+    out[np.arange(len(structure.mass_row)), structure.mass_column] = True
+    return out
 
 
 def _considered(
