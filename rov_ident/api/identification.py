@@ -36,10 +36,9 @@ from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
+from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_without_velocity
 
-_UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 _UNEXPLAINED = "Without linear velocity it cannot be told what the model lacks."
 
 
@@ -151,7 +150,7 @@ class Identification(Shown):
     def table(self) -> Tables:
         """Every coefficient against the configured one, and the errors before and after."""
         rows = [
-            [name, f"{before:.3g}", f"{after:.3g}", _UNITS[VELOCITIES.index(name)]]
+            [name, f"{before:.3g}", f"{after:.3g}", UNITS[VELOCITIES.index(name)]]
             for name, (before, after) in self.errors.items()
         ]
         parts = "held-out parts" if self.explanation else "what was fitted"

@@ -1,11 +1,10 @@
 """The parameter file of nodes and commands, as frozen dataclasses.
 
 Every key is declared once, as a field with :func:`option`: its type, default, unit, bounds and
-meaning. Reading, checking, writing, the declaration of ROS parameters and the documentation all
-follow from the declarations, so that a new key is one new field.
+meaning, from which reading, checking, writing, ROS parameters and documentation follow.
 
-Vectors in the file are in the axes of ``vehicle.frame``; a :class:`Config` holds them in
-forward-starboard-down. Coefficients (SNAME) and effects are forward-starboard-down in the file too.
+Vectors in the file are in the axes of ``vehicle.frame``, those of a :class:`Config` in
+forward-starboard-down; so are coefficients (SNAME) and effects, in the file too.
 """
 
 import dataclasses
@@ -399,11 +398,10 @@ class Qos:
 class Config:
     """A checked configuration; vectors in forward-starboard-down.
 
-    ``estimate`` names the coefficients to estimate, in the order of ``model.names``; the others
-    are held. ``estimate_effects`` are the parameters of effects to estimate, (effect, parameter);
-    in the file both are names under ``estimate``. ``effects`` are part of the simulation: {effect:
-    {parameter: value}}, complete.
-    ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what really moves.
+    ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what moves with the
+    ``effects``: {effect: {parameter: value}}, complete. ``estimate`` names the coefficients to
+    estimate, in the order of ``model.names``, the others are held; ``estimate_effects`` the
+    parameters of effects, (effect, parameter). In the file both are under ``estimate``.
     """
 
     name: str

@@ -1,9 +1,5 @@
-"""The input messages, and what else they are made from, free of middleware.
-
-The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
-forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
-the estimators through one path.
-"""
+"""The input messages, and what else they are made from, free of middleware: in the axes of ROS, or
+after ``frames.to_core`` (body forward-starboard-down, world north-east-down)."""
 
 from typing import NamedTuple
 

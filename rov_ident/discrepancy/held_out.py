@@ -185,15 +185,14 @@ def judged(gain: Gain) -> Gain | Together:
 
 
 def gain_of(components: Sequence[str], before: Array, after: Array, count: float | Array) -> Gain:
-    """Gain of one of K components, from squared errors summed over chunks of time, (C, K).
+    """Gain of one of K components, from squared errors summed over chunks of time, (C, K);
+    ``count`` are the errors of each.
 
-    The intervals come from resampled chunks and hold for all components at once: no deviation from
-    its component's gain, in units of its spread, is larger in 95 % of the draws (Romano and Wolf
-    2005). So the component that gains most of those that surely gain may be picked. ``count`` are
-    the errors of each.
+    The intervals come from resampled chunks and hold for all components at once: in 95 % of the
+    draws none deviates from its gain, in units of its spread, by more (Romano and Wolf 2005). So
+    the component that gains most of those that surely gain may be picked.
     """
-    chunks = len(before)
-    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    draws = _draws(len(before))
     change = log_ratio(after.sum(axis=0), before.sum(axis=0))
     drawn = log_ratio(draws @ after, draws @ before)
     std = drawn.std(axis=0) + 1e-12
@@ -209,8 +208,7 @@ def gain_of(components: Sequence[str], before: Array, after: Array, count: float
 
 def together(before: Array, after: Array) -> Together:
     """The gain of all components (C, K) together: one number, so nothing has been picked."""
-    chunks = len(before)
-    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    draws = _draws(len(before))
     change = log_ratio(after.sum(axis=0), before.sum(axis=0)).mean()
     drawn = log_ratio(draws @ after, draws @ before).mean(axis=1)
     widest = np.quantile(np.abs(drawn - change), 0.95)
@@ -221,9 +219,13 @@ def together(before: Array, after: Array) -> Together:
 def surely_less(a: Array, b: Array) -> bool:
     """Whether squared errors a are less than b, both summed over chunks of time (C, K), all
     components taken together: in 97.5 % of resampled chunks, one end of a 95 % interval."""
-    chunks = len(a)
-    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    draws = _draws(len(a))
     return bool(np.quantile(log_ratio(draws @ a, draws @ b).sum(axis=1), 0.975) < 0.0)
+
+
+def _draws(chunks: int) -> NDArray[np.int64]:
+    """How often each of so many chunks is in each draw of the bootstrap (_DRAWS, chunks)."""
+    return np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
 
 
 def log_ratio(a: Array, b: Array) -> Array:

@@ -7,8 +7,8 @@ A checkpoint is one file::
     {"format": 1, "estimator": ..., "configuration": ..., "structure": ..., "stamp": ...}\n
     the arrays of OnlineEstimator.memory(), one after the other, as they are in memory
 
-Nothing in the file is run or decides how much is read. Only the same estimator of the same
-configuration (but for what may change while a node runs) takes it. There is always a whole one.
+Nothing in it is run or decides how much is read. Only the same estimator of the same configuration
+(but for what may change while a node runs) takes it.
 """
 
 import contextlib

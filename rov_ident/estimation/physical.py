@@ -26,13 +26,13 @@ class Estimate:
 
 
 def calibrated(covariance: Array, score: Array) -> Array:
-    """The covariance (n, n), in prior standard deviations, widened to that of the sandwich.
+    """The covariance (n, n), in prior standard deviations, widened to that of the sandwich
+    ``covariance @ score @ covariance``.
 
-    ``score`` (n, n) is the covariance of the accumulated score, the prior's included, with its
-    correlation in time: for white innovations the inverse of ``covariance``, and nothing changes.
-    The sandwich is ``covariance @ score @ covariance``; from a short record it is itself uncertain,
-    and mostly too thin, so that nothing is narrowed. Nor is anything widened beyond the prior: what
-    no motion has shown is as well known as before.
+    ``score`` (n, n): covariance of the accumulated score, the prior's included, with its
+    correlation in time; for white innovations the inverse of ``covariance``. Nothing is narrowed,
+    as the sandwich of a short record is mostly too thin; nor widened beyond the prior, which no
+    motion makes less known.
     """
     variance = np.sum((covariance @ score) * covariance, axis=1)  # of the sandwich
     return widened(covariance, np.minimum(variance, 1.0))
@@ -42,10 +42,9 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     """The values (n,) nearest the estimate, in its own metric, that a passive hull can have.
 
     Signs first: the nearest set without positive diagonal derivatives, in either direction of the
-    motion (a non-negative least-squares problem in the multipliers); what is held at its limit
-    moves the others as their correlation says. Then, should couplings still make the mass matrix
-    indefinite or the damping feed energy, the set is drawn back towards the prior just as far as
-    needed.
+    motion (non-negative least squares in the multipliers); what is held at its limit moves the
+    others as their correlation says. Should couplings still make the mass matrix indefinite or the
+    damping feed energy, the set is drawn back towards the prior as far as needed.
     """
     if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
         return estimate.values

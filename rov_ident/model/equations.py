@@ -411,12 +411,12 @@ def momentum_columns(structure, nu, momentum):
 
 @lean
 def columns(structure, nu, momentum, force, extended):
-    """The regressor's two parts: per unit of each coefficient, momentum and force (6, n).
+    """The regressor's two parts: per unit of each coefficient, momentum and force (6, n),
+    overwritten.
 
-    ``wrench = d/dt(momentum @ theta) + force @ theta + known``: the derivative is left to the
-    caller, who may differentiate (:func:`momentum_columns` of nu_dot), filter or integrate by
-    parts. Both arrays are overwritten; extended (EXTENDED_SIZE, 1) is work space that holds the
-    inputs (:func:`extend_inputs`).
+    ``wrench = d/dt(momentum @ theta) + force @ theta + known``: how to take the derivative is left
+    to the caller. extended (EXTENDED_SIZE, 1) is work space that holds the inputs
+    (:func:`extend_inputs`).
     """
     momentum_columns(structure, nu, momentum)
     first = len(structure.mass_row)
