@@ -16,6 +16,7 @@ import dataclasses
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -332,7 +333,7 @@ def common_squares(
         common = reduce(np.intersect1d, times)
         common = common[within(spans, common)]
         last = int(common[-1] / length) + 1 if len(common) else 0
-        parts: list[Array] = []
+        parts: list[Any] = []
         for c, t in zip(same, times, strict=True):
             use = np.isin(t, common)
             squares = (c.r[use] * (c.scale / same[unit].scale)) ** 2
