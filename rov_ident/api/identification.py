@@ -48,12 +48,11 @@ class Identification(Shown):
 
     ``fit``: the coefficients, of the extended model where something was missing; its ``fitted`` is
     the configuration to use. ``explanation``: what was missing, and the errors on data that no fit
-    has used, those of the same structure fitted without them; None of dives without linear
-    velocity. ``checks``: of the dives used;
-    ``left_out``: why others were not. ``judge``: the name of the dive that was held back, empty
-    where parts of each dive were. ``next``: the manoeuvre to fly next; None where none is safe in
-    the free water assumed. ``judged``: RMSE on the dive that was held back, of the configuration as
-    given and of ``fit.fitted``.
+    has used, those of the same structure fitted without them; None without linear velocity.
+    ``checks``: of the dives used; ``left_out``: why others were not. ``judge``: the dive that was
+    held back, empty where parts of each were; ``judged``: RMSE on it, of the configuration as given
+    and of ``fit.fitted``. ``next``: the manoeuvre to fly next; None where none is safe in the free
+    water assumed.
     """
 
     fit: Fit

@@ -104,13 +104,13 @@ def rigid_body_covariance(
 ) -> Array:
     """What an uncertain rigid body adds to the covariance (n, n) of the estimates ``values`` (n,).
 
-    An error of a moment of inertia is one of K_pdot, M_qdot or N_rdot, as a motion shows their sum;
-    and so is, where the thrust is known, an error of the mass one of X_udot, Y_vdot and Z_wdot.
-    Where the scale of the thrust is estimated, all forces are compared with the mass: the motion is
-    the same with mass, inertia, weight, buoyancy, thrust and all coefficients times k.
+    ``gain`` (n, n) is how far estimates follow what the data alone would say, None: all the way. A
+    narrow prior holds them where the data, with a wrong mass, say something else.
 
-    ``gain`` (n, n): how far estimates follow what the data alone would say, against a narrow prior;
-    None: all the way.
+    An error of a moment of inertia is one of K_pdot, M_qdot or N_rdot, as a motion shows their sum.
+    So is an error of the mass one of X_udot, Y_vdot and Z_wdot, where the thrust is known. Where
+    its scale is estimated, the mass is what all forces are compared with: the equations of motion
+    stay the same with mass, inertia, weight, buoyancy, thrust and all coefficients times k.
     """
     known, body = config.vehicle_uncertainty, config.model.body
     value = dict(zip(names, values.tolist(), strict=True))

@@ -24,14 +24,11 @@ T = TypeVar("T")
 Vector = tuple[float, ...]
 Names = tuple[str, ...]
 
-POSITIVE = 1e-9
-"""The lower bound of what must be greater than zero."""
+POSITIVE = 1e-9  # the lower bound of what must be greater than zero
 
-ANY = -1
-"""The ``size`` of a list of any length."""
+ANY = -1  # the ``size`` of a list of any length
 
-LARGEST = 1e20
-"""No number of a vehicle is larger; below it nothing computed from them overflows."""
+LARGEST = 1e20  # no number of a vehicle is larger; below it nothing computed from them overflows
 
 
 # ------------------------------------------------------------------ declarations

@@ -21,8 +21,7 @@ from rov_ident.core.messages import Array, Imu, Joints, Odometry, Wrench
 _FRD_SUFFIXES = ("_frd", "_fsd", "_ned")
 _NED_SUFFIX = "_ned"
 
-FLIP_BODY = np.array([1.0, -1.0, -1.0])
-"""Multiplies a vector in FLU to give FRD, and back."""
+FLIP_BODY = np.array([1.0, -1.0, -1.0])  # multiplies a vector in FLU to give FRD, and back
 FLIP_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Takes a vector in ENU to NED, and back."""
 for _constant in (FLIP_BODY, FLIP_WORLD):

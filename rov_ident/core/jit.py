@@ -143,12 +143,12 @@ def interpreting() -> bool:
 class Compiler:
     """The kernels that one job needs, compiled by a process of its own for all who run them.
 
-    The process that compiles does not itself run the same machine code: in the cache each kernel
-    holds its own, further optimised copy of the functions it calls, so sums differ in their last
-    bits; but the same bag has to give the same numbers.
+    A process does not run the same machine code after compiling it as after reading it from the
+    cache, where each kernel holds its own copy of the functions it calls, optimised once more. Sums
+    differ in their last bits then, and the same bag has to give the same numbers.
 
-    ``exercise`` is a function at the top level of a module, which the other process finds by its
-    name; called with ``arguments`` it runs every kernel of the job.
+    ``exercise`` is a function at the top level of a module; called with ``arguments`` it runs every
+    kernel of the job. The other process finds it by its name.
     """
 
     def __init__(self, exercise: Callable[..., object], *arguments: str) -> None:

@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
-"""The roles of the three inputs."""
+ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"  # the roles of the three inputs
 
-DRIVE = "inputs"
-"""The role of fin angles and shaft speeds, where a vehicle has such."""
+DRIVE = "inputs"  # the role of fin angles and shaft speeds, where a vehicle has such
 
 
 class Odometry(NamedTuple):
@@ -87,8 +85,7 @@ class Commands(NamedTuple):
 
 Message = Odometry | Imu | Wrench | Joints
 
-LAST_STAMP = (2**31 - 1) * 10**9
-"""ns; the end of ROS time, 32 bits of seconds."""
+LAST_STAMP = (2**31 - 1) * 10**9  # ns; the end of ROS time, 32 bits of seconds
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -24,8 +24,7 @@ _COLOURS = {
 
 _add = ElementTree.SubElement
 
-Curve = tuple[str, str, str]
-"""Its path, label and colour."""
+Curve = tuple[str, str, str]  # its path, label and colour
 
 
 def _nodes(namespace: str) -> dict[str, str]:

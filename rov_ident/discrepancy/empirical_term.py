@@ -1,9 +1,9 @@
 """A term for what a fit leaves and no effect explains: a smooth function of one or two variables.
 
-For each axis of body and world all variables, and pairs, are scored on the linearisation of the fit
-by a few polynomials; of the best few a penalised spline (Eilers and Marx 1996) is fitted, its
-smoothness by cross-validation over windows. The best becomes the effect ``empirical``: its shape
-stays, its scale is a parameter like any other.
+For each axis of the body and of the world all variables, and pairs of them, are scored on the
+linearisation of the fit by a few polynomials; of the best few a penalised spline (Eilers and Marx
+1996) is fitted, its smoothness by cross-validation over windows. The best becomes the effect
+``empirical``: its shape then stays, and its scale is a parameter like any other.
 """
 
 import dataclasses

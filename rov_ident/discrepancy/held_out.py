@@ -31,8 +31,7 @@ _MARGIN = 0.25  # s cut off beside held-out blocks: five odometry messages at 20
 _ENOUGH = 600.0  # s of data to fit; an hour is explained in less than a minute so
 MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
 
-CHUNK = 2.5
-"""Seconds; of the chunks that the bootstrap resamples: four to a block."""
+CHUNK = 2.5  # seconds; of the chunks that the bootstrap resamples: four to a block
 
 PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
 _DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
@@ -185,12 +184,12 @@ def judged(gain: Gain) -> Gain | Together:
 
 
 def gain_of(components: Sequence[str], before: Array, after: Array, count: float | Array) -> Gain:
-    """Gain of one of K components, from squared errors summed over chunks of time, (C, K);
-    ``count`` are the errors of each.
+    """Gain of one of K components, from squared errors summed over chunks of time, (C, K).
 
-    The intervals come from resampled chunks and hold for all components at once: in 95 % of the
-    draws none deviates from its gain, in units of its spread, by more (Romano and Wolf 2005). So
-    the component that gains most of those that surely gain may be picked.
+    The intervals come from resampled chunks and hold for all components at once: no deviation from
+    its component's gain, in units of its spread, is larger in 95 % of the draws (Romano and Wolf
+    2005). So the component that gains most of those that surely gain may be picked. ``count`` are
+    the errors of each.
     """
     draws = _draws(len(before))
     change = log_ratio(after.sum(axis=0), before.sum(axis=0))

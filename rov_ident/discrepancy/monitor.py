@@ -45,8 +45,7 @@ from rov_ident.estimation.compilation import any_vehicle
 from rov_ident.model.coefficients import ABSOLUTE, AXES, MOTIONS, NEGATIVE, ONE, VELOCITIES, parse
 from rov_ident.sampling.sample import SAMPLE, joined
 
-FEWEST = 12
-"""Windows, from which on their scatter is known to about 40 % (chi-squared)."""
+FEWEST = 12  # windows, from which on their scatter is known to about 40 % (chi-squared)
 
 ALARM = 1e-4
 """How often chance may raise a false alarm from a memory full of windows with nothing missing."""

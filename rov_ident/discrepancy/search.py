@@ -39,8 +39,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
 
-LATE_THRUST = ("thruster_lag", "actuation_delay")
-"""What every thruster has a little of."""
+LATE_THRUST = ("thruster_lag", "actuation_delay")  # what every thruster has a little of
 
 # What is likelier beforehand needs less evidence. The rates in docs/explain-bench.md were measured
 # with these.

@@ -1,15 +1,15 @@
 """Whether the sensors agree with each other: pose against velocity, velocity against IMU.
 
-This takes no model of the vehicle. Two kinds of dead reckoning in the world frame are compared with
-what is measured directly (Titterton and Weston 2004, ch. 3), and the odometry's rate with the
-gyro::
+No model of the vehicle is needed for this, so what a sensor does wrong is found before the
+dynamics are looked at. Two kinds of dead reckoning in the world frame are compared with what is
+measured directly (Titterton and Weston 2004, ch. 3)::
 
     position:  x(t) - integral of R v dt            velocity:  R v(t) - integral of (R f + g) dt
 
-A dead-reckoned difference is a random walk plus white noise; the one-step innovations of that
-local-level model (Durbin and Koopman 2012, ch. 2) are white, and every regressor goes through the
-same filter: generalised least squares. All sensor effects are linear to first order, and the fit is
-repeated about its own result.
+and the odometry's angular rate with the gyro. A dead-reckoned difference is a random walk plus
+white noise; the one-step innovations of that local-level model (Durbin and Koopman 2012, ch. 2) are
+white, and every regressor goes through the same filter: generalised least squares. All sensor
+effects are linear to first order, and the fit is repeated about its own result.
 """
 
 import dataclasses

@@ -49,8 +49,7 @@ _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
 
-Spans = list[tuple[float, float]]
-"""From and to [s] each."""
+Spans = list[tuple[float, float]]  # from and to [s] each
 
 
 class _Remembered:

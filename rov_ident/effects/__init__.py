@@ -62,8 +62,7 @@ def _library() -> dict[str, Effect]:
     return {**dict(_of_others(ours)), **ours}
 
 
-EFFECTS: dict[str, Effect] = _library()
-"""Every effect by the name users give it."""
+EFFECTS: dict[str, Effect] = _library()  # every effect by the name users give it
 
 _INPUT = sorted((e for e in EFFECTS.values() if e.act), key=lambda e: (e.order, e.name))
 _STEER = sorted((e for e in EFFECTS.values() if e.steer), key=lambda e: (e.order, e.name))
@@ -218,12 +217,12 @@ def parameter(effect: str, name: str) -> EffectParameter:
 
 
 def estimable(name: str) -> dict[str, float | None]:
-    """The parameters of an effect that an estimator can follow while the vehicle moves, each with
-    the value at which it is left alone unless asked for: the null of a limit, and of a parameter of
-    one axis or fin, of which there are several; None for others.
+    """The parameters of an effect that an estimator can follow while the vehicle moves.
 
-    Not among them: an onset, a frequency, a phase, the noise of a reading, and what shows in no
-    velocity (the sampler finds the biases of an IMU itself).
+    With each of them the value at which it is better left alone unless asked for: the null of a
+    parameter of one axis or fin, of which an effect has several, and of a limit; None for others.
+    An onset, a frequency and a phase are not among them, nor what shows in no velocity (the sampler
+    finds the biases of an IMU itself), nor the noise of a reading.
     """
     effect = EFFECTS[name]
     if effect.heading or effect.noise:

@@ -51,16 +51,13 @@ from rov_ident.model.coefficients import INPUTS, parse
 
 Array = NDArray[np.float64]
 
-SIZE = 44
-"""The most parameters that a kernel takes."""
+SIZE = 44  # the most parameters that a kernel takes
 
 Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed", "shape"]
 Axes = tuple[str, str, str]
 
-MEMORY = 1024
-"""Numbers that an input effect may keep from one call to the next."""
-STEER_MEMORY = 8
-"""The same of an effect on fins."""
+MEMORY = 1024  # numbers that an input effect may keep from one call to the next
+STEER_MEMORY = 8  # the same of an effect on fins
 
 
 class Reading(NamedTuple):

@@ -7,8 +7,8 @@ A checkpoint is one file::
     {"format": 1, "estimator": ..., "configuration": ..., "structure": ..., "stamp": ...}\n
     the arrays of OnlineEstimator.memory(), one after the other, as they are in memory
 
-Nothing in it is run or decides how much is read. Only the same estimator of the same configuration
-(but for what may change while a node runs) takes it.
+Nothing in the file is run or decides how much is read. Only the same estimator of the same
+configuration (but for what may change while a node runs) takes it. There is always a whole one.
 """
 
 import contextlib
@@ -28,10 +28,8 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.files import lock, open_input, write_file
 from rov_ident.estimation.online import Memory, OnlineEstimator
 
-FORMAT = 1
-"""To be raised when the same numbers get another meaning."""
-LARGEST = 1 << 24
-"""Bytes; a state of a hundred coefficients has a fiftieth of that."""
+FORMAT = 1  # to be raised when the same numbers get another meaning
+LARGEST = 1 << 24  # bytes; a state of a hundred coefficients has a fiftieth of that
 
 _MAGIC = b"rov_ident checkpoint\n"
 _WORDS = {"estimator": "estimator", "configuration": "configuration"}

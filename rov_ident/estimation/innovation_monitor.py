@@ -1,17 +1,17 @@
 """What the innovations of an estimator tell about noise, outliers and changes of the vehicle.
 
-One monitor an axis, the same for both estimators, of normalised innovations. The square of one
-(NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mean if all is well.
+One monitor an axis, the same for both estimators. It takes in each normalised innovation, in its
+standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mean if all is well.
 
-* *Process noise.* The density of an unexplained acceleration is found from innovations added up
-  over a second: what they have in common is process noise, while each alone is nearly all the
-  sensor's (Mehra 1972; Myers and Tapley 1976). A wrong structure then widens the intervals instead
-  of being learnt as a coefficient. It starts high and comes down: what is learnt with too little
-  process noise weighs too much for ever.
-* *Whiteness.* The power of the sums, averaged over a minute of motion, says whether the model
-  explains that, too: noise comes down where the vehicle rests.
-* *A change of the vehicle* is a NIS that stays large over two seconds against the last minute's
-  average: that of a rough model is large at all times.
+* *Process noise.* The density of an unexplained acceleration is found from the innovations (Mehra
+  1972; Myers and Tapley 1976): a wrong structure then widens the intervals instead of being learnt
+  as a coefficient. It starts high and comes down: what an estimator learns with too little process
+  noise weighs too much for ever. Innovations are added up over a second: what they have in common
+  is process noise, while each alone is nearly all the sensor's.
+* *Whiteness.* Noise that comes down where the vehicle rests is not what it does in motion: the
+  power of the sums, averaged over a minute of motion, says whether the model explains that, too.
+* *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
+  average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
   it was the wrench: the velocity is lost, and restarts from the measurement.
 """

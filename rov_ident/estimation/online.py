@@ -285,10 +285,10 @@ class OnlineEstimator:
     def _recentre(self, at_once: bool = False) -> None:
         """Have the sampler take over the parameters of effects as they are estimated now.
 
-        Not changes far below their uncertainty, as samples are right to first order; a time only
-        once the data know it. After a long step of a time all is learnt anew, as information gained
-        about another value claims too much; each such step needs more information than the one
-        before. ``at_once``: a memory was recalled.
+        But not for changes far below their uncertainty, as samples are right to first order. A time
+        is followed once the data know it. After a long step all is learnt anew: information gained
+        about another value claims to know what it does not. Each such step needs more information
+        than the one before. ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         own = slice(len(self.config.estimate), None)

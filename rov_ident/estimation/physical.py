@@ -26,13 +26,13 @@ class Estimate:
 
 
 def calibrated(covariance: Array, score: Array) -> Array:
-    """The covariance (n, n), in prior standard deviations, widened to that of the sandwich
-    ``covariance @ score @ covariance``.
+    """The covariance (n, n), in prior standard deviations, widened to that of the sandwich.
 
-    ``score`` (n, n): covariance of the accumulated score, the prior's included, with its
-    correlation in time; for white innovations the inverse of ``covariance``. Nothing is narrowed,
-    as the sandwich of a short record is mostly too thin; nor widened beyond the prior, which no
-    motion makes less known.
+    ``score`` (n, n) is the covariance of the accumulated score, the prior's included, with its
+    correlation in time: for white innovations the inverse of ``covariance``, and nothing changes.
+    The sandwich is ``covariance @ score @ covariance``; from a short record it is itself uncertain,
+    and mostly too thin, so that nothing is narrowed. Nor is anything widened beyond the prior: what
+    no motion has shown is as well known as before.
     """
     variance = np.sum((covariance @ score) * covariance, axis=1)  # of the sandwich
     return widened(covariance, np.minimum(variance, 1.0))

@@ -1,14 +1,11 @@
 """What vehicles publish, into the three messages of the core: one definition for topics and bags.
 
-The types are the configuration's (``inputs``). A :class:`Reader` takes messages as bytes and gives
-what the sampler takes:
-
-* a wrench as it is; one without a stamp, and any array without a header, is stamped on arrival (in
-  a bag: its log time), which presumes that the computer's clock is that of the sensors;
-* commands of single thrusters through `Allocator`, pulses at the
-  voltage of the battery that was last heard;
-* a twist and the poses around it joined into odometry at the stamp of the twist: the position
-  straight in between, the attitude along the shortest rotation.
+A :class:`Reader` takes messages of the configured types (``inputs``) as bytes and gives what the
+sampler takes: a wrench, stamped on arrival (in a bag: its log time) where it comes without a stamp,
+which presumes that the computer's clock is that of the sensors; commands of single thrusters
+through `Allocator`, pulses at the voltage of the battery that was last heard; a twist and the poses
+around it joined into odometry at the stamp of the twist, position straight in between, attitude
+along the shortest rotation.
 """
 
 from bisect import bisect_left

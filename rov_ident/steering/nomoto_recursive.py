@@ -114,8 +114,7 @@ class RecursiveNomoto:
         self._samples: list[tuple[float, float, float, bool]] = []
         self._filters: list[Filter] = []
         self._filtered = (0.0, 0.0)  # t and rudder of the filters' last sample
-        self.result: KandT | None = None
-        """After the last sample; None while nothing is known."""
+        self.result: KandT | None = None  # after the last sample; None while nothing is known
 
     def push(self, t: float, heading: float, rudder: float) -> None:
         """A sample at t [s], both in rad; one that is less than STEP after the last is left out."""

@@ -31,8 +31,7 @@ from rov_ident.core.frames import FLIP_BODY, FLIP_WORLD, quaternion_from_euler, 
 from rov_ident.model.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficient, parse
 from rov_ident.model.equations import GRAVITY
 
-DENSITY = 1000.0
-"""kg/m3, what the Buoyancy plugin assumes unless told otherwise."""
+DENSITY = 1000.0  # kg/m3, what the Buoyancy plugin assumes unless told otherwise
 
 _FLIP = np.tile(FLIP_BODY, 2)
 _ADDED = {
