@@ -25,9 +25,7 @@ Vector = tuple[float, ...]
 Names = tuple[str, ...]
 
 POSITIVE = 1e-9  # the lower bound of what must be greater than zero
-
 ANY = -1  # the ``size`` of a list of any length
-
 LARGEST = 1e20  # no number of a vehicle is larger; below it nothing computed from them overflows
 
 

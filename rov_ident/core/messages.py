@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"  # the roles of the three inputs
-
 DRIVE = "inputs"  # the role of fin angles and shaft speeds, where a vehicle has such
 
 

@@ -32,7 +32,6 @@ _ENOUGH = 600.0  # s of data to fit; an hour is explained in less than a minute 
 MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
 
 CHUNK = 2.5  # seconds; of the chunks that the bootstrap resamples: four to a block
-
 PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
 _DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
 _FAILED = 3.0  # standard deviations of the motion: a simulation further off counts as so far off
