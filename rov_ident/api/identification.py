@@ -36,10 +36,9 @@ from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
+from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_without_velocity
 
-_UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 _UNEXPLAINED = "Without linear velocity it cannot be told what the model lacks."
 
 
@@ -49,12 +48,11 @@ class Identification(Shown):
 
     ``fit``: the coefficients, of the extended model where something was missing; its ``fitted`` is
     the configuration to use. ``explanation``: what was missing, and the errors on data that no fit
-    has used, those of the same structure fitted without them; None of dives without linear
-    velocity. ``checks``: of the dives used;
-    ``left_out``: why others were not. ``judge``: the name of the dive that was held back, empty
-    where parts of each dive were. ``next``: the manoeuvre to fly next; None where none is safe in
-    the free water assumed. ``judged``: RMSE on the dive that was held back, of the configuration as
-    given and of ``fit.fitted``.
+    has used, those of the same structure fitted without them; None without linear velocity.
+    ``checks``: of the dives used; ``left_out``: why others were not. ``judge``: the dive that was
+    held back, empty where parts of each were; ``judged``: RMSE on it, of the configuration as given
+    and of ``fit.fitted``. ``next``: the manoeuvre to fly next; None where none is safe in the free
+    water assumed.
     """
 
     fit: Fit
@@ -151,7 +149,7 @@ class Identification(Shown):
     def table(self) -> Tables:
         """Every coefficient against the configured one, and the errors before and after."""
         rows = [
-            [name, f"{before:.3g}", f"{after:.3g}", _UNITS[VELOCITIES.index(name)]]
+            [name, f"{before:.3g}", f"{after:.3g}", UNITS[VELOCITIES.index(name)]]
             for name, (before, after) in self.errors.items()
         ]
         parts = "held-out parts" if self.explanation else "what was fitted"

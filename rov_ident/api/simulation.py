@@ -20,6 +20,7 @@ from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table
 from rov_ident.sampling.records import (
     HORIZON,
+    UNITS,
     VELOCITIES,
     Score,
     measured_motion,
@@ -30,7 +31,6 @@ from rov_ident.sampling.records import (
 from rov_ident.simulation.virtual_sensors import Dive, Suite, dive, measure, odometry_of
 from rov_ident.steering import autopilot
 
-_UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 _POINTS = 2000  # of a curve in a picture
 _FIN_ANGLE = float(np.radians(20.0))  # of zigzags (IMO MSC.137(76)), and of changes of course
 
@@ -73,7 +73,7 @@ class Simulation(Shown):
         if self.whole is None or self.windows is None:
             rows = [
                 [name, f"{x.min():.3f}", f"{x.max():.3f}", f"{np.sqrt(np.mean(x**2)):.3f}", unit]
-                for name, x, unit in zip(VELOCITIES, self.nu.T, _UNITS)
+                for name, x, unit in zip(VELOCITIES, self.nu.T, UNITS)
             ]
             return Table(self.sentence, ["", "least", "most", "rms", "unit"], rows, text=(4,))
         rows = []
@@ -82,7 +82,7 @@ class Simulation(Shown):
             cells = [f"{x:.{d}f}" for x, d in zip(scores, (3, 4, 4))]
             if not np.isfinite(self.whole.rmse[i]):
                 cells = ["not measured", "-", "-"]
-            rows.append([VELOCITIES[i], *cells, _UNITS[i]])
+            rows.append([VELOCITIES[i], *cells, UNITS[i]])
         head = ["", "R2, one run", "RMSE, one run", f"RMSE, {HORIZON:g} s windows", "unit"]
         return Table(f"open-loop simulation against {self.name}", head, rows, text=(4,))
 
@@ -105,7 +105,7 @@ class Simulation(Shown):
             }
             velocities = {
                 VELOCITIES[i]: {k: by[VELOCITIES[i]] for k, by in columns.items()}
-                | {"unit": _UNITS[i]}
+                | {"unit": UNITS[i]}
                 for i in self._chosen
             }
             result = {"bag": self.name, "horizon_s": HORIZON, "velocities": velocities}

@@ -29,20 +29,16 @@ def add(commands: Commands) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    # Its own pictures are the progress: with --quiet there are none.
-    err = Console(stderr=True, quiet=True) if options.quiet else ERR
-    _play(options.out, options.rate, err, OUT)
-
-
-def _play(out: Path, rate: float, err: Console, console: Console) -> None:
     """Replay the shipped bag over DDS into both nodes and report against the simulator's truth."""
     from rov_ident.cli import demo_page as pages
     from rov_ident.nodes.replay import replay
     from rov_ident.reports import plots
     from rov_ident.sampling.records import read_record
 
+    # Its own pictures are the progress: with --quiet there are none.
+    err = Console(stderr=True, quiet=True) if options.quiet else ERR
     coefficients, path, picture = (
-        out / name for name in ("coefficients.mcap", "report.html", "convergence.png")
+        options.out / name for name in ("coefficients.mcap", "report.html", "convergence.png")
     )
     check_outputs([path, picture], [], coefficients)
     bag, start = shipped("bags/demo.mcap"), shipped("config/bluerov2_heavy_demo.yaml")
@@ -52,8 +48,8 @@ def _play(out: Path, rate: float, err: Console, console: Console) -> None:
     seen: dict[str, list[Report]] = {name: [] for name in LIVE}
 
     err.print(
-        f"Playing {bag.name} over DDS at {rate:g} x into rls_node and ukf_node, which start from "
-        f"{start.name}: coefficients off by up to 50 %."
+        f"Playing {bag.name} over DDS at {options.rate:g} x into rls_node and ukf_node, which "
+        f"start from {start.name}: coefficients off by up to 50 %."
     )
     with Live(console=err, refresh_per_second=4, transient=True) as live:
 
@@ -62,8 +58,8 @@ def _play(out: Path, rate: float, err: Console, console: Console) -> None:
                 seen[name].append(state)
                 live.update(_table(config, truth, seen))
 
-        result = replay(bag, start, LIVE, rate, coefficients, show)
-    console.print(_table(config, truth, seen))
+        result = replay(bag, start, LIVE, options.rate, coefficients, show)
+    OUT.print(_table(config, truth, seen))
 
     record = read_record(bag, config)
     histories = {name: pages.history_of(reports) for name, reports in seen.items()}
@@ -74,13 +70,13 @@ def _play(out: Path, rate: float, err: Console, console: Console) -> None:
         begun = np.abs(np.array([config.value(n) for n in history.names]) / true - 1.0)
         error = np.abs(history.values[-1] / true - 1.0)
         z = np.abs(history.values[-1] - true) / history.std[-1]
-        console.print(
+        OUT.print(
             f"{name}: the median error of a coefficient fell from {100 * np.median(begun):.0f} % "
             f"to {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} % "
             f"({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
             "values inside their 95 % interval"
         )
-    console.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")
+    OUT.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")
 
 
 def _table(config: Config, truth: dict[str, float], seen: "dict[str, list[Report]]") -> Table:

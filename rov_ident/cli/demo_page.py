@@ -10,9 +10,7 @@ from rov_ident.config import Config
 from rov_ident.estimation.online import Report
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
-from rov_ident.sampling.records import HORIZON, VELOCITIES, Record, predicted, score
-
-_UNITS = ("m/s",) * 3 + ("rad/s",) * 3
+from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, Record, predicted, score
 
 
 def history_of(reports: Sequence[Report]) -> plots.History:
@@ -41,7 +39,7 @@ def page(
     runs = {name: predicted(model, samples, math.inf)[stretch] for name, model in models.items()}
     scores = {name: score(model, samples).rmse for name, model in models.items()}
     rows = [[name, *(f"{value:.4f}" for value in rmse)] for name, rmse in scores.items()]
-    labels = [f"{name} [{unit}]" for name, unit in zip(VELOCITIES, _UNITS)]
+    labels = [f"{name} [{unit}]" for name, unit in zip(VELOCITIES, UNITS)]
     motions = [
         plots.motion(t, measured[:, i], {name: run[:, i] for name, run in runs.items()}, label)
         for i, label in enumerate(labels)

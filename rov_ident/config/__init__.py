@@ -22,15 +22,5 @@ from rov_ident.config.schema import (
 from rov_ident.config.writing import as_file_name, dump, to_parameters
 
 __all__ = ["LARGEST", "PARAMETERS", "VEHICLE_PARAMETERS", "Config", "Fin", "Inputs", "Names"]
-__all__ += [
-    "Parameter",
-    "Qos",
-    "Shaft",
-    "Thrusters",
-    "Vector",
-    "as_file_name",
-    "checked",
-    "dump",
-    "from_parameters",
-]
-__all__ += ["load", "thruster_signal", "to_parameters"]
+__all__ += ["Parameter", "Qos", "Shaft", "Thrusters", "Vector", "as_file_name", "checked", "dump"]
+__all__ += ["from_parameters", "load", "thruster_signal", "to_parameters"]

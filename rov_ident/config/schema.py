@@ -1,11 +1,10 @@
 """The parameter file of nodes and commands, as frozen dataclasses.
 
 Every key is declared once, as a field with :func:`option`: its type, default, unit, bounds and
-meaning. Reading, checking, writing, the declaration of ROS parameters and the documentation all
-follow from the declarations, so that a new key is one new field.
+meaning, from which reading, checking, writing, ROS parameters and documentation follow.
 
-Vectors in the file are in the axes of ``vehicle.frame``; a :class:`Config` holds them in
-forward-starboard-down. Coefficients (SNAME) and effects are forward-starboard-down in the file too.
+Vectors in the file are in the axes of ``vehicle.frame``, those of a :class:`Config` in
+forward-starboard-down; so are coefficients (SNAME) and effects, in the file too.
 """
 
 import dataclasses
@@ -25,14 +24,9 @@ T = TypeVar("T")
 Vector = tuple[float, ...]
 Names = tuple[str, ...]
 
-POSITIVE = 1e-9
-"""The lower bound of what must be greater than zero."""
-
-ANY = -1
-"""The ``size`` of a list of any length."""
-
-LARGEST = 1e20
-"""No number of a vehicle is larger; below it nothing computed from them overflows."""
+POSITIVE = 1e-9  # the lower bound of what must be greater than zero
+ANY = -1  # the ``size`` of a list of any length
+LARGEST = 1e20  # no number of a vehicle is larger; below it nothing computed from them overflows
 
 
 # ------------------------------------------------------------------ declarations
@@ -44,6 +38,16 @@ def option(default: T | None, description: str, unit: str = "", **details: Any) 
     if isinstance(default, tuple):
         details.setdefault("size", len(default))
     return field(default=default, metadata=details)  # type: ignore[return-value]
+
+
+def positive(default: float | None, description: str, unit: str = "", **details: Any) -> Any:
+    """The same of what must be greater than zero."""
+    return option(default, description, unit, lower=POSITIVE, **details)
+
+
+def not_negative(default: T, description: str, unit: str = "", **details: Any) -> T:
+    """The same of what may be zero, but not less; of a vector each element."""
+    return option(default, description, unit, lower=0.0, **details)
 
 
 @dataclass(frozen=True)
@@ -76,14 +80,12 @@ class Parameter:
 class VehicleUncertainty:
     """`vehicle`: how well the rigid body is known; standard deviations, zero: exactly."""
 
-    mass_std: float = option(
-        0.01, "of the mass, relative; it widens X_udot Y_vdot Z_wdot", lower=0.0
+    mass_std: float = not_negative(0.01, "of the mass, relative; it widens X_udot Y_vdot Z_wdot")
+    inertia_std: float = not_negative(
+        0.05, "of the moments of inertia, relative; it widens K_pdot M_qdot N_rdot"
     )
-    inertia_std: float = option(
-        0.05, "of the moments of inertia, relative; it widens K_pdot M_qdot N_rdot", lower=0.0
-    )
-    buoyancy_std: float = option(0.02, "of the buoyancy, relative to the weight", lower=0.0)
-    cog_std: float = option(0.005, "of the centre of gravity, each component", "m", lower=0.0)
+    buoyancy_std: float = not_negative(0.02, "of the buoyancy, relative to the weight")
+    cog_std: float = not_negative(0.005, "of the centre of gravity, each component", "m")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,11 +99,9 @@ class Vehicle(VehicleUncertainty):
         "forward-left-up (flu)",
         choices=("frd", "fsd", "flu"),
     )
-    mass: float = option(None, "mass in air, with enclosed air", "kg", lower=POSITIVE)
-    weight: float = option(
-        None, "weight; left out: gravity * mass", "N", lower=POSITIVE, computed=True
-    )
-    buoyancy: float = option(None, "weight of the displaced water", "N", lower=POSITIVE)
+    mass: float = positive(None, "mass in air, with enclosed air", "kg")
+    weight: float = positive(None, "weight; left out: gravity * mass", "N", computed=True)
+    buoyancy: float = positive(None, "weight of the displaced water", "N")
     cog: Vector = option(None, "centre of gravity from the body origin", "m", size=3)
     cob: Vector = option(None, "centre of buoyancy from the body origin", "m", size=3)
     inertia: Vector = option(
@@ -116,9 +116,7 @@ class Vehicle(VehicleUncertainty):
 class Prior:
     """`prior`: how well the coefficients in the file are known before any data."""
 
-    relative_std: float = option(
-        0.5, "standard deviation of a coefficient relative to its value", lower=POSITIVE
-    )
+    relative_std: float = positive(0.5, "standard deviation of a coefficient relative to its value")
     std: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of single coefficients by name, in their units; overrides the above."""
 
@@ -256,11 +254,10 @@ class Thrusters(thrusters.Geometry):
     channels: Vector = option(
         (), "which element of the array is each thruster, from 1; empty: the first ones", size=ANY
     )
-    voltage: float = option(
+    voltage: float = positive(
         16.0,
         "supply of the thrusters, for the curve of the T200; with inputs.battery until it is heard",
         "V",
-        lower=POSITIVE,
     )
     curve_pwm: Vector = option(
         (), "pulse widths of another thruster's curve of thrust; empty: the T200's", "us", size=ANY
@@ -273,22 +270,17 @@ class OdometrySensor:
     """`odometry`: the velocity sensor."""
 
     position: Vector = option((0.0, 0.0, 0.0), "velocity sensor from the body origin", "m")
-    linear_std: float = option(
-        0.01, "noise of a velocity, where the message gives no variance", "m/s", lower=POSITIVE
+    linear_std: float = positive(
+        0.01, "noise of a velocity, where the message gives no variance", "m/s"
     )
-    angular_std: float = option(
-        0.005, "noise of an angular rate, where the message gives none", "rad/s", lower=POSITIVE
+    angular_std: float = positive(
+        0.005, "noise of an angular rate, where the message gives none", "rad/s"
     )
-    attitude_std: float = option(0.005, "noise of an attitude angle", "rad", lower=POSITIVE)
-    latency_std: float = option(
-        0.1,
-        "how late linear velocities may be against their stamps; zero: not at all",
-        "s",
-        lower=0.0,
+    attitude_std: float = positive(0.005, "noise of an attitude angle", "rad")
+    latency_std: float = not_negative(
+        0.1, "how late linear velocities may be against their stamps; zero: not at all", "s"
     )
-    gate: float = option(
-        5.0, "a velocity further off the integrated IMU is refused", "sigma", lower=POSITIVE
-    )
+    gate: float = positive(5.0, "a velocity further off the integrated IMU is refused", "sigma")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,21 +291,20 @@ class ImuSensor:
     rotation: Vector = option(
         (0.0, 0.0, 0.0), "roll, pitch, yaw of the sensor axes from the body axes", "rad"
     )
-    accelerometer_std: float = option(
+    accelerometer_std: float = positive(
         1.0,
         "trust in the integrated acceleration between odometry messages: noise, vibration and "
         "thrust that steps between two samples (docs/samples.md shows how it was chosen)",
         "m/s2",
-        lower=POSITIVE,
     )
-    gyro_std: float = option(
-        0.003, "noise of an angular rate, where the message gives none", "rad/s", lower=POSITIVE
+    gyro_std: float = positive(
+        0.003, "noise of an angular rate, where the message gives none", "rad/s"
     )
-    accelerometer_bias_std: float = option(
-        0.1, "prior standard deviation of the accelerometer bias", "m/s2", lower=0.0
+    accelerometer_bias_std: float = not_negative(
+        0.1, "prior standard deviation of the accelerometer bias", "m/s2"
     )
-    gyro_bias_std: float = option(
-        0.01, "prior standard deviation of the gyroscope bias", "rad/s", lower=0.0
+    gyro_bias_std: float = not_negative(
+        0.01, "prior standard deviation of the gyroscope bias", "rad/s"
     )
 
 
@@ -321,21 +312,16 @@ class ImuSensor:
 class WrenchNoise:
     """`wrench`: how well the thruster wrench is known."""
 
-    scale_std: float = option(
-        0.15, "of one factor on the whole wrench; zero: it is exact", lower=0.0
+    scale_std: float = not_negative(0.15, "of one factor on the whole wrench; zero: it is exact")
+    lag_std: float = not_negative(
+        0.2, "time constant that the thrusters' lag may have; zero: none", "s"
     )
-    lag_std: float = option(
-        0.2, "time constant that the thrusters' lag may have; zero: none", "s", lower=0.0
+    relative_std: float = not_negative(0.01, "standard deviation relative to the wrench")
+    correlation_time: float = positive(
+        0.02, "how long an error of the wrench lasts; at least until the next message", "s"
     )
-    relative_std: float = option(0.01, "standard deviation relative to the wrench", lower=0.0)
-    correlation_time: float = option(
-        0.02,
-        "how long an error of the wrench lasts; at least until the next message",
-        "s",
-        lower=POSITIVE,
-    )
-    floor_std: Vector = option(
-        (0.0,) * 6, "standard deviation at zero wrench: X Y Z, K M N", "N, N m", lower=0.0
+    floor_std: Vector = not_negative(
+        (0.0,) * 6, "standard deviation at zero wrench: X Y Z, K M N", "N, N m"
     )
 
 
@@ -346,16 +332,13 @@ class Rls:
     forgetting: str = option(
         "variable", "how old data lose weight", choices=("variable", "constant")
     )
-    forgetting_factor: float = option(
+    forgetting_factor: float = positive(
         1.0,
         "weight kept per 0.1 s by constant forgetting, in directions that move",
-        lower=POSITIVE,
         upper=1.0,
         live=True,
     )
-    gate: float = option(
-        5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
-    )
+    gate: float = positive(5.0, "a sample further off than this is refused", "sigma", live=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -363,11 +346,9 @@ class Ukf:
     """`ukf`: the unscented Kalman filter."""
 
     alpha: float = option(0.5, "spread of the sigma points", lower=1e-4, upper=1.0)
-    beta: float = option(2.0, "weight of the centre point: 2 suits a Gaussian", lower=0.0)
-    kappa: float = option(0.0, "secondary spread of the sigma points", lower=0.0)
-    gate: float = option(
-        5.0, "a sample further off than this is refused", "sigma", lower=POSITIVE, live=True
-    )
+    beta: float = not_negative(2.0, "weight of the centre point: 2 suits a Gaussian")
+    kappa: float = not_negative(0.0, "secondary spread of the sigma points")
+    gate: float = positive(5.0, "a sample further off than this is refused", "sigma", live=True)
     change_threshold: float = option(
         3.0,
         "normalised innovation squared of an axis, over 2 s, from which the vehicle is taken to "
@@ -375,11 +356,10 @@ class Ukf:
         "is rough",
         lower=1.0,
     )
-    random_walk: float = option(
+    random_walk: float = not_negative(
         0.0,
         "drift of a coefficient relative to its value, without any evidence of a change",
         "1/sqrt(h)",
-        lower=0.0,
     )
 
 
@@ -399,11 +379,10 @@ class Qos:
 class Config:
     """A checked configuration; vectors in forward-starboard-down.
 
-    ``estimate`` names the coefficients to estimate, in the order of ``model.names``; the others
-    are held. ``estimate_effects`` are the parameters of effects to estimate, (effect, parameter);
-    in the file both are names under ``estimate``. ``effects`` are part of the simulation: {effect:
-    {parameter: value}}, complete.
-    ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what really moves.
+    ``model`` is what ``vehicle`` and ``coefficients`` say, :attr:`dynamics` what moves with the
+    ``effects``: {effect: {parameter: value}}, complete. ``estimate`` names the coefficients to
+    estimate, in the order of ``model.names``, the others are held; ``estimate_effects`` the
+    parameters of effects, (effect, parameter). In the file both are under ``estimate``.
     """
 
     name: str
@@ -422,15 +401,14 @@ class Config:
     odometry: OdometrySensor = OdometrySensor()
     imu: ImuSensor = ImuSensor()
     wrench: WrenchNoise = WrenchNoise()
-    process_std: Vector = option(
+    process_std: Vector = not_negative(
         (0.0001,) * 6,
         "least density of the acceleration that the model does not explain, besides the noise of "
         "the wrench (more is found from the innovations): surge sway heave, roll pitch yaw",
         "m/s2/sqrt(Hz), rad/s2/sqrt(Hz)",
-        lower=0.0,
     )
-    residual_corner: float = option(
-        3.0, "corner of the filter on the published wrench residual", "rad/s", lower=POSITIVE
+    residual_corner: float = positive(
+        3.0, "corner of the filter on the published wrench residual", "rad/s"
     )
     rls: Rls = Rls()
     ukf: Ukf = Ukf()
@@ -438,12 +416,12 @@ class Config:
     publish_rate: float = option(
         5.0, "rate of the published coefficients", "Hz", lower=0.01, upper=1000.0, live=True
     )
-    timeout: float = option(
-        1.0, "inputs silent for longer are reported as stopped", "s", lower=POSITIVE, live=True
+    timeout: float = positive(
+        1.0, "inputs silent for longer are reported as stopped", "s", live=True
     )
-    grace: float = option(0.3, "how long a late topic is waited for, in stamp time", "s", lower=0.0)
-    current_std: float = option(
-        0.3, "of the velocity of the water north and east; zero: it is still", "m/s", lower=0.0
+    grace: float = not_negative(0.3, "how long a late topic is waited for, in stamp time", "s")
+    current_std: float = not_negative(
+        0.3, "of the velocity of the water north and east; zero: it is still", "m/s"
     )
     vehicle_uncertainty: VehicleUncertainty = field(default_factory=VehicleUncertainty)
     nomoto: bool = option(

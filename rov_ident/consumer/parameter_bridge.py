@@ -59,10 +59,9 @@ def targets(
 ) -> tuple[Target, ...]:
     """Where the estimated coefficients go.
 
-    ``mapping`` are entries `NAME=PARAMETER`, `NAME=-PARAMETER` (of the other sign) or
-    `NAME=PARAMETER[INDEX]`; where there are any, or a ``layout`` of :data:`LAYOUTS`, what they do
-    not name is not sent. Otherwise ``template`` makes the parameter of every coefficient, such as
-    `hydrodynamics.{name}`.
+    ``mapping``: entries `NAME=PARAMETER`, `NAME=-PARAMETER` (of the other sign) or
+    `NAME=PARAMETER[INDEX]`. What neither these nor the ``layout`` (of :data:`LAYOUTS`) name is not
+    sent; without either, ``template`` makes the parameter of each, such as `hydrodynamics.{name}`.
 
     Raises UserError: one sentence naming the entry and what to change.
     """

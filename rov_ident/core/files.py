@@ -24,8 +24,7 @@ _BAG = b"\x89MCAP"  # how a bag begins, whatever its name and version
 _ROSBAG2 = b"rosbag2_bagfile_information"  # and how the metadata.yaml of a rosbag2 directory does
 
 
-VEHICLES = ("bluerov2", "bluerov2_heavy", "remus100")
-"""Those with a file in the folder `config`."""
+VEHICLES = ("bluerov2", "bluerov2_heavy", "remus100")  # those with a file in the folder `config`
 
 
 def shipped(name: str) -> Path:

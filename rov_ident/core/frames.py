@@ -1,12 +1,10 @@
 """Axis conventions, quaternions and angles: the only module that knows another frame than FRD/NED.
 
 Inside the core the body axes are forward-starboard-down (FRD) and the world north-east-down (NED).
-ROS messages are forward-left-up (FLU) and east-north-up (ENU) unless a frame id says otherwise.
-A quaternion is an array [w, x, y, z] that rotates body axes into world axes. The quaternion
-functions broadcast over leading dimensions.
-
-Turning FLU into FRD is half a turn about x, ENU into NED half a turn about the north-east
-diagonal. Both are their own inverse.
+ROS messages are forward-left-up (FLU) and east-north-up (ENU) unless a frame id says otherwise:
+half a turn about x, and half a turn about the north-east diagonal, both their own inverse. A
+quaternion is an array [w, x, y, z] that rotates body axes into world axes; the quaternion functions
+broadcast over leading dimensions.
 """
 
 from collections.abc import Sequence
@@ -23,8 +21,7 @@ from rov_ident.core.messages import Array, Imu, Joints, Odometry, Wrench
 _FRD_SUFFIXES = ("_frd", "_fsd", "_ned")
 _NED_SUFFIX = "_ned"
 
-FLIP_BODY = np.array([1.0, -1.0, -1.0])
-"""Multiplies a vector in FLU to give FRD, and back."""
+FLIP_BODY = np.array([1.0, -1.0, -1.0])  # multiplies a vector in FLU to give FRD, and back
 FLIP_WORLD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Takes a vector in ENU to NED, and back."""
 for _constant in (FLIP_BODY, FLIP_WORLD):
@@ -104,9 +101,8 @@ def quaternion_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> 
 def quaternion_to_euler(q: ArrayLike) -> Array:
     """Roll, pitch, yaw (rad), (..., 3), of quaternions (..., 4) of any length but zero.
 
-    Half the sum and half the difference of roll and yaw are polar angles of quaternion
-    components, so that precision holds up to pitch +-90 degrees, where only one of them exists
-    and the other is taken as zero.
+    From half the sum and half the difference of roll and yaw, so that precision holds up to pitch
+    +-90 degrees, where only one of these exists and the other is taken as zero.
     """
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
     half_sum = np.arctan2(x + z, w - y)

@@ -13,17 +13,14 @@ reordered  no            kernels             long sums: vector instructions, oth
 inlined    as caller     kernels             loops whose length is a constant of the caller
 =========  ============  ==================  =====================================================
 
-A slice that is copied counts as an array that is made. ``released`` is not the rule because giving
-up Python's lock and taking it again costs microseconds. ``reordered`` is not for functions that ask
-whether a number is finite: ``x - x`` may be taken for zero. ``inlined`` is also right for a
-function with a single caller: numba optimises whatever a kernel calls once more with each kernel.
+A slice that is copied counts as an array that is made. ``released`` costs microseconds to give up
+Python's lock and take it again. ``reordered`` must not ask whether a number is finite: ``x - x``
+may be taken for zero. ``inlined`` also suits a function with one caller.
 
-numba compiles a cached function again when its own file changes, but not when a function it calls
-or a constant of another module does. The folder of the cache is therefore named after the source of
-the whole package and of installed effects, and the versions of all that makes the machine code; and
-after the place of the package, as numba keeps kernels by the path of their source: a second copy of
-the same version would find that all is compiled (the mark of a :class:`Compiler`), but none of its
-own kernels, and compile them within a live node.
+numba does not notice that a function or constant of another module has changed. So the folder of
+the cache is named after the source of the package and of installed effects, the versions of all
+that makes the machine code, and the place of the package: numba keeps kernels by the path of their
+source, so a copy elsewhere would find the mark of a :class:`Compiler`, but no kernels of its own.
 """
 
 import contextlib
@@ -106,10 +103,9 @@ inlined = _decorator(inline="always")
 def only_run() -> None:
     """Set numba up for a process that runs what others have compiled: 30 MB less, and faster.
 
-    To be called before the first kernel is. Otherwise scipy's linear algebra is loaded in case a
-    kernel with products of matrices has to be compiled, and the helpers that numba compiles for
-    itself at each start are optimised, though only newly compiled kernels would use them. Kernels
-    without such products can still be compiled afterwards.
+    To be called before the first kernel is. scipy's linear algebra, of use only to compile products
+    of matrices, is not loaded then, and numba's own helpers are not optimised. Kernels without such
+    products can still be compiled afterwards.
     """
     blas, level = "scipy.linalg.cython_blas", numba.config.OPT
     try:

@@ -1,9 +1,5 @@
-"""The input messages, and what else they are made from, free of middleware.
-
-The same types carry a message as it is on the wire (ROS axes) and after ``frames.to_core`` (body
-forward-starboard-down, world north-east-down), so that live nodes, replay and offline fits feed
-the estimators through one path.
-"""
+"""The input messages, and what else they are made from, free of middleware: in the axes of ROS, or
+after ``frames.to_core`` (body forward-starboard-down, world north-east-down)."""
 
 from typing import NamedTuple
 
@@ -12,11 +8,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"
-"""The roles of the three inputs."""
-
-DRIVE = "inputs"
-"""The role of fin angles and shaft speeds, where a vehicle has such."""
+ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"  # the roles of the three inputs
+DRIVE = "inputs"  # the role of fin angles and shaft speeds, where a vehicle has such
 
 
 class Odometry(NamedTuple):
@@ -91,8 +84,7 @@ class Commands(NamedTuple):
 
 Message = Odometry | Imu | Wrench | Joints
 
-LAST_STAMP = (2**31 - 1) * 10**9
-"""ns; the end of ROS time, 32 bits of seconds."""
+LAST_STAMP = (2**31 - 1) * 10**9  # ns; the end of ROS time, 32 bits of seconds
 
 
 @np.errstate(over="ignore", invalid="ignore")

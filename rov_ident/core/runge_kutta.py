@@ -2,8 +2,7 @@
 
 from rov_ident.core.jit import inlined
 
-NODES = (0.0, 0.5, 0.5, 1.0)
-"""When a stage is, in steps."""
+NODES = (0.0, 0.5, 0.5, 1.0)  # when a stage is, in steps
 
 WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 """Of the slope of each stage in that of the whole step."""

@@ -21,8 +21,7 @@ a quarter. Reading that much takes some ten seconds."""
 _DEEPEST = 32
 """Levels: a configuration and a bag's metadata have six; Python's own stack ends at some 200."""
 
-_LARGEST_NUMBER = 1 << 64
-"""ROS has no larger whole number."""
+_LARGEST_NUMBER = 1 << 64  # ROS has no larger whole number
 
 _PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in "null bool int float str seq map".split()}
 

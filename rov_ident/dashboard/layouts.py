@@ -1,9 +1,8 @@
 """Ready layouts for Foxglove and PlotJuggler: the topics of both nodes, by the names they have.
 
-Both read `~/coefficients`, where a coefficient is found by its name whatever else is estimated.
-Foxglove's plots take the numbers of its texts as they are, PlotJuggler's parser of DiagnosticArray
-makes a series `TOPIC/HARDWARE_ID/NAME/KEY` of each, with the vehicle's name for hardware id. What
-is the same for all vehicles is in `foxglove.json` and `plotjuggler.xml` of this folder.
+Both read `~/coefficients`. Foxglove plots the numbers in its texts; PlotJuggler's parser of
+DiagnosticArray makes a series `TOPIC/HARDWARE_ID/NAME/KEY` of each, the hardware id being the
+vehicle's name. What all vehicles share is in `foxglove.json` and `plotjuggler.xml` of this folder.
 """
 
 import json
@@ -25,8 +24,7 @@ _COLOURS = {
 
 _add = ElementTree.SubElement
 
-Curve = tuple[str, str, str]
-"""Its path, label and colour."""
+Curve = tuple[str, str, str]  # its path, label and colour
 
 
 def _nodes(namespace: str) -> dict[str, str]:

@@ -32,8 +32,7 @@ _FILES = {
     "/page.css": ("page.css", "text/css"),
     "/page.js": ("page.js", "text/javascript"),
 }
-NAMES = (HOST, "localhost")
-"""The names of this computer that a request may give."""
+NAMES = (HOST, "localhost")  # the names of this computer that a request may give
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 

@@ -24,8 +24,7 @@ LONGEST = 1000  # characters of a text, and entries of a status: ours have a ten
 KINDS = ("inputs", "estimation", "model", "checkpoint")  # of an estimator's statuses
 GONE = 3.0  # s without a message after which an estimator is silent: three of its /diagnostics
 
-Mark = tuple[int, int]
-"""What a reader has of a series: (epoch, rows)."""
+Mark = tuple[int, int]  # what a reader has of a series: (epoch, rows)
 
 
 class Series:

@@ -23,7 +23,7 @@ from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import HEADING, NOISE, with_noise
-from rov_ident.discrepancy.windowed_problem import Spans, within
+from rov_ident.discrepancy.windowed_problem import Spans
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
@@ -247,10 +247,8 @@ def sensor_findings(
         rest, _ = sensor_consistency.search(streams, config, fit, others, fixed)
         given = as_headed if name == HEADING and as_headed is not None else judged
         before = sensor_consistency.comparisons(given, config, rest)
-        sums = [_common(*pair, held) for pair in zip(before, after, strict=True)]
-        last = max(map(len, sums))
-        of = np.stack([np.pad(s, ((0, last - len(s)), (0, 0))) for s in sums], axis=2)
-        of = of[of[:, 2].any(axis=1)][:, :, of[:, 2].any(axis=0)]
+        of = sensor_consistency.common_squares((before, after), held, unit=1, length=CHUNK)
+        of = of[:, :, of[:, 2].any(axis=0)]
         gain = gain_of(["kinematic"] * of.shape[2], of[:, 0], of[:, 1], of[:, 2].sum(axis=0))
         parameters = {
             p.name: Value(found[name][p.name], std[name, p.name], p.unit)
@@ -263,20 +261,3 @@ def sensor_findings(
         run = None if sure else EFFECTS[name].manoeuvre
         findings.append(Finding(name, (), parameters, None, gain, sure, run, rivals, words))
     return findings
-
-
-def _common(
-    before: sensor_consistency.Comparison, after: sensor_consistency.Comparison, spans: Spans
-) -> Array:
-    """Squared innovations of two corrections of the sensors, in units of the later one's noise, and
-    how many instants they are of where both count, all summed over chunks of time: (C, 3)."""
-    times = [np.round(c.t, 6) for c in (before, after)]
-    x, y = (t[within(spans, c.t)] for t, c in zip(times, (before, after), strict=True))
-    common = np.intersect1d(x, y)
-    last = int(common[-1] / CHUNK) + 1 if len(common) else 0
-    sums = []
-    for c, t in zip((before, after), times, strict=True):
-        use = np.isin(t, common)
-        squares = (c.r[use] * (c.scale / after.scale)) ** 2
-        sums.append(np.bincount((t[use] / CHUNK).astype(int), squares, last))
-    return np.stack([*sums, np.bincount((common / CHUNK).astype(int), minlength=last)], axis=1)

@@ -31,9 +31,7 @@ _MARGIN = 0.25  # s cut off beside held-out blocks: five odometry messages at 20
 _ENOUGH = 600.0  # s of data to fit; an hour is explained in less than a minute so
 MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
 
-CHUNK = 2.5
-"""Seconds; of the chunks that the bootstrap resamples: four to a block."""
-
+CHUNK = 2.5  # seconds; of the chunks that the bootstrap resamples: four to a block
 PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
 _DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
 _FAILED = 3.0  # standard deviations of the motion: a simulation further off counts as so far off
@@ -192,8 +190,7 @@ def gain_of(components: Sequence[str], before: Array, after: Array, count: float
     2005). So the component that gains most of those that surely gain may be picked. ``count`` are
     the errors of each.
     """
-    chunks = len(before)
-    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    draws = _draws(len(before))
     change = log_ratio(after.sum(axis=0), before.sum(axis=0))
     drawn = log_ratio(draws @ after, draws @ before)
     std = drawn.std(axis=0) + 1e-12
@@ -209,8 +206,7 @@ def gain_of(components: Sequence[str], before: Array, after: Array, count: float
 
 def together(before: Array, after: Array) -> Together:
     """The gain of all components (C, K) together: one number, so nothing has been picked."""
-    chunks = len(before)
-    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    draws = _draws(len(before))
     change = log_ratio(after.sum(axis=0), before.sum(axis=0)).mean()
     drawn = log_ratio(draws @ after, draws @ before).mean(axis=1)
     widest = np.quantile(np.abs(drawn - change), 0.95)
@@ -221,9 +217,13 @@ def together(before: Array, after: Array) -> Together:
 def surely_less(a: Array, b: Array) -> bool:
     """Whether squared errors a are less than b, both summed over chunks of time (C, K), all
     components taken together: in 97.5 % of resampled chunks, one end of a 95 % interval."""
-    chunks = len(a)
-    draws = np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
+    draws = _draws(len(a))
     return bool(np.quantile(log_ratio(draws @ a, draws @ b).sum(axis=1), 0.975) < 0.0)
+
+
+def _draws(chunks: int) -> NDArray[np.int64]:
+    """How often each of so many chunks is in each draw of the bootstrap (_DRAWS, chunks)."""
+    return np.random.default_rng(0).multinomial(chunks, np.full(chunks, 1.0 / chunks), _DRAWS)
 
 
 def log_ratio(a: Array, b: Array) -> Array:

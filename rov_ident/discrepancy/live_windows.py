@@ -1,17 +1,14 @@
 """What a live monitor remembers of the last minutes: windows of motion as normal equations.
 
-Each window of a few seconds is simulated with the coefficients as they are estimated then, and the
-sensitivities of the simulated velocity to every watched parameter, at its null, are taken against
-what the simulation leaves unexplained (`linearisation`, the same as the offline search). Windows of
-different coefficients theta_w add up, because what is remembered of one are its normal equations
-about a common origin::
+Each window of a few seconds is simulated with the coefficients as they are estimated then; the
+sensitivities to every watched parameter, at its null, are taken against what is left unexplained.
+Windows of different coefficients theta_w add up as normal equations about a common origin::
 
     J'J,  J'(r + J theta_w),  r'r + 2 r'J theta_w + (J theta_w)'(J theta_w)
 
-Effects on sensors are not watched: they do not act on the wrench, and what gives them away is that
-two sensors disagree. Nor is a wave, whose frequency takes a search, nor the slow fade of a battery,
-which in the memory of some minutes looks like a thruster gain. Effects with an onset are watched as
-if they had always been there; the memory is short enough for that.
+Not watched are effects on sensors, which do not act on the wrench; a wave, whose frequency takes a
+search; and the slow fade of a battery, which in some minutes looks like a thruster gain. Effects
+with an onset are watched as if they had always been there: the memory is short enough.
 """
 
 from collections.abc import Mapping, Sequence

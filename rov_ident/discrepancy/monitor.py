@@ -1,12 +1,10 @@
 """The live monitor: what a model may lack, watched while it runs; the cheap part of `explain`.
 
-:class:`Monitor` cuts the samples of an estimator into windows of a few seconds, remembers the last
-minutes of them (`live_windows`) and keeps the list of suspicions up to date.
-
-The score of an effect is what it takes off the squared residuals, beyond what another choice of the
-estimated coefficients can, over the variance inflation (`uncertainty`). It becomes a warning where
-it passes a penalty that allows for the number of effects tried, and where the effect explains a
-share of the residual that matters.
+:class:`Monitor` cuts the samples of an estimator into windows (`live_windows`) and keeps the list
+of suspicions. The score of an effect is what it takes off the squared residuals, beyond what
+another choice of the estimated coefficients can, over the variance inflation. It becomes a warning
+where it passes a penalty that allows for the number of effects tried, and explains a share that
+matters.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,8 +45,7 @@ from rov_ident.estimation.compilation import any_vehicle
 from rov_ident.model.coefficients import ABSOLUTE, AXES, MOTIONS, NEGATIVE, ONE, VELOCITIES, parse
 from rov_ident.sampling.sample import SAMPLE, joined
 
-FEWEST = 12
-"""Windows, from which on their scatter is known to about 40 % (chi-squared)."""
+FEWEST = 12  # windows, from which on their scatter is known to about 40 % (chi-squared)
 
 ALARM = 1e-4
 """How often chance may raise a false alarm from a memory full of windows with nothing missing."""

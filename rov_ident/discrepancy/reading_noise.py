@@ -1,14 +1,11 @@
 """Noise of the wrench's reading: how large it is, and how much of it a simulation makes.
 
-A model is simulated with the wrench as it was read. What is read beside the command moves the
-simulated vehicle only, so that an effect which makes the model follow the reading less (a dead
-band, a failure, a gain below one) predicts better although it is not there (attenuation: Fuller
-1987, ch. 1). The expected squares of what noise makes are therefore taken off those of the
-residuals (the corrected score of Nakamura 1990): they are then as if the command had been read.
-
-The live watch has no fits to compare, but scores: sensitivities times residuals. These are without
-bias where the wrench is smoothed with the motion first, as the best linear estimate of the commands
-is not correlated with what contradicts it (the conditional score of Stefanski, Carroll 1987).
+A model is simulated with the wrench as read. What is read beside the command moves the simulated
+vehicle only, so that an effect which makes the model follow the reading less (a dead band, a
+failure, a gain below one) predicts better although it is not there (attenuation: Fuller 1987, ch.
+1). The expected squares of what noise makes are therefore taken off those of the residuals (the
+corrected score of Nakamura 1990). The live watch, which has scores and no fits, smooths the wrench
+instead (`wrench_smoothing`).
 """
 
 import numpy as np
@@ -29,10 +26,8 @@ def jitter(demand: Array, std: Array) -> Array:
         return np.zeros_like(demand)
     ends = np.pad(demand, ((_HALF + 1, _HALF), (0, 0)), mode="edge")
     total = np.cumsum(ends, axis=0)
-    before, after = (
-        total[_HALF : -_HALF - 1] - total[:-width],
-        total[width:] - total[_HALF + 1 : -_HALF],
-    )
+    before = total[_HALF : -_HALF - 1] - total[:-width]
+    after = total[width:] - total[_HALF + 1 : -_HALF]
     rests = np.abs(after - before) <= _LARGEST * np.sqrt(2.0 * _HALF) * std
     off: Array = demand - (total[width:] - total[:-width]) / width
     return np.where(rests, off, 0.0)

@@ -1,9 +1,8 @@
 """Whether a cause is the same in each of several records, and whether it repeats.
 
-The model that was found is fitted to each record alone: where an effect's parameters differ by more
-than chance, the records differ in it, as in a current or in what a vehicle carries. Then each
-record is left out as a whole: it is predicted by fits to the others, with the effect and without
-(cross-validation in groups; Stone 1974).
+The model found is fitted to each record alone: where an effect's parameters differ by more than
+chance, the records differ in it, as in a current or a payload. Then each record is left out as a
+whole and predicted by fits to the others, with the effect and without (Stone 1974).
 """
 
 import dataclasses

@@ -24,8 +24,7 @@ from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate, number
 UNITS = dict(zip(VELOCITIES, ("m/s",) * 3 + ("rad/s",) * 3))
 _SIDES = ("to port", "to starboard")
 _SENSES = (("astern", "forward"), _SIDES, ("up", "down"), _SIDES, ("bow down", "bow up"), _SIDES)
-SENSES = dict(zip(VELOCITIES, _SENSES))
-"""What a negative and a positive velocity mean."""
+SENSES = dict(zip(VELOCITIES, _SENSES))  # what a negative and a positive velocity mean
 
 _BEFORE_THE_FIT = (
     "All from here on is from the search that came before the last fit, whose values are those "

@@ -1,10 +1,11 @@
 """What `explain` found, as plain results: written to findings.json, told in the report."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
+
+from rov_ident.reports.result import as_json
 
 Verdict = Literal["agrees", "retuned", "explained", "unexplained"]
 
@@ -133,7 +134,7 @@ class Findings:
             "notes": list(self.notes),
             "provenance": dict(self.provenance),
         }
-        return json.dumps(_finite(document), indent=2, allow_nan=False) + "\n"
+        return as_json(_finite(document))
 
 
 def _finite(x: Any) -> Any:

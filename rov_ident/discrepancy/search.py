@@ -1,11 +1,10 @@
 """The search for what a model of the dynamics lacks.
 
-1. The coefficients that the model has are refitted: what that gains is tuning, not physics.
-2. Every effect of the library is scored on the linearisation of that fit (`screening`); the best
-   few are fitted in full, and the best of them, if it is significant, joins the model. This repeats
-   until nothing is left, or the simulation budget is spent.
-3. Each named effect is compared with its rivals, the others in place: other effects, and patterns
-   of no known cause (`pattern_search`). An effect that does not earn its place leaves.
+1. The coefficients that the model has are refitted: that is tuning, not physics. 2. Every effect is
+scored on the linearisation of that fit (`screening`), the best few are fitted in full, and the best
+of them, if significant, joins the model; and again, until nothing is left or the simulation budget
+is spent. 3. Each named effect is compared with its rivals, the others in place: other effects, and
+patterns of no known cause (`patterns`). One that does not earn its place leaves.
 """
 
 import contextlib
@@ -40,8 +39,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
 
-LATE_THRUST = ("thruster_lag", "actuation_delay")
-"""What every thruster has a little of."""
+LATE_THRUST = ("thruster_lag", "actuation_delay")  # what every thruster has a little of
 
 # What is likelier beforehand needs less evidence. The rates in docs/explain-bench.md were measured
 # with these.

@@ -141,10 +141,9 @@ class Scores:
         """Of units of parameters that join together those worth having, one after the other; their
         penalised score, and the same as if the residuals that they leave were white.
 
-        ``together``: also beginning with all of them, as each may show only beside the others.
-        Where none is worth having by the inflation that it leaves, those are given that would be
-        if that were white, with a score of minus infinity: where a linear view is far from the
-        truth, only a fit shows what they do.
+        ``together``: also beginning with all, as each may show only beside the others. Where none
+        is worth having, those are given that would be if what they leave were white, with a score
+        of minus infinity: where a linear view is far from the truth, only a fit shows what they do.
         """
         lists = [list(u) for u in units]
         begins = [[], lists] if together and len(lists) > 1 else [[]]

@@ -1,13 +1,10 @@
 """Which effects on the sensors are believed: how the sensors agree proposes, the dynamics decide.
 
-A correction of the velocities that makes the sensors agree, but the motion disagree with the
-thrust, is none: the pose may be what is wrong. So a correction is dropped where held-out data, as
-they were recorded, are surely predicted better without it; and whether the heading of the pose is
-off or the velocity sensor is turned, which a level vehicle cannot tell from its odometry, is
-decided by the thrust.
-
-The noise of the wrench's reading shows where commands rest. It is believed if the dynamics fit
-better without it.
+A correction that makes the sensors agree, but the motion disagree with the thrust, is none: the
+pose may be wrong. So it is dropped where held-out data, as recorded, are surely predicted better
+without. Whether the heading is off or the velocity sensor turned, which a level vehicle's odometry
+does not tell, is decided by the thrust. The noise of the wrench's reading, which shows where
+commands rest, is believed if the dynamics fit better without it.
 """
 
 import dataclasses
@@ -24,6 +21,7 @@ from rov_ident.discrepancy.output_error import Fitted, fit
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import a_reading
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
@@ -79,7 +77,8 @@ class _Data:
     def agreement(self, of: Sequence[Sensors]) -> list[Array]:
         """Squared innovations (C, comparisons) of corrections, in the units of the first."""
         all_found = [sensor_consistency.comparisons(self.judged, self.config, s) for s in of]
-        return sensor_consistency.common_squares(all_found, self.held)
+        sums = sensor_consistency.common_squares(all_found, self.held)
+        return [sums[:, i] for i in range(len(of))]
 
 
 def chosen(
@@ -164,7 +163,7 @@ def _moves_velocity(name: str, values: Mapping[str, float]) -> bool:
     effect = EFFECTS[name]
     if effect.sense is None:
         return True
-    reading = sensor_consistency.a_reading()
+    reading = a_reading()
     return not np.array_equal(effect.sense(reading, **values).linear, reading.linear)
 
 
@@ -195,11 +194,8 @@ def noise_of_wrench(search: Search, start: Fitted) -> dict[str, float]:
 
 def _better_as_read(fitted: Fitted) -> set[str]:
     """The parameters of the noise without which a fit that has them all would be better."""
-    problem, linearisation, h = (
-        fitted.linearisation.problem,
-        fitted.linearisation,
-        fitted.hypothesis,
-    )
+    linearisation, h = fitted.linearisation, fitted.hypothesis
+    problem = linearisation.problem
     change = problem.thrust(with_noise(h, {}).effects)[0] - problem.thrust(h.effects)[0]
     use = [i for i in np.flatnonzero(~problem.guided) if change[:, i].any()]
     if not use:

@@ -15,6 +15,8 @@ effects are linear to first order, and the fit is repeated about its own result.
 import dataclasses
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -317,31 +319,30 @@ def _linear_problem(
 
 
 def common_squares(
-    found: Sequence[Sequence[Comparison]], spans: Sequence[tuple[float, float]]
-) -> list[Array]:
-    """Squared innovations of several corrections, in units of the first one's noise, at the
-    instants in the spans where all count, summed over clusters of time: (C, comparisons) each."""
-    out: list[list[Array]] = [[] for _ in found]
-    last = int(max(c.t[-1] for of in found for c in of) / _CLUSTER) + 1
+    found: Sequence[Sequence[Comparison]],
+    spans: Sequence[tuple[float, float]],
+    unit: int = 0,
+    length: float = _CLUSTER,
+) -> Array:
+    """Squared innovations of ``found`` corrections of the sensors, at the instants in the spans
+    where all count, in units of the noise of correction number ``unit``; and how many instants
+    these are. Summed over chunks of ``length`` seconds: (C, corrections + 1, comparisons)."""
+    sums: list[Array] = []
     for same in zip(*found, strict=True):
         times = [np.round(c.t, 6) for c in same]
-        common = times[0][within(spans, times[0])]
-        for t in times[1:]:
-            common = np.intersect1d(common, t)
-        for sums, c, t in zip(out, same, times, strict=True):
+        common = reduce(np.intersect1d, times)
+        common = common[within(spans, common)]
+        last = int(common[-1] / length) + 1 if len(common) else 0
+        parts: list[Any] = []
+        for c, t in zip(same, times, strict=True):
             use = np.isin(t, common)
-            squares = (c.r[use] * (c.scale / same[0].scale)) ** 2
-            total: Array = np.zeros(last)
-            np.add.at(total, (t[use] / _CLUSTER).astype(int), squares)
-            sums.append(total)
-    stacked = [np.stack(sums, axis=1) for sums in out]
-    there = stacked[0].any(axis=1)
-    return [s[there] for s in stacked]
-
-
-def a_reading() -> Reading:
-    """A reading in which nothing is zero or like another."""
-    return Reading(*np.arange(1.0, 13.0).reshape(4, 3))
+            squares = (c.r[use] * (c.scale / same[unit].scale)) ** 2
+            parts.append(np.bincount((t[use] / length).astype(int), squares, last))
+        counts = np.bincount((common / length).astype(int), minlength=last)
+        sums.append(np.stack([*parts, counts], axis=1))
+    last = max(map(len, sums))
+    out = np.stack([np.pad(s, ((0, last - len(s)), (0, 0))) for s in sums], axis=2)
+    return out[out[:, -1].any(axis=1)]
 
 
 def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:

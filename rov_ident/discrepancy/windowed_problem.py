@@ -8,7 +8,7 @@ its parameters.
 import contextlib
 import copy
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
 
 import numpy as np
@@ -49,8 +49,23 @@ _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
 
-Spans = list[tuple[float, float]]
-"""From and to [s] each."""
+Spans = list[tuple[float, float]]  # from and to [s] each
+
+
+class _Remembered:
+    """Arrays by key, ``most`` of them; with one more all are forgotten."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._known = most, dict[object, Array]()
+
+    def of(self, key: object, make: Callable[[], Array]) -> Array:
+        """The array of a key, which ``make`` makes where it is not known."""
+        found = self._known.get(key)
+        if found is None:
+            if len(self._known) > self._most:
+                self._known = {}
+            found = self._known[key] = make()
+        return found
 
 
 class WindowedProblem:
@@ -116,11 +131,15 @@ class WindowedProblem:
         self.patterns: dict[Key, Array] = {}
         self._simulations = 0  # of all windows, so far
         self._stopped = False
-        self._thrusts: dict[object, Array] = {}
-        self._driven: dict[object, Array] = {}
-        self._noisy: dict[object, Array] = {}
-        self._remembered = threading.local()  # wrenches along a motion
+        self._driven = _Remembered(_REMEMBERED_THRUSTS)
+        self._forget()
         self._counting = threading.Lock()
+
+    def _forget(self) -> None:
+        """What is remembered of the thrust."""
+        self._thrusts = _Remembered(_REMEMBERED_THRUSTS)
+        self._noisy = _Remembered(_REMEMBERED_NOISE)
+        self._remembered = threading.local()  # wrenches along a motion
 
     def _measured_at(self, t: Array) -> Array:
         """Velocities (k, 6) between those measured."""
@@ -140,41 +159,31 @@ class WindowedProblem:
 
     def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
-        key = _inputs(effects)
-        known = self._thrusts.get(key)
-        if known is None:
-            if len(self._thrusts) > _REMEMBERED_THRUSTS:
-                self._thrusts = {}
-            known = self._thrusts[key] = thrust(self.steps, compiled(effects))
-        return known
+        return self._thrusts.of(_inputs(effects), lambda: thrust(self.steps, compiled(effects)))
 
     def driven(self, effects: Mapping[str, Mapping[str, float]]) -> Steps:
         """The time axis with the inputs as they act, after the effects on fins."""
         key = tuple(sorted((n, *v.values()) for n, v in effects.items() if EFFECTS[n].steer))
         if not key:
             return self.steps
-        known = self._driven.get(key)
-        if known is None:
-            if len(self._driven) > _REMEMBERED_THRUSTS:
-                self._driven = {}
-            steps = self.steps
-            known = steered(compiled(effects), np.diff(steps.t), steps.inputs, self._ends)
-            self._driven[key] = known
-        return self.steps._replace(inputs=known)
+        steps = self.steps
+
+        def acting() -> Array:
+            return steered(compiled(effects), np.diff(steps.t), steps.inputs, self._ends)
+
+        return steps._replace(inputs=self._driven.of(key, acting))
 
     def noisy_thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """What noise of the reading adds to the mean thrust in each step, (K, 6, draws)."""
-        key = _inputs(effects)
-        known = self._noisy.get(key)
-        if known is None:
-            if len(self._noisy) > _REMEMBERED_NOISE:
-                self._noisy = {}
+
+        def added() -> Array:
             base, acting = self.thrust(effects)[0], compiled(effects)
             of = draws(SMALL * self.reading_std, len(self.streams.demand))
             demands = (self.steps.demand + noise[self._held] for noise in of)
             moved = [thrust(self.steps._replace(demand=d), acting)[0] for d in demands]
-            known = self._noisy[key] = np.stack([(m - base) / SMALL for m in moved], axis=2)
-        return known
+            return np.stack([(m - base) / SMALL for m in moved], axis=2)
+
+        return self._noisy.of(_inputs(effects), added)
 
     def response(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """What a unit of each reading of the wrench adds to the mean thrust in each step, (K, 6,
@@ -193,7 +202,7 @@ class WindowedProblem:
         """The same with something (D, 6) taken off what was read of the wrench."""
         other = copy.copy(self)
         other.steps = self.steps._replace(demand=self.steps.demand - taken[self._held])
-        other._thrusts, other._noisy, other._remembered = {}, {}, threading.local()
+        other._forget()
         return other
 
     def motion(self, h: Hypothesis, starts: Array) -> Motion | None:

@@ -68,11 +68,8 @@ class Known(NamedTuple):
 
     def change(self, linearisation: Linearisation) -> Array:
         """How far (B,) the best values with one more window are from those it is simulated with."""
-        linear, theta = (
-            linearisation.linear,
-            np.array(list(linearisation.hypothesis.values.values())),
-        )
-        gradient = linear.gradient.sum(axis=0)
+        linear, values = linearisation.linear, linearisation.hypothesis.values
+        gradient, theta = linear.gradient.sum(axis=0), np.array(list(values.values()))
         rest = self.moment - self.normal @ theta
         return scaled_solve(self.normal + linear.normal, gradient + rest, 1e-9)
 

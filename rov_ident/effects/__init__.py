@@ -27,6 +27,7 @@ from rov_ident.effects.base import (
     Effect,
     EffectParameter,
     Reading,
+    a_reading,
     faults,
 )
 from rov_ident.model.equations import RigidBody, add_current
@@ -61,8 +62,7 @@ def _library() -> dict[str, Effect]:
     return {**dict(_of_others(ours)), **ours}
 
 
-EFFECTS: dict[str, Effect] = _library()
-"""Every effect by the name users give it."""
+EFFECTS: dict[str, Effect] = _library()  # every effect by the name users give it
 
 _INPUT = sorted((e for e in EFFECTS.values() if e.act), key=lambda e: (e.order, e.name))
 _STEER = sorted((e for e in EFFECTS.values() if e.steer), key=lambda e: (e.order, e.name))
@@ -228,13 +228,9 @@ def estimable(name: str) -> dict[str, float | None]:
     if effect.heading or effect.noise:
         return {}
     if effect.sense is not None and effect.correct is not None:
-        given = Reading(*np.arange(1.0, 13.0).reshape(4, 3))
         nulls = {p.name: p.null for p in effect.parameters}
-        same = effect.correct(given, **nulls)
-        moved = [
-            effect.correct(given, **{**nulls, p.name: p.null + p.typical})
-            for p in effect.parameters
-        ]
+        beside = [{**nulls, p.name: p.null + p.typical} for p in effect.parameters]
+        same, *moved = (effect.correct(a_reading(), **values) for values in (nulls, *beside))
         if all((m.linear == same.linear).all() for m in moved):
             return {}
     return {
@@ -309,10 +305,9 @@ def add_surroundings(
     """Add to out (6,) what wrench effects and moving water do at time t, ``position`` (3,) and nu
     (6,) over ground, while the thrusters give ``thrust`` (6,).
 
-    ``structure``, ``added_mass`` (6, 6, 1) and ``theta`` (n, 1) are those of the model;
-    ``rotation`` (3, 3) turns body axes into the world; s is a record of
-    :data:`rov_ident.model.equations.CURRENT`, work space. There is one version of this for any
-    effects, as each takes ten seconds to compile.
+    ``structure``, ``added_mass`` (6, 6, 1), ``theta`` (n, 1): of the model; ``rotation`` (3, 3):
+    body axes into the world; s: a record of :data:`rov_ident.model.equations.CURRENT`, work space.
+    One version for any effects, as each takes ten seconds to compile.
     """
     north, east, down = acting.water[0], acting.water[1], acting.water[2]
     if north != 0.0 or east != 0.0 or down != 0.0:

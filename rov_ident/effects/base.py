@@ -51,16 +51,13 @@ from rov_ident.model.coefficients import INPUTS, parse
 
 Array = NDArray[np.float64]
 
-SIZE = 44
-"""The most parameters that a kernel takes."""
+SIZE = 44  # the most parameters that a kernel takes
 
 Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed", "shape"]
 Axes = tuple[str, str, str]
 
-MEMORY = 1024
-"""Numbers that an input effect may keep from one call to the next."""
-STEER_MEMORY = 8
-"""The same of an effect on fins."""
+MEMORY = 1024  # numbers that an input effect may keep from one call to the next
+STEER_MEMORY = 8  # the same of an effect on fins
 
 
 class Reading(NamedTuple):
@@ -70,6 +67,11 @@ class Reading(NamedTuple):
     angular: Array  # rad/s, of the odometry
     gyro: Array  # rad/s
     specific_force: Array  # m/s2
+
+
+def a_reading() -> Reading:
+    """One in which nothing is zero or like another."""
+    return Reading(*np.arange(1.0, 13.0).reshape(4, 3))
 
 
 @dataclass(frozen=True)
@@ -146,13 +148,12 @@ def vector(
 class Effect:
     """An effect of the library; see the module for the hooks, of which each has exactly one.
 
-    ``place`` is where it enters: the *input* (between what is commanded and what acts), the
-    *motion* (between the motion through the water and what is measured) or the *wrench*.
-    ``manoeuvre`` is the run that shows it and tells it from its neighbours. ``beyond`` names the
-    effect that does nearly the same and that every vehicle has: this one is looked for only in a
-    model that has some of that. ``lasting`` are the effects that one with an onset cannot be told
-    from if it has been there from the start. ``within`` names the effect of which this one is a
-    special case.
+    ``place``: it enters between what is commanded and what acts (*input*), between the motion
+    through the water and what is measured (*motion*), or in the *wrench*. ``manoeuvre``: the run
+    that shows it and tells it from its neighbours. ``beyond``: the effect that does nearly the same
+    and that every vehicle has, without which this one is not looked for. ``lasting``: what one with
+    an onset cannot be told from if it was there from the start. ``within``: the effect of which
+    this is a special case.
     """
 
     place: Literal["input", "motion", "wrench"]

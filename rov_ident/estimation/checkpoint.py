@@ -28,10 +28,8 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.files import lock, open_input, write_file
 from rov_ident.estimation.online import Memory, OnlineEstimator
 
-FORMAT = 1
-"""To be raised when the same numbers get another meaning."""
-LARGEST = 1 << 24
-"""Bytes; a state of a hundred coefficients has a fiftieth of that."""
+FORMAT = 1  # to be raised when the same numbers get another meaning
+LARGEST = 1 << 24  # bytes; a state of a hundred coefficients has a fiftieth of that
 
 _MAGIC = b"rov_ident checkpoint\n"
 _WORDS = {"estimator": "estimator", "configuration": "configuration"}

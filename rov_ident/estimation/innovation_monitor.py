@@ -74,14 +74,12 @@ def interrupt(m):
 def watch(m, process, i, room, moving, own, gate, innovation, considered):
     """Take in a normalised innovation of axis i; whether it is an outlier.
 
-    ``moving`` says whether any velocity is, ``own`` whether that of this axis is.
+    ``moving``: whether any velocity is; where none is (on the ground, on deck), what holds the
+    vehicle says nothing of a dive. ``own``: whether that of this axis is. ``room``: the power of
+    summed innovations, 1 being expected, from which process noise is added; noise added by chance
+    does not go away by chance, and the less room, the more information it costs.
 
-    ``room`` is the power of summed innovations from which process noise is added; 1 is expected.
-    Noise that is added by chance does not go below the floor by chance: the less room, the more
-    information is lost to that, and the better the intervals where the model is wrong. Where no
-    velocity is ``moving`` (on the ground, on deck), what holds the vehicle says nothing of a dive.
-
-    ``considered`` is the correlation of the innovation with the error of what is considered and not
+    ``considered``: the correlation of the innovation with the error of what is considered and not
     estimated. That stays the same, so its share of successive innovations adds up, not its square.
     """
     nis = innovation * innovation

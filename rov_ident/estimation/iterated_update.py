@@ -1,12 +1,11 @@
 """Rows of RLS that were taken about poor estimates, taken again about better ones.
 
-A row of the least squares is right to first order in the distance of the coefficients it was taken
-about. Before much is known that distance is large: rows then claim to know combinations of
-coefficients that the motion does not tell, and no later row takes that back ("Looking back" in
-docs/accuracy.md). So the samples of a window are kept, with the state from before them. Once the
-estimate has left the values that the rows were taken about, the samples are folded again from that
-state, with an observer at the estimate as it is now: the iterated update (Bell and Cathey 1993,
-IEEE Trans. Automat. Contr. 38, 294), which is a Gauss-Newton step, over a window.
+A row is right to first order in the distance of the coefficients it was taken about. While little
+is known, rows claim combinations of coefficients that the motion does not tell, and no later row
+takes that back ("Looking back" in docs/accuracy.md). So the samples of a window are kept with the
+state from before them, and folded again from it, about the present estimate, once that has moved:
+the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a Gauss-Newton
+step.
 """
 
 import numpy as np

@@ -42,10 +42,9 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     """The values (n,) nearest the estimate, in its own metric, that a passive hull can have.
 
     Signs first: the nearest set without positive diagonal derivatives, in either direction of the
-    motion (a non-negative least-squares problem in the multipliers); what is held at its limit
-    moves the others as their correlation says. Then, should couplings still make the mass matrix
-    indefinite or the damping feed energy, the set is drawn back towards the prior just as far as
-    needed.
+    motion (non-negative least squares in the multipliers); what is held at its limit moves the
+    others as their correlation says. Should couplings still make the mass matrix indefinite or the
+    damping feed energy, the set is drawn back towards the prior as far as needed.
     """
     if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
         return estimate.values

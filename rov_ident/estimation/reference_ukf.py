@@ -1,10 +1,9 @@
 """filterpy's unscented Kalman filter on the same model and samples, to check ours against.
 
-filterpy (R. Labbe) is the textbook's filter in plain Python: the sigma points of Van der Merwe, one
-function for the motion, one for the measurement. It is given the equations of `rov_ident.model`,
-the noise of `rov_ident.estimation.ukf`, and what that filter decides sample by sample: which
-measurements are outliers, which coefficients the motion does not show, and how much process noise
-there is. Both must then give the same numbers; ours is some three hundred times as fast.
+filterpy (R. Labbe) is the textbook's filter in plain Python. It is given the equations of
+`rov_ident.model`, the noise of our filter, and what that decides sample by sample: which
+measurements are outliers, which coefficients the motion does not show, how much process noise there
+is. Both must then give the same numbers; ours is some three hundred times as fast.
 """
 
 from collections.abc import Callable

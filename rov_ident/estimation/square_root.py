@@ -58,7 +58,7 @@ def solve(root, x):
 def inverse_of(root):
     """R^-1 (n, n) of the root (n, n + 1) = [R | z]."""
     n = len(root)
-    columns = _WIDTH * ((n + 2) // _WIDTH + 1)
+    columns = columns_of(n)
     padded, inverse = np.zeros((n + 2, columns)), np.zeros((n + 2, columns))
     copy(root, padded)
     invert(padded, inverse)

@@ -49,8 +49,7 @@ class Remark:
     subject: str
     level: str
     text: str
-    hopeless: bool = False
-    """No model explains such data: a fit is refused."""
+    hopeless: bool = False  # no model explains such data: a fit is refused
 
 
 def of_messages(streams: Streams, config: Config) -> list[Remark]:

@@ -44,12 +44,10 @@ class _Layout(NamedTuple):
 
 
 # Quaternions are x y z w on the wire; of a covariance only the diagonal is kept.
-_ODOMETRY = _Layout(
-    85, np.r_[0:3, 6, 3:6, 43:46, 46:49, 49:85:7]
-)  # pose 7, its covariance 36, twist 6, its covariance 36
-_IMU = _Layout(
-    37, np.r_[3, 0:3, 13:16, 25:28, 16:25:4, 28:37:4]
-)  # orientation 4 + 9, angular velocity 3 + 9, acceleration 3 + 9
+# pose 7, its covariance 36, twist 6, its covariance 36
+_ODOMETRY = _Layout(85, np.r_[0:3, 6, 3:6, 43:46, 46:49, 49:85:7])
+# orientation 4 + 9, angular velocity 3 + 9, acceleration 3 + 9
+_IMU = _Layout(37, np.r_[3, 0:3, 13:16, 25:28, 16:25:4, 28:37:4])
 _WRENCH = _Layout(6, np.r_[0:6])
 _IMU_ORIENTATION_COVARIANCE = 4
 _TWIST = _Layout(6, np.r_[0:6])

@@ -1,14 +1,11 @@
 """What vehicles publish, into the three messages of the core: one definition for topics and bags.
 
-The types are the configuration's (``inputs``). A :class:`Reader` takes messages as bytes and gives
-what the sampler takes:
-
-* a wrench as it is; one without a stamp, and any array without a header, is stamped on arrival (in
-  a bag: its log time), which presumes that the computer's clock is that of the sensors;
-* commands of single thrusters through `Allocator`, pulses at the
-  voltage of the battery that was last heard;
-* a twist and the poses around it joined into odometry at the stamp of the twist: the position
-  straight in between, the attitude along the shortest rotation.
+A :class:`Reader` takes messages of the configured types (``inputs``) as bytes and gives what the
+sampler takes: a wrench, stamped on arrival (in a bag: its log time) where it comes without a stamp,
+which presumes that the computer's clock is that of the sensors; commands of single thrusters
+through `Allocator`, pulses at the voltage of the battery that was last heard; a twist and the poses
+around it joined into odometry at the stamp of the twist, position straight in between, attitude
+along the shortest rotation.
 """
 
 from bisect import bisect_left
@@ -351,15 +348,17 @@ def survey(bag: Bag) -> Survey:
     found: dict[str, Seen] = {}
     notes: list[str] = []
 
-    def look(role: str, kinds: Collection[str], name: Callable[[str], str]) -> None:
+    def look(role: str, kinds: Collection[str], name: str = "") -> None:
         for kind in kinds:
+            typed: dict[str, Any] = {role: kind}
             of_kind = [t for t, i in bag.topics.items() if i.type_name == _full(kind)]
             if kind.startswith("std_msgs"):  # arrays of numbers are of everything
                 of_kind = [t for t in of_kind if "thrust" in t or "pwm" in t or "rc" in t]
             if not of_kind or not any(bag.topics[t].message_count for t in of_kind):
                 continue
             try:
-                topic = select_topic(bag, role, name(kind), _full(kind), "")
+                called = name or sources(Inputs(**typed))[role].topic
+                topic = select_topic(bag, role, called, _full(kind), "")
             except UserError as error:
                 topic = max(of_kind, key=lambda t: bag.topics[t].message_count)
                 notes.append(f"{role}: {topic} is taken, the one with most messages. {error}")
@@ -367,20 +366,13 @@ def survey(bag: Bag) -> Survey:
                 found[role] = _seen(bag, topic, kind)
                 return
 
-    def named(role: str) -> Callable[[str], str]:
-        def of_kind(kind: str) -> str:
-            chosen: dict[str, Any] = {role: kind}
-            return sources(Inputs(**chosen))[role].topic
-
-        return of_kind
-
-    look(ODOMETRY, schema.ODOMETRY_TYPES, named(ODOMETRY))
-    look(IMU, ("sensor_msgs/Imu",), lambda kind: ROLE_NAMES[IMU])
-    look(WRENCH, _CHOICES[WRENCH], named(WRENCH))
+    look(ODOMETRY, schema.ODOMETRY_TYPES)
+    look(IMU, ("sensor_msgs/Imu",), ROLE_NAMES[IMU])
+    look(WRENCH, _CHOICES[WRENCH])
     if ODOMETRY in found and found[ODOMETRY].type_name != schema.ODOMETRY_TYPES[0]:
-        look(POSE, schema.POSE_TYPES, lambda kind: "pose")
+        look(POSE, schema.POSE_TYPES, "pose")
     if WRENCH in found and found[WRENCH].type_name in schema.PULSE_TYPES:
-        look(BATTERY, (schema.BATTERY_TYPE,), lambda kind: "battery")
+        look(BATTERY, (schema.BATTERY_TYPE,))
     return Survey(found, tuple(notes))
 
 

@@ -10,14 +10,12 @@ In body axes (forward, starboard, down) about the body origin (Fossen 2021, eq. 
     extended = [1, nu, |nu|, min(nu, 0), u^2, inputs]
     g   = -[(W - B) k; (W r_g - B r_b) x k]         k: unit vector down, in body axes
 
-The inputs are fin angles and the propeller's speed: what they make is part of d.
+The inputs are fin angles and the propeller's speed: what they make is part of d. ``C(nu) nu`` from
+the momentum of the *total* mass matrix holds for rigid body and added mass, with the centre of
+gravity anywhere, off-diagonal terms included, and does no work by construction.
 
-``C(nu) nu`` from the momentum of the *total* mass matrix holds for rigid body and added mass, with
-the centre of gravity anywhere, off-diagonal terms included, and does no work by construction.
-
-:func:`generalized_force` gives ``C nu - d`` for states side by side ("lanes": one in simulation;
-many, of sigma points, become vector instructions), :func:`columns` gives the same forces per
-unit of each coefficient (the regressor), and the forward dynamics solve the inverse ones.
+:func:`generalized_force` gives ``C nu - d`` for states side by side ("lanes": one in simulation,
+many of sigma points as vector instructions), :func:`columns` the same per unit of each coefficient.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,8 +44,7 @@ from rov_ident.model.coefficients import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-GRAVITY = 9.81
-"""m/s2, where nothing else is said."""
+GRAVITY = 9.81  # m/s2, where nothing else is said
 
 
 class Structure(NamedTuple):

@@ -18,8 +18,7 @@ Against the maker's whole sheets the curves (14 V: interpolated) are off by 0.1 
 water does to thrust at speed is larger.
 """
 
-KILOGRAM_FORCE = 9.80665
-"""N."""
+KILOGRAM_FORCE = 9.80665  # N
 
 _AT_16 = {
     1100: -4.07, 1184: -2.94, 1308: -1.35, 1400: -0.45, 1440: -0.16, 1472: 0.0,

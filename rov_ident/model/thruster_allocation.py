@@ -1,9 +1,8 @@
 """From the commands of single thrusters to the wrench on the body.
 
-``tau = B f``: column i of the allocation ``B`` (6, n) is thruster i's unit force ``d`` and its
-moment ``r x d``, with ``r`` its position and ``d`` the direction in which it pushes at a positive
-command (Fossen 2021, sec. 9.4). Forces come as they are, or from pulse widths by a curve of
-thrust at rest (:mod:`rov_ident.model.t200_curve`).
+``tau = B f``: column i of the allocation ``B`` (6, n) is thruster i's unit force ``d``, the
+direction in which it pushes at a positive command, and its moment ``r x d`` about the body origin
+(Fossen 2021, sec. 9.4). Forces come as they are, or from pulse widths by a curve of thrust at rest.
 """
 
 from collections.abc import Sequence

@@ -4,9 +4,10 @@ A set is sent when something in it has left the dead band, not more often than `
 approval mode once it is approved; and it is read back: one taken in part is undone.
 """
 
+import contextlib
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -156,7 +157,7 @@ class ControllerBridge(GuardedNode):
     def _look(self) -> None:
         """Compare, and send what is due."""
         self._pending = ()
-        try:
+        with self._telling():
             self._settle()
             self._pending = self._compare()
             due = time.monotonic() - self._tried >= self._settings["period"]
@@ -168,9 +169,6 @@ class ControllerBridge(GuardedNode):
                 self._send(self._pending)
             else:
                 self._say(Level.OK, "waiting for the period to pass")
-        except UserError as error:
-            self._complain(error)
-        self._publish_pending()
 
     def _compare(self) -> Sequence[Change]:
         """What should be sent; raises UserError where nothing can be."""
@@ -305,30 +303,22 @@ class ControllerBridge(GuardedNode):
 
     def _approve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Send what `~/pending` shows."""
-        try:
+        with self._telling(response):
             if not self._pending:
                 raise UserError(f"nothing is pending: {self._words}")
             if refusal := self._usable()[2]:
                 raise UserError(refusal)
             self._send(self._pending)
-        except UserError as error:
-            self._complain(error)
-        self._publish_pending()
-        response.success, response.message = self._level == Level.OK, self._words
         return response
 
     def _revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._enabled, self._pending = False, ()
-        try:
+        with self._telling(response):
             if self._original is None:
                 raise UserError("the controller was never changed")
             self._wait_for_answer()
             self._exchange(self._read(), self._original)
             self._say(Level.OK, "the controller has what it had at first; disabled until ~/enable")
-        except UserError as error:
-            self._complain(error)
-        self._publish_pending()
-        response.success, response.message = self._level == Level.OK, self._words
         return response
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -350,9 +340,17 @@ class ControllerBridge(GuardedNode):
             self.get_logger().warning(words)
         self._diagnose()
 
-    def _complain(self, error: UserError) -> None:
-        half_changed = isinstance(error, _HalfChangedError)
-        self._say(Level.ERROR if half_changed else Level.WARN, str(error))
+    @contextlib.contextmanager
+    def _telling(self, response: Trigger.Response | None = None) -> Iterator[None]:
+        """Say what goes wrong within the block; then publish what is pending, and answer."""
+        try:
+            yield
+        except UserError as error:
+            half_changed = isinstance(error, _HalfChangedError)
+            self._say(Level.ERROR if half_changed else Level.WARN, str(error))
+        self._publish_pending()
+        if response is not None:
+            response.success, response.message = self._level == Level.OK, self._words
 
     def _publish_pending(self) -> None:
         message = DiagnosticArray()

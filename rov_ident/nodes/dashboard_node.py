@@ -22,8 +22,7 @@ _OWN = (
         upper=65535.0),
 )  # fmt: skip
 
-Announce = Callable[[str], None]
-"""Called with the address of the page."""
+Announce = Callable[[str], None]  # called with the address of the page
 
 
 def dashboard(port: int, announce: Announce) -> None:

@@ -50,9 +50,7 @@ _OWN_NAMES = [parameter.key for parameter in _OWN]
 _SILENCE_PERIOD = 0.1  # s; between looks at the inputs: a tenth of the default timeout
 _DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
-_INPUT_SHARE = (
-    4.0  # s left to the inputs for each that publishing takes, whatever publish_rate says
-)
+_INPUT_SHARE = 4.0  # s left to the inputs for each of publishing, whatever publish_rate says
 _TURN = 0.02  # s; of using messages that wait before anything else is done: one input at 50 Hz
 _MOST_WAITING = 200_000
 """messages, of half a kilobyte: what 100 MB hold, a quarter of an hour at 200 Hz. More than enough

@@ -75,17 +75,14 @@ class NomotoInput:
             at, heading = self._headings.popleft()
             while len(self._rudder) > 1 and self._rudder[1][0] < at:
                 self._rudder.popleft()
-            (begin, angle), (end, after) = (
-                self._rudder[0],
-                self._rudder[min(len(self._rudder), 2) - 1],
-            )
+            begin, angle = self._rudder[0]
+            end, after = self._rudder[min(len(self._rudder), 2) - 1]
             if at < begin or end - begin > GAP * 1e9:
                 continue  # nothing is known of the rudder then
             share = (at - begin) / (end - begin) if end > begin else 0.0
             self._origin = self._origin or at
-            self._estimator.push(
-                1e-9 * (at - self._origin), heading, angle + share * (after - angle)
-            )
+            turned = angle + share * (after - angle)
+            self._estimator.push(1e-9 * (at - self._origin), heading, turned)
             self._stamp = at
 
     def beside(self, report: Report) -> Report:
@@ -96,10 +93,8 @@ class NomotoInput:
         std = np.sqrt(np.diag(covariance))
         text, state = "converging", State.CONVERGING
         if not self._rudder:
-            text, state = (
-                f"held: no rudder on {self._node.resolve_topic_name(self._topic)}",
-                State.HELD,
-            )
+            topic = self._node.resolve_topic_name(self._topic)
+            text, state = f"held: no rudder on {topic}", State.HELD
         elif found is None:
             text, state = "held: the rudder has not yet turned the vehicle enough", State.HELD
         elif self._heard - self._stamp > GAP * 1e9:

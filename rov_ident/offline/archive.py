@@ -79,10 +79,7 @@ def total(parts: Sequence[Sums]) -> Sums:
 def of_records(records: Sequence[Record]) -> Archive:
     """Records that have been read already, in this process."""
     paths = [record.path for record in records]
-
-    def reread(config: Config, columns: bool) -> Archive:
-        return _archive((_tried(path, config, columns) for path in paths), _here, reread)
-
+    reread = _reader(lambda *how: (_tried(path, *how) for path in paths), _here)
     return _archive([_parts(record) for record in records], _here, reread)
 
 
@@ -107,12 +104,8 @@ def opened(
 
     if dask:
         with children.environment(), _cluster(dask, jobs) as client:
-
-            def on_dask(config: Config, columns: bool = False) -> Archive:
-                read = _on_dask(client, paths, config, columns)
-                return _archive(told(read), partial(_by_dask, client), on_dask)
-
-            yield on_dask(config)
+            on_dask = partial(_by_dask, client)
+            yield _reader(lambda *how: told(_on_dask(client, paths, *how)), on_dask)(config, False)
     elif jobs > 1 and len(paths) > 1:
         # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
         with (
@@ -122,19 +115,14 @@ def opened(
         ):
             readings = count()
 
-            def in_processes(config: Config, columns: bool = False) -> Archive:
+            def in_processes(config: Config, columns: bool) -> Iterator[Outcome]:
                 k = next(readings)
                 files = [Path(folder) / f"{k}-{i}.npy" for i in range(len(paths))]
-                outcomes = pool.map(_stored, paths, repeat(config), repeat(columns), files)
-                return _archive(told(outcomes), partial(_by_processes, pool), in_processes)
+                return told(pool.map(_stored, paths, repeat(config), repeat(columns), files))
 
-            yield in_processes(config)
+            yield _reader(in_processes, partial(_by_processes, pool))(config, False)
     else:
-
-        def here(config: Config, columns: bool = False) -> Archive:
-            return _archive(told(_tried(path, config, columns) for path in paths), _here, here)
-
-        yield here(config)
+        yield _reader(lambda *how: told(_tried(path, *how) for path in paths), _here)(config, False)
 
 
 def default_jobs() -> int:
@@ -144,6 +132,17 @@ def default_jobs() -> int:
 
 Outcome = tuple[Bag, Any] | str
 """A bag and where its samples are (the array, a file, or a future), or why it was left out."""
+
+
+def _reader(
+    read: Callable[[Config, bool], Iterable[Outcome]], each: Callable[..., list[Any]]
+) -> Reader:
+    """What reads the same bags again, with another configuration."""
+
+    def reread(config: Config, columns: bool) -> Archive:
+        return _archive(read(config, columns), each, reread)
+
+    return reread
 
 
 def _archive(

@@ -2,17 +2,16 @@
 
 Every row is a state (velocities, fin angles) and the forces and moments on the vehicle in it. On
 each axis the terms of the grammar that the table excites are candidates. Structures are grown term
-by term and refined by exchange; each is judged by leave-one-out cross-validation, exactly and at
-once from the projection ``h`` of least squares, ``e_i / (1 - h_i)``. Chosen is the smallest whose
-squared error exceeds that of the best by less than two standard errors of the difference, row by
-row paired: where several do equally well, the simplest is believed. (A term that acts on a few rows
-alone makes that standard error large by itself; a term that is clearly seen there is kept.)
+by term and refined by exchange, each judged by leave-one-out cross-validation, exactly, from the
+projection ``h`` of least squares: ``e_i / (1 - h_i)``. Chosen is the smallest whose squared error
+exceeds the best's by less than two standard errors of the difference, row by row paired. (A term
+that acts on a few rows alone makes that standard error large by itself; if clearly seen, it is
+kept.)
 
 Intervals allow for noise that grows with the force: heteroscedastic covariance HC3 (MacKinnon and
-White 1985), Student's distribution.
-
-Steady forces hold the Coriolis forces of the added mass too (Munk's moment and its kind): with
-``added_mass`` they are taken off before the fit, so that a model does not count them twice.
+White 1985), Student's distribution. Steady forces hold the Coriolis forces of the added mass
+(Munk's moment and its kind): with ``added_mass`` they are taken off first, or a model would count
+them twice.
 """
 
 import math

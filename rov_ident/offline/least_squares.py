@@ -1,18 +1,16 @@
 """Batch least squares over the 6-DOF regressor, and instrumental variables.
 
-*From a record*: the rows ``y = Phi theta + noise`` are those of `filtered_regression`, every
-channel through one low-pass filter, so that nothing is differentiated. Least squares is the
-solution of ``sum w Phi' (y - Phi theta) = 0``. Its regressors hold the noise of the velocities, and
-the estimate is biased however long the record: noise in Phi meets itself in Phi', and the square of
-a noisy velocity is too large on average, by the noise's variance. *Instrumental variables* replace
-the left factor by what is not noisy::
+The rows ``y = Phi theta + noise`` are those of `filtered_regression`. Least squares solves ``sum w
+Phi' (y - Phi theta) = 0``. Its regressors hold the noise of the velocities, and it is biased
+however long the record: noise in Phi meets itself in Phi', and the square of a noisy velocity is
+too large by the noise's variance. *Instrumental variables* replace the left factor by what is not
+noisy::
 
     sum w Z' (y - Phi theta) = 0,   Z: the same rows along the *simulated* motion
 
 simulated from the wrench with the present coefficients, and again with the new ones (refined
-instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias, which is the
-added masses'. It does not cure the second, that of the quadratic damping: an expected square is no
-matter of correlation. Maximum likelihood has neither.
+instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias, the added
+masses', not the second, that of quadratic damping. Maximum likelihood has neither.
 
 Sums over the samples of several bags are sums over bags: an archive is one fit.
 """

@@ -10,7 +10,7 @@ from rov_ident.reports import plots
 from rov_ident.reports.html import beside_table, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.records import HORIZON, VELOCITIES
+from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES
 
 _BEFORE, _AFTER = "as configured", "retuned"
 _MOST = 4  # bags that are drawn
@@ -84,10 +84,10 @@ def _motion(
 ) -> str:
     """Six panels of ``pair``, before and after (k, 6)."""
     svgs = []
-    for i, name in enumerate(VELOCITIES):
+    for i, (name, unit) in enumerate(zip(VELOCITIES, UNITS)):
         drawn = plots.curves(
             curve.t, {_BEFORE: pair[0][:, i], _AFTER: pair[1][:, i]}, name, "time [s]",
-            label.format(name=name, unit="m/s" if i < 3 else "rad/s"),
+            label.format(name=name, unit=unit),
             measured=None if measured is None else measured[:, i],
         )  # fmt: skip
         svgs.append(plots.zoomable(drawn, f"{key}{i}"))

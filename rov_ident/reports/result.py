@@ -30,8 +30,7 @@ class Shown(ABC):
     ``str(result)`` is its table.
     """
 
-    notes: tuple[str, ...] = ()
-    """What was refused or is doubtful, in words."""
+    notes: tuple[str, ...] = ()  # what was refused or is doubtful, in words
 
     @property
     @abstractmethod

@@ -49,7 +49,13 @@ class Table:
         return table
 
     def __str__(self) -> str:
-        return _printed(self)
+        from rich.console import Console
+
+        # As wide as the table needs, without colour or escapes.
+        console = Console(file=StringIO(), width=1000, color_system=None, force_terminal=False)
+        with console.capture() as captured:
+            console.print(self)
+        return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
     def html(self) -> str:
         """An HTML table without the title."""
@@ -104,16 +110,6 @@ def fitting(tables: "Iterable[RichTable]", console: "Console", width: int) -> "R
         if Measurement.get(console, unbound, table).maximum <= width:
             break
     return table
-
-
-def _printed(table: Table) -> str:
-    from rich.console import Console
-
-    # As wide as the table needs, without colour or escapes.
-    console = Console(file=StringIO(), width=1000, color_system=None, force_terminal=False)
-    with console.capture() as captured:
-        console.print(table)
-    return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
 
 def number(x: float, digits: int = 3) -> str:

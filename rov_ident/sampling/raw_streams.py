@@ -58,10 +58,9 @@ class Streams:
     def guided(self) -> NDArray[np.bool_]:
         """Axes (6,) whose velocity a simulation can only take as measured.
 
-        Thrusters hardly push without some moment: a wrench that never holds any was recorded, or
-        computed, without. What turns the vehicle is then unknown, unless fins do that are heard.
-        A velocity that never changes was not measured: a record in the plane holds zeros for the
-        rest.
+        Thrusters hardly push without some moment: a wrench without any was recorded so, and what
+        turns the vehicle is unknown, unless fins are heard. A velocity that never changes was not
+        measured: a record in the plane holds zeros for the rest.
         """
         unknown: NDArray[np.bool_] = np.repeat(
             [False, not (self.demand[:, 3:].any() or self.inputs[:, :3].any())], 3

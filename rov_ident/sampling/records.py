@@ -25,6 +25,7 @@ from rov_ident.simulation.virtual_sensors import Dive
 
 HORIZON = 10.0  # s; of the open-loop windows by which models are judged
 VELOCITIES = tuple("uvwpqr")
+UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 
 Progress = Callable[[int, int], None]
 """Called now and then with the messages read so far and in all."""

@@ -1,17 +1,11 @@
 """From messages to samples: one clock, one set of axes, one filter for every channel.
 
 Topics come at their own rates and phases. A :class:`Sampler` waits until every topic has reached an
-instant (or is ``grace`` seconds behind), then emits one sample for it, by the stamps alone. The
-instants are those of the IMU messages while there is an IMU, else those of the odometry.
-
-What a sample holds, and why (docs/samples.md has the measurements):
-
-* ``wrench`` is the *mean* over the interval that ends at the sample, ``wrench_slope`` its trend in
-  there, of all that acts besides the model: thrusters and configured wrench effects.
-* ``nu`` is the best estimate of the body velocity *through the water*. A steady current is a moving
-  frame, in which the equations of motion are those for still water, so it is subtracted here.
-* ``odometry`` and ``gyro`` are the same measurements one by one, their noise independent. With a
-  gyro the odometry's own angular rate only serves to find the gyro's bias.
+instant (or is ``grace`` seconds behind), then emits one sample for it, by the stamps alone: at
+those of the IMU while there is one, else of the odometry. What a sample holds is in `sample`, and
+why in docs/samples.md: the wrench is a mean over the interval, so that held commands do not look
+late, and the velocity that through the water, in which a steady current is a moving frame. With a
+gyro the odometry's own rate only serves to find the gyro's bias.
 """
 
 import math

@@ -1,16 +1,14 @@
 """Smoothing of samples for offline fits, which know what came later; a live estimator cannot.
 
-The gyro's bias is found from odometry and gyro as they come, so it is known worst in the first
-seconds; here each sample takes the bias known two minutes later. The attitude, too, is smoothed.
-Its error matters: gravity's direction times buoyancy is a moment, and an error that lasts for
-seconds cannot be told from one of the coefficients.
-
-Attitude: the integrated rates give Q, off by a random walk d that the measured attitudes see with
-white noise (a local-level model; Durbin and Koopman 2012, ch. 2)::
+The gyro's bias, known worst in the first seconds, is the one known two minutes later. The attitude
+is smoothed: gravity's direction times buoyancy is a moment, and an error of it that lasts for
+seconds cannot be told from one of the coefficients. The integrated rates give Q, off by a random
+walk d that the measured attitudes see with white noise (a local-level model; Durbin and Koopman
+2012, ch. 2)::
 
     q = exp(d) Q,   d[k] = d[k - 1] + w,   log(q_measured Q^-1) = d + v
 
-v's variance is half that of the differences of successive measurements. w's is that of the rates'
+v's variance is half that of the differences of successive measurements; w's that of the rates'
 noise times the factor of highest likelihood, as integration has errors of its own.
 """
 

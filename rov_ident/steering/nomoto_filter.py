@@ -7,7 +7,14 @@ import numpy as np
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
-from rov_ident.steering.nomoto_model import STEP, Nomoto, model_of, names_of, simulate_heading
+from rov_ident.steering.nomoto_model import (
+    STEP,
+    Nomoto,
+    model_of,
+    names_of,
+    numbers_of,
+    simulate_heading,
+)
 from rov_ident.steering.zigzag import Zigzag
 
 
@@ -45,13 +52,10 @@ class Filter:
         points = self.x + np.vstack([spread, -spread])
         out, state = np.empty(2), np.zeros(3)
         for point in points:
-            v = dict(zip(self.names, point[self.states :] * self.sizes))
+            numbers = numbers_of(self.names, point[self.states :] * self.sizes)
             state[:] = 0.0
             state[: self.states] = point[: self.states]
-            simulate_heading(
-                self.order, v["a0"], v.get("a1", 0.0), v["b0"], v.get("b1", 0.0), v.get("c", 0.0),
-                v["delta_0"], t, rudder, held, state, STEP, out,
-            )  # fmt: skip
+            simulate_heading(self.order, *numbers, t, rudder, held, state, STEP, out)
             point[: self.states] = state[: self.states]
         self.x = points.mean(axis=0)
         off = points - self.x

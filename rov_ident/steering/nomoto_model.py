@@ -15,7 +15,7 @@ infinite or negative)::
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,6 +129,14 @@ def names_of(order: int, nonlinear: bool) -> tuple[str, ...]:
     return (*linear, *(("c",) if nonlinear else ()), "delta_0")
 
 
+def numbers_of(
+    names: Sequence[str], theta: Array
+) -> tuple[float, float, float, float, float, float]:
+    """a0, a1, b0, b1, c and delta_0, as :func:`simulate_heading` takes them."""
+    x = dict(zip(names, theta))
+    return x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0), x["delta_0"]
+
+
 def to_json(model: Nomoto, validation: float | None = None, diverges: bool = False) -> str:
     """The result as JSON; ``validation`` is the heading RMSE [rad] on another run, ``diverges``
     whether that prediction does."""
@@ -201,7 +209,7 @@ def respond(
     The rudder is linear between the rows, or where the run says so, held. ``shares`` (j,) from 0
     to 1 says when within its step each of ``run.reversals`` came about; None or empty: not at all.
     """
-    x = dict(zip(names_of(order, nonlinear), theta))
+    names = names_of(order, nonlinear)
     t, rudder, rows = run.t, run.rudder, None
     state = np.zeros(3)
     state[: len(first)] = first
@@ -218,10 +226,7 @@ def respond(
             rudder, twice, np.column_stack([rudder[after - 1], rudder[after]]).ravel()
         )
     out = np.empty(len(t))
-    simulate_heading(
-        order, x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0),
-        x["delta_0"], t, rudder, run.held, state, STEP, out,
-    )  # fmt: skip
+    simulate_heading(order, *numbers_of(names, theta), t, rudder, run.held, state, STEP, out)
     return out if rows is None else out[rows]
 
 

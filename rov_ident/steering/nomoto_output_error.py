@@ -68,22 +68,10 @@ def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
     return best
 
 
-def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, theta: Array) -> Nomoto:
-    """Output error from theta (n,); an RMSE of infinity where it does not converge."""
-    states, shares = zip(*(first_state(order, nonlinear, theta, run) for run in runs))
-    return _descend(runs, order, nonlinear, theta, states, shares)
-
-
-def _descend(
-    runs: Sequence[Zigzag],
-    order: int,
-    nonlinear: bool,
-    start: Array,
-    firsts: Sequence[Array],
-    shares: Sequence[Array] = (),
-) -> Nomoto:
-    """Least squares on the simulated headings over theta, every run's first state, and the instants
-    of jumps that fall between two rows (:attr:`Zigzag.reversals`)."""
+def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, start: Array) -> Nomoto:
+    """Least squares on the simulated headings over theta, from ``start`` (n,), every run's first
+    state, and the instants of jumps that fall between two rows (:attr:`Zigzag.reversals`); an RMSE
+    of infinity where it does not converge."""
     n, states = len(start), order + 1
     known = [run.known for run in runs]
     speed = max(float(np.std(np.gradient(r.heading[k], r.t[k]))) for r, k in zip(runs, known))
@@ -105,10 +93,10 @@ def _descend(
         # a manoeuvre is faster than those fitted.
         lower[0][names.index("c")] = 0.0
     size = np.array([0.1, *[speed] * order])
-    for i, (first, count) in enumerate(zip(firsts, jumps)):
-        guess = np.clip(shares[i], 0.01, 0.99) if shares else np.full(count, 0.5)
+    for run, count in zip(runs, jumps):
+        first, shares = first_state(order, nonlinear, start, run)
         scales += [size, np.ones(count)]
-        x0 += [first / size, guess]
+        x0 += [first / size, np.clip(shares, 0.01, 0.99)]
         lower += [np.full(states, -np.inf), np.zeros(count)]
         upper += [np.full(states, np.inf), np.ones(count)]
     sizes = np.concatenate(scales)

@@ -21,18 +21,14 @@ import numpy as np
 from rov_ident.core.messages import Array
 from rov_ident.steering.nomoto_filter import Filter
 
-STEP = (
-    0.1  # s between the samples used: a tenth of the T of the quickest vehicles of docs/nomoto.md
-)
+STEP = 0.1  # s between the samples used: a tenth of the least T in docs/nomoto.md
 GAP = 3.0  # s without a sample, after which the motion before is unknown
 _CORNERS = 0.01 * 4.0 ** np.arange(6)  # rad/s: T from a tanker's to less than a second
 _MATCH = 2.0  # of c T: on measured zigzags, K and T are those of output error from about 1 to 5
 _REACH = math.log(3.0)  # either side, more than half of the distance between two corners
 _FIRST = 1e4  # variance of parameters in units of c and of angles, before any data
 _ROUGHLY = 0.3  # relative standard deviation of K and T with which filters can begin
-_DRIVES = np.exp(
-    [-6.0, -4.5, -3.0, -1.5]
-)  # over the rate; docs/nomoto.md has what is found offline
+_DRIVES = np.exp([-6.0, -4.5, -3.0, -1.5])  # over the rate; about those that docs/nomoto.md finds
 _MOST = 6000  # samples that filters begin with: ten minutes
 
 
@@ -118,8 +114,7 @@ class RecursiveNomoto:
         self._samples: list[tuple[float, float, float, bool]] = []
         self._filters: list[Filter] = []
         self._filtered = (0.0, 0.0)  # t and rudder of the filters' last sample
-        self.result: KandT | None = None
-        """After the last sample; None while nothing is known."""
+        self.result: KandT | None = None  # after the last sample; None while nothing is known
 
     def push(self, t: float, heading: float, rudder: float) -> None:
         """A sample at t [s], both in rad; one that is less than STEP after the last is left out."""

@@ -1,14 +1,13 @@
 """A Gazebo model (SDFormat 1.10, Gazebo Harmonic and later), body axes forward-left-up.
 
-Added mass goes into ``<fluid_added_mass>`` of the link, where the physics engine (DART, Gazebo's
-default) takes it up with the rigid body, Coriolis terms included. The hydrodynamics plugin could
-hold it too, but computes it explicitly from the last step's acceleration, which diverges as soon as
-it reaches the rigid body's mass (gz-sim issue 1923), and in gz-sim 7 and 8 its added-mass Coriolis
-terms ``Z_wdot w q`` have the opposite sign to its added mass. The plugin gets the damping, whose
-terms ``c v_j |v_k|`` and ``c v_j v_k`` hold nearly all of our grammar.
+Added mass goes into ``<fluid_added_mass>`` of the link, which DART, the default engine, adds to the
+rigid body, Coriolis terms included. The hydrodynamics plugin would take it from the last step's
+acceleration, which diverges once it reaches the rigid body's mass (gz-sim issue 1923), and in
+gz-sim 7 and 8 its Coriolis terms ``Z_wdot w q`` have the wrong sign. The plugin gets the damping,
+whose terms ``c v_j |v_k|`` and ``c v_j v_k`` hold nearly all of our grammar.
 
-Buoyancy is the volume of the link's collision shapes times the density of the water (plugin
-Buoyancy of the world): a box of the right volume about the centre of buoyancy stands for them.
+Buoyancy is that of the collision shapes (plugin Buoyancy of the world): a box of the right volume
+about the centre of buoyancy.
 """
 
 import re
@@ -32,8 +31,7 @@ from rov_ident.core.frames import FLIP_BODY, FLIP_WORLD, quaternion_from_euler, 
 from rov_ident.model.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficient, parse
 from rov_ident.model.equations import GRAVITY
 
-DENSITY = 1000.0
-"""kg/m3, what the Buoyancy plugin assumes unless told otherwise."""
+DENSITY = 1000.0  # kg/m3, what the Buoyancy plugin assumes unless told otherwise
 
 _FLIP = np.tile(FLIP_BODY, 2)
 _ADDED = {

@@ -1,9 +1,8 @@
 """A URDF: mass, centre of gravity and inertia of the whole tree, and where its sensors sit.
 
-Axes are forward-left-up (REP-103); the body origin is that of `base_link`, or of the root where no
-link is called so. Links are taken as one rigid body, joints that move at their zero. A URDF holds
-no hydrodynamics: buoyancy comes from another configuration, and so do the coefficients, unless a
-`<gazebo>` element has the hydrodynamics plugin.
+Axes are forward-left-up (REP-103); the body origin is that of `base_link`, or else of the root.
+Links are one rigid body, joints that move at their zero. Buoyancy, and without the hydrodynamics
+plugin the coefficients, come from another configuration.
 """
 
 import re
