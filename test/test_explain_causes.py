@@ -18,7 +18,7 @@ from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.reading_noise import resting_noise
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
-MINUTE = Conditions(duration=60.0)
+MINUTE = Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 NOISY = Conditions(duration=120.0, excitation="pilot", reading=(0.5, 0.06))
 
 
