@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
+from tiers import more
 
 from bench import DATA
 from rov_ident.core.frames import quaternion_from_euler
@@ -89,7 +90,9 @@ def test_nothing_is_said_of_a_straight_course():
 
 
 @pytest.mark.skipif(not KVLCC2.exists(), reason="the measured zigzags are not here")
-@pytest.mark.parametrize("name", ["hsva_Z_10_01", "hsva_Z_20_05", "hsva_Z_25_05", "marin_zz_20_m"])
+@pytest.mark.parametrize(
+    "name", ["hsva_Z_10_01", *more("hsva_Z_20_05", "hsva_Z_25_05"), "marin_zz_20_m"]
+)
 def test_measured_zigzags_as_output_error_has_them(name):
     """Differences, the recursion of the literature, find less than half of T on the same data."""
     run = read(KVLCC2 / f"{name}.csv")

@@ -297,7 +297,7 @@ def test_garbage(wrong, messages, kind, what, begin):
     """Twelve seconds of it, from the start or amid: no exception, every report fit for use, and
     the estimator is not lost for good."""
     estimator = OnlineEstimator(wrong, kind)
-    part = [(role, m) for role, m in messages if seconds(m) < 40.0]
+    part = [(role, m) for role, m in messages if seconds(m) < 32.0]
     used = 0
     for k, (role, m) in enumerate(spoiled(part, GARBAGE[what], begin, begin + 12.0)):
         used += np.count_nonzero(estimator.push(role, m)["reason"] == 0)

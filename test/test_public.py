@@ -401,7 +401,7 @@ def test_the_lines_in_the_readme_run(tmp_path, monkeypatch, capsys):
 def test_the_notebook_runs(tmp_path):
     """In a kernel of its own, from top to bottom, as the reader runs it."""
     (tmp_path / "examples").mkdir()
-    as_shipped(tmp_path, 60.0)
+    as_shipped(tmp_path, 45.0)
     notebook = nbformat.read(ROOT / "examples" / "first_fit.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "shipped without output"
     where = {"metadata": {"path": str(tmp_path / "examples")}}
