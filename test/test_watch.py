@@ -20,7 +20,6 @@ from rov_ident.sampling.sample import SAMPLE
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.virtual_sensors import Suite, dive, measure
 
-
 LEAN = {"odometry_rate": 10.0, "imu_rate": 50.0}
 
 
