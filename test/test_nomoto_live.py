@@ -111,7 +111,7 @@ def played(vehicle, joint, t, heading, rudder):
     now = vehicle.node.get_clock().now
     origin = 1_000_000_000_000 if joint else now().nanoseconds
     zero = np.zeros(3)
-    for at, psi, delta in zip(t, heading, rudder, strict=True):
+    for k, (at, psi, delta) in enumerate(zip(t, heading, rudder, strict=True)):
         stamp = origin + round(1e9 * at)
         if joint:
             message = JointState(name=["other", joint], position=[9.0, delta])
@@ -124,7 +124,14 @@ def played(vehicle, joint, t, heading, rudder):
         odometry = Odometry(stamp, "world_ned", "base_frd", zero, q, zero, zero, np.zeros(6))
         vehicle.publish("odom", cdr.encode(odometry))
         publisher.publish(message)
+        if joint and k % 100 == 99:  # Fast DDS has room for 512 that a busy node has not taken yet
+            vehicle.until(lambda stamp=stamp: used(vehicle) >= stamp)
     return origin
+
+
+def used(vehicle):
+    """The stamp [ns] of the last heading that the node has published something of."""
+    return max((from_diagnostics(m).stamp for m in vehicle.coefficients[-1:]), default=0)
 
 
 @pytest.fixture
