@@ -79,7 +79,7 @@ def test_several_processes_give_the_same(paths, off, alone):
 def test_dask_gives_the_same(paths, off, alone):
     pytest.importorskip("distributed", reason="the extra dask is not installed")
     with archive.opened(paths, off, jobs=2, dask="local") as bags:
-        same(fit_batch(bags, off, "ml"), alone["ml"])
+        same(fit_batch(bags, off, "ls"), alone["ls"])
 
 
 def test_no_scheduler_is_said(paths, off):

@@ -170,13 +170,13 @@ def test_the_command(heavy_path, messages, tmp_path):
 
 @pytest.fixture(scope="module")
 def at_sea(tmp_path_factory):
-    """check() of a minute of the independent simulator, its coefficients guessed within 25 %."""
+    """check() of 45 s of the independent simulator, its coefficients guessed within 25 %."""
     folder = tmp_path_factory.mktemp("sea")
 
     def run(seed, change=lambda role, m: m, **unknown):
         rng = np.random.default_rng(seed)
         vehicle, what = sea.draw_vehicle(rng), sea.Sea(**unknown)
-        messages = sea.measured(sea.dive(vehicle, what, "six-axis", 60.0, rng), what, rng)
+        messages = sea.measured(sea.dive(vehicle, what, "six-axis", 45.0, rng), what, rng)
         config = configuration.from_parameters(sea.told(vehicle, what, rng))
         path = folder / "bag.mcap"
         write_messages(path, [(at, role, change(role, m)) for at, role, m in messages])
@@ -189,7 +189,7 @@ def at_sea(tmp_path_factory):
 def test_guessed_coefficients_are_no_fault_of_a_bag(at_sea, seed):
     found = check(*at_sea(seed))
     assert found.fit
-    apart = ("messages", "coefficients")  # lone outliers; a minute shows some only roughly
+    apart = ("messages", "coefficients")  # lone outliers; 45 s show some only roughly
     assert {r.text for r in found.remarks if r.level != GOOD and r.subject not in apart} == set()
 
 

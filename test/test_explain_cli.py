@@ -19,6 +19,7 @@ from rov_ident.io.write_messages import write_messages
 from rov_ident.simulation.virtual_sensors import dive
 
 FILES = ["extended.yaml", "findings.json", "report.html"]
+LEAN = Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 VOID = {"meta", "br", "img", "link", "hr", "input"}
 
 
@@ -54,7 +55,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def case():
     """A minute of well-excited motion; the configuration knows nothing of the thruster lag."""
-    return draw(3, ("thruster_lag",), conditions=Conditions(duration=60.0))
+    return draw(3, ("thruster_lag",), conditions=LEAN)
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +193,9 @@ def test_page_follows_the_colours_of_the_reader(page):
 
 
 def test_validation_on_another_bag(folder, case):
-    other = draw(3, ("thruster_lag",), conditions=Conditions(duration=30.0, noise=1.01))
+    other = draw(
+        3, ("thruster_lag",), conditions=dataclasses.replace(LEAN, duration=30.0, noise=1.01)
+    )
     write_messages(folder / "other.mcap", other.messages)
     made = explain(folder, "--validate", folder / "other.mcap", out="validated")
     assert made.returncode == 0, made.stderr

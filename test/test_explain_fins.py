@@ -30,7 +30,7 @@ def hidden(effect, seed):
 
 def explained(config, effects, path, seed):
     world = dataclasses.replace(config, effects=effects)
-    dive = ri.simulate(world, manoeuvre="waypoints", duration=180.0, seed=seed, sensors=LEAN)
+    dive = ri.simulate(world, manoeuvre="waypoints", duration=120.0, seed=seed, sensors=LEAN)
     dive.save(path)
     return ri.explain(path, config).findings
 

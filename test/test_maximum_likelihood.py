@@ -16,6 +16,8 @@ from rov_ident.sampling.records import predicted, read_record
 from rov_ident.sampling.smoothing import smoothed
 from rov_ident.simulation import virtual_sensors as sensors
 
+LEAN = sensors.Suite(odometry_rate=10.0, imu_rate=50.0)
+
 
 def in_one(samples):
     return lambda function, *arguments: [function(samples, *arguments)]
@@ -114,7 +116,7 @@ def test_innovations_of_the_truth_are_white_and_of_unit_size(heavy, seen, axes, 
 
 
 def test_noise_levels_are_found(heavy):
-    suite = dataclasses.replace(sensors.Suite(), wrench_std=0.03)
+    suite = dataclasses.replace(LEAN, wrench_std=0.03)
     samples = samples_of(heavy, 90.0, suite)
     samples["odometry_variance"] /= 4.0  # the messages claim half the noise
     found = ml.maximise(in_one(samples), heavy, heavy.model)
@@ -129,7 +131,7 @@ def test_the_truth_is_found_from_afar_within_the_stated_errors(heavy, off, dives
     ratios = []
     for seed in range(dives):
         start = off if seed == 0 else near  # what is stated does not depend on it
-        samples = samples_of(heavy, 40.0, seed=seed)
+        samples = samples_of(heavy, 40.0, LEAN, seed=seed)
         found = ml.maximise(in_one(samples), start, start.model)
         assert found.converged
         std = np.sqrt(np.diag(found.covariance))

@@ -85,8 +85,15 @@ def blanked(run, step):
 # ------------------------------------------------------------------ on data of the model
 
 
-@pytest.mark.parametrize("rate", [None, np.radians(20.0), np.radians(5.0)])
-@pytest.mark.parametrize("K, T", [(-0.92, 0.95), (0.3, 4.0)])
+@pytest.mark.parametrize(
+    "K, T, rate",
+    [
+        (-0.92, 0.95, None),
+        (0.3, 4.0, np.radians(20.0)),
+        (-0.92, 0.95, np.radians(5.0)),
+        *more((0.3, 4.0, None), (-0.92, 0.95, np.radians(20.0)), (0.3, 4.0, np.radians(5.0))),
+    ],
+)
 def test_output_error_finds_k_and_t_at_every_rate(K, T, rate):
     run = simulated(K, T, rate)
     for step in (0.1, 0.2, 0.5):
@@ -384,7 +391,7 @@ def test_measured_zigzags_are_predicted(fitted, judged, limit, order):
 
 
 @pytest.mark.skipif(not KVLCC2.is_dir(), reason="the measured zigzags are not here")
-@pytest.mark.parametrize("nonlinear", [False, True])
+@pytest.mark.parametrize("nonlinear", [*more(False), True])
 @pytest.mark.parametrize("fitted", ["10_05", *more("20_05", "25_05")])
 def test_measured_zigzags_choose_the_second_order(fitted, nonlinear):
     """An unstable ship, and K of one sign, whichever run is fitted; with the cubic term, too,

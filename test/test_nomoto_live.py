@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
+from tiers import more
 
 from bench import DATA
 from rov_ident.core.frames import quaternion_from_euler
@@ -89,7 +90,9 @@ def test_nothing_is_said_of_a_straight_course():
 
 
 @pytest.mark.skipif(not KVLCC2.exists(), reason="the measured zigzags are not here")
-@pytest.mark.parametrize("name", ["hsva_Z_10_01", "hsva_Z_20_05", "hsva_Z_25_05", "marin_zz_20_m"])
+@pytest.mark.parametrize(
+    "name", ["hsva_Z_10_01", *more("hsva_Z_20_05", "hsva_Z_25_05"), "marin_zz_20_m"]
+)
 def test_measured_zigzags_as_output_error_has_them(name):
     """Differences, the recursion of the literature, find less than half of T on the same data."""
     run = read(KVLCC2 / f"{name}.csv")
@@ -108,7 +111,7 @@ def played(vehicle, joint, t, heading, rudder):
     now = vehicle.node.get_clock().now
     origin = 1_000_000_000_000 if joint else now().nanoseconds
     zero = np.zeros(3)
-    for at, psi, delta in zip(t, heading, rudder, strict=True):
+    for k, (at, psi, delta) in enumerate(zip(t, heading, rudder, strict=True)):
         stamp = origin + round(1e9 * at)
         if joint:
             message = JointState(name=["other", joint], position=[9.0, delta])
@@ -121,7 +124,14 @@ def played(vehicle, joint, t, heading, rudder):
         odometry = Odometry(stamp, "world_ned", "base_frd", zero, q, zero, zero, np.zeros(6))
         vehicle.publish("odom", cdr.encode(odometry))
         publisher.publish(message)
+        if joint and k % 100 == 99:  # Fast DDS has room for 512 that a busy node has not taken yet
+            vehicle.until(lambda stamp=stamp: used(vehicle) >= stamp)
     return origin
+
+
+def used(vehicle):
+    """The stamp [ns] of the last heading that the node has published something of."""
+    return max((from_diagnostics(m).stamp for m in vehicle.coefficients[-1:]), default=0)
 
 
 @pytest.fixture

@@ -159,7 +159,7 @@ def test_what_is_not_excited_is_held_and_said_to_be(wrong, kind):
 # ------------------------------------------------------------------ switching
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["rls", *more("ukf")])
 def test_reset_is_a_fresh_start(wrong, messages, kind):
     """Amid the motion: back to the prior, then as good as an estimator that began there."""
     estimator, fresh = OnlineEstimator(wrong, kind), OnlineEstimator(wrong, kind)
@@ -179,7 +179,7 @@ def test_reset_is_a_fresh_start(wrong, messages, kind):
     np.testing.assert_allclose(a.std, b.std, rtol=0.3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*more("rls"), "ukf"])
 def test_disabled_learns_nothing_and_goes_on_without_a_jolt(wrong, messages, kind):
     """What happened meanwhile is not seen: neither as motion nor as an outlier."""
     estimator, gap = OnlineEstimator(wrong, kind), OnlineEstimator(wrong, kind)
@@ -297,7 +297,7 @@ def test_garbage(wrong, messages, kind, what, begin):
     """Twelve seconds of it, from the start or amid: no exception, every report fit for use, and
     the estimator is not lost for good."""
     estimator = OnlineEstimator(wrong, kind)
-    part = [(role, m) for role, m in messages if seconds(m) < 40.0]
+    part = [(role, m) for role, m in messages if seconds(m) < 32.0]
     used = 0
     for k, (role, m) in enumerate(spoiled(part, GARBAGE[what], begin, begin + 12.0)):
         used += np.count_nonzero(estimator.push(role, m)["reason"] == 0)

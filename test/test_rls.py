@@ -510,7 +510,7 @@ def test_errors_are_small_after_ninety_seconds(heavy, dives):
 
 @pytest.fixture(scope="module")
 def dives(heavy):
-    return textbook.prior_and_samples(heavy, range(8), 90.0)
+    return textbook.prior_and_samples(heavy, range(6), 90.0)
 
 
 def test_simulated_sensors_suite_is_what_the_configuration_assumes(heavy):

@@ -52,7 +52,7 @@ def noisy(heavy):
 
 @pytest.fixture(scope="module")
 def dives(heavy):
-    return textbook.prior_and_samples(heavy, range(8), 90.0)
+    return textbook.prior_and_samples(heavy, range(6), 90.0)
 
 
 def wrong_prior(config, seed=5, spread=0.2):
@@ -90,17 +90,17 @@ def mixed(rows, every):
     ],
 )
 def test_equals_filterpy(heavy, names, alpha, dt, kind):
-    """State and covariance to 1e-9 after every one of 200 samples, a restart among them."""
+    """State and covariance to 1e-9 after every one of 100 samples, a restart among them."""
     config = coupled(heavy) if names > 15 else heavy
     assert names <= len(config.model.names)
     rng = np.random.default_rng(names)
     rows = textbook.rows_of(
-        *driven(config, 205 * dt, 31, dt=dt), rng, wrench_std=0.01, gyro=kind == "mixed"
+        *driven(config, 105 * dt, 31, dt=dt), rng, wrench_std=0.01, gyro=kind == "mixed"
     )
     rows["wrench_slope"] = rng.standard_normal((len(rows), 6)) * [9.0, 9.0, 9.0, 0.5, 0.5, 0.5]
     if kind == "mixed":
         rows = mixed(rows, 4)
-    k = 101
+    k = 51
     rows["restart"][k], rows["dt"][k], rows["odometry"][k] = True, 0.0, rows["nu"][k]
     config = wrong_prior(config, spread=0.1)
     config = dataclasses.replace(config, estimate=config.model.names[:names])

@@ -20,6 +20,8 @@ from rov_ident.sampling.sample import SAMPLE
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.virtual_sensors import Suite, dive, measure
 
+LEAN = {"odometry_rate": 10.0, "imu_rate": 50.0}
+
 
 def watching(config, kind="rls"):
     online = OnlineEstimator(config, kind)
@@ -43,7 +45,7 @@ def play(online, messages):
     [("quadratic_damping", "XY"), *more(("constant_force", "XYZ"), ("thruster_deadband", "NY"))],
 )
 def test_what_is_missing_is_named(effect, axes):
-    case = hidden.draw(200, (effect,), 0.5, conditions=hidden.Conditions(duration=90.0))
+    case = hidden.draw(200, (effect,), 0.5, conditions=hidden.Conditions(duration=90.0, **LEAN))
     found = play(watching(case.config), case.messages)[-1]
     assert found and found[0].effect == effect
     assert set(found[0].axes) <= set(axes)
@@ -58,7 +60,7 @@ def test_what_is_missing_is_named(effect, axes):
 
 @pytest.mark.parametrize("kind", ["rls", *more("ukf")])  # both have the same monitor
 def test_nothing_is_said_of_a_model_that_lacks_nothing(kind):
-    case = hidden.draw(102, conditions=hidden.Conditions(duration=150.0))
+    case = hidden.draw(102, conditions=hidden.Conditions(duration=150.0, **LEAN))
     assert not any(play(watching(case.config, kind), case.messages))
 
 
@@ -99,7 +101,7 @@ def test_a_command_that_trembles_is_told_from_noise_of_the_reading(heavy, acts):
 @pytest.mark.parametrize("every", [True, False])
 def test_what_a_single_window_says_proves_nothing(every):
     """A knock or a gust fills one window, and something always fits that."""
-    case = hidden.draw(102, conditions=hidden.Conditions(duration=85.0))
+    case = hidden.draw(102, conditions=hidden.Conditions(duration=85.0, **LEAN))
     watcher = (online := watching(case.config)).monitor
     play(online, case.messages)
     task, state = watcher._task, watcher._state
@@ -139,7 +141,7 @@ def test_what_ends_is_forgotten(heavy):
 
 
 def test_watching_changes_no_estimate():
-    case = hidden.draw(200, ("lift",), 0.5, conditions=hidden.Conditions(duration=70.0))
+    case = hidden.draw(200, ("lift",), 0.5, conditions=hidden.Conditions(duration=70.0, **LEAN))
     online, alone = watching(case.config), OnlineEstimator(case.config, "rls")
     play(online, case.messages)
     for _, role, message in case.messages:

@@ -1,6 +1,7 @@
 """A vehicle without a velocity sensor: what can be told is, the rest is said to be impossible."""
 
 import json
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -11,6 +12,7 @@ import rov_ident as ri
 from bench import HEAVY, ROOT
 from bench.simulators import sea
 from bench.studies.without_velocity import stripped
+from rov_ident.api import identification
 from rov_ident.cli.program import main
 from rov_ident.config.prior import prior_of
 from rov_ident.core.messages import Odometry
@@ -144,13 +146,16 @@ def dive(folder, driving, seed, seconds):
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory):
     """Heave and all rotations driven, surge and sway at rest."""
-    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 30.0)
+    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 20.0)
 
 
 @pytest.fixture(scope="module")
 def identified(turning):
+    """The next manoeuvre that is planned lasts 20 s, not a minute: a third of the search."""
     bag, file, _ = turning
-    return ri.identify(bag, file)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identification, "plan", partial(ri.plan, duration=20.0))
+        return ri.identify(bag, file)
 
 
 def sigmas(fit, theta):

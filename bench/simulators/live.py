@@ -65,7 +65,8 @@ def same_to_rounding(values, std, expected):
 
 _CHUNK = 50  # messages
 _AHEAD = 1.0  # s; that the messages published may be ahead of the samples used
-_PATIENCE = 0.2  # s a chunk; not all messages make samples
+_PATIENCE = 10.0  # s without any progress: a busy computer runs none of the nodes for so long
+_GIVEN_UP = 0.2  # s a chunk after that; not all messages make samples, and some nodes are disabled
 
 
 def in_pace(messages, used, listen, ahead=_AHEAD, patience=_PATIENCE):
@@ -74,13 +75,21 @@ def in_pace(messages, used, listen, ahead=_AHEAD, patience=_PATIENCE):
     Fast DDS has 512 messages in shared memory for a process that has no processor for a while. What
     is lost beyond them is sent again, but seconds after what was sent behind it, which is too late.
     ``used()`` gives the stamp [ns] of the last sample that all nodes have used; ``listen(seconds)``
-    waits for news of it.
+    waits for news of it. Where none comes for ``patience`` [s], the rest is not waited for as long.
     """
+    reached, wait = None, patience
     for k, (arrival, role, message) in enumerate(messages, 1):
         yield arrival, role, message
-        if k % _CHUNK == 0:
-            end = time.monotonic() + patience
-            while message.stamp - used() > ahead * 1e9 and time.monotonic() < end:
+        reached = message.stamp if reached is None else reached
+        end = time.monotonic() + wait
+        while k % _CHUNK == 0 and message.stamp - reached > ahead * 1e9:
+            if (now := used()) > reached:
+                reached, wait = now, patience
+                end = time.monotonic() + wait
+            elif time.monotonic() > end:
+                wait = min(patience, _GIVEN_UP)
+                break
+            else:
                 listen(0.01)
 
 

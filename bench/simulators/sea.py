@@ -414,7 +414,9 @@ def dive(
                 k1 = plant.rates(t, x, reached)
             else:
                 k1 = end[k - 1]
-            begin[k], acting[k] = k1, plant.wrench(reached, _through(plant, t, x))
+            # only the loss with speed needs the velocity through the water
+            through = _through(plant, t, x) if sea.advance else state[k, 7:]
+            begin[k], acting[k] = k1, plant.wrench(reached, through)
             state[k + 1] = x = plant.step(t, x, k1, middle, last)
             reached = last
             end[k] = plant.rates(t + STEP, x, reached)

@@ -33,11 +33,16 @@ def one_blas_thread() -> Iterator[None]:
     The limit holds for the process, so that calls in several threads share one: the first sets it
     and the last restores it.
     """
-    global _inside, _limits
+    global _inside, _before
     with _lock:
         if _inside == 0:
             # scipy brings a BLAS of its own
-            _limits = _controller("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas")
+            libraries = _libraries("scipy.linalg" in sys.modules)
+            _before = [
+                (library, n) for library in libraries if (n := library.get_num_threads()) != 1
+            ]
+            for library, _ in _before:
+                library.set_num_threads(1)
         _inside += 1
     try:
         yield
@@ -45,12 +50,13 @@ def one_blas_thread() -> Iterator[None]:
         with _lock:
             _inside -= 1
             if _inside == 0:
-                _limits.restore_original_limits()
+                for library, n in _before:
+                    library.set_num_threads(n)
 
 
 _lock = threading.Lock()
 _inside = 0
-_limits: Any = None
+_before: list[tuple[Any, int]] = []  # libraries that had more threads, and how many
 
 
 @cache
@@ -61,3 +67,9 @@ def _controller(with_scipy: bool) -> Any:
     if with_scipy:
         import scipy.linalg  # noqa: F401
     return ThreadpoolController()
+
+
+@cache
+def _libraries(with_scipy: bool) -> list[Any]:
+    """They, one by one: a limit by the controller itself costs as much as a sample's arithmetic."""
+    return _controller(with_scipy).select(user_api="blas").lib_controllers
