@@ -115,6 +115,25 @@ def test_innovations_of_the_truth_are_white_and_of_unit_size(heavy, seen, axes, 
             assert abs(np.mean(e[lag:] * e[:-lag])) < 4.0 / np.sqrt(len(e)) + 0.02
 
 
+def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
+    """As if all were estimated from data that tell of it no more than the others leave unknown."""
+    rng, n, held = np.random.default_rng(2), 5, np.arange(5) >= 3
+    root = rng.standard_normal((n, n))
+    information, precision = root @ root.T, rng.uniform(0.1, 1.0, n)
+    bound, covariance = ml._considered(information, information, precision, held)
+    ours = np.linalg.inv((information + np.diag(precision))[:3, :3])
+    alike = information.copy()
+    alike[3:, 3:] = information[3:, :3] @ ours @ information[:3, 3:]
+    expected = np.linalg.inv(alike + np.diag(precision))
+    np.testing.assert_allclose(bound, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.diag(bound)[3:], 1.0 / precision[3:], rtol=1e-9)
+    np.testing.assert_allclose(covariance, bound, rtol=1e-9, atol=1e-12)
+    nothing = np.zeros(n, dtype=bool)
+    freely, _ = ml._considered(information, information, precision, nothing)
+    np.testing.assert_allclose(freely, np.linalg.inv(information + np.diag(precision)), rtol=1e-9)
+    assert (np.diag(bound)[:3] > np.diag(freely)[:3]).all()
+
+
 def test_noise_levels_are_found(heavy):
     suite = dataclasses.replace(LEAN, wrench_std=0.03)
     samples = samples_of(heavy, 90.0, suite)

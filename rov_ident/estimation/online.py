@@ -465,12 +465,13 @@ class OnlineEstimator:
         if abs(raw[i] - values[i]) > CONTRADICTED * std[i]:
             return State.AT_BOUND, "at bound: held at its physical bound, the data contradict it"
         excited = excitation[i] >= _EXCITED
-        if not consistency.consistent and (
-            excited or is_known(values[i], std[i], self.prior.std[i])
-        ):
+        known = is_known(values[i], std[i], self.prior.std[i])
+        if waiting and not (known and consistency.consistent):
+            return State.HELD, f"held: {waiting}"
+        if not consistency.consistent and (excited or known):
             return State.CONVERGING, "converging: data and model disagree"
-        if is_known(values[i], std[i], self.prior.std[i]):
+        if known:
             return State.CONVERGED, "converged" if excited else "converged: not excited now"
         if excited:
             return State.CONVERGING, "converging"
-        return State.HELD, f"held: {waiting or 'not excited, the motion does not show it'}"
+        return State.HELD, "held: not excited, the motion does not show it"
