@@ -7,7 +7,6 @@ uses, `slow` by slow.txt, which `make tiers` measures anew.
 
 import contextlib
 import fcntl
-import gc
 import itertools
 import os
 import signal
@@ -124,16 +123,10 @@ def compiled():
 
 
 def pytest_collection_finish(session):
-    """Compile what nodes run before the workers start; core/jit.py says why.
-
-    What collecting the tests leaves, some 400,000 objects, is not looked through for garbage each
-    time that a test makes many of its own: that was a twentieth of all time.
-    """
+    """Compile what nodes run before the workers start; core/jit.py says why."""
     wanted = any("compiled" in getattr(item, "fixturenames", ()) for item in session.items)
     if wanted and not session.config.option.collectonly:
         compile_all(offline=True)
-    gc.collect()
-    gc.freeze()
 
 
 # Workers begin far from each other: what one has just left, another should not take up.
