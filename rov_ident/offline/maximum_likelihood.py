@@ -45,6 +45,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import inlined, kernel, record
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.effects import EFFECTS
 from rov_ident.estimation.observer import (
     LANES,
     OBSERVER,
@@ -95,7 +96,9 @@ class Noise:
     density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
     relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
     ``restoring`` (6, 3) [N, N m] times the unit vector down is the wrench of weight, which has the
-    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact.
+    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact. ``untaught``
+    (p, 6): parameters of effects that do not learn from the wrench of an axis, as it would teach
+    them noise of its reading.
     """
 
     measurement: Array
@@ -103,6 +106,7 @@ class Noise:
     relative: float
     correlation_time: float
     restoring: Array
+    untaught: NDArray[np.bool_]
 
     def process(self, samples: Samples) -> Array:
         """Density (k, 6) of the wrench's error."""
@@ -121,7 +125,8 @@ def assumed(config: Config, least: float = _SMALLEST) -> Noise:
     smallest = least * authority(config.dynamics)
     floor = np.maximum(np.array(w.floor_std), smallest) ** 2 * w.correlation_time
     restoring = config.dynamics.body.restoring
-    return Noise(np.ones(6), floor, w.relative_std, w.correlation_time, restoring)
+    untaught = np.zeros((len(config.estimate_effects), 6), dtype=bool)
+    return Noise(np.ones(6), floor, w.relative_std, w.correlation_time, restoring, untaught)
 
 
 class _Equations(NamedTuple):
@@ -205,6 +210,9 @@ def _passed(
     free = np.ones(6, dtype=bool) if free is None else free
     samples, sides = parts(samples)
     sides = sides if len(effects) else NO_SIDES
+    if len(effects) and noise.untaught.any():
+        sides = sides.copy()
+        sides[:, :6][:, noise.untaught.T] = 0.0
     mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
     inverse, at = np.zeros((6, 6)), np.ix_(free, free)
     inverse[at] = np.linalg.inv(mass[at])
@@ -365,6 +373,7 @@ def maximise(
 
     looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
+    actuators = np.array([EFFECTS[name].of_actuators for name, _ in config.estimate_effects], bool)
     taught = np.vstack([_rows(model.structure)[estimated[own]], factors_of(config)])
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
@@ -392,6 +401,7 @@ def maximise(
         # loud, and not a command that trembles, which the vehicle would follow
         noisy = (readings > SHARE * wrenches) & (samples * noise.floor > FOLLOWED * readings)
         held = (taught & noisy).any(axis=1) & (precision > 0.0)
+        noise = replace(noise, untaught=(actuators & ~held[own.sum() :])[:, None] & noisy)
         bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
         there = partial(look, gate=gate, noise=noise)
         theta = np.clip(theta, *bounds)
