@@ -96,9 +96,9 @@ class Noise:
     density of an unknown wrench [N2 s, (N m)2 s], ``relative`` the wrench's own standard deviation
     relative to itself, an error of which lasts ``correlation_time`` s, or as long as a message.
     ``restoring`` (6, 3) [N, N m] times the unit vector down is the wrench of weight, which has the
-    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact. ``untaught``
-    (p, 6): parameters of effects that do not learn from the wrench of an axis, as it would teach
-    them noise of its reading.
+    error of the measured attitude (`estimation.process_noise`); zeros: taken for exact.
+    ``untaught`` (p, 6): parameters of effects that do not learn from the wrench of an axis, as it
+    would teach them noise of its reading.
     """
 
     measurement: Array
@@ -304,7 +304,8 @@ class Likelihood:
 
     ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
     ``held`` (n,): what kept its prior, as the axes ``noisy`` (6,) would teach it noise of the
-    wrench's reading: their coefficients, and factors of the thrust there.
+    wrench's reading: their coefficients, and factors of the thrust there. Other parameters of
+    actuators are learnt from the other axes (a lag would smooth the noise away).
     """
 
     values: Array
