@@ -130,19 +130,35 @@ def test_round_trip(message):
     assert_equal(cdr.DECODERS[type_name(message)](cdr.encode(message)), message)
 
 
-def test_only_the_diagonal_of_a_full_covariance_is_kept():
+@given(hnp.arrays(float, (6, 6), elements=st.floats(-1.0, 1.0)), st.integers(0, 2**32 - 1))
+def test_variances_of_a_covariance_claim_no_more_than_it_does(root, seed):
+    scale = 10.0 ** np.random.default_rng(seed).uniform(-3.0, 1.0, 6)  # m/s and rad/s
+    covariance = np.outer(scale, scale) * (root @ root.T)
+    variance = cdr.independent(covariance)
+    more = (np.diag(variance) - covariance) / np.outer(scale, scale)
+    assert np.linalg.eigvalsh(more)[0] > -1e-9
+    np.testing.assert_array_equal(cdr.independent(np.diag(variance)), variance)
+
+
+def test_covariances_are_read_beside_their_diagonal():
+    """Of pairs that share all of their error each variance is doubled: they count once."""
+    correlated = np.diag([1.0, 4.0, 9.0, 16.0, 25.0, 0.0])
+    correlated[0, 1] = correlated[1, 0] = 2.0
+    correlated[2, 5] = correlated[5, 2] = 1.0  # with what is not measured
+    correlated[3, 4] = correlated[4, 3] = -10.0
     ros = RosOdometry()
     ros.pose.covariance = np.arange(100.0, 136.0)
-    ros.twist.covariance = np.arange(36.0)
+    ros.twist.covariance = correlated.ravel()
     message = cdr.decode_odometry(serialize_message(ros))
-    np.testing.assert_array_equal(message.twist_variance, [0, 7, 14, 21, 28, 35])
+    np.testing.assert_allclose(message.twist_variance, [2.0, 8.0, 9.0, 24.0, 37.5, 0.0])
     ros = RosImu()
     ros.orientation_covariance = np.arange(100.0, 109.0)
-    ros.angular_velocity_covariance = np.arange(9.0)
-    ros.linear_acceleration_covariance = np.arange(10.0, 19.0)
+    ros.angular_velocity_covariance = correlated[:3, :3].ravel()
+    # the first says that there is none
+    ros.linear_acceleration_covariance = np.array([-1.0, 2.0, 2.0, 2.0, 1.0, 2.0, 2.0, 2.0, 4.0])
     imu = cdr.decode_imu(serialize_message(ros))
-    np.testing.assert_array_equal(imu.angular_variance, [0, 4, 8])
-    np.testing.assert_array_equal(imu.acceleration_variance, [10, 14, 18])
+    np.testing.assert_allclose(imu.angular_variance, [2.0, 8.0, 9.0])
+    np.testing.assert_allclose(imu.acceleration_variance, [-1.0, 2.0, 8.0])
 
 
 def test_an_imu_without_attitude_says_so_on_the_wire():

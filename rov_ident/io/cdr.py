@@ -41,17 +41,19 @@ class _Layout(NamedTuple):
 
     size: int  # float64 in the message
     kept: NDArray[np.intp]  # (n,) their indices, in the order of the fields of the core type
+    # where covariances are: index of the first number, rows, and index of the first variance kept
+    covariances: tuple[tuple[int, int, int], ...] = ()
 
 
-# Quaternions are x y z w on the wire; of a covariance only the diagonal is kept.
+# Quaternions are x y z w on the wire; of a covariance variances are kept.
 # pose 7, its covariance 36, twist 6, its covariance 36
-_ODOMETRY = _Layout(85, np.r_[0:3, 6, 3:6, 43:46, 46:49, 49:85:7])
+_ODOMETRY = _Layout(85, np.r_[0:3, 6, 3:6, 43:46, 46:49, 49:85:7], ((49, 6, 13),))
 # orientation 4 + 9, angular velocity 3 + 9, acceleration 3 + 9
-_IMU = _Layout(37, np.r_[3, 0:3, 13:16, 25:28, 16:25:4, 28:37:4])
+_IMU = _Layout(37, np.r_[3, 0:3, 13:16, 25:28, 16:25:4, 28:37:4], ((16, 3, 10), (28, 3, 13)))
 _WRENCH = _Layout(6, np.r_[0:6])
 _IMU_ORIENTATION_COVARIANCE = 4
 _TWIST = _Layout(6, np.r_[0:6])
-TWIST_WITH_COVARIANCE = _Layout(42, np.r_[0:6, 6:42:7])
+TWIST_WITH_COVARIANCE = _Layout(42, np.r_[0:6, 6:42:7], ((6, 6, 6),))
 _POSE = _Layout(7, np.r_[0:3, 6, 3:6])
 POSE_WITH_COVARIANCE = _Layout(43, _POSE.kept)
 
@@ -94,11 +96,36 @@ class _Fields:
         return np.frombuffer(self._data, kind, count, start).astype(float, copy=False)
 
     def kept(self, layout: _Layout) -> Array:
-        return self.numbers("<f8", layout.size).take(layout.kept)
+        numbers = self.numbers("<f8", layout.size)
+        kept = numbers.take(layout.kept)
+        for first, size, to in layout.covariances:
+            covariance = numbers[first : first + size * size]
+            if np.count_nonzero(covariance) > size:
+                kept[to : to + size] = independent(covariance.reshape(size, size))
+        return kept
 
     def sequence(self, kind: str) -> Array:
         length = self.length()
         return self.numbers(kind, length) if length else np.zeros(0)  # without padding then
+
+
+@np.errstate(invalid="ignore", over="ignore", divide="ignore")
+def independent(covariance: Array) -> Array:
+    """Variances (n,) of independent errors that are nowhere surer than ``covariance`` (n, n).
+
+    Estimators here take the errors of one message as independent, and would count twice what two
+    of them share. With s_i^2 sum_j |rho_ij| instead of s_i^2 nothing is: what this adds to the
+    covariance is diagonally dominant once scaled by each 1/s_i, so it is no less in any direction
+    (Gershgorin). What is not given (zero, negative, not finite) stays as it is.
+    """
+    variance = np.diag(covariance)
+    given = (variance > 0.0) & (variance < np.inf)
+    std = np.sqrt(np.where(given, variance, np.inf))
+    share = np.minimum(np.abs(covariance) / np.outer(std, std), 1.0)
+    share[~np.isfinite(share)] = 0.0
+    np.fill_diagonal(share, 1.0)
+    out: Array = np.where(given, variance * share.sum(axis=1), variance)
+    return out
 
 
 # Each raises ValueError on malformed bytes; axes are those on the wire.
