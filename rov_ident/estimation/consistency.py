@@ -127,7 +127,7 @@ def consistency_of(
 
     ``values`` (n,) are not yet drawn to what is physically possible. ``unexplained`` (6,) is the
     force that lasts a second and that the model does not have, relative to the working wrench; NaN
-    where it is not known. ``lasting`` (6,), of the recursive estimators, is the power of
+    where it is not known. ``lasting`` (6,), of RLS, UKF and ML, is the power of
     innovations added up over a second in motion: 1 is expected, NaN where it is not known.
     ``sensors`` are test ratios of the odometry's parts against the IMU.
     """

@@ -80,6 +80,7 @@ class _Stage(NamedTuple):
     states: dict[str, State]
     more: dict[str, Any]
     unexplained: Array  # (6,): as consistency_of takes it
+    lasting: Array  # (6,), too
     noise: maximum_likelihood.Noise | None = None
 
 
@@ -119,12 +120,13 @@ def fit_batch(
     config = config.with_nuisance if effects else config
     prior = prior_of(config, effects)
     values, covariance = prior.mean.copy(), np.diag(prior.std**2)
-    states, unexplained = dict.fromkeys(prior.names, State.HELD), np.full(6, np.nan)
+    states = dict.fromkeys(prior.names, State.HELD)
+    unexplained, lasting = np.full((2, 6), np.nan)
     now, parts = config, []
     if effects and config.estimate_effects:
         archive, whole = _relinearised(archive, config, kind, settings, notes, tell)
         values, covariance, states = whole.values, whole.covariance, whole.states
-        unexplained = whole.unexplained
+        unexplained, lasting = whole.unexplained, whole.lasting
         now = config.with_values(dict(zip(whole.names, values.tolist(), strict=True)))
         parts.append(whole.more)
     for stage in () if parts else settings.stages or (MOTIONS,):
@@ -136,13 +138,14 @@ def fit_batch(
         states.update(found.states)
         covariance[np.ix_(at, at)] = found.covariance
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
+        lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
         now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
     judged = _as_read_by(archive, config, now)
     after = open_loop_rmse(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
-    consistency = consistency_of(config, prior, values, unexplained)
+    consistency = consistency_of(config, prior, values, unexplained, lasting)
     consistency = consistency.with_open_loop(before, after, chance)
     if unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
@@ -281,7 +284,7 @@ def _stage(
         }
     }
     noise = None
-    unexplained = np.full(6, np.nan)
+    unexplained, lasting = np.full((2, 6), np.nan)
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
@@ -305,6 +308,7 @@ def _stage(
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         unexplained[:2] = np.nan if unmeasured else unexplained[:2]
+        lasting[free] = likelihood.lasting[free]
         bound = np.sqrt(np.diag(likelihood.bound))
         more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
         more["noise"] = _noise(likelihood, free)
@@ -343,7 +347,7 @@ def _stage(
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
     if free[0] and not any(archive.each(_pushes_ahead)):
         notes += _said_of_scale(config, names, covariance)
-    return _Stage(names, values, covariance, states, more, unexplained, noise)
+    return _Stage(names, values, covariance, states, more, unexplained, lasting, noise)
 
 
 def _pushes_ahead(samples: Samples) -> bool:

@@ -45,6 +45,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import inlined, kernel, record
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.observer import (
     LANES,
@@ -197,6 +198,25 @@ def innovations(
     return Innovations(*out)
 
 
+def whiteness(
+    samples: Samples,
+    model: Model,
+    noise: Noise,
+    free: NDArray[np.bool_] | None = None,
+    gate: float = np.inf,
+    effects: Array = _NONE,
+) -> Array:
+    """(2, 6): seconds in which the vehicle moved, and the integral over them of the power of
+    innovations added up over a second (:mod:`rov_ident.core.whiteness`).
+
+    The levels of the noise are those of the whole record, in which a vehicle may mostly rest.
+    """
+    found, (samples, _) = innovations(samples, model, noise, free, gate, effects), parts(samples)
+    out = np.zeros((2, 6))
+    _add_power(found.e / np.sqrt(found.s), samples, out)
+    return out
+
+
 def _passed(
     samples: Samples,
     model: Model,
@@ -303,6 +323,8 @@ class Likelihood:
     """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
 
     ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
+    ``lasting`` (6,) is the power of innovations added up over a second in motion: 1 is expected,
+    NaN where it is not known.
     ``held`` (n,): what kept its prior, as the axes ``noisy`` (6,) would teach it noise of the
     wrench's reading: their coefficients, and factors of the thrust there. Other parameters of
     actuators are learnt from the other axes (a lag would smooth the noise away).
@@ -313,6 +335,7 @@ class Likelihood:
     bound: Array
     noise: Noise
     total: Pass
+    lasting: Array
     held: NDArray[np.bool_]
     noisy: NDArray[np.bool_]
     iterations: int
@@ -408,8 +431,11 @@ def maximise(
         theta = np.clip(theta, *bounds)
         theta, at, more, converged = minimise(theta, bounds, there, slope_of, enough, _ITERATIONS)
         steps += more
+    seconds, power = np.sum(each(whiteness, at_values(theta), noise, free, gate, theta[~own]), 0)
+    known = seconds > JUDGED_TIME
+    lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
     bound, covariance = _considered(at.information, at.scatter, precision, held)
-    return Likelihood(theta, covariance, bound, noise, at, held, noisy, steps, converged)
+    return Likelihood(theta, covariance, bound, noise, at, lasting, held, noisy, steps, converged)
 
 
 def _rows(structure: Structure) -> NDArray[np.bool_]:
@@ -627,6 +653,27 @@ def _sunk(sample, half, x, p, sensitivity, work):
             sensitivity[6, j] += half * sample.down[i] * sensitivity[i, j]
     for j in range(6):
         p[6, j] = p[j, 6] = cross[j]
+
+
+@kernel
+def _add_power(e, samples, out):
+    """Add to out (2, 6) what :func:`whiteness` gives; e (k, 6) are normalised innovations."""
+    for i in range(6):
+        summed, expected, since = 0.0, 0.0, 0.0
+        for k in range(len(samples)):
+            since += samples[k].dt
+            moving = False
+            for j in range(6):
+                moving |= samples[k].moving[j] != 0
+            if samples[k].restart or not moving:
+                summed, expected, since = 0.0, 0.0, 0.0
+            elif np.isfinite(e[k, i]):
+                keep = np.exp(-since / SUM_TIME)
+                summed = keep * summed + min(max(e[k, i], -LARGEST), LARGEST)
+                expected = keep * keep * expected + 1.0
+                out[0, i] += since
+                out[1, i] += since * summed * summed / expected
+                since = 0.0
 
 
 @kernel
