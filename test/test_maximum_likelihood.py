@@ -134,6 +134,19 @@ def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
     assert (np.diag(bound)[:3] > np.diag(freely)[:3]).all()
 
 
+@pytest.mark.parametrize(("name", "axis"), [("X_uu", 0), ("N_rr", 5)])
+def test_innovations_of_a_wrong_model_last(heavy, samples, name, axis):
+    """With half of its drag they add up over a second; those of the right model do not."""
+    noise, theta = ml.assumed(heavy), heavy.model.theta.copy()
+    seconds, power = ml.whiteness(samples, heavy.model, noise)
+    assert (seconds > 40.0).all()
+    # sixty seconds of sums over one: a scatter of a fifth
+    np.testing.assert_allclose(power / seconds, 1.0, atol=0.6)
+    theta[heavy.model.names.index(name)] *= 0.5
+    seconds, power = ml.whiteness(samples, heavy.model.with_theta(theta), noise)
+    assert power[axis] > 4.0 * seconds[axis]
+
+
 def test_noise_levels_are_found(heavy):
     suite = dataclasses.replace(LEAN, wrench_std=0.03)
     samples = samples_of(heavy, 90.0, suite)
