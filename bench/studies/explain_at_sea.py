@@ -85,7 +85,9 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
         _pose, ("heading_offset", "sensor_misalignment", "imu_bias", "cog_offset"),
     ),
     "late stamps": (_stamps, ("actuation_delay", "velocity_latency")),
-    "lag under wrench noise": (both("thruster lag", "wrench noise"), ("thruster_lag", "wrench_noise")),
+    "lag under wrench noise": (
+        both("thruster lag", "wrench noise"), ("thruster_lag", "wrench_noise"),
+    ),
     "thrust scale and smoothed odometry": (
         both("thrust scale", "smoothed odometry"), (*SCALE, "velocity_latency"),
     ),
