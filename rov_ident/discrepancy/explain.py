@@ -160,6 +160,9 @@ def explain(
             "anything"
         )
     say("comparing the sensors", 0.05)
+    bags = [sensor_consistency.with_rates_of_the_attitude(bag) for bag in bags]
+    if validate is not None:
+        validate = sensor_consistency.with_rates_of_the_attitude(validate)
     with_others = [*bags, *([] if validate is None else [validate])]
     as_headed = joined(bags)[0] if validate is None else validate
     turned, headings = repetition.turned(with_others, config)

@@ -49,6 +49,9 @@ _DRIFT = 1.0  # s; from which the pose tells velocity better than the IMU
 _STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
 _ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
 _MAX_GAP = 0.5  # s without a message: no step of dead reckoning reaches across
+_CLOCK = 0.05  # s by which the IMU's clock is set on and back: less than an ROV's response
+_BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
+_FEWEST_CLUSTERS = 6  # in which they differ: of fewer the scatter is not known
 _FEWEST_IMU = 8  # messages of the IMU; fewer are none
 _FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
 _CLUSTER = 5.0  # s; of which residuals are correlated, as long as the windows of the dynamics
@@ -70,11 +73,13 @@ class Comparison:
 
 _LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
 
-THRUST_TIMING = tuple(("thrust held", axis) for axis in "XYZ")
+TIMING = (*(("thrust held", axis) for axis in "XYZ"), ("clock", "imu"))
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
 To the accelerations of thrust that is a time offset of milliseconds, the drag that answers to them
-is not offset: together they would pass for a velocity scale of up to two percent.
+is not offset: together they would pass for a velocity scale of up to two percent. And the IMU's
+stamps may be early or late by milliseconds: only a pose of their own clock tells that velocities
+are old.
 """
 
 
@@ -104,12 +109,13 @@ def comparisons(
     reading = Reading(moving, turning, gyrating, here.specific_force)
     moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
     made: list[tuple[str, Array, Array, list[Array]]] = []
+    none = [np.zeros_like(here.linear)] * len(TIMING)
     if streams.has_pose:
         way, *ways = (
             integral(streams.t, np.einsum("kij,kj->ki", r, m.linear)) for m in (here, *moved)
         )
         y, columns = streams.position - way, [-w for w in ways]
-        made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
+        made.append(("pose", streams.t, y, [*columns, *none]))
     if inertial is not None:
         down = inertial.rotation[:, 2]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
@@ -123,15 +129,52 @@ def comparisons(
         held = np.clip(np.searchsorted(streams.demand_t, t, side="right") - 1, 0, None)
         thrust = streams.demand[held, :3] / config.model.body.mass
         columns += [r[inside][:, :, i] * thrust[:, i : i + 1] for i in range(3)]
+        clock = none[-1]
+        if streams.has_pose:
+            early, late = (
+                _DeadReckoning(
+                    dataclasses.replace(streams, imu_t=streams.imu_t + by), config, there, rate
+                ).velocity
+                for by in (-_CLOCK, _CLOCK)
+            )
+            clock = (early - late) / (2.0 * _CLOCK)
+        columns.append(clock[inside])
         made.append(("imu", t, y, columns))
         y = here.angular[inside] - here.gyro[inside]
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
-        made.append(("gyro", t, y, [*columns, *[np.zeros_like(y)] * 3]))
+        made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
     return [
         Comparison(name, *_whitened(t, y, columns, walk=name != "gyro"))
         for name, t, y, columns in made
         if len(t) > _FEWEST
     ]
+
+
+def with_rates_of_the_attitude(streams: Streams) -> Streams:
+    """The streams without the constant by which the odometry's angular velocities differ from how
+    its attitude turns: it copies them from a gyro, whose bias would pass for forces that turn the
+    vehicle. The median over clusters, as an attitude may be reset."""
+    q, step = streams.orientation, np.diff(streams.t)[:, None]
+    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
+    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
+    turn = 2.0 * np.arctan2(size, between[:, :1]) * between[:, 1:] / np.maximum(size, 1e-12)
+    rate = streams.nu[:, 3:]
+    off = np.hstack([0.5 * (rate[1:] + rate[:-1]) * step - turn, step])
+    at = (streams.t[1:] / _CLUSTER).astype(int)
+    sums = np.stack([np.bincount(at, x * (step[:, 0] < _MAX_GAP)) for x in off.T], axis=1)
+    sums = sums[sums[:, 3] > 0.5 * _CLUSTER]
+    if len(sums) < _FEWEST_CLUSTERS or not np.ptp(q, axis=0).any():
+        return streams
+    apart = sums[:, :3] / sums[:, 3:]
+    bias = np.median(apart, axis=0)
+    std = np.median(np.abs(apart - bias), axis=0) * 1.4826 * np.sqrt(0.5 * np.pi / len(apart))
+    bias = np.where((np.abs(bias) > _BIASED * std) & (np.ptp(rate, axis=0) > 0.0), bias, 0.0)
+    if not bias.any():
+        return streams
+    told = ", ".join(f"{b:.2g}" for b in bias)
+    note = f"the odometry's angular velocities differ from how its attitude turns: {told} rad/s, "
+    nu = streams.nu - np.append(np.zeros(3), bias)
+    return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note + "taken off"))
 
 
 def _has_imu(streams: Streams) -> bool:
@@ -302,7 +345,7 @@ def _linear_problem(
     found: Sequence[Comparison], spans: Sequence[tuple[float, float]]
 ) -> LinearProblem:
     """The rows whose time is in the spans, in clusters of _CLUSTER seconds."""
-    keys = (*sensor_parameters(), *THRUST_TIMING)
+    keys = (*sensor_parameters(), *TIMING)
     last = max((int(b.t[-1] / _CLUSTER) for b in found if len(b.t)), default=0) + 1
     normal, gradient = np.zeros((len(keys), len(keys))), np.zeros((last, len(keys)))
     rss, count = np.zeros(last), 0
@@ -374,17 +417,17 @@ def search(
         units = [[k for k in free if k[0] == n] for n in library if n not in found]
         added = [k for unit in units for k in unit]
         if allowed is None:
-            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units, bounds)
+            best, score, _ = Scores(linear, [*chosen, *TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
         both = [*chosen, *added]
         if not both:
             break
-        change, _ = Scores(linear, THRUST_TIMING).solve(both)
+        change, _ = Scores(linear, TIMING).solve(both)
         for (name, parameter), delta in zip(both, change.tolist(), strict=True):
             nulls = {p.name: p.null for p in EFFECTS[name].parameters}
             value = found.setdefault(name, nulls)[parameter] + delta
             found[name][parameter] = float(np.clip(value, *bounds((name, parameter))[1:]))
-        at = linear.index([*both, *THRUST_TIMING])
+        at = linear.index([*both, *TIMING])
         covariance = scaled_inverse(linear.normal[np.ix_(at, at)])
         variance = np.maximum(np.diag(covariance), 0.0) * variance_inflation(linear, at)
         width = np.sqrt(variance)[: len(both)]
