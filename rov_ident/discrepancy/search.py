@@ -39,6 +39,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
 
+LIKELIEST = (*HULL_DAMPING, "thrust_scale")  # thrust is never just as configured
 LATE_THRUST = ("thruster_lag", "actuation_delay")  # what every thruster has a little of
 
 # What is likelier beforehand needs less evidence. The rates in docs/explain-bench.md were measured
@@ -201,13 +202,13 @@ class Search:
         return [f for f in fits if f is not None]
 
     def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
-        """Full fits of the best candidates, and of hull damping, whatever its score: a model that
-        lacks it can be too far off for its linearisation to show it."""
+        """Full fits of the best candidates, and of what is lacking most often, whatever its score:
+        a model that lacks it can be too far off for its linearisation to show it."""
         least = max(_LEAST_SHARE * candidates[0].score, 0.0) if candidates else 0.0
         chosen = [c for c in candidates[:_FITTED] if c.score >= least]
         white = sorted((c for c in candidates if c.white_score > 0.0), key=lambda c: -c.white_score)
         chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
-        chosen += [c for c in candidates if c.name in HULL_DAMPING and c not in chosen]
+        chosen += [c for c in candidates if c.name in LIKELIEST and c not in chosen]
         fits = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
         return [f for f in fits if f is not None]
 
