@@ -82,6 +82,17 @@ def test_rates_that_agree_with_the_attitude_are_left_alone():
     assert with_rates_of_the_attitude(none) is none
     short = turning((0.02, 0.0, 0.0), seconds=20.0)[0]
     assert with_rates_of_the_attitude(short) is short
+    seldom = turning((0.02, 0.0, 0.0))[0]
+    seldom = dataclasses.replace(
+        seldom, t=seldom.t[::20], orientation=seldom.orientation[::20], nu=seldom.nu[::20]
+    )
+    assert with_rates_of_the_attitude(seldom) is seldom
+
+
+def test_without_pose_and_imu_no_sensor_is_judged():
+    streams, _ = turning()
+    config = configuration.from_parameters(dive_of("clean", "pilot", 1, 60.0).parameters)
+    assert sensors_of(streams, config)[0] == {}
 
 
 # ------------------------------------------------------------------ clocks

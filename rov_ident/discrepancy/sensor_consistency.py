@@ -169,6 +169,8 @@ def with_rates_of_the_attitude(streams: Streams) -> Streams:
         apart = integral(t, rate) - np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
         grows = [np.outer(t - t[0], axis) for axis in np.eye(3)]
         at, r, columns, _ = _whitened(t, apart, [*grows, rate[0] - rate], walk=True)
+        if len(at) < _FEWEST:
+            return streams
         cluster = (at // _CLUSTER).astype(int)
         normal, gradient = columns.T @ columns, np.zeros((cluster.max() + 1, 4))
         np.add.at(gradient, cluster, columns * r[:, None])
