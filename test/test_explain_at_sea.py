@@ -63,7 +63,8 @@ def turning(bias=(0.0, 0.0, 0.0), late=0.0, noise=1.0, seconds=60.0):
 @pytest.mark.parametrize("late", [0.0, 0.1])
 def test_rates_are_those_of_the_attitude(bias, late):
     streams, true = turning(bias, late)
-    mended = with_rates_of_the_attitude(streams)
+    mended, filtered = with_rates_of_the_attitude(streams)
+    assert filtered == (late > 0.0)
     error = (mended.nu[:, 3:] - true)[2:-3]
     assert np.abs(error.mean(axis=0)).max() < 5e-4
     assert error.std() < 1.2 * 0.004
@@ -73,20 +74,20 @@ def test_rates_are_those_of_the_attitude(bias, late):
 
 def test_rates_that_agree_with_the_attitude_are_left_alone():
     streams, _ = turning()
-    assert with_rates_of_the_attitude(streams) is streams
+    assert with_rates_of_the_attitude(streams)[0] is streams
     early, _ = turning(late=-0.1)  # it is the attitude that is late
-    np.testing.assert_array_equal(with_rates_of_the_attitude(early).nu, early.nu)
+    np.testing.assert_array_equal(with_rates_of_the_attitude(early)[0].nu, early.nu)
     none = dataclasses.replace(
         turning((0.02, 0.0, 0.0))[0], orientation=np.tile([1.0, 0.0, 0.0, 0.0], (1200, 1))
     )
-    assert with_rates_of_the_attitude(none) is none
+    assert with_rates_of_the_attitude(none)[0] is none
     short = turning((0.02, 0.0, 0.0), seconds=20.0)[0]
-    assert with_rates_of_the_attitude(short) is short
+    assert with_rates_of_the_attitude(short)[0] is short
     seldom = turning((0.02, 0.0, 0.0))[0]
     seldom = dataclasses.replace(
         seldom, t=seldom.t[::20], orientation=seldom.orientation[::20], nu=seldom.nu[::20]
     )
-    assert with_rates_of_the_attitude(seldom) is seldom
+    assert with_rates_of_the_attitude(seldom)[0] is seldom
 
 
 def test_without_pose_and_imu_no_sensor_is_judged():
@@ -163,6 +164,15 @@ def test_drag_that_thrusters_make_is_not_sure():
     found = {f.effect: f.separable for f in explain([streams], config).findings.effects}
     assert found.keys() & {"oblique_damping", "crossflow", "tether_drag", "coriolis"}
     assert not any(sure for name, sure in found.items() if name not in ("thrust_scale",))
+
+
+@pytest.mark.study
+def test_nothing_is_sure_beside_a_filter():
+    """It takes more than a delay from quick motion."""
+    _, streams, config = streams_of("smoothed odometry", "slow pilot", 0, 150.0)
+    findings = explain([streams], config).findings
+    assert {f.effect for f in findings.effects if f.separable} == {"velocity_latency"}
+    assert any("filtered" in note for note in findings.notes)
 
 
 @pytest.mark.study

@@ -156,21 +156,22 @@ def comparisons(
     ]
 
 
-def with_rates_of_the_attitude(streams: Streams) -> Streams:
+def with_rates_of_the_attitude(streams: Streams) -> tuple[Streams, bool]:
     """The streams with angular velocities that are those of the odometry's attitude: copied from a
     gyro they have its bias, which would pass for forces that turn the vehicle, and filtered they
-    are late, which would pass for late thrust. Only what surely differs is set right."""
+    are late, which would pass for late thrust. Only what surely differs is set right. Also, whether
+    they are later than the odometry's rate can hide."""
     t, measured = streams.t, streams.nu[:, 3:]
     turn, value, std = _turned_by(streams.orientation), np.zeros(4), np.zeros(4)
     if t[-1] - t[0] < _FEWEST_CLUSTERS * _CLUSTER or not turn.any():
-        return streams
+        return streams, False
     for _ in range(_ROUNDS):
         rate = interpolated(t, measured, t + value[3]) - value[:3]
         apart = integral(t, rate) - np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
         grows = [np.outer(t - t[0], axis) for axis in np.eye(3)]
         at, r, columns, _ = _whitened(t, apart, [*grows, rate[0] - rate], walk=True)
         if len(at) < _FEWEST:
-            return streams
+            return streams, False
         cluster = (at // _CLUSTER).astype(int)
         normal, gradient = columns.T @ columns, np.zeros((cluster.max() + 1, 4))
         np.add.at(gradient, cluster, columns * r[:, None])
@@ -183,7 +184,7 @@ def with_rates_of_the_attitude(streams: Streams) -> Streams:
     value[:3] *= np.ptp(measured, axis=0) > 0.0
     value[3] = np.clip(value[3], 0.0, _LATEST)  # an attitude that is late is no fault of the rates
     if not value.any():
-        return streams
+        return streams, False
     rate = interpolated(t, measured, t + value[3]) - value[:3]
     told = ", ".join(f"{bias:.2g}" for bias in value[:3])
     note = (
@@ -191,7 +192,8 @@ def with_rates_of_the_attitude(streams: Streams) -> Streams:
         f"{value[3]:.2g} s late; set right"
     )
     nu = np.hstack([streams.nu[:, :3], rate])
-    return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note))
+    late = bool(value[3] > 0.5 * np.median(np.diff(t)))
+    return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note)), late
 
 
 def _turned_by(q: Array) -> Array:
