@@ -111,6 +111,7 @@ COMPILE := .venv/audit/bin/uv pip compile --quiet --no-header --no-annotate --ge
 ## stopped and goes on where it was)
 explain-bench: .venv/demo.stamp
 	$(BIN)/python -m bench.studies.explain
+	$(BIN)/python -m bench.studies.explain_at_sea
 
 ## the shipped bag, anew
 bag: .venv/demo.stamp

@@ -12,8 +12,9 @@ from tiers import more
 import rov_ident as ri
 from bench.simulators import sea
 from bench.simulators.sea import Sea, skew
-from bench.studies import at_sea
+from bench.studies import at_sea, explain_at_sea
 from rov_ident import config as configuration
+from rov_ident.effects import EFFECTS
 from rov_ident.io.write_messages import write_messages
 
 STILL = np.zeros(8)
@@ -169,7 +170,7 @@ def told_the_truth(vehicle):
     )
 
 
-@pytest.mark.parametrize("driving", sea.DRIVING)
+@pytest.mark.parametrize("driving", [*sea.DRIVING, *sea.SPARSE])
 def test_the_packages_equations_give_the_wrench_that_acted(driving):
     vehicle = vehicle_of(11)
     truth = sea.dive(vehicle, Sea(), driving, 20.0, np.random.default_rng(11))
@@ -270,6 +271,30 @@ def test_each_fault_is_in_the_messages(clean):
         np.testing.assert_allclose(late - right, next(iter(changes.values())), atol=1e-9)
 
 
+def test_a_pose_with_axes_of_its_own(clean):
+    _, right = read(clean, "odom", "orientation")
+    _, wrong = read(clean, "odom", "orientation", heading=0.2, tilt=(0.03, -0.02))
+    R, W = sea.rotations(right), sea.rotations(wrong)
+    turn, c, s = np.array([0.03, 0.02, 0.0]), math.cos(0.2), math.sin(0.2)
+    world = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # east, north, up
+    for a, b in zip(R, W, strict=True):  # to second order in the tilt
+        np.testing.assert_allclose(b, world @ a @ (np.eye(3) + skew(turn)), atol=1e-3)
+
+
+def test_messages_that_are_long_on_the_way_keep_their_stamps(clean):
+    sent = sea.measured(clean, Sea(on_the_way=(0.1, 0.05, 0.2)), np.random.default_rng(1))
+    for role, delay in (("odom", 0.1), ("imu", 0.05), ("wrench", 0.2)):
+        age = {arrival - m.stamp for arrival, r, m in sent if r == role}
+        assert age == {sea.LATENCY + round(1e9 * delay)}
+    assert [arrival for arrival, _, _ in sent] == sorted(arrival for arrival, _, _ in sent)
+
+
+def test_one_axis_at_a_time():
+    t = np.arange(5000) / sea.COMMAND_RATE
+    driven = sea.axis_by_axis(np.random.default_rng(2), t) != 0.0
+    assert (driven.sum(axis=1) <= 1).all() and driven.any(axis=0).all()
+
+
 # ------------------------------------------------------------------ the study
 
 
@@ -337,3 +362,39 @@ def test_bars_of_the_tables(capsys):
     at_sea.lies(at_sea.grouped([line(case="IMU turned")]), bars)
     assert any(m.startswith("IMU turned, six-axis, rls: honest") for m in bars.missed)
     assert "**0 %**" in capsys.readouterr().out
+
+
+def explained(case, *found):
+    told = [{"effect": n, "sure": sure, "alternatives": others} for n, sure, others in found]
+    return {
+        "trial": {"case": case, "driving": "pilot"}, "found": told, "minor": [],
+        "verdict": "explained" if found else "agrees", "cpu": 1.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "found, right, wrong",
+    [
+        (("thruster_lag", True, []), True, []),
+        (("actuation_delay", False, ["thruster_lag"]), True, []),
+        (("actuation_delay", False, []), False, ["actuation_delay"]),
+        (("actuation_delay", True, ["thruster_lag"]), False, ["actuation_delay!"]),
+    ],
+)
+def test_a_name_is_right_wrong_or_wrong_and_sure(capsys, found, right, wrong):
+    line = explained("thruster lag", found)
+    assert explain_at_sea.right(line) == right and explain_at_sea.wrong(line) == wrong
+    bars = explain_at_sea.Bars()
+    explain_at_sea.report([line], bars)
+    missed = [m.split(": ")[1] for m in bars.missed]
+    assert missed == ["right where named"] * (not right) + ["wrong and sure"] * ("!" in str(wrong))
+    explain_at_sea.report([explained("clean", found), explained("clean")], bars)
+    assert any(m.startswith("clean, pilot: a wrong name") for m in bars.missed)
+    assert "1 of 2" in capsys.readouterr().out
+
+
+def test_names_that_are_right_are_in_the_library():
+    assert {n for _, names in explain_at_sea.CASES.values() for n in names} <= set(EFFECTS)
+    for case, (draw, _) in explain_at_sea.CASES.items():
+        replace(Sea(), **draw(np.random.default_rng(8), vehicle_of(8)))
+        assert case not in at_sea.CASES or draw is at_sea.CASES[case]

@@ -121,6 +121,9 @@ class Sea:
     accelerometer_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # m/s2
     gyro_is_shared: bool = False  # odometry copies its angular velocity from the IMU
     imu_clock: float = 0.0  # s, of the IMU's stamps ahead of the others
+    heading: float = 0.0  # rad, of the pose ahead of the world's
+    tilt: tuple[float, ...] = (0.0, 0.0)  # rad, roll and pitch of the pose against the body
+    on_the_way: tuple[float, ...] = (0.0, 0.0, 0.0)  # s to the recorder: odometry, IMU, wrench
 
     frozen_from: float = math.inf  # s; then the velocity sensor reads zero, with little noise
     imu_turned: bool = False  # half a turn about the body's z axis
@@ -306,7 +309,12 @@ STICK_DEADBAND = 0.1  # share of its travel
 STICK_RATE = 5.0  # full travels in a second
 
 
-def pilot(rng: np.random.Generator, t: Array) -> Array:
+def pilot(
+    rng: np.random.Generator,
+    t: Array,
+    pauses: tuple[float, float] = (0.3, 3.0),
+    deadband: float = STICK_DEADBAND,
+) -> Array:
     """(K, 6) demands of a pilot: one or two sticks at a time, and long pauses between."""
     stick, begin = np.zeros((len(t), 6)), rng.uniform(1.0, 4.0)
     while begin < t[-1]:
@@ -316,20 +324,33 @@ def pilot(rng: np.random.Generator, t: Array) -> Array:
         end = begin + rng.uniform(1.0, 6.0)
         size = rng.uniform(0.2, 1.0, count) * rng.choice([-1.0, 1.0], count)
         stick[(t >= begin) & (t < end)] += size @ np.eye(6)[used]
-        pause = rng.uniform(6.0, 20.0) if rng.random() < 0.25 else rng.uniform(0.3, 3.0)
+        pause = rng.uniform(6.0, 20.0) if rng.random() < 0.25 else rng.uniform(*pauses)
         begin = end + pause
     hand = 0.03 * lfilter([0.1], [1.0, -0.9], rng.standard_normal((len(t), 6)), axis=0)
     stick += hand
     most = STICK_RATE * (t[1] - t[0])
     for k in range(1, len(t)):
         stick[k] = stick[k - 1] + np.clip(stick[k] - stick[k - 1], -most, most)
-    beyond = np.maximum(np.abs(stick) - STICK_DEADBAND, 0.0) / (1.0 - STICK_DEADBAND)
+    beyond = np.maximum(np.abs(stick) - deadband, 0.0) / (1.0 - deadband)
     return LEVELS * np.minimum(beyond, 1.0) * np.sign(stick) * [1.0, 1.0, 1.0, 0.0, 0.0, 1.0]
 
 
 def only(*axes: int) -> Callable[[np.random.Generator, Array], Array]:
     """:func:`six_axes` of which only these are driven."""
     return lambda rng, t: six_axes(rng, t) * np.isin(np.arange(6), axes)
+
+
+def axis_by_axis(rng: np.random.Generator, t: Array) -> Array:
+    """:func:`six_axes` of which one is driven at a time, 4 to 10 s each, none twice in a row."""
+    edges = np.cumsum(rng.uniform(4.0, 10.0, int(t[-1] / 4.0) + 2))
+    driven = np.cumsum(rng.integers(1, 6, len(edges) + 1)) % 6
+    driven = driven[np.searchsorted(edges, t, side="right")]
+    return six_axes(rng, t) * (driven[:, None] == np.arange(6))
+
+
+def slow_pilot(rng: np.random.Generator, t: Array) -> Array:
+    """:func:`pilot` who rests the sticks longer, whose middle fifth does nothing."""
+    return pilot(rng, t, pauses=(5.0, 15.0), deadband=0.2)
 
 
 DRIVING: dict[str, Callable[[np.random.Generator, Array], Array]] = {
@@ -341,9 +362,14 @@ PARTIAL = {
     **{name: only(2 + i) for i, name in enumerate(("heave", "roll", "pitch", "yaw"))},
 }
 """Surge and sway rest."""
+SPARSE = {"axis by axis": axis_by_axis, "slow pilot": slow_pilot}
+"""Of which `explain` must not make more than they show."""
 # N m per sine of the tilt and per rad/s: of the autopilot that keeps the vehicle upright. It works
 # against the excitation of roll and pitch, so its gain is low there.
-LEVELLING = {"six-axis": (2.0, 0.3), "pilot": (4.0, 1.0), **dict.fromkeys(PARTIAL, (2.0, 0.3))}
+LEVELLING = {
+    **dict.fromkeys(("six-axis", "axis by axis", *PARTIAL), (2.0, 0.3)),
+    **dict.fromkeys(("pilot", "slow pilot"), (4.0, 1.0)),
+}
 
 
 # ------------------------------------------------------------------ the dive
@@ -380,7 +406,7 @@ def dive(
     """The motion under a driver and an autopilot; commands change only between two steps."""
     plant, per_command = Plant(vehicle, sea), round(1.0 / COMMAND_RATE / STEP)
     command_t = np.arange(round(duration * COMMAND_RATE)) / COMMAND_RATE
-    demand = (DRIVING | PARTIAL)[driving](rng, command_t)
+    demand = (DRIVING | PARTIAL | SPARSE)[driving](rng, command_t)
     demand[command_t < 1.0] = 0.0  # recording begins before the driving
     readings = rng.standard_normal((len(command_t), 6))
     level, damp = LEVELLING[driving]
@@ -459,6 +485,7 @@ def _coloured(rng: np.random.Generator, shape: tuple[int, int], std: float, time
 def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
     """(arrival [ns], role, message in ROS axes), in order of arrival."""
     duration, messages = truth.t[-1] - STEP, []
+    on_the_way = dict(zip(("odom", "imu", "wrench"), sea.on_the_way, strict=True))
 
     def clock(rate: float) -> Array:
         return np.arange(rng.uniform(0.3, 1.0) / rate, duration, 1.0 / rate)
@@ -466,7 +493,8 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
     def send(t: Array, role: str, ahead: float, make: Callable[[int, int], Message]) -> None:
         for i, ns in enumerate(np.round(1e9 * t).astype(np.int64).tolist()):
             stamp = EPOCH + ns + round(1e9 * ahead)
-            messages.append((EPOCH + ns + LATENCY, role, make(i, stamp)))
+            arrival = EPOCH + ns + LATENCY + round(1e9 * on_the_way[role])
+            messages.append((arrival, role, make(i, stamp)))
 
     # IMU
     t = clock(IMU_RATE)
@@ -514,6 +542,11 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
     if (frozen := t >= sea.frozen_from).any():  # a position that is dead reckoning stands, too
         linear[frozen] = 0.003 * rng.standard_normal((frozen.sum(), 3))
         position[frozen] = position[frozen][0]
+    if any(sea.tilt):
+        attitude = _tilted(attitude, np.broadcast_to([*sea.tilt, 0.0], (len(t), 3)))
+    if sea.heading:
+        half = 0.5 * sea.heading
+        attitude = product(np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), attitude)
     seen_q, flat = _ros_attitude(attitude), position[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     v, r = _FLIP * linear, _FLIP * angular
     send(

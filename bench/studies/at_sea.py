@@ -211,10 +211,11 @@ def _stream(seed: int, purpose: str) -> np.random.Generator:
 
 
 @lru_cache(maxsize=1)  # the fits of one dive follow each other
-def dive_of(case: str, driving: str, seed: int, seconds: float) -> Dive:
-    """Draw the vehicle and the strength of the case, dive, and write the bag."""
+def dive_of(case: str, driving: str, seed: int, seconds: float, draw: Draw | None = None) -> Dive:
+    """Draw the vehicle and the strength of the case, dive, and write the bag; ``draw``: of a case
+    that is not in the lists above."""
     vehicle = sea.draw_vehicle(_stream(seed, "vehicle"))
-    draw = CASES.get(case) or LIES[case]
+    draw = draw or CASES.get(case) or LIES[case]
     unknown = replace(Sea(), **draw(_stream(seed, case), vehicle))
     truth = sea.dive(vehicle, unknown, driving, seconds, _stream(seed, driving))
     messages = sea.measured(truth, unknown, _stream(seed, "sensors"))
@@ -434,7 +435,8 @@ def source() -> str:
     return digest(Path(sea.__file__).read_bytes(), here.encode())
 
 
-def _chosen(text: str, known: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
+def chosen(text: str, known: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
+    """The words of an option, all that are known by default."""
     asked = [word.strip() for word in text.split(",")] if text else list(known)
     if wrong := set(asked) - set(known):
         parser.error(f"there is no {', '.join(sorted(wrong))}: use {', '.join(known)}")
@@ -454,9 +456,9 @@ def main() -> int:
     )
     parser.add_argument("--folder", type=Path, default=Path("build/at_sea"))
     options = parser.parse_args()
-    cases = _chosen(options.cases, (*CASES, *LIES), parser)
-    driving = _chosen(options.driving, tuple(DRIVING), parser)
-    estimators = _chosen(options.estimators, ESTIMATORS, parser)
+    cases = chosen(options.cases, (*CASES, *LIES), parser)
+    driving = chosen(options.driving, tuple(DRIVING), parser)
+    estimators = chosen(options.estimators, ESTIMATORS, parser)
     asked = trials(cases, driving, estimators, options.dives, options.seconds)
     bars, path = Bars(), options.folder / "fits.jsonl"
     announce()

@@ -28,6 +28,7 @@ from rov_ident.discrepancy.findings import (
     noise_finding,
     residuals,
     sensor_findings,
+    unsure,
     with_parameters,
 )
 from rov_ident.discrepancy.held_out import (
@@ -74,6 +75,10 @@ _NO_TORQUE = (
 )
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"
+)
+_FILTERED = (
+    "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
+    "cause beside it is sure; record what the filter is fed with"
 )
 _ONLY_FITTED = (
     "the extended model cannot be simulated through all of the data: its values are those of the "
@@ -160,6 +165,9 @@ def explain(
             "anything"
         )
     say("comparing the sensors", 0.05)
+    bags, late = zip(*map(sensor_consistency.with_rates_of_the_attitude, bags), strict=True)
+    if validate is not None:
+        validate, _ = sensor_consistency.with_rates_of_the_attitude(validate)
     with_others = [*bags, *([] if validate is None else [validate])]
     as_headed = joined(bags)[0] if validate is None else validate
     turned, headings = repetition.turned(with_others, config)
@@ -201,6 +209,8 @@ def explain(
         records = repetition.Records(streams, bags, joined(bags)[1])
         of_dynamics = repetition.in_each(search, records, last, of_dynamics)
     found += of_dynamics
+    if any(late):  # a filter does more than delay, and what it does besides looks like any cause
+        found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
             found[i] = empirical_term.described(f, last.hypothesis)
@@ -227,6 +237,7 @@ def explain(
     everything = WindowedProblem(streams, blocks(streams))
     notes = [*choice.notes, *notes, *filter(None, [written.note, far])]
     notes += [_OWN_HEADINGS] if any(headings) else []
+    notes += [_FILTERED] if any(late) else []
     notes += [_NO_TORQUE] if streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)

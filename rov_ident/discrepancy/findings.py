@@ -129,6 +129,12 @@ def possibly_earlier(found: Finding) -> Finding:
     return dataclasses.replace(found, separable=False, manoeuvre=run, alternatives=others)
 
 
+def unsure(found: Finding) -> Finding:
+    """The finding as one that something else may be behind."""
+    run = EFFECTS[found.effect].manoeuvre
+    return dataclasses.replace(found, separable=False, manoeuvre=run)
+
+
 def parameters_of(final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:
     """Parameters with their standard deviations; damping for negative velocity is told as the
     coefficient that holds there, not as its difference from the other."""

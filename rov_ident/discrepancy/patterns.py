@@ -21,6 +21,7 @@ from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 
+INTERPLAY = "all|thrust of other axes"
 _KNOTS = 12.0  # s between the knots of a function of time
 _MOST_KNOTS = 40
 
@@ -118,6 +119,31 @@ class PatternSearch:
                 waves = np.stack([np.cos(angle), np.sin(angle)], axis=1)
                 found.append(Pattern(axis, "time", waves, frequency=frequency))
         return [p for p in found if not self._problem.guided[p.axis]]
+
+    def interplay(self, now: Fitted) -> Fitted | None:
+        """With thrust along one axis that depends on the thrust along others: what the supply
+        lacks, all thrusters lack, and one at an angle loses thrust with the speed along it, for
+        whichever axis it works (Fossen 2021, sec. 9.5). Which thrusters these are no wrench tells.
+        """
+        thrust, nu = (
+            self._problem.thrust(now.hypothesis.effects)[0],
+            now.linearisation.motion.middle,
+        )
+        scale = [np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-6) for x in (thrust, nu)]
+        load = np.abs(thrust) / scale[0]
+        force = np.zeros((*thrust.shape, 12, 6))
+        for i in np.flatnonzero(~self._problem.guided).tolist():
+            force[:, i, i] = thrust[:, i : i + 1] * load
+            force[:, i, 6 + i] = nu[:, i : i + 1] / scale[1][i] * load * scale[0][i]
+        force = force.reshape(len(thrust), 6, -1)
+        force = force[:, :, force.any(axis=(0, 1))]
+        keys: list[Key] = [(UNKNOWN, f"{INTERPLAY}|{i}") for i in range(force.shape[2])]
+        sensitivity = now.linearisation.sensitivity_to(force)
+        scores = scores_of(now.linearisation, keys, sensitivity)
+        found = scores.select([(k,) for k in keys], bounds)[0]
+        self._problem.patterns |= {key: force[:, :, i] for i, key in enumerate(keys)}
+        start = dict(zip(found.keys, found.change.tolist(), strict=True))
+        return refit(now.hypothesis.having(start), now.linearisation) if start else None
 
     def adopt(self, pattern: Pattern) -> None:
         """Make the parameters of a pattern known to the problem."""

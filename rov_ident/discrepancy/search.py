@@ -29,7 +29,7 @@ from rov_ident.discrepancy.hypothesis import (
 )
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
-from rov_ident.discrepancy.patterns import PatternSearch, choice_penalty
+from rov_ident.discrepancy.patterns import INTERPLAY, PatternSearch, choice_penalty
 from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening, Workers
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
@@ -39,6 +39,8 @@ from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
 
+LIKELIEST = (*HULL_DAMPING, "thrust_scale")  # thrust is never just as configured
+INTERPLAY_NAME = f"{UNKNOWN} {INTERPLAY}"  # it makes a name unsure, and is none itself
 LATE_THRUST = ("thruster_lag", "actuation_delay")  # what every thruster has a little of
 
 # What is likelier beforehand needs less evidence. The rates in docs/explain-bench.md were measured
@@ -201,13 +203,13 @@ class Search:
         return [f for f in fits if f is not None]
 
     def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
-        """Full fits of the best candidates, and of hull damping, whatever its score: a model that
-        lacks it can be too far off for its linearisation to show it."""
+        """Full fits of the best candidates, and of what is lacking most often, whatever its score:
+        a model that lacks it can be too far off for its linearisation to show it."""
         least = max(_LEAST_SHARE * candidates[0].score, 0.0) if candidates else 0.0
         chosen = [c for c in candidates[:_FITTED] if c.score >= least]
         white = sorted((c for c in candidates if c.white_score > 0.0), key=lambda c: -c.white_score)
         chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
-        chosen += [c for c in candidates if c.name in HULL_DAMPING and c not in chosen]
+        chosen += [c for c in candidates if c.name in LIKELIEST and c not in chosen]
         fits = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
         return [f for f in fits if f is not None]
 
@@ -281,7 +283,12 @@ class Search:
         ]
         fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
         fits.pop(name, None)  # two families share some coefficients
-        return fits | self.patterns.fits(rest)
+        fits |= self.patterns.fits(rest)
+        given = (*HULL_DAMPING, "thrust_advance")
+        if name in EFFECTS and EFFECTS[name].place == "wrench" and name not in given:
+            interplay = self.patterns.interplay(rest)
+            fits |= {} if interplay is None else {INTERPLAY_NAME: interplay}
+        return fits
 
     def _better(self, final: Fitted, name: str, trial: Trial) -> Fitted | None:
         """What should stand in place of ``name``, if anything. A pattern can imitate any cause, and
@@ -293,7 +300,7 @@ class Search:
         choices = [trial.rest]
         for rival, fitted in (trial.rivals or {}).items():
             margin = 0.0
-            if rival in EFFECTS and EFFECTS[rival].beyond == name:
+            if rival == INTERPLAY_NAME or (rival in EFFECTS and EFFECTS[rival].beyond == name):
                 continue
             if rival.startswith(UNKNOWN) and not name.startswith(UNKNOWN):
                 margin = 0.0 if rival in there else _MORE_THAN_NAMED

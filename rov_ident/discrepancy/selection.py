@@ -104,6 +104,15 @@ class Selected(NamedTuple):
         return self.gain / self.inflation - PENALTY * len(self.keys)
 
 
+class Rows(NamedTuple):
+    """Residuals ``error`` (R,) and their ``columns`` (R, P) of the parameters that are fitted
+    anyway; windows begin at the rows ``first``."""
+
+    columns: Array
+    error: Array
+    first: Indices
+
+
 def scores_of(linearisation: Linearisation, keys: Sequence[Key], columns: Array) -> "Scores":
     """Candidates ``keys``, of the sensitivities ``columns`` (R, C), on top of a fit."""
     base = linearisation.hypothesis.keys
@@ -121,7 +130,7 @@ class Scores:
         self,
         linear: LinearProblem,
         base: Sequence[Key],
-        fit: Linearisation | None = None,
+        fit: Linearisation | Rows | None = None,
         columns: Array | None = None,
     ) -> None:
         self._linear, self._base, self._fit = linear, linear.index(base), fit

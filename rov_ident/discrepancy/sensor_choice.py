@@ -135,7 +135,10 @@ def _heading_or_mounting(data: _Data, found: Choice, turned: bool) -> Choice:
 
 def _without_refuted(data: _Data, choice: Choice) -> Choice:
     """Without the corrections of velocities that make the prediction of the data surely worse."""
-    corrects = [n for n in choice.sensors if EFFECTS[n].sense or EFFECTS[n].late]
+    late = [n for n in choice.sensors if EFFECTS[n].late]
+    if late and not data.streams.has_pose:  # the clock of the IMU may be off instead
+        choice = dataclasses.replace(choice, unsure=choice.unsure | set(late))
+    corrects = [n for n in choice.sensors if EFFECTS[n].sense or n in late]
     corrects = [n for n in corrects if _moves_velocity(n, choice.sensors[n])]
     squares = data.dynamics(choice.sensors) if corrects else None
     for name in corrects:

@@ -29,15 +29,15 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
 )
 from rov_ident.core.jit import kernel
-from rov_ident.core.linalg import interpolated, scaled_inverse
+from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.quaternions import turned
 from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
-from rov_ident.discrepancy.selection import VERY_STRONG, Scores, variance_inflation
+from rov_ident.discrepancy.selection import VERY_STRONG, Rows, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
 from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
-from rov_ident.model.equations import Array
+from rov_ident.model.equations import Array, Indices
 from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
 
 # Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
@@ -49,6 +49,10 @@ _DRIFT = 1.0  # s; from which the pose tells velocity better than the IMU
 _STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
 _ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
 _MAX_GAP = 0.5  # s without a message: no step of dead reckoning reaches across
+_CLOCK = 0.05  # s by which the IMU's clock is set on and back: less than an ROV's response
+_BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
+_FEWEST_CLUSTERS = 6  # that a record must last: of fewer the scatter is not known
+_LATEST = 1.0  # s; as late as velocities may be
 _FEWEST_IMU = 8  # messages of the IMU; fewer are none
 _FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
 _CLUSTER = 5.0  # s; of which residuals are correlated, as long as the windows of the dynamics
@@ -70,17 +74,24 @@ class Comparison:
 
 _LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
 
-THRUST_TIMING = tuple(("thrust held", axis) for axis in "XYZ")
+TIMING = (*(("thrust held", axis) for axis in "XYZ"), ("clock", "imu"))
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
 To the accelerations of thrust that is a time offset of milliseconds, the drag that answers to them
-is not offset: together they would pass for a velocity scale of up to two percent.
+is not offset: together they would pass for a velocity scale of up to two percent. And the IMU's
+stamps may be early or late by milliseconds: only a pose of their own clock tells that velocities
+are old.
 """
 
 
 def sensor_parameters() -> list[Key]:
     """Keys of all parameters of the effects of the velocity sensor and the IMU."""
     return [(e.name, p.name) for e in _LIBRARY for p in e.parameters]
+
+
+def _keys() -> tuple[Key, ...]:
+    """Of the columns of a comparison."""
+    return (*sensor_parameters(), *TIMING)
 
 
 def comparisons(
@@ -104,12 +115,13 @@ def comparisons(
     reading = Reading(moving, turning, gyrating, here.specific_force)
     moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
     made: list[tuple[str, Array, Array, list[Array]]] = []
+    none = [np.zeros_like(here.linear)] * len(TIMING)
     if streams.has_pose:
         way, *ways = (
             integral(streams.t, np.einsum("kij,kj->ki", r, m.linear)) for m in (here, *moved)
         )
         y, columns = streams.position - way, [-w for w in ways]
-        made.append(("pose", streams.t, y, [*columns, *[np.zeros_like(y)] * 3]))
+        made.append(("pose", streams.t, y, [*columns, *none]))
     if inertial is not None:
         down = inertial.rotation[:, 2]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
@@ -123,15 +135,74 @@ def comparisons(
         held = np.clip(np.searchsorted(streams.demand_t, t, side="right") - 1, 0, None)
         thrust = streams.demand[held, :3] / config.model.body.mass
         columns += [r[inside][:, :, i] * thrust[:, i : i + 1] for i in range(3)]
+        clock = none[-1]
+        if streams.has_pose:
+            early, late = (
+                _DeadReckoning(
+                    dataclasses.replace(streams, imu_t=streams.imu_t + by), config, there, rate
+                ).velocity
+                for by in (-_CLOCK, _CLOCK)
+            )
+            clock = (early - late) / (2.0 * _CLOCK)
+        columns.append(clock[inside])
         made.append(("imu", t, y, columns))
         y = here.angular[inside] - here.gyro[inside]
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
-        made.append(("gyro", t, y, [*columns, *[np.zeros_like(y)] * 3]))
+        made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
     return [
         Comparison(name, *_whitened(t, y, columns, walk=name != "gyro"))
         for name, t, y, columns in made
         if len(t) > _FEWEST
     ]
+
+
+def with_rates_of_the_attitude(streams: Streams) -> tuple[Streams, bool]:
+    """The streams with angular velocities that are those of the odometry's attitude: copied from a
+    gyro they have its bias, which would pass for forces that turn the vehicle, and filtered they
+    are late, which would pass for late thrust. Only what surely differs is set right. Also, whether
+    they are later than the odometry's rate can hide."""
+    t, measured = streams.t, streams.nu[:, 3:]
+    turn, value, std = _turned_by(streams.orientation), np.zeros(4), np.zeros(4)
+    if t[-1] - t[0] < _FEWEST_CLUSTERS * _CLUSTER or not turn.any():
+        return streams, False
+    for _ in range(_ROUNDS):
+        rate = interpolated(t, measured, t + value[3]) - value[:3]
+        apart = integral(t, rate) - np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
+        grows = [np.outer(t - t[0], axis) for axis in np.eye(3)]
+        at, r, columns, _ = _whitened(t, apart, [*grows, rate[0] - rate], walk=True)
+        if len(at) < _FEWEST:
+            return streams, False
+        cluster = (at // _CLUSTER).astype(int)
+        normal, gradient = columns.T @ columns, np.zeros((cluster.max() + 1, 4))
+        np.add.at(gradient, cluster, columns * r[:, None])
+        change = scaled_solve(normal, gradient.sum(axis=0), 1e-9)
+        np.add.at(gradient, cluster, -columns * (columns @ change)[:, None])
+        # scores of whole clusters, as what differs otherwise lasts for seconds (White 1980)
+        std = np.sqrt((scaled_solve(normal, gradient.T, 1e-9) ** 2).sum(axis=1))
+        value = value + change
+    value = np.where(np.abs(value) > _BIASED * std, value, 0.0)
+    value[:3] *= np.ptp(measured, axis=0) > 0.0
+    value[3] = np.clip(value[3], 0.0, _LATEST)  # an attitude that is late is no fault of the rates
+    if not value.any():
+        return streams, False
+    rate = interpolated(t, measured, t + value[3]) - value[:3]
+    told = ", ".join(f"{bias:.2g}" for bias in value[:3])
+    note = (
+        f"the odometry's angular velocities are not those of its attitude: {told} rad/s too much, "
+        f"{value[3]:.2g} s late; set right"
+    )
+    nu = np.hstack([streams.nu[:, :3], rate])
+    late = bool(value[3] > 0.5 * np.median(np.diff(t)))
+    return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note)), late
+
+
+def _turned_by(q: Array) -> Array:
+    """Rotation vectors (N - 1, 3) from each attitude (N, 4) to the next, in the body."""
+    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
+    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, between[:, :1])
+    out: Array = angle * between[:, 1:] / np.maximum(size, 1e-12)
+    return out
 
 
 def _has_imu(streams: Streams) -> bool:
@@ -298,24 +369,40 @@ def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
     return out
 
 
-def _linear_problem(
-    found: Sequence[Comparison], spans: Sequence[tuple[float, float]]
-) -> LinearProblem:
+def _rows(found: Sequence[Comparison], spans: Sequence[tuple[float, float]]) -> Rows:
     """The rows whose time is in the spans, in clusters of _CLUSTER seconds."""
-    keys = (*sensor_parameters(), *THRUST_TIMING)
-    last = max((int(b.t[-1] / _CLUSTER) for b in found if len(b.t)), default=0) + 1
-    normal, gradient = np.zeros((len(keys), len(keys))), np.zeros((last, len(keys)))
-    rss, count = np.zeros(last), 0
-    for comparison in found:
-        keep = within(spans, comparison.t)
-        at = (comparison.t[keep] / _CLUSTER).astype(int)
-        columns, r = comparison.columns[keep], comparison.r[keep]
-        normal += columns.T @ columns
-        np.add.at(gradient, at, columns * r[:, None])
-        np.add.at(rss, at, r**2)
-        count += len(r)
-    filled = rss > 0.0
-    return LinearProblem(keys, normal, gradient[filled], rss[filled], count)
+    use = [within(spans, c.t) for c in found]
+    at = np.concatenate([np.zeros(0), *(c.t[k] // _CLUSTER for c, k in zip(found, use))])
+    order = np.argsort(at, kind="stable")
+    none = np.zeros((0, len(_keys())))
+    columns = np.concatenate([none, *(c.columns[k] for c, k in zip(found, use))])[order]
+    r = np.concatenate([np.zeros(0), *(c.r[k] for c, k in zip(found, use))])[order]
+    return Rows(columns, r, np.flatnonzero(np.diff(at[order], prepend=-1.0)))
+
+
+def _linear(rows: Rows) -> LinearProblem:
+    gradient = np.add.reduceat(rows.columns * rows.error[:, None], rows.first)
+    rss = np.add.reduceat(rows.error**2, rows.first)
+    normal = rows.columns.T @ rows.columns
+    return LinearProblem(_keys(), normal, gradient, rss, len(rows.error))
+
+
+def _fitted(rows: Rows, at: Indices) -> Rows:
+    """The rows with what the columns ``at`` explain taken off the residuals."""
+    base = rows.columns[:, at]
+    change = scaled_solve(base.T @ base, base.T @ rows.error, 1e-9)
+    return rows._replace(error=rows.error - base @ change)
+
+
+def _scores(rows: Rows, base: Sequence[Key]) -> Scores:
+    """Each effect is judged by the scatter that it leaves, as what is missing makes residuals
+    large; what nuisances explain is no scatter."""
+    at = _linear(rows).index(base)
+    rows = _fitted(rows, at)
+    others = np.setdiff1d(np.arange(len(_keys())), at)
+    return Scores(
+        _linear(rows), base, rows._replace(columns=rows.columns[:, at]), rows.columns[:, others]
+    )
 
 
 def common_squares(
@@ -368,25 +455,28 @@ def search(
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     for _ in range(_ROUNDS):
-        linear = _linear_problem(comparisons(streams, config, found), spans)
+        rows = _rows(comparisons(streams, config, found), spans)
+        linear = _linear(rows)
         free = [key for key in linear.keys if key not in fixed]
         chosen = [key for key in free if key[0] in found]
         units = [[k for k in free if k[0] == n] for n in library if n not in found]
         added = [k for unit in units for k in unit]
         if allowed is None:
-            best, score, _ = Scores(linear, [*chosen, *THRUST_TIMING]).select(units, bounds)
+            best, score, _ = _scores(rows, [*chosen, *TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
         both = [*chosen, *added]
         if not both:
             break
-        change, _ = Scores(linear, THRUST_TIMING).solve(both)
+        change, _ = Scores(linear, TIMING).solve(both)
         for (name, parameter), delta in zip(both, change.tolist(), strict=True):
             nulls = {p.name: p.null for p in EFFECTS[name].parameters}
             value = found.setdefault(name, nulls)[parameter] + delta
             found[name][parameter] = float(np.clip(value, *bounds((name, parameter))[1:]))
-        at = linear.index([*both, *THRUST_TIMING])
+        at = linear.index([*both, *TIMING])
         covariance = scaled_inverse(linear.normal[np.ix_(at, at)])
-        variance = np.maximum(np.diag(covariance), 0.0) * variance_inflation(linear, at)
+        variance = np.maximum(np.diag(covariance), 0.0) * variance_inflation(
+            _linear(_fitted(rows, at)), at
+        )
         width = np.sqrt(variance)[: len(both)]
         std = dict(zip(both, width.tolist(), strict=True))
         if not added and (np.abs(change) < _SETTLED * width).all():

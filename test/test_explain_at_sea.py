@@ -1,0 +1,186 @@
+"""What explain makes of sensors and thrusters as vehicles have them: samples of the study."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiers import more
+
+from bench.studies import at_sea
+from bench.studies.at_sea import dive_of
+from rov_ident import config as configuration
+from rov_ident.core.frames import quaternion_from_rotation_vector, quaternion_multiply
+from rov_ident.discrepancy import patterns, search, sensor_consistency
+from rov_ident.discrepancy.explain import explain
+from rov_ident.discrepancy.held_out import split
+from rov_ident.discrepancy.screening import Candidate
+from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
+from rov_ident.discrepancy.sensor_consistency import with_rates_of_the_attitude
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
+from rov_ident.sampling.raw_streams import Streams, gather
+
+
+def streams_of(case, driving, seed, seconds=60.0, draw=None):
+    dive = dive_of(case, driving, seed, seconds, draw)
+    config = configuration.from_parameters(dive.parameters)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "dive.mcap"
+        path.write_bytes(dive.bag)
+        bag = Bag(path)
+        topics = inputs.select(bag, config)
+        return dive, gather(inputs.messages(bag, topics, config), config), config
+
+
+# ------------------------------------------------------------------ rates and attitude
+
+
+def turning(bias=(0.0, 0.0, 0.0), late=0.0, noise=1.0, seconds=60.0):
+    """A vehicle that turns about all axes; odometry at 20 Hz whose rates are those of a gyro."""
+    rng, fine = np.random.default_rng(5), 0.005
+    t = np.arange(0.0, seconds, fine)
+    phase = rng.uniform(0.0, 6.0, (3, 1)) + np.outer([0.9, 1.3, 0.4], t)
+    rate = (np.array([[0.3], [0.2], [0.5]]) * np.sin(phase)).T
+    q = [np.array([1.0, 0.0, 0.0, 0.0])]
+    for step in 0.5 * fine * (rate[1:] + rate[:-1]):
+        q.append(quaternion_multiply(q[-1], quaternion_from_rotation_vector(step)))
+    attitude, k = np.array(q)[::10], np.arange(0, len(t), 10)
+    small = noise * 0.002 * rng.standard_normal((len(k), 3))
+    attitude = quaternion_multiply(attitude, quaternion_from_rotation_vector(small))
+    measured = rate[np.clip(k - round(late / fine), 0, len(t) - 1)] + bias
+    measured = measured + noise * 0.004 * rng.standard_normal(measured.shape)
+    none, nu = np.zeros((len(k), 3)), np.hstack([np.zeros((len(k), 3)), measured])
+    empty, three, four = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4))
+    streams = Streams(
+        t[k], none, attitude, nu, empty, three, three, t[k], np.ones((len(k), 6)), empty, four
+    )
+    return streams, rate[k]
+
+
+@pytest.mark.parametrize("bias", [(0.02, -0.01, 0.015), (0.0, 0.0, 0.005)])
+@pytest.mark.parametrize("late", [0.0, 0.1])
+def test_rates_are_those_of_the_attitude(bias, late):
+    streams, true = turning(bias, late)
+    mended, filtered = with_rates_of_the_attitude(streams)
+    assert filtered == (late > 0.0)
+    error = (mended.nu[:, 3:] - true)[2:-3]
+    assert np.abs(error.mean(axis=0)).max() < 5e-4
+    assert error.std() < 1.2 * 0.004
+    (note,) = mended.notes
+    assert "attitude" in note and f"{late:.2g} s late" in note
+
+
+def test_rates_that_agree_with_the_attitude_are_left_alone():
+    streams, _ = turning()
+    assert with_rates_of_the_attitude(streams)[0] is streams
+    early, _ = turning(late=-0.1)  # it is the attitude that is late
+    np.testing.assert_array_equal(with_rates_of_the_attitude(early)[0].nu, early.nu)
+    none = dataclasses.replace(
+        turning((0.02, 0.0, 0.0))[0], orientation=np.tile([1.0, 0.0, 0.0, 0.0], (1200, 1))
+    )
+    assert with_rates_of_the_attitude(none)[0] is none
+    short = turning((0.02, 0.0, 0.0), seconds=20.0)[0]
+    assert with_rates_of_the_attitude(short)[0] is short
+    seldom = turning((0.02, 0.0, 0.0))[0]
+    seldom = dataclasses.replace(
+        seldom, t=seldom.t[::20], orientation=seldom.orientation[::20], nu=seldom.nu[::20]
+    )
+    assert with_rates_of_the_attitude(seldom)[0] is seldom
+
+
+def test_without_pose_and_imu_no_sensor_is_judged():
+    streams, _ = turning()
+    config = configuration.from_parameters(dive_of("clean", "pilot", 1, 60.0).parameters)
+    assert sensors_of(streams, config)[0] == {}
+
+
+# ------------------------------------------------------------------ clocks
+
+
+def sensors_of(streams, config):
+    return sensor_consistency.search(streams, config, split(streams.duration)[0])
+
+
+def test_a_clock_of_the_imu_is_no_latency_of_the_velocities(monkeypatch):
+    _, streams, config = streams_of("clocks", "pilot", 0, 150.0)
+    assert "velocity_latency" not in sensors_of(streams, config)[0]
+    compared = sensor_consistency.comparisons
+
+    def on_one_clock(*of):
+        found = compared(*of)
+        for comparison in found:
+            comparison.columns[:, -1] = 0.0
+        return found
+
+    monkeypatch.setattr(sensor_consistency, "comparisons", on_one_clock)
+    assert "velocity_latency" in sensors_of(streams, config)[0]
+
+
+@pytest.mark.parametrize("driving", ["axis by axis", *more("slow pilot")])
+def test_late_velocities_show_in_a_few_reversals(driving):
+    """What the latency itself leaves of the sensors' agreement is not held against it."""
+    dive, streams, config = streams_of("late velocities", driving, 0, 150.0)
+    found, std = sensors_of(streams, config)
+    delay = found["velocity_latency"]["delay"]
+    assert abs(delay - dive.sea.velocity_delay) < 4.0 * std["velocity_latency", "delay"]
+
+
+# ------------------------------------------------------------------ thrust
+
+
+@pytest.fixture(scope="module")
+def begun():
+    _, streams, config = streams_of("clean", "pilot", 1)
+    there = Search(streams, config, split(streams.duration)[0])
+    return there, there.start()
+
+
+def test_a_thrust_scale_is_tried_whatever_its_score(begun, monkeypatch):
+    there, start = begun
+    likelier = [Candidate(f"effect {i}", {}, 100.0 - i, 100.0 - i) for i in range(9)]
+    candidates = [*likelier, Candidate("thrust_scale", {}, -5.0, 1.0)]
+    tried = []
+    monkeypatch.setattr(there, "_fit_candidate", lambda now, c: tried.append(c.name))
+    there.fit_best(start, candidates)
+    assert "thrust_scale" in tried and "effect 8" not in tried
+
+
+def test_thrust_of_other_axes_is_a_rival_of_drag_and_of_nothing_else(begun, monkeypatch):
+    there, start = begun
+    monkeypatch.setattr(there.patterns, "interplay", lambda rest: rest)
+    for name in ("oblique_damping", "crossflow", "tether_drag"):
+        assert INTERPLAY_NAME in there._rivals(start, name)
+    for name in ("quadratic_damping", "thruster_lag", "thrust_advance"):
+        assert INTERPLAY_NAME not in there._rivals(start, name)
+    assert search.INTERPLAY is patterns.INTERPLAY
+
+
+@pytest.mark.study
+def test_drag_that_thrusters_make_is_not_sure():
+    """One at an angle loses thrust with the speed along it, for whichever axis it works."""
+    _, streams, config = streams_of("advance", "six-axis", 0, 150.0, lambda *_: {"advance": 0.27})
+    found = {f.effect: f.separable for f in explain([streams], config).findings.effects}
+    assert found.keys() & {"oblique_damping", "crossflow", "tether_drag", "coriolis"}
+    assert not any(sure for name, sure in found.items() if name not in ("thrust_scale",))
+
+
+@pytest.mark.study
+def test_nothing_is_sure_beside_a_filter():
+    """It takes more than a delay from quick motion."""
+    _, streams, config = streams_of("smoothed odometry", "slow pilot", 0, 150.0)
+    findings = explain([streams], config).findings
+    assert {f.effect for f in findings.effects if f.separable} == {"velocity_latency"}
+    assert any("filtered" in note for note in findings.notes)
+
+
+@pytest.mark.study
+def test_a_bias_of_the_gyro_is_named_and_nothing_else():
+    dive, streams, config = streams_of("biases", "pilot", 0, 150.0)
+    assert dive.sea.gyro_is_shared
+    (found,) = explain([streams], config).findings.effects
+    assert found.effect == "imu_bias" and found.separable
+    for name, true in zip(("gx", "gy", "gz"), dive.sea.gyro_bias, strict=True):
+        assert found.parameters[name].value == pytest.approx(true, abs=4e-4)
+    assert at_sea.CASES["biases"]
