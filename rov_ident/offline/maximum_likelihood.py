@@ -327,7 +327,7 @@ class Likelihood:
     NaN where it is not known.
     ``held`` (n,): what kept its prior, as the axes ``noisy`` (6,) would teach it noise of the
     wrench's reading: their coefficients, and factors of the thrust there. Other parameters of
-    actuators are learnt from the other axes (a lag would smooth the noise away).
+    thrusters are learnt from the other axes (a lag would smooth the noise away).
     """
 
     values: Array
@@ -397,7 +397,7 @@ def maximise(
 
     looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
-    actuators = np.array([EFFECTS[name].of_actuators for name, _ in config.estimate_effects], bool)
+    of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
     taught = np.vstack([_rows(model.structure)[estimated[own]], factors_of(config)])
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
@@ -425,7 +425,7 @@ def maximise(
         # loud, and not a command that trembles, which the vehicle would follow
         noisy = (readings > SHARE * wrenches) & (samples * noise.floor > FOLLOWED * readings)
         held = (taught & noisy).any(axis=1) & (precision > 0.0)
-        noise = replace(noise, untaught=(actuators & ~held[own.sum() :])[:, None] & noisy)
+        noise = replace(noise, untaught=(of_thrust & ~held[own.sum() :])[:, None] & noisy)
         bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
         there = partial(look, gate=gate, noise=noise)
         theta = np.clip(theta, *bounds)
