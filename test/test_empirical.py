@@ -16,7 +16,7 @@ DIVE = hidden.Conditions(duration=120.0, odometry_rate=10.0, imu_rate=50.0)
 
 @pytest.mark.parametrize(
     "name, seed, strength",
-    [("slope", 2, 0.1), *more(("bump", 1, 0.15), ("shaking", 1, 0.2), ("heading_moment", 2, 0.3))],
+    [("heading_moment", 2, 0.3), *more(("bump", 1, 0.15), ("shaking", 1, 0.2), ("slope", 2, 0.1))],
 )
 def test_an_unknown_effect_is_mended_without_a_name(name, seed, strength, tmp_path):
     """80 % of the gain of the true wrench; what is written simulates it, and is read again."""
