@@ -125,6 +125,21 @@ def test_a_righting_moment_of_a_measured_attitude_is_no_news(kind):
     assert len(judged) >= 4 and np.mean(judged) < 1.3
 
 
+@pytest.mark.parametrize("late", [0.0, 0.2])
+def test_a_batch_fit_asks_odometry_and_imu(tmp_path, late):
+    """Odometry that is stamped late looks like a vehicle with a delay; the IMU knows better."""
+    rng = np.random.default_rng(7)
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(odometry_clock=late)
+    truth = sea.dive(vehicle, unknown, "pilot", 40.0, rng)
+    write_messages(tmp_path / "dive.mcap", sea.measured(truth, unknown, rng))
+    document = {"/**": {"ros__parameters": sea.told(vehicle, unknown, rng)}}
+    (tmp_path / "vehicle.yaml").write_text(yaml.safe_dump(document))
+    fit = ri.fit(tmp_path / "dive.mcap", tmp_path / "vehicle.yaml", "ls")
+    of_sensors = [t for t in fit.consistency.tests if t.name.startswith("odometry and IMU")]
+    assert len(of_sensors) == 3
+    assert all(t.passed for t in of_sensors) == (late == 0.0)
+
+
 def test_a_fit_says_so_and_widens_its_intervals(tmp_path):
     vehicle, parameters, messages = dive("sag", "six-axis", 3)
     write_messages(tmp_path / "dive.mcap", messages)

@@ -8,7 +8,7 @@ several, or on a Dask cluster, and the result is the same.
 import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -45,6 +45,7 @@ class Bag:
     notes: tuple[str, ...]
     samples: int
     duration: float  # s
+    contradictions: Mapping[str, float]  # as those of the record
 
 
 class Archive:
@@ -164,7 +165,15 @@ def _archive(
 
 def _parts(record: Record) -> tuple[Bag, Samples]:
     samples = smoothed(record.samples)
-    return Bag(record.path, record.sha256, record.notes, len(samples), record.duration), samples
+    bag = Bag(
+        record.path,
+        record.sha256,
+        record.notes,
+        len(samples),
+        record.duration,
+        record.contradictions,
+    )
+    return bag, samples
 
 
 def _tried(path: Path, config: Config, columns: bool = False) -> Outcome:

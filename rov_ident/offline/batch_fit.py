@@ -145,7 +145,10 @@ def fit_batch(
     judged = _as_read_by(archive, config, now)
     after = open_loop_rmse(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
-    consistency = consistency_of(config, prior, values, unexplained, lasting)
+    sensors: dict[str, float] = {}
+    for bag in judged.bags:
+        sensors |= {p: max(r, sensors.get(p, 0.0)) for p, r in bag.contradictions.items()}
+    consistency = consistency_of(config, prior, values, unexplained, lasting, sensors)
     consistency = consistency.with_open_loop(before, after, chance)
     if unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))

@@ -1,8 +1,8 @@
 """A bag as the estimators see it: its samples, and what had to be refused."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,7 @@ class Record:
     """The samples (k,) of SAMPLE of one bag, in its own time.
 
     ``notes`` say in words what was refused or lost; ``sha256`` is of the bag's bytes.
+    ``contradictions`` are test ratios of the odometry's parts against the IMU: 1 is expected.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class Record:
     counts: Counter[str]
     notes: tuple[str, ...]
     sha256: str
+    contradictions: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def duration(self) -> float:
@@ -86,7 +88,8 @@ def read_record(
             f"{path}: its messages make no samples"
             + (f": {'; '.join(notes)}" if notes else ", it is too short")
         )
-    return Record(Path(path), samples, counts, tuple(notes), bag.sha256)
+    contradictions = sampler.kinematic_filter.contradictions
+    return Record(Path(path), samples, counts, tuple(notes), bag.sha256, contradictions)
 
 
 def _said_of_inputs(config: Config, samples: NDArray[np.void]) -> list[str]:
