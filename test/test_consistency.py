@@ -114,7 +114,7 @@ def test_so_it_is_where_a_pilot_rests_between(case, kind, seed):
     assert State.CONVERGED not in report.states
 
 
-@pytest.mark.parametrize("kind", [*more("rls"), "ukf"])  # both have the same tests
+@pytest.mark.parametrize("kind", more("rls", "ukf"))
 def test_a_righting_moment_of_a_measured_attitude_is_no_news(kind):
     """Roll and pitch of a vehicle that a pilot steers: innovations as large as noise explains."""
     judged = []

@@ -42,7 +42,7 @@ def test_nothing_is_named_where_the_file_is_right(tmp_path):
     assert np.isfinite(list(found.baseline.values())).all() and len(found.baseline) == 6
 
 
-@pytest.mark.parametrize("effect", ["fin_lag", *more("fin_offset", "fin_saturation")])
+@pytest.mark.parametrize("effect", more("fin_lag", "fin_offset", "fin_saturation"))
 def test_a_hidden_effect_on_fins_is_named(effect, tmp_path):
     values, drawn = hidden(effect, 2)
     found = explained(configuration.load(REMUS), {effect: values}, tmp_path / "dive.mcap", 3)

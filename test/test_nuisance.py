@@ -225,7 +225,7 @@ def test_a_current_may_turn_unless_it_is_known(heavy):
     assert not drift_of(given, prior_of(given, effects=True).names).any()
 
 
-@pytest.mark.parametrize("kind", [*more("rls"), "ukf"])
+@pytest.mark.parametrize("kind", more("rls", "ukf"))
 def test_a_current_that_turns_is_followed(kind):
     """A third of its speed in ten minutes: at the end, the present one is known."""
     rng = np.random.default_rng([3, len(kind)])
