@@ -36,7 +36,7 @@ from rov_ident.estimation.shared import Problem
 from rov_ident.io.cdr import encode
 from rov_ident.io.topics import Reader
 from rov_ident.io.write_messages import write_messages
-from rov_ident.model.coefficients import ABSOLUTE, EXTENDED_SIZE, NEGATIVE, ONE, PLAIN
+from rov_ident.model.coefficients import ABSOLUTE, EXTENDED_SIZE, NEGATIVE, ONE, PLAIN, SQUARE
 from rov_ident.model.equations import Model
 from rov_ident.sampling import records
 from rov_ident.sampling.sampler import Sampler
@@ -115,7 +115,7 @@ class TextbookModel:
             self.unit[i, j, c] = self.unit[j, i, c] = 1.0
         self.unit = self.unit.reshape(36, self.first)
         self.rigid, self.restoring = model.body.mass_matrix, model.body.restoring
-        self.extended = np.empty(EXTENDED_SIZE)
+        self.extended = np.zeros(EXTENDED_SIZE)  # without inputs
         self.set(model.theta)
 
     def set(self, theta: np.ndarray) -> None:
@@ -128,7 +128,8 @@ class TextbookModel:
         e = self.extended
         e[ONE], e[PLAIN:ABSOLUTE] = 1.0, nu
         np.abs(nu, out=e[ABSOLUTE:NEGATIVE])
-        np.minimum(nu, 0.0, out=e[NEGATIVE:])
+        np.minimum(nu, 0.0, out=e[NEGATIVE:SQUARE])
+        e[SQUARE] = nu[0] * nu[0]
         a, b, c, d, m, n = (self.mass @ nu).tolist()
         u, v, w, p, q, r = nu.tolist()
         coriolis = np.array(
