@@ -230,28 +230,37 @@ def dive_of(case: str, driving: str, seed: int, seconds: float, draw: Draw | Non
         return Dive(vehicle, unknown, path.read_bytes(), parameters)
 
 
-def measure(trial: Trial) -> Line:
-    """The line of one fit."""
-    dive = dive_of(trial.case, trial.driving, trial.seed, trial.seconds)
+def answered(dive: Dive, question: Callable[[Path, Path], Line]) -> Line:
+    """What was drawn, and the answer to a question about the bag and the file; or why none."""
     line: Line = {
         "drawn": {f.name: v for f in fields(Sea) if (v := getattr(dive.sea, f.name)) != f.default}
     }
-    begin = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         bag, file = Path(folder) / "dive.mcap", Path(folder) / "vehicle.yaml"
         bag.write_bytes(dive.bag)
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dive.parameters}}))
         try:
-            fit = json.loads(ri.fit(bag, file, trial.estimator).to_json())
+            return line | question(bag, file)
         except ri.UserError as error:
             return line | {"refused": str(error)}
         except Exception as error:  # the study goes on; a crash is a bar missed
             return line | {"crashed": f"{type(error).__name__}: {error}"}
+
+
+def measure(trial: Trial) -> Line:
+    """The line of one fit."""
+    dive = dive_of(trial.case, trial.driving, trial.seed, trial.seconds)
+    return answered(dive, lambda bag, file: _fitted(dive, bag, file, trial.estimator))
+
+
+def _fitted(dive: Dive, bag: Path, file: Path, estimator: str) -> Line:
+    begin = time.monotonic()
+    fit = json.loads(ri.fit(bag, file, estimator).to_json())
     entries = {name: fit["coefficients"][name] for name in dive.vehicle.theta}
     lower = [e.get("lower", e["value"] - Z * e["std"]) for e in entries.values()]
     upper = [e.get("upper", e["value"] + Z * e["std"]) for e in entries.values()]
     verdict = fit.get("consistency", {})
-    return line | {
+    return {
         "seconds": time.monotonic() - begin,
         "names": list(entries),
         "true": list(dive.vehicle.theta.values()),

@@ -18,23 +18,21 @@ often it is named first is told, and of dives in which something is named 90 % m
 import argparse
 import json
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 import rov_ident as ri
 from bench.harness import Bars, Line, announce, digest, lines_of, table
 from bench.simulators import sea
-from bench.simulators.sea import DRIVING, SPARSE, Sea, Vehicle
+from bench.simulators.sea import DRIVING, SPARSE, Vehicle
 from bench.studies import at_sea
-from bench.studies.at_sea import ALONE, Draw, chosen, dive_of
+from bench.studies.at_sea import ALONE, Draw, answered, chosen, dive_of
 
 
 def _pose(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
@@ -120,22 +118,13 @@ class Trial:
 def measure(trial: Trial) -> Line:
     """What a dive is said to lack."""
     draw = CASES[trial.case][0]
-    dive = dive_of(trial.case, trial.driving, trial.seed, trial.seconds, draw)
-    line: Line = {
-        "drawn": {f.name: v for f in fields(Sea) if (v := getattr(dive.sea, f.name)) != f.default}
-    }
+    return answered(dive_of(trial.case, trial.driving, trial.seed, trial.seconds, draw), _explained)
+
+
+def _explained(bag: Path, file: Path) -> Line:
     begin = time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
-        bag, file = Path(folder) / "dive.mcap", Path(folder) / "vehicle.yaml"
-        bag.write_bytes(dive.bag)
-        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dive.parameters}}))
-        try:
-            said = json.loads(ri.explain(bag, file).to_json())
-        except ri.UserError as error:
-            return line | {"refused": str(error)}
-        except Exception as error:  # the study goes on; a crash is a bar missed
-            return line | {"crashed": f"{type(error).__name__}: {error}"}
-    return line | {
+    said = json.loads(ri.explain(bag, file).to_json())
+    return {
         "cpu": time.process_time() - begin,
         "verdict": said["verdict"],
         "found": [_told(f) for f in said["effects"]],
