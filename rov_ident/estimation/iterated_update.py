@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core.jit import interpreting
 from rov_ident.core.messages import Array
+from rov_ident.core.threads import one_blas_thread
 from rov_ident.estimation import rls
 from rov_ident.estimation.shared import Problem
 from rov_ident.sampling.sample import joined
@@ -40,12 +41,14 @@ class IteratedUpdate:
         """How many of the next samples (k,) are to be folded before :meth:`after` is asked."""
         if np.isnan(self._began) and len(samples):
             self._began = float(samples["t"][0])
-        due = np.flatnonzero(samples["t"] >= self._began + _TIMES[self._looks])
-        return int(due[0]) + 1 if len(due) else len(samples)
+        due = self._began + _TIMES[self._looks]
+        if samples["t"][-1] < due:
+            return len(samples)
+        return int(np.argmax(samples["t"] >= due)) + 1
 
     def after(self, task: Problem, state: rls.State, samples: NDArray[np.void]) -> rls.State:
         """The state to go on with, after these samples (k,) were folded."""
-        self._samples.append(samples.copy())
+        self._samples.append(samples)
         if samples["t"][-1] < self._began + _TIMES[self._looks]:
             return state
         state = self.look_back(task, state)
@@ -54,6 +57,7 @@ class IteratedUpdate:
             self.begin(state)
         return state
 
+    @one_blas_thread()
     def look_back(self, task: Problem, state: rls.State) -> rls.State:
         """The state with the window's samples folded about its estimate, if that has moved.
 

@@ -31,8 +31,8 @@ from rov_ident.sampling.sampler import Sampler
 Kind = Literal["rls", "ukf"]
 
 CENTRING_TIME = 1.0
-"""s; the sampler takes over the estimated parameters of effects this often. A choice: these take
-many seconds to be learnt, and each time costs a report, which is slower than a step."""
+"""s; the sampler takes over the estimated parameters of effects, and the excitation is summed up,
+this often. A choice: both take many seconds, and cost more than a step."""
 _RECENTRE = 0.2
 """Standard deviations by which a parameter of an effect must have moved for samples to follow: what
 a sample is then wrong by is of second order in this."""
@@ -222,7 +222,6 @@ class OnlineEstimator:
             self._state = self._update.look_back(self._task, self._state)
         return info
 
-    @one_blas_thread()
     def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
         """Fold samples (k,) into the estimate unless disabled; INFO (k,)."""
         if len(samples) == 0 or not self._enabled:
@@ -239,13 +238,16 @@ class OnlineEstimator:
         info = self._fold(samples)
         self._reading_noise = samples["reading_noise"][-1]
         self._last_t = float(samples["t"][-1])
-        for reason in self._module.REFUSALS:
-            if count := int(np.count_nonzero(info["reason"] == reason)):
-                self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += count
-        self._follow_excitation(float(samples["dt"].sum()))
-        if len(self._about) and not abs(self._last_t - self._centred) < CENTRING_TIME:
+        for reason in info["reason"].tolist():
+            if reason in self._module.REFUSALS:
+                self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += 1
+        self._window += sum(samples["dt"].tolist())
+        if not abs(self._last_t - self._centred) < CENTRING_TIME:
             self._centred = self._last_t
-            self._recentre()
+            with one_blas_thread():
+                self._follow_excitation()
+                if len(self._about):
+                    self._recentre()
         if self.monitor is not None and self.sampler.commands is not None:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:
@@ -364,13 +366,12 @@ class OnlineEstimator:
         self._gained, self._window = memory.gained.copy(), memory.window.copy()
         self._variance, self._safe = memory.variance, memory.safe
 
-    def _follow_excitation(self, elapsed: float) -> None:
+    def _follow_excitation(self) -> None:
         """Information gained per coefficient, in windows of EXCITATION_TIME."""
         variance: Array = self._module.variance(self._task, self._state)
         gained = self.prior.std**2 * (1.0 / variance - 1.0 / self._variance)
         self._gained[0] += np.maximum(gained, 0.0)
         self._variance = variance
-        self._window += elapsed
         if self._window >= EXCITATION_TIME:
             self._gained[1], self._gained[0] = self._gained[0], 0.0
             self._window[0] = 0.0

@@ -371,6 +371,7 @@ def _index_by_summary(path: Path, stream: IO[bytes]) -> _File | None:
     stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
     if stream.read() != MCAP0_MAGIC:
         return None
+    stream.seek(0)  # where the reader expects the magic
     try:
         summary = SeekingReader(stream).get_summary()
     except _DAMAGE:

@@ -91,9 +91,9 @@ def sample_type(size: int) -> np.dtype[np.void]:
 
 def one_sample(size: int) -> tuple[NDArray[np.void], NDArray[np.void], Array]:
     """A sample (1,) of :func:`sample_type`, zeros; and views: its SAMPLE, its sides (13, size)."""
-    whole = np.zeros(SAMPLE.itemsize + 104 * size, dtype=np.uint8)
-    sides = whole[SAMPLE.itemsize :].view(np.float64).reshape(13, size)
-    return whole.view(sample_type(size)), whole[: SAMPLE.itemsize].view(SAMPLE), sides
+    whole = np.zeros(1, dtype=sample_type(size))
+    sides: Array = np.ndarray((13, size), np.float64, whole, SAMPLE.itemsize)
+    return whole, np.ndarray(1, SAMPLE, whole), sides
 
 
 def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:

@@ -221,7 +221,7 @@ class Sampler:
         assert odometry is None or isinstance(odometry, Odometry)
         if odometry is not None and self._simulated is not None:
             odometry = odometry._replace(linear=self._simulated.v)
-        if odometry is not None and np.isfinite(odometry.position).all():
+        if odometry is not None and math.isfinite(sum(odometry.position.tolist())):
             self._position = odometry.position
         sample["position"][0] = self._position
         sample["reading_noise"][0] = self._acting.reading_noise
