@@ -542,6 +542,14 @@ def test_a_damaged_schema_or_channel_outside_chunks_is_passed_over(tmp_path):
                         assert raw.topic
 
 
+def test_a_complete_bag_is_not_walked_through(tmp_path, monkeypatch):
+    """Its summary says where everything is: an hour's bag is opened at once."""
+    path = tmp_path / "dive.mcap"
+    write(path, entries(20))
+    monkeypatch.setattr(bag_reader, "_index_by_walking", None)
+    assert Bag(path).topics["/odom"].message_count == 20
+
+
 def test_numbers_in_names_may_be_of_any_script(tmp_path):
     (tmp_path / "bag").mkdir()
     for name in ("²0a", "٣", "dive_10", "dive_2"):

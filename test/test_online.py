@@ -88,6 +88,17 @@ def test_converged(trained, heavy):
     assert report.units[report.names.index("X_u")] == "N s/m"
 
 
+def test_a_recording_is_followed_as_if_pushed(trained, wrong, messages):
+    """Samples that are folded together give the same to the last bit, and so what is known."""
+    estimator = OnlineEstimator(wrong, trained.kind)
+    estimator.follow(messages)
+    ours, theirs = estimator.report(), trained.report()
+    assert ours.values.tolist() == theirs.values.tolist()
+    assert ours.covariance.tolist() == theirs.covariance.tolist()
+    assert ours.excitation.tolist() == theirs.excitation.tolist()
+    assert estimator.counts == trained.counts
+
+
 def test_stamp_is_the_last_sample_s(trained, messages):
     last = max(m.stamp for role, m in messages if role in (ODOMETRY, IMU))
     assert abs(trained.report().stamp - last) <= 2

@@ -224,16 +224,12 @@ def fit(
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         if table:
             found = _beside_the_table(found, given, table)
-        say("simulating in open loop")
-        found = dataclasses.replace(
-            found, curves=tuple(batch_fit.curves(many, given, found.fitted))
-        )
         if validate is None:
             return found
         judge = stack.enter_context(_opened([_existing(validate)], given, say))
-        more = {"validation": batch_fit.validation(judge, given, found.fitted)}
-        judged = tuple(batch_fit.curves(judge, given, found.fitted))
-        return dataclasses.replace(found, more=found.more | more, judged=judged)
+        say("simulating in open loop")
+        told, judged = batch_fit.validation(judge, given, found.fitted)
+        return dataclasses.replace(found, more=found.more | {"validation": told}, judged=judged)
 
 
 def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:

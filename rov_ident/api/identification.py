@@ -276,7 +276,7 @@ def identify(
     judged: dict[str, Any] = {}
     if judge is not None:
         with _opened([judge], given, say) as held_back:
-            judged = validation(held_back, given, fitted.fitted)
+            judged, _ = validation(held_back, given, fitted.fitted)
     proposal, why = None, list(fitted.notes)
     try:  # what is planned drives surge and sway
         proposal = plan(fitted.fitted, used, progress=say) if explanation else None

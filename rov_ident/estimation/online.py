@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Literal, NamedTuple, Protocol
@@ -25,7 +25,7 @@ from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.estimation.shared import INFO, noisy_axes, too_noisy
-from rov_ident.sampling.sample import believed
+from rov_ident.sampling.sample import believed, joined
 from rov_ident.sampling.sampler import Sampler
 
 Kind = Literal["rls", "ukf"]
@@ -215,6 +215,28 @@ class OnlineEstimator:
         """
         return self.take(self.sampler.push(role, message))
 
+    def follow(self, messages: Iterable[tuple[str, Message]]) -> None:
+        """:meth:`push` all messages of a recording and :meth:`flush`, with the same result.
+
+        But samples wait until the next look at the parameters of effects, and are folded together.
+        """
+        waiting: list[NDArray[np.void]] = []
+        for role, message in messages:
+            samples = self.sampler.push(role, message)
+            if not len(samples):
+                continue
+            waiting.append(samples)
+            if self._is_due(samples):
+                self.take(joined(waiting))
+                waiting = []
+        if waiting:
+            self.take(joined(waiting))
+        self.flush()
+
+    def _is_due(self, samples: NDArray[np.void]) -> bool:
+        """Whether it is time to see what samples (k,) have taught."""
+        return not abs(float(samples["t"][-1]) - self._centred) < CENTRING_TIME
+
     def flush(self) -> NDArray[np.void]:
         """The input has ended or stopped: use what still waits for a late topic."""
         info = self.take(self.sampler.flush())
@@ -242,7 +264,7 @@ class OnlineEstimator:
             if reason in self._module.REFUSALS:
                 self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += 1
         self._window += sum(samples["dt"].tolist())
-        if not abs(self._last_t - self._centred) < CENTRING_TIME:
+        if self._is_due(samples):
             self._centred = self._last_t
             with one_blas_thread():
                 self._follow_excitation()

@@ -374,7 +374,7 @@ def _index_by_summary(path: Path, stream: IO[bytes]) -> _File | None:
     stream.seek(0)  # where the reader expects the magic
     try:
         summary = SeekingReader(stream).get_summary()
-    except _DAMAGE:
+    except (*_DAMAGE, OSError):  # OSError: shorter than what a complete file ends with
         return None
     if summary is None or summary.statistics is None:
         return None

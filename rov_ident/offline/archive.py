@@ -60,6 +60,10 @@ class Archive:
     ) -> None:
         self.bags, self.notes, self.each, self.reread = tuple(bags), tuple(notes), each, reread
 
+    def as_read_by(self, after: Config, before: Config) -> "Archive":
+        """The archive, read by ``before``, as ``after`` reads it: with its effects on the input."""
+        return self if after.effects == before.effects else self.reread(after, False)
+
     @property
     def samples(self) -> int:
         return sum(bag.samples for bag in self.bags)

@@ -15,22 +15,20 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import Prior, first_centre, gain_of, prior_of, rigid_body_covariance
 from rov_ident.core.errors import UserError
-from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
-from rov_ident.effects import Acting, compiled
 from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
 from rov_ident.model.coefficients import MOTIONS, Coefficient
-from rov_ident.model.equations import Model, RigidBody
+from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Samples, total
-from rov_ident.offline.fit import IDENTIFIABLE, Curves, Fit
-from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
+from rov_ident.offline.fit import IDENTIFIABLE, Fit
+from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_loop_rmse
 from rov_ident.reports.result import NORMAL, provenance
-from rov_ident.sampling.records import HORIZON, VELOCITIES, measured_motion, numbers, predicted
+from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
@@ -51,7 +49,6 @@ DRIVEN_UNSEEN = (
     "and sway rest (or record a DVL)"
 )
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
-_POINTS = 1500  # of a curve in a picture
 
 Say = Callable[[str], None]
 
@@ -114,7 +111,8 @@ def fit_batch(
         settings = replace(settings, readings=2 * settings.readings)
     tell = say or (lambda what: None)
     tell("open loop, as configured")
-    before = open_loop_rmse(archive, config)
+    read, given = archive, config
+    before = open_loop_rmse(read, given)
     notes = list(archive.notes)
     effects = kind == "ml" and not settings.stages
     config = config.with_nuisance if effects else config
@@ -142,7 +140,7 @@ def fit_batch(
         now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
-    judged = _as_read_by(archive, config, now)
+    judged = read.as_read_by(now, config)
     after = open_loop_rmse(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
     sensors: dict[str, float] = {}
@@ -178,6 +176,7 @@ def fit_batch(
         provenance=provenance(((b.path.name, b.sha256) for b in archive.bags), vehicle=config.name),
         notes=tuple(notes),
         more=more,
+        curves=tuple(curves(read, given, judged, now)),
     )
 
 
@@ -478,43 +477,19 @@ def _size(samples: Samples) -> tuple[Array, Array]:
     return np.sqrt(np.mean(samples["nu"] ** 2, axis=0)), noise
 
 
-def curves(archive: Archive, before: Config, after: Config) -> list[Curves]:
-    """One for each bag: the open-loop simulation in windows of HORIZON, before and after."""
-    known = archive.each(_curves, before.dynamics, compiled(before.effects))
-    found = _as_read_by(archive, before, after).each(
-        _curves, after.dynamics, compiled(after.effects)
-    )
-    return [
-        Curves(
-            bag.path.name, t, measured, simulated,
-            interpolated(later, fitted, t),
-        )
-        for bag, (t, measured, simulated), (later, _, fitted) in zip(
-            archive.bags, known, found, strict=True
-        )
-    ]  # fmt: skip
-
-
-def _curves(samples: Samples, model: Model, effects: Acting) -> tuple[Array, Array, Array]:
-    keep = slice(None, None, max(1, len(samples) // _POINTS))
-    simulated = predicted(model, samples, HORIZON, None, effects)[keep]
-    return samples["t"][keep], measured_motion(samples)[keep], simulated
-
-
-def _as_read_by(archive: Archive, before: Config, after: Config) -> Archive:
-    """The archive, read by ``before``, as ``after`` reads it: with its effects on the input."""
-    return archive if after.effects == before.effects else archive.reread(after, False)
-
-
-def validation(archive: Archive, before: Config, after: Config) -> dict[str, Any]:
-    """RMSE of the open-loop simulation on bags that no fit has seen, for the JSON of a fit."""
-    fitted = _as_read_by(archive, before, after)
-    return {
+def validation(
+    archive: Archive, before: Config, after: Config
+) -> tuple[dict[str, Any], tuple[Curves, ...]]:
+    """RMSE of the open-loop simulation on bags that no fit has seen, for the JSON of a fit; and
+    the simulation itself."""
+    fitted = archive.as_read_by(after, before)
+    told = {
         "horizon_s": HORIZON,
         "rmse_before": numbers(open_loop_rmse(archive, before)),
         "rmse": numbers(open_loop_rmse(fitted, after)),
         "bags": [{"file": bag.path.name, "sha256": bag.sha256} for bag in archive.bags],
     }
+    return told, tuple(curves(archive, before, fitted, after))
 
 
 def _noise(found: maximum_likelihood.Likelihood, free: NDArray[np.bool_]) -> dict[str, Any]:

@@ -18,10 +18,10 @@ from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
 from rov_ident.offline import archive
-from rov_ident.offline.prediction_error import by_chance, open_loop_rmse
+from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_loop_rmse
 from rov_ident.reports.result import Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON, Record, numbers, read_record
+from rov_ident.sampling.records import HORIZON, Record, numbers
 
 IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
@@ -29,17 +29,6 @@ IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have rem
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
 _SHOWN = 60.0  # s of motion in the picture of a fit
-
-
-@dataclass(frozen=True)
-class Curves:
-    """Measured and simulated velocities (k, 6) of a bag, thinned for a picture."""
-
-    name: str
-    t: Array
-    measured: Array
-    before: Array
-    after: Array
 
 
 SCALE = "thrust_scale.scale"
@@ -240,9 +229,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         estimator.next_record()
         if estimator.config.estimate_effects:  # samples depend on what is known by then
             bag = Bag(record.path)
-            for role, message in inputs.messages(bag, inputs.select(bag, config), config):
-                estimator.push(role, message)
-            estimator.flush()
+            estimator.follow(inputs.messages(bag, inputs.select(bag, config), config))
         else:
             estimator.take(record.samples)
     report = estimator.report()
@@ -256,10 +243,9 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     ]
     config = estimator.config
     found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
-    before = open_loop_rmse(archive.of_records(records), config)
-    if found.effects != config.effects:  # what acts is no longer what was read
-        records = [read_record(record.path, found) for record in records]
-    judged = archive.of_records(records)
+    read = archive.of_records(records)
+    judged = read.as_read_by(found, config)
+    before = open_loop_rmse(read, config)
     after = open_loop_rmse(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
     assert report.consistency is not None
@@ -274,10 +260,11 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         states=consistency.of_states(states),
         given=config,
         fitted=found,
-        samples=judged.samples,
-        duration=judged.duration,
+        samples=read.samples,
+        duration=read.duration,
         rmse=after,
         consistency=consistency,
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
+        curves=tuple(curves(read, config, judged, found)),
     )

@@ -1,11 +1,13 @@
 """The error of open-loop simulation over an archive, and what a fit's uncertainty makes of it."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
+from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State
 from rov_ident.effects import EFFECTS, Acting, compiled
@@ -13,8 +15,38 @@ from rov_ident.model.equations import Model
 from rov_ident.offline.archive import Archive, Samples
 from rov_ident.sampling.records import HORIZON, measured_motion, predicted
 
+_POINTS = 1500  # of a curve in a picture
 _DRAWS = 8  # the RMS over them is known to 25 %
 _STEP = 0.1  # standard deviations: small enough to be linear, and to stay physical
+
+
+class Curves(NamedTuple):
+    """Measured and simulated velocities (k, 6) of a bag, thinned for a picture."""
+
+    name: str
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+def curves(read: Archive, before: Config, reread: Archive, after: Config) -> list[Curves]:
+    """One for each bag: the open-loop simulation in windows of HORIZON with one configuration and
+    another, and the archive as each of them reads it."""
+    known = read.each(_curves, before.dynamics, compiled(before.effects))
+    found = reread.each(_curves, after.dynamics, compiled(after.effects))
+    return [
+        Curves(bag.path.name, t, measured, simulated, interpolated(later, fitted, t))
+        for bag, (t, measured, simulated), (later, _, fitted) in zip(
+            read.bags, known, found, strict=True
+        )
+    ]
+
+
+def _curves(samples: Samples, model: Model, effects: Acting) -> tuple[Array, Array, Array]:
+    keep = slice(None, None, max(1, len(samples) // _POINTS))
+    simulated = predicted(model, samples, HORIZON, None, effects)[keep]
+    return samples["t"][keep], measured_motion(samples)[keep], simulated
 
 
 def open_loop_rmse(

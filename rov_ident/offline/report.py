@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rov_ident.core.messages import Array
-from rov_ident.offline.fit import Curves, Fit
+from rov_ident.offline.fit import Fit
+from rov_ident.offline.prediction_error import Curves
 from rov_ident.reports import plots
 from rov_ident.reports.html import beside_table, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
