@@ -182,10 +182,9 @@ class EffectJacobians:
             self._motion, sample, self._acts, self._impulse, self._time, self._scale,
             self._velocity, self._about, self._followed, sides,
         )  # fmt: skip
-        for (i, *_), (low, high) in zip(self._steers, self._steered[:, :, 0], strict=True):
-            motion = self._motion
-            change = _force(motion, sample, low) - _force(motion, sample, high)
-            sides[:6, i] = change / self._width[i]
+        for k, (i, *_) in enumerate(self._steers):
+            low, high = (_force(self._motion, sample, inputs) for inputs in self._steered[k, :, 0])
+            sides[:6, i] = (low - high) / self._width[i]
         self._impulse[:] = 0.0
         self._time = 0.0
 

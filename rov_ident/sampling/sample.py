@@ -91,9 +91,10 @@ def sample_type(size: int) -> np.dtype[np.void]:
 
 def one_sample(size: int) -> tuple[NDArray[np.void], NDArray[np.void], Array]:
     """A sample (1,) of :func:`sample_type`, zeros; and views: its SAMPLE, its sides (13, size)."""
-    whole = np.zeros(1, dtype=sample_type(size))
-    sides: Array = np.ndarray((13, size), np.float64, whole, SAMPLE.itemsize)
-    return whole, np.ndarray(1, SAMPLE, whole), sides
+    # np.zeros fills records field by field
+    buffer = bytearray(SAMPLE.itemsize + 104 * size)
+    whole, sample = np.frombuffer(buffer, sample_type(size)), np.frombuffer(buffer, SAMPLE, 1)
+    return whole, sample, np.ndarray((13, size), np.float64, buffer, SAMPLE.itemsize)
 
 
 def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
