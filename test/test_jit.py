@@ -15,8 +15,10 @@ import pytest
 from packaging.requirements import Requirement
 
 import rov_ident
+from rov_ident.config import load
 from rov_ident.core import jit
 from rov_ident.core.jit import Compiler, interpret, interpreting, kernel, record, stop_interpreting
+from rov_ident.estimation.compilation import ensure_compiled
 
 PACKAGE = Path(rov_ident.__file__).parent
 ROOT = PACKAGE.parent
@@ -40,6 +42,38 @@ import scipy.linalg.cython_blas
 def test_who_only_runs_kernels_loads_no_linear_algebra(heavy_path):
     """A node does no more. Whoever needs it can load it later."""
     subprocess.run([sys.executable, "-c", _ONLY_RUN, heavy_path], check=True)
+
+
+_WARM = """
+import sys
+from numba.core import event
+
+class Listener(event.Listener):
+    on_end = lambda self, event: None
+    on_start = lambda self, event: compiled.append(event.data["dispatcher"].py_func)
+
+compiled = []
+event.register("numba:compile", Listener())
+from rov_ident import config
+from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.simulation import virtual_sensors
+given = config.load(sys.argv[1], "rls_node")
+assert given.with_nuisance.estimate_effects
+estimator = OnlineEstimator(given, sys.argv[2])
+estimator.follow(m[1:] for m in virtual_sensors.dive(given, "steps", 3.0, seed=1).messages)
+estimator.report()
+assert estimator.stamp > 0 and not compiled, compiled
+"""
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_nothing_is_compiled_by_the_second_to_run_it(kind):
+    """Each start would take a second more, and memory for good."""
+    path = str(ROOT / "config" / "bluerov2_heavy.yaml")
+    ensure_compiled(load(path, "rls_node"), kind)
+    command = [sys.executable, "-c", _WARM, path, kind]
+    subprocess.run(command, capture_output=True)  # whoever is first
+    subprocess.run(command, check=True)
 
 
 POINT = record([("x", "f8"), ("v", "f8", (2,))])

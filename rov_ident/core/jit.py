@@ -97,7 +97,7 @@ lean = _decorator(**_LEAN)
 released = _decorator(nogil=True, **_LEAN)
 inner = _decorator(**_INNER)
 reordered = _decorator(fastmath={"contract", "reassoc", "nsz"}, **_INNER)
-inlined = _decorator(inline="always")
+inlined = _decorator(inline="always", cache=True)  # cached for those who call it from Python
 
 
 def only_run() -> None:
