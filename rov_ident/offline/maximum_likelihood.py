@@ -113,7 +113,9 @@ class Noise:
         """Density (k, 6) of the wrench's error."""
         lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
         variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
-        turned = np.square(np.cross(self.restoring, samples["down"][:, None])).sum(axis=2)
+        # |r x down|^2, of a unit vector
+        along = (samples["down"] @ self.restoring.T) ** 2
+        turned = np.maximum(np.sum(self.restoring**2, axis=1) - along, 0.0)
         return self.floor + lasting * variance + samples["tilt"][:, None] * turned
 
 
@@ -172,7 +174,8 @@ def one_pass(
     ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
     measurement.
     """
-    return _passed(samples, model, estimated, noise, free, gate, effects, np.zeros((3, 0, 6)))
+    nothing = np.zeros((3, 0, 6))
+    return _passed(parts(samples), model, estimated, noise, free, gate, effects, nothing)
 
 
 class Innovations(NamedTuple):
@@ -193,8 +196,19 @@ def innovations(
     effects: Array = _NONE,
 ) -> Innovations:
     """What the filter finds in each sample."""
-    out = np.full((3, len(samples), 6), np.nan)
-    _passed(samples, model, np.zeros(0, dtype=np.int64), noise, free, gate, effects, out)
+    return _innovations(parts(samples), model, noise, free, gate, effects)
+
+
+def _innovations(
+    split: tuple[Samples, Array],
+    model: Model,
+    noise: Noise,
+    free: NDArray[np.bool_] | None,
+    gate: float,
+    effects: Array,
+) -> Innovations:
+    out, nothing = np.full((3, len(split[0]), 6), np.nan), np.zeros(0, dtype=np.int64)
+    _passed(split, model, nothing, noise, free, gate, effects, out)
     return Innovations(*out)
 
 
@@ -218,7 +232,7 @@ def whiteness(
 
 
 def _passed(
-    samples: Samples,
+    split: tuple[Samples, Array],
     model: Model,
     estimated: NDArray[np.int64],
     noise: Noise,
@@ -228,8 +242,7 @@ def _passed(
     out: Array,
 ) -> Pass:
     free = np.ones(6, dtype=bool) if free is None else free
-    samples, sides = parts(samples)
-    sides = sides if len(effects) else NO_SIDES
+    samples, sides = split if len(effects) else (split[0], NO_SIDES)
     if len(effects) and noise.untaught.any():
         sides = sides.copy()
         sides[:, :6][:, noise.untaught.T] = 0.0
@@ -282,9 +295,8 @@ def noise_slope(
 
     Without ``process`` only the measurements' are looked at.
     """
-    samples = samples[:_NOISE_SAMPLES]
-    levels = _levels(noise)
-    base = innovations(samples, model, noise, free, _GATE, effects)
+    split, levels = parts(samples[:_NOISE_SAMPLES]), _levels(noise)
+    base = _innovations(split, model, noise, free, _GATE, effects)
     keep = np.isfinite(base.e)
     e, s = base.e[keep], base.s[keep]
     free_levels = np.concatenate([free, free & process, [process]])
@@ -292,9 +304,7 @@ def noise_slope(
     for i in np.flatnonzero(free_levels):
         moved = levels.copy()
         moved[i] += _STEP_NOISE
-        there = innovations(
-            samples, model, _at_levels(noise, moved, process), free, effects=effects
-        )
+        there = _innovations(split, model, _at_levels(noise, moved, process), free, np.inf, effects)
         slopes[i, 0] = (there.e[keep] - e) / (_STEP_NOISE * np.sqrt(s))
         slopes[i, 1] = np.log(there.s[keep] / s) / _STEP_NOISE
     unit = e / np.sqrt(s)
