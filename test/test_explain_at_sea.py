@@ -1,5 +1,6 @@
 """What explain makes of sensors and thrusters as vehicles have them: samples of the study."""
 
+import copy
 import dataclasses
 import tempfile
 from pathlib import Path
@@ -10,13 +11,17 @@ from tiers import more
 
 from bench.studies import at_sea
 from bench.studies.at_sea import dive_of
+from bench.studies.explain_at_sea import CASES
 from rov_ident import config as configuration
 from rov_ident.core.frames import quaternion_from_rotation_vector, quaternion_multiply
 from rov_ident.discrepancy import patterns, search, sensor_consistency
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import split
+from rov_ident.discrepancy.linearisation import linearise
+from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
+from rov_ident.discrepancy.sensor_choice import noise_of_wrench
 from rov_ident.discrepancy.sensor_consistency import with_rates_of_the_attitude
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -127,6 +132,26 @@ def test_late_velocities_show_in_a_few_reversals(driving):
     assert abs(delay - dive.sea.velocity_delay) < 4.0 * std["velocity_latency", "delay"]
 
 
+# ------------------------------------------------------------------ noise of the reading
+
+
+@pytest.mark.parametrize(
+    ("case", "driving", "noisy"),
+    [
+        ("trim and biases", "axis by axis", False),
+        *more(("trim", "axis by axis", False), ("trim", "slow pilot", False)),
+        *more(("wrench noise", "pilot", True), ("wrench noise", "axis by axis", True)),
+    ],
+)
+def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy):
+    """An autopilot passes on the noise of its gyro. Neglecting it would hide a trim."""
+    _, streams, config = streams_of(case, driving, 0, 150.0, CASES[case][0])
+    streams, _ = with_rates_of_the_attitude(streams)
+    there = Search(streams, config, split(streams.duration)[0])
+    assert there.problem.reading_std[3:5].all()
+    assert bool(noise_of_wrench(there, there.start())) == noisy
+
+
 # ------------------------------------------------------------------ thrust
 
 
@@ -135,6 +160,39 @@ def begun():
     _, streams, config = streams_of("clean", "pilot", 1)
     there = Search(streams, config, split(streams.duration)[0])
     return there, there.start()
+
+
+def test_noise_has_not_made_more_than_there_is(begun):
+    """A model that nearly tumbles makes any amount of noise, and would win by what is taken off."""
+    there, start = begun
+    for std, some in ((0.01, True), (1e3, False)):
+        problem = copy.copy(there.problem)
+        problem.reading_std = np.full(6, std)
+        problem._forget()
+        starts = start.linearisation.starts
+        fitted = Fitted(
+            start.hypothesis, linearise(problem, start.hypothesis, starts, start.noise), True
+        )
+        assert bool(fitted.noise_squares.any()) == some
+        assert 0.0 < fitted.squares <= fitted.rss
+
+
+def test_a_rival_begins_where_its_last_fit_has_ended(begun):
+    there, start = begun
+    current = dict.fromkeys([("ocean_current", n) for n in ("north", "east", "down")], 0.2)
+    lag = {("thruster_lag", "time_constant"): 0.3}
+    candidates = [Candidate(k[0], v, 9.0, 9.0) for v in (current, lag) for k in list(v)[:1]]
+    steps, squares = [], []
+    for _ in range(2):
+        before = there.problem.steps_simulated
+        squares.append(
+            {tuple(f.hypothesis.keys): f.squares for f in there.fit_best(start, candidates)}
+        )
+        steps.append(there.problem.steps_simulated - before)
+    assert squares[0].keys() == squares[1].keys()
+    for keys, value in squares[0].items():
+        assert squares[1][keys] < value + 1e-4 * start.linear.count
+    assert steps[1] < 0.7 * steps[0]
 
 
 def test_a_thrust_scale_is_tried_whatever_its_score(begun, monkeypatch):

@@ -89,9 +89,9 @@ class Linearisation:
             q, r = np.linalg.qr(j0[a:b].reshape(6 * (b - a), -1))
             self._q.append(q)
             self._r.append(r)
-        spans = zip(self._q, self._spans(), strict=True)
-        self._start_error = [q.T @ error[a:b].ravel() for q, (a, b) in spans]
-        self.error = self._projected(error.reshape(-1, 1))[:, 0]
+        error = error.reshape(-1, 1)
+        self._start_error = [x[:, 0] for x in self._eliminate(error)]
+        self.error = error[:, 0]
         self._squares = np.add.reduceat(self.error**2, self.first)
         self._sensitivities: tuple[list[Array], Array, LinearProblem] | None = None
 
@@ -101,13 +101,10 @@ class Linearisation:
         lock in Python 3.11."""
         if self._sensitivities is None:
             keys = self.hypothesis.keys
-            raw = self.unprojected(self.problem.columns(self.hypothesis, self.motion, keys))
-            spans = zip(self._q, self._spans(), strict=True)
-            starts = [q.T @ raw[6 * a : 6 * b] for q, (a, b) in spans]
-            columns = self._projected(raw)
+            columns = self.unprojected(self.problem.columns(self.hypothesis, self.motion, keys))
+            starts = self._eliminate(columns)
             count = int(np.count_nonzero(self._weight)) - 6 * len(self.first)
-            normal = columns.T @ columns
-            gradient = np.add.reduceat(columns * self.error[:, None], self.first)
+            normal, gradient = columns.T @ columns, self._gradient(columns)
             linear = LinearProblem(tuple(keys), normal, gradient, self._squares, count)
             self._sensitivities = starts, columns, linear
         return self._sensitivities
@@ -136,18 +133,27 @@ class Linearisation:
         edges = [*self._rows.tolist(), len(self.problem.nodes)]
         return itertools.pairwise(edges)
 
-    def _projected(self, raw: Array) -> Array:
-        """Columns (6 N, P) without what the initial velocities explain, in place."""
+    def _eliminate(self, raw: Array) -> list[Array]:
+        """Take from columns (6 N, P) what the initial velocities of each window explain, and return
+        that."""
+        out = []
         for q, (a, b) in zip(self._q, self._spans(), strict=True):
             part = raw[6 * a : 6 * b]
-            part -= q @ (q.T @ part)
-        return raw
+            out.append(q.T @ part)
+            part -= q @ out[-1]
+        return out
+
+    def _gradient(self, columns: Array) -> Array:
+        """Of each window (W, P), of columns (6 N, P)."""
+        spans = [slice(6 * a, 6 * b) for a, b in self._spans()]
+        return np.stack([columns[s].T @ self.error[s] for s in spans])
 
     def over_variance(self, error: Array) -> tuple[Array, Array]:
         """Of a single window with more noise: the residuals (N, 6) over the variance of that noise
         and their own, and the square that is expected of them."""
         assert self.more is not None
-        back = self._projected(self.more.whitening.copy())
+        back = self.more.whitening.copy()
+        self._eliminate(back)
         return (back.T @ error).reshape(-1, 6), np.sum(back**2, axis=0).reshape(-1, 6)
 
     def pushed_by(self, error: Array) -> Array:
@@ -157,7 +163,9 @@ class Linearisation:
 
     def sensitivity_to(self, force: Array) -> Array:
         """Sensitivities (6 N, C) of the simulated velocities to wrenches (K, 6, C)."""
-        return self._projected(self.unprojected(force))
+        out = self.unprojected(force)
+        self._eliminate(out)
+        return out
 
     def unprojected(self, force: Array) -> Array:
         """The same (6 N, C) with the initial velocities held."""
@@ -168,8 +176,7 @@ class Linearisation:
 
     def having(self, keys: Sequence[Key], columns: Array) -> LinearProblem:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
-        cross = self.columns.T @ columns
-        gradient = np.add.reduceat(columns * self.error[:, None], self.first)
+        cross, gradient = self.columns.T @ columns, self._gradient(columns)
         own = self.linear
         normal = np.block([[own.normal, cross], [cross.T, columns.T @ columns]])
         both = np.hstack([own.gradient, gradient])

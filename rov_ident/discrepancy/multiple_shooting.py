@@ -93,29 +93,13 @@ def guided_by(eq: Equations, guided: NDArray[np.bool_]) -> Equations:
 
 def thrust(steps: Steps, acting: Acting) -> Array:
     """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
-    wrench = _acted(steps, acting)
-    share = np.diff(steps.piece_t)[:, None] * wrench
-    length = np.diff(steps.t)[:, None]
-    mean = np.add.reduceat(share, steps.piece) / length
-    middle, of_step = (0.5 * (t[1:] + t[:-1]) for t in (steps.piece_t, steps.t))
-    late = middle - np.repeat(of_step, np.diff(np.append(steps.piece, len(wrench))))
-    slope = 12.0 / length**3 * np.add.reduceat(share * late[:, None], steps.piece)
-    return np.stack([mean, slope])
-
-
-def mean_thrust(steps: Steps, acting: Acting) -> Array:
-    """The mean (K, 6) alone."""
-    share = np.diff(steps.piece_t)[:, None] * _acted(steps, acting)
-    mean: Array = np.add.reduceat(share, steps.piece) / np.diff(steps.t)[:, None]
-    return mean
-
-
-def _acted(steps: Steps, acting: Acting) -> Array:
-    """The wrench (J, 6) in each piece, after the input effects."""
-    wrench = steps.demand.copy()
+    wrench = steps.demand
     if acting.inputs.any():
+        wrench = wrench.copy()
         _thrust(acting, memory(), steps.piece_t, wrench)
-    return wrench
+    out = np.zeros((2, len(steps.piece), 6))
+    _means(steps.piece_t, wrench, steps.t, steps.piece, out)
+    return out
 
 
 def shoot(
@@ -174,6 +158,19 @@ def wrenches(eq: Equations, steps: Steps, thrust: Array, motion: Motion) -> Arra
 def _thrust(acting, state, t, wrench):
     for k in range(len(wrench)):
         act(acting, state, t[k], t[k + 1] - t[k], wrench[k])
+
+
+@released
+def _means(piece_t, wrench, t, piece, out):
+    for k in range(len(piece)):
+        end = piece[k + 1] if k + 1 < len(piece) else len(wrench)
+        middle, length = 0.5 * (t[k] + t[k + 1]), t[k + 1] - t[k]
+        for j in range(piece[k], end):
+            share = (piece_t[j + 1] - piece_t[j]) / length
+            late = 0.5 * (piece_t[j] + piece_t[j + 1]) - middle
+            for i in range(6):
+                out[0, k, i] += share * wrench[j, i]
+                out[1, k, i] += 12.0 / length**2 * share * late * wrench[j, i]
 
 
 @released

@@ -72,12 +72,15 @@ class Fitted:
 
     @cached_property
     def noise_squares(self) -> Array:
-        """Squared residuals (draws,) that noise of the wrench's reading makes."""
+        """Squared residuals (draws,) that noise of the wrench's reading makes; none where each draw
+        makes more than there are: a model that nearly tumbles makes any amount of so little noise
+        that it is none of the vehicle's."""
         problem = self.linearisation.problem
         if not problem.reading_std.any():
             return np.zeros(DRAWS)
         force = problem.noisy_thrust(self.hypothesis.effects)
-        return np.sum(self.linearisation.sensitivity_to(force) ** 2, axis=0)
+        squares = np.sum(self.linearisation.sensitivity_to(force) ** 2, axis=0)
+        return squares if squares.min() < self.rss else np.zeros(DRAWS)
 
     @property
     def squares(self) -> float:
@@ -125,11 +128,17 @@ def fit(problem: WindowedProblem, h: Hypothesis) -> Fitted | None:
 
 
 def refit(
-    h: Hypothesis, start: Linearisation, iterations: int = _ITERATIONS, update_noise: bool = False
+    h: Hypothesis,
+    start: Linearisation,
+    iterations: int = _ITERATIONS,
+    update_noise: bool = False,
+    known: Hypothesis | None = None,
 ) -> Fitted | None:
     """Fit a hypothesis on the windows of ``start``, from its initial velocities and its noise; None
-    where it cannot be simulated."""
-    begin = _adapted(h, start)
+    where it cannot be simulated. ``known``: the same parameters with other values, from which the
+    fit begins if these are likelier."""
+    begins = [_adapted(values, start) for values in (h, known) if values is not None]
+    begin = min(filter(None, begins), key=lambda x: x.rss, default=None)
     if begin is None:
         return None
     fitted = _gauss_newton(begin, iterations)

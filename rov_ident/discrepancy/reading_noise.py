@@ -8,6 +8,8 @@ corrected score of Nakamura 1990). The live watch, which has scores and no fits,
 instead (`wrench_smoothing`).
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from rov_ident.core.messages import Array
@@ -36,5 +38,10 @@ def jitter(demand: Array, std: Array) -> Array:
 def draws(std: Array, count: int) -> Array:
     """Noise (DRAWS, count, 6) with standard deviations (6,): the same ones every time, so that
     models are compared under the same noise."""
-    out: Array = np.random.default_rng(0).standard_normal((DRAWS, count, 6)) * std
+    return _normal(count) * std
+
+
+@lru_cache(maxsize=2)
+def _normal(count: int) -> Array:
+    out: Array = np.random.default_rng(0).standard_normal((DRAWS, count, 6))
     return out

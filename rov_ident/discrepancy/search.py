@@ -94,6 +94,7 @@ class Search:
         self._workers = Workers(self.problem)
         self.screening = Screening(self.problem, self._workers)
         self.patterns = PatternSearch(self.problem, self._workers)
+        self._ends: dict[frozenset[Key], Hypothesis] = {}  # of the last fit of these parameters
         self.cut_short = False  # whether something was left untried
 
     def _budget_spent(self) -> bool:
@@ -210,16 +211,23 @@ class Search:
         white = sorted((c for c in candidates if c.white_score > 0.0), key=lambda c: -c.white_score)
         chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
         chosen += [c for c in candidates if c.name in LIKELIEST and c not in chosen]
-        fits = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
-        return [f for f in fits if f is not None]
+        found = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
+        fits = [f for f in found if f is not None]
+        # here, not by the threads, of which now one, now the other is first
+        self._ends |= {frozenset(f.hypothesis.keys): f.hypothesis for f in fits}
+        return fits
 
     def _fit_candidate(self, now: Fitted, candidate: Candidate) -> Fitted | None:
-        there = refit(now.hypothesis.having(candidate.start), now.linearisation)
+        """A full fit; one of the same parameters, as rivals often are, begins where the last one
+        has ended."""
+        h = now.hypothesis.having(candidate.start)
+        known = self._ends.get(frozenset(h.keys))
+        there = refit(h, now.linearisation, known=known)
         if there is not None and candidate.name in HULL_DAMPING:
             there = self._pruned(there, now)
         if there is None or there.hypothesis.keys == now.hypothesis.keys:
             return None
-        return with_best_onsets(there, candidate.start)
+        return there if known is not None else with_best_onsets(there, candidate.start)
 
     def _pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
         """Without the coefficients beyond ``base`` that are not worth their penalty."""

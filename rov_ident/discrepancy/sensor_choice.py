@@ -14,11 +14,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key
 from rov_ident.discrepancy.output_error import Fitted, fit
+from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.search import Search
+from rov_ident.discrepancy.selection import VERY_STRONG, mean_inflation
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import a_reading
@@ -175,13 +178,19 @@ def _moves_velocity(name: str, values: Mapping[str, float]) -> bool:
 
 def noise_of_wrench(search: Search, start: Fitted) -> dict[str, float]:
     """The parameters of the noise of the reading, on the axes where the fit ``start`` is likelier
-    without it; empty where it is on none. It has no parameter that is fitted, so no more is asked.
+    without it; empty where it is on none, or where the vehicle may follow what looks like noise. It
+    has no parameter that is fitted, so no more is asked.
     """
     config, problem = search.config, search.problem
     if NOISE in config.effects or not problem.reading_std.any():
         return {}
+    evidence = _evidence_of_noise(start)
+    possible = evidence > -VERY_STRONG
+    if evidence[possible].sum() < VERY_STRONG:
+        return {}
     names = {p.axis: p.name for p in EFFECTS[NOISE].parameters}
-    values = {names[a]: float(s) for a, s in zip(AXES, problem.reading_std, strict=True)}
+    std = np.where(possible, problem.reading_std, 0.0)
+    values = {names[a]: float(s) for a, s in zip(AXES, std, strict=True)}
     there = fit(problem, with_noise(start.hypothesis, values))
     # What is read on an axis may act after all: tried with what the noise is taken off there.
     acting = {} if there is None else _better_as_read(there)
@@ -193,6 +202,24 @@ def noise_of_wrench(search: Search, start: Fitted) -> dict[str, float]:
     free = ~problem.guided
     likelier = np.log(there.noise[free]).sum() < np.log(start.noise[free]).sum()
     return values if likelier else {}
+
+
+def _evidence_of_noise(fitted: Fitted) -> Array:
+    """Twice the logarithm (6,) of the likelihood that the vehicle does not follow what looks like
+    noise on an axis, over that it does. What trembles can be a command (an autopilot passes on the
+    noise of its gyro); and noise that is too small to show cannot be what a model gains by
+    neglecting small commands: a trim can."""
+    linearisation, effects = fitted.linearisation, fitted.hypothesis.effects
+    problem, base = linearisation.problem, linearisation.columns
+    still = problem.with_less(jitter(problem.streams.demand, problem.reading_std))
+    trembling = problem.thrust(effects)[0] - still.thrust(effects)[0]
+    columns = linearisation.sensitivity_to(trembling[:, :, None] * np.eye(6))
+    normal = linearisation.linear.normal
+    columns -= base @ scaled_solve(normal, base.T @ columns, 1e-9)
+    left = linearisation.error[:, None] + columns  # where the simulation does not follow it, either
+    gain = np.sum(linearisation.error**2) - np.sum(left**2, axis=0)
+    inflation = [mean_inflation(columns[:, [i]], left[:, i], linearisation.first) for i in range(6)]
+    return gain / np.maximum(inflation, 1e-9)
 
 
 def _better_as_read(fitted: Fitted) -> set[str]:

@@ -23,7 +23,6 @@ from rov_ident.discrepancy.multiple_shooting import (
     Steps,
     equations,
     guided_by,
-    mean_thrust,
     regressors,
     shoot,
     thrust,
@@ -188,14 +187,14 @@ class WindowedProblem:
     def response(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """What a unit of each reading of the wrench adds to the mean thrust in each step, (K, 6,
         D), by changes of the size of their noise."""
-        base, acting = mean_thrust(self.steps, compiled(effects)), compiled(effects)
+        base, acting = self.thrust(effects)[0], compiled(effects)
         out = np.zeros((*base.shape, len(self.streams.demand)))
         step = SMALL * np.where(self.reading_std > 0.0, self.reading_std, 1.0)
         for i in range(out.shape[2]):
             at = self._held == i
             if at.any():
                 moved = self.steps._replace(demand=self.steps.demand + step * at[:, None])
-                out[:, :, i] = (mean_thrust(moved, acting) - base) / step
+                out[:, :, i] = (thrust(moved, acting)[0] - base) / step
         return out
 
     def with_less(self, taken: Array) -> "WindowedProblem":
@@ -232,9 +231,13 @@ class WindowedProblem:
             found = sorted((parse(n) for n in names), key=lambda c: not c.is_added_mass)
             model = Model(h.model.body, tuple(found), np.zeros(len(found)))
             at, eq = [place[COEFFICIENTS, c.name] for c in found], h.equations.acting
-            out[:, :, at] = regressors(
+            own = regressors(
                 equations(model, eq), self.driven(h.effects), self._relative(h, motion)
             )
+            if at == list(range(len(keys))):
+                return own
+            in_a_row = at == list(range(at[0], at[0] + len(at)))
+            out[:, :, slice(at[0], at[-1] + 1) if in_a_row else at] = own  # a slice is quicker
         for key in keys:
             if key in self.patterns:
                 out[:, :, place[key]] = self.patterns[key]

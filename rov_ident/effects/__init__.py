@@ -150,12 +150,12 @@ def compiled(effects: Values) -> Acting:
 
 
 def _table(library: list[Effect], effects: Values) -> tuple[NDArray[np.bool_], Array]:
-    parameters = np.zeros((len(library), SIZE))
+    there, parameters = np.zeros(len(library), dtype=bool), np.zeros((len(library), SIZE))
     for row, effect in enumerate(library):
         if effect.name in effects:
             values = [effects[effect.name][p.name] for p in effect.parameters]
-            parameters[row, : len(values)] = values
-    return np.array([effect.name in effects for effect in library], dtype=bool), parameters
+            there[row], parameters[row, : len(values)] = True, values
+    return there, parameters
 
 
 def rigid_body(body: RigidBody, effects: Values) -> RigidBody:

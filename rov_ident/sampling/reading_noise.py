@@ -15,6 +15,7 @@ import numpy as np
 from rov_ident.core.messages import Array
 
 _BLOCK = 50  # commands in which noise is measured, to a fifth
+_ROUNDING = 1e-6  # of the largest command: 32 bits round by less
 _OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
@@ -31,7 +32,7 @@ def resting_noise(demand: Array) -> Array:
     if len(demand) < _BLOCK + 2:
         return np.zeros(6)
     std: Array = np.quantile(_medians(demand, _BLOCK), RESTING, axis=0)
-    return _OF_MEDIAN * std
+    return np.where(std > _ROUNDING * np.abs(demand).max(axis=0), _OF_MEDIAN * std, 0.0)
 
 
 def _medians(demand: Array, size: int) -> Array:
