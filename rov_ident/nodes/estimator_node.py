@@ -283,15 +283,16 @@ class EstimatorNode(GuardedNode):
             self._inputs.silence[role] += elapsed
         self._idle += elapsed
         before, self._stopped = self._stopped, ""
+        ended = not self._waiting and self._inputs.have_stopped(self._config.timeout)
         if self._waiting:
             self._idle = 0.0  # there are messages to use, whether or not more come
-        elif self._inputs.have_stopped(self._config.timeout):
+        elif ended:
             self._stopped = "inputs stopped"
             self._idle = 0.0  # counted from their return: the first messages have to wait
         elif self._online.enabled and self._idle > self._config.timeout:
             self._stopped = "no message of the inputs can be used"
         if self._stopped != before:
-            if self._stopped:
+            if ended:  # else what is waited for is still to come, and this node may just be slow
                 self._show(self._online.flush())
             self._publish()
 
