@@ -542,12 +542,16 @@ def test_a_damaged_schema_or_channel_outside_chunks_is_passed_over(tmp_path):
                         assert raw.topic
 
 
-def test_a_complete_bag_is_not_walked_through(tmp_path, monkeypatch):
-    """Its summary says where everything is: an hour's bag is opened at once."""
+def test_a_complete_bag_is_not_walked_through(tmp_path):
+    """Its summary says where everything is: a damaged chunk is met when it is read."""
     path = tmp_path / "dive.mcap"
     write(path, entries(20))
-    monkeypatch.setattr(bag_reader, "_index_by_walking", None)
-    assert Bag(path).topics["/odom"].message_count == 20
+    data = path.read_bytes()
+    chunk = next(r for r in _records(data, len(MCAP0_MAGIC)) if r[0] == 6)
+    path.write_bytes(data[: chunk[3] - 1] + bytes([data[chunk[3] - 1] ^ 255]) + data[chunk[3] :])
+    bag = Bag(path)
+    assert bag.topics["/odom"].message_count == 20 and bag.damaged_chunks == 0
+    assert not list(bag.iter_raw()) and bag.damaged_chunks == 1
 
 
 def test_numbers_in_names_may_be_of_any_script(tmp_path):

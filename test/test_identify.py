@@ -54,7 +54,7 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     # what is judged is what is saved
     given, saved = ri.load(WRONG), ri.load(tmp_path / "found" / "extended.yaml")
     with archive.opened([dives / "short.mcap"], given) as judge:
-        told, _ = validation(judge, given, saved)
+        told = validation(judge, given, judge.as_read_by(saved, given), saved)
     for name, row in result["rmse"].items():
         assert row["before"] == pytest.approx(told["rmse_before"][name])
         assert row["after"] == pytest.approx(told["rmse"][name], rel=1e-3)

@@ -276,7 +276,8 @@ def identify(
     judged: dict[str, Any] = {}
     if judge is not None:
         with _opened([judge], given, say) as held_back:
-            judged, _ = validation(held_back, given, fitted.fitted)
+            reread = held_back.as_read_by(fitted.fitted, given)
+            judged = validation(held_back, given, reread, fitted.fitted)
     proposal, why = None, list(fitted.notes)
     try:  # what is planned drives surge and sway
         proposal = plan(fitted.fitted, used, progress=say) if explanation else None

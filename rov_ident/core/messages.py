@@ -98,7 +98,7 @@ def fault(message: Message) -> str:
         return ""  # a joint that nobody uses may be not finite
     if isinstance(message, Odometry):
         p, q, v, w = message.position, message.orientation, message.linear, message.angular
-        if not 0.7 < hypot(*q.tolist()) < 1.4:  # NaN too
+        if not 0.5**0.5 < hypot(*q.tolist()) < 2.0**0.5:  # NaN too
             return "orientation is not a unit quaternion"
         size = hypot(*v.tolist(), *w.tolist(), 1e-6 * hypot(*p.tolist()))
     elif isinstance(message, Imu):

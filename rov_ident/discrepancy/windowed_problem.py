@@ -236,8 +236,7 @@ class WindowedProblem:
             )
             if at == list(range(len(keys))):
                 return own
-            in_a_row = at == list(range(at[0], at[0] + len(at)))
-            out[:, :, slice(at[0], at[-1] + 1) if in_a_row else at] = own  # a slice is quicker
+            out[:, :, at] = own
         for key in keys:
             if key in self.patterns:
                 out[:, :, place[key]] = self.patterns[key]
