@@ -22,7 +22,7 @@ from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
-from rov_ident.discrepancy.sensor_consistency import with_rates_of_the_attitude
+from rov_ident.discrepancy import rates_and_attitude
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.sampling.raw_streams import Streams, gather

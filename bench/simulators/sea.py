@@ -122,6 +122,8 @@ class Sea:
     gyro_is_shared: bool = False  # odometry copies its angular velocity from the IMU
     imu_clock: float = 0.0  # s, of the IMU's stamps ahead of the others
     heading: float = 0.0  # rad, of the pose ahead of the world's
+    heading_drift: float = 0.0  # rad/s, by which that grows
+    dead_reckoned: bool = False  # the position is the integral of the velocity along that heading
     tilt: tuple[float, ...] = (0.0, 0.0)  # rad, roll and pitch of the pose against the body
     on_the_way: tuple[float, ...] = (0.0, 0.0, 0.0)  # s to the recorder: odometry, IMU, wrench
 
@@ -544,9 +546,12 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
         position[frozen] = position[frozen][0]
     if any(sea.tilt):
         attitude = _tilted(attitude, np.broadcast_to([*sea.tilt, 0.0], (len(t), 3)))
-    if sea.heading:
-        half = 0.5 * sea.heading
-        attitude = product(np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), attitude)
+    if sea.heading or sea.heading_drift:
+        half, none = 0.5 * (sea.heading + sea.heading_drift * t), np.zeros_like(t)
+        attitude = product(np.stack([np.cos(half), none, none, np.sin(half)], axis=1), attitude)
+    if sea.dead_reckoned:
+        way = np.einsum("kij,kj->ki", rotations(attitude), linear) * np.gradient(t)[:, None]
+        position = position[0] + np.cumsum(way, axis=0)
     seen_q, flat = _ros_attitude(attitude), position[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     v, r = _FLIP * linear, _FLIP * angular
     send(

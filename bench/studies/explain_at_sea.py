@@ -47,6 +47,17 @@ def _heading(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
     return {"heading": rng.uniform(0.05, 0.2) * rng.choice([-1.0, 1.0])}
 
 
+def _drift(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """A heading that drifts, slowly or fast, of a position fix or of dead reckoning."""
+    rate = 10.0 ** rng.uniform(-3.0, -1.5) * rng.choice([-1.0, 1.0])
+    return {"heading_drift": rate, "dead_reckoned": bool(rng.random() < 0.3)}
+
+
+def _dead_reckoned(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """The position is the sum of the velocities, along the attitude."""
+    return {"dead_reckoned": True}
+
+
 def _on_the_way(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
     return {"on_the_way": tuple(rng.uniform(0.0, 0.2, 3).tolist())}
 
@@ -67,6 +78,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     "mass and inertia": (ALONE["mass and inertia"], ()),
     "clocks": (ALONE["clocks"], ()),
     "delays to the recorder": (_on_the_way, ()),
+    "dead reckoning": (_dead_reckoned, ()),
     "wrench noise": (ALONE["wrench noise"], ("wrench_noise",)),
     "biases": (ALONE["biases"], ("imu_bias",)),
     "thrust scale": (ALONE["thrust scale"], SCALE),
@@ -78,6 +90,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     # voltage falls with the load and with time
     "sag and advance": (ALONE["sag and advance"], ("battery_sag", "thrust_advance", *SCALE)),
     "heading": (_heading, ("heading_offset",)),
+    "heading that drifts": (_drift, ("heading_offset",)),
     # where the attitude is tilted, velocities and IMU are turned against it, and so is the weight
     "tilted heading": (
         _pose, ("heading_offset", "sensor_misalignment", "imu_bias", "cog_offset"),
@@ -99,7 +112,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     ),
 }  # fmt: skip
 """What the file does not say, and the names that are right for it."""
-NOTHING = tuple(CASES)[:6]
+NOTHING = tuple(CASES)[:7]
 """Cases in which the vehicle moves as the file says, but for its coefficients."""
 KINDS = (*DRIVING, *SPARSE)
 

@@ -17,6 +17,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import (
     empirical_term,
     extension,
+    rates_and_attitude,
     repetition,
     sensor_choice,
     sensor_consistency,
@@ -165,9 +166,10 @@ def explain(
             "anything"
         )
     say("comparing the sensors", 0.05)
-    bags, late = zip(*map(sensor_consistency.with_rates_of_the_attitude, bags), strict=True)
+    rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
+    bags, late = [r.streams for r in rates], any(r.late for r in rates)
     if validate is not None:
-        validate, _ = sensor_consistency.with_rates_of_the_attitude(validate)
+        validate = rates_and_attitude.agreed(validate, config).streams
     with_others = [*bags, *([] if validate is None else [validate])]
     as_headed = joined(bags)[0] if validate is None else validate
     turned, headings = repetition.turned(with_others, config)
@@ -209,8 +211,10 @@ def explain(
         records = repetition.Records(streams, bags, joined(bags)[1])
         of_dynamics = repetition.in_each(search, records, last, of_dynamics)
     found += of_dynamics
-    if any(late):  # a filter does more than delay, and what it does besides looks like any cause
+    if late:  # a filter does more than delay, and what it does besides looks like any cause
         found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
+    if any(r.may_drift for r in rates):
+        found = list(map(unsure, found))
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
             found[i] = empirical_term.described(f, last.hypothesis)
@@ -237,7 +241,7 @@ def explain(
     everything = WindowedProblem(streams, blocks(streams))
     notes = [*choice.notes, *notes, *filter(None, [written.note, far])]
     notes += [_OWN_HEADINGS] if any(headings) else []
-    notes += [_FILTERED] if any(late) else []
+    notes += [_FILTERED] if late else []
     notes += [_NO_TORQUE] if streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)

@@ -52,7 +52,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class _Data:
+class Data:
     """What is fitted, and what is judged on, as recorded."""
 
     streams: Streams
@@ -65,9 +65,10 @@ class _Data:
         found, std = sensor_consistency.search(self.streams, self.config, self.spans, names, fixed)
         return Choice(found, std, fixed=fixed)
 
-    def dynamics(self, sensors: Sensors) -> Array | None:
+    def dynamics(self, sensors: Sensors, axes: str = AXES) -> Array | None:
         """Squared errors (C, free axes) of held-out data as recorded, summed over chunks, of the
-        model fitted to corrected data; None where it cannot be simulated."""
+        model fitted to corrected data, on those of the ``axes`` that are simulated; None where it
+        cannot be."""
         streams, judged = (
             sensor_consistency.corrected(s, sensors) for s in (self.streams, self.judged)
         )
@@ -75,7 +76,8 @@ class _Data:
         if fitted is None:
             return None
         judge = Judge(WindowedProblem(judged, self.held), sensors)
-        return judge.summed(fitted.hypothesis)[:, ~streams.guided]
+        use = [i for i in np.flatnonzero(~streams.guided) if AXES[i] in axes]
+        return judge.summed(fitted.hypothesis)[:, use] if use else None
 
     def agreement(self, of: Sequence[Sensors]) -> list[Array]:
         """Squared innovations (C, comparisons) of corrections, in the units of the first."""
@@ -94,7 +96,7 @@ def chosen(
 ) -> Choice:
     """The effects that the streams support in the ``spans``, by what they do in the spans ``held``
     of the streams ``judged``. ``turned``: the heading is off, by what several records say."""
-    data = _Data(streams, spans, judged, held, config)
+    data = Data(streams, spans, judged, held, config)
     found, std = sensor_consistency.search(streams, config, spans)
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
@@ -102,7 +104,7 @@ def chosen(
     return _without_refuted(data, choice)
 
 
-def _heading_or_mounting(data: _Data, found: Choice, turned: bool) -> Choice:
+def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
     """The heading of the pose, the mounting of the velocity sensor, or its tilt and the heading:
     those that the sensors refute are dropped, then those that the dynamics refute, and of the rest
     that is taken which changes the velocities least."""
@@ -136,7 +138,7 @@ def _heading_or_mounting(data: _Data, found: Choice, turned: bool) -> Choice:
     return dataclasses.replace(variants[mine], alternatives=rivals)
 
 
-def _without_refuted(data: _Data, choice: Choice) -> Choice:
+def _without_refuted(data: Data, choice: Choice) -> Choice:
     """Without the corrections of velocities that make the prediction of the data surely worse."""
     late = [n for n in choice.sensors if EFFECTS[n].late]
     if late and not data.streams.has_pose:  # the clock of the IMU may be off instead

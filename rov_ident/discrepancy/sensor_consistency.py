@@ -50,13 +50,10 @@ _STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
 _ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
 _MAX_GAP = 0.5  # s without a message: no step of dead reckoning reaches across
 _CLOCK = 0.05  # s by which the IMU's clock is set on and back: less than an ROV's response
-_BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
-_FEWEST_CLUSTERS = 6  # that a record must last: of fewer the scatter is not known
-_LATEST = 1.0  # s; as late as velocities may be
 _FEWEST_IMU = 8  # messages of the IMU; fewer are none
-_FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
-_CLUSTER = 5.0  # s; of which residuals are correlated, as long as the windows of the dynamics
-_ROUNDS = 6  # of linearisation; each adds an effect or ends where changes are below ...
+FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
+CLUSTER = 5.0  # s; of which residuals are correlated, as long as the windows of the dynamics
+ROUNDS = 6  # of linearisation; each adds an effect or ends where changes are below ...
 _SETTLED = 0.05  # ... this share of their standard deviations
 
 
@@ -150,59 +147,10 @@ def comparisons(
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
         made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
     return [
-        Comparison(name, *_whitened(t, y, columns, walk=name != "gyro"))
+        Comparison(name, *whitened(t, y, columns, walk=name != "gyro"))
         for name, t, y, columns in made
-        if len(t) > _FEWEST
+        if len(t) > FEWEST
     ]
-
-
-def with_rates_of_the_attitude(streams: Streams) -> tuple[Streams, bool]:
-    """The streams with angular velocities that are those of the odometry's attitude: copied from a
-    gyro they have its bias, which would pass for forces that turn the vehicle, and filtered they
-    are late, which would pass for late thrust. Only what surely differs is set right. Also, whether
-    they are later than the odometry's rate can hide."""
-    t, measured = streams.t, streams.nu[:, 3:]
-    turn, value, std = _turned_by(streams.orientation), np.zeros(4), np.zeros(4)
-    if t[-1] - t[0] < _FEWEST_CLUSTERS * _CLUSTER or not turn.any():
-        return streams, False
-    for _ in range(_ROUNDS):
-        rate = interpolated(t, measured, t + value[3]) - value[:3]
-        apart = integral(t, rate) - np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
-        grows = [np.outer(t - t[0], axis) for axis in np.eye(3)]
-        at, r, columns, _ = _whitened(t, apart, [*grows, rate[0] - rate], walk=True)
-        if len(at) < _FEWEST:
-            return streams, False
-        cluster = (at // _CLUSTER).astype(int)
-        normal, gradient = columns.T @ columns, np.zeros((cluster.max() + 1, 4))
-        np.add.at(gradient, cluster, columns * r[:, None])
-        change = scaled_solve(normal, gradient.sum(axis=0), 1e-9)
-        np.add.at(gradient, cluster, -columns * (columns @ change)[:, None])
-        # scores of whole clusters, as what differs otherwise lasts for seconds (White 1980)
-        std = np.sqrt((scaled_solve(normal, gradient.T, 1e-9) ** 2).sum(axis=1))
-        value = value + change
-    value = np.where(np.abs(value) > _BIASED * std, value, 0.0)
-    value[:3] *= np.ptp(measured, axis=0) > 0.0
-    value[3] = np.clip(value[3], 0.0, _LATEST)  # an attitude that is late is no fault of the rates
-    if not value.any():
-        return streams, False
-    rate = interpolated(t, measured, t + value[3]) - value[:3]
-    told = ", ".join(f"{bias:.2g}" for bias in value[:3])
-    note = (
-        f"the odometry's angular velocities are not those of its attitude: {told} rad/s too much, "
-        f"{value[3]:.2g} s late; set right"
-    )
-    nu = np.hstack([streams.nu[:, :3], rate])
-    late = bool(value[3] > 0.5 * np.median(np.diff(t)))
-    return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note)), late
-
-
-def _turned_by(q: Array) -> Array:
-    """Rotation vectors (N - 1, 3) from each attitude (N, 4) to the next, in the body."""
-    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
-    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, between[:, :1])
-    out: Array = angle * between[:, 1:] / np.maximum(size, 1e-12)
-    return out
 
 
 def _has_imu(streams: Streams) -> bool:
@@ -329,7 +277,7 @@ def _filter_attitude(q, t, rate):
         q[i] /= np.sqrt(size)
 
 
-def _whitened(
+def whitened(
     t: Array, y: Array, columns: Sequence[Array], walk: bool
 ) -> tuple[Array, Array, Array, float]:
     """Innovations of the local-level model with the gain that leaves the least of them: times,
@@ -370,9 +318,9 @@ def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
 
 
 def _rows(found: Sequence[Comparison], spans: Sequence[tuple[float, float]]) -> Rows:
-    """The rows whose time is in the spans, in clusters of _CLUSTER seconds."""
+    """The rows whose time is in the spans, in clusters of CLUSTER seconds."""
     use = [within(spans, c.t) for c in found]
-    at = np.concatenate([np.zeros(0), *(c.t[k] // _CLUSTER for c, k in zip(found, use))])
+    at = np.concatenate([np.zeros(0), *(c.t[k] // CLUSTER for c, k in zip(found, use))])
     order = np.argsort(at, kind="stable")
     none = np.zeros((0, len(_keys())))
     columns = np.concatenate([none, *(c.columns[k] for c, k in zip(found, use))])[order]
@@ -409,7 +357,7 @@ def common_squares(
     found: Sequence[Sequence[Comparison]],
     spans: Sequence[tuple[float, float]],
     unit: int = 0,
-    length: float = _CLUSTER,
+    length: float = CLUSTER,
 ) -> Array:
     """Squared innovations of ``found`` corrections of the sensors, at the instants in the spans
     where all count, in units of the noise of correction number ``unit``; and how many instants
@@ -454,7 +402,7 @@ def search(
     library = library if allowed is None else [n for n in library if n in set(allowed)]
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         rows = _rows(comparisons(streams, config, found), spans)
         linear = _linear(rows)
         free = [key for key in linear.keys if key not in fixed]

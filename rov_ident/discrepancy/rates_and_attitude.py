@@ -1,0 +1,149 @@
+"""Whether the odometry's angular velocities are those of its attitude, and which are believed.
+
+Rates that are copied from a gyro have its bias, which would pass for forces that turn the vehicle;
+filtered ones are late, which would pass for late thrust; and an attitude whose heading drifts turns
+more than the vehicle. Bias and drift look the same in a level vehicle's attitude and rates. The
+other sensors tell them apart: the position, as the heading turns velocities into the world, and
+the IMU, as a vehicle that moves and turns accelerates to the side. So do the dynamics, as thrust
+turns the vehicle.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply, quaternion_to_matrix
+from rov_ident.core.linalg import interpolated, scaled_solve
+from rov_ident.discrepancy import sensor_choice, sensor_consistency
+from rov_ident.discrepancy.held_out import split, surely_less
+from rov_ident.discrepancy.sensor_consistency import CLUSTER, FEWEST, ROUNDS, whitened
+from rov_ident.model.equations import Array
+from rov_ident.sampling.raw_streams import Streams, integral
+
+_BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
+_FEWEST_CLUSTERS = 6  # that a record must last: of fewer the scatter is not known
+_LATEST = 1.0  # s; as late as velocities may be
+
+
+@dataclass(frozen=True)
+class Agreed:
+    """Streams whose angular velocities are those of the attitude; whether they were later than the
+    odometry's rate can hide; and whether a bias was taken off that may be a heading's drift."""
+
+    streams: Streams
+    late: bool = False
+    may_drift: bool = False
+
+
+def agreed(streams: Streams, config: Config) -> Agreed:
+    """The streams with what surely differs set right: the rates, or the heading."""
+    body = [np.broadcast_to(axis, (len(streams.t), 3)) for axis in np.eye(3)]
+    value = _apart(streams, body)
+    value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
+    if not value.any():
+        return Agreed(streams)
+    late = bool(value[3] > 0.5 * np.median(np.diff(streams.t)))
+    told = ", ".join(f"{bias:.2g}" for bias in value[:3])
+    note = (
+        f"the odometry's angular velocities are not those of its attitude: {told} rad/s too much, "
+        f"{value[3]:.2g} s late; set right"
+    )
+    biased = _noted(streams, _rates(streams, body, value), note)
+    drift = _drift(streams, body) if value[:3].any() else 0.0
+    if not drift:
+        return Agreed(biased, late)
+    turned = _turned(streams, -drift)
+    note = (
+        f"the heading of the odometry's attitude drifts by {drift:.2g} rad/s beside its angular "
+        "velocities and the other sensors; set right"
+    )
+    drifts = _noted(turned, _rates(turned, body, value * [0.0, 0.0, 0.0, 1.0]), note)
+    return _chosen(biased, drifts, late, config)
+
+
+def _chosen(biased: Streams, drifts: Streams, late: bool, config: Config) -> Agreed:
+    """Of rates with a bias and a heading that drifts what the sensors or the dynamics surely
+    prefer; where none does, or one contradicts another, the bias, which is the commoner: a position
+    may be reckoned along the very heading, and a tether may turn the vehicle as a bias would."""
+    both, (to_fit, held) = (biased, drifts), split(biased.duration)
+    found = [sensor_consistency.search(s, config, to_fit)[0] for s in both]
+    compared = [sensor_consistency.comparisons(*of) for of in zip(both, [config] * 2, found)]
+    squares: list[tuple[Array, Array]] = []
+    if compared[0]:
+        sums = sensor_consistency.common_squares(compared, held)
+        squares += [(sums[:, 0, [i]], sums[:, 1, [i]]) for i in range(len(compared[0]))]
+    turning = [sensor_choice.Data(s, to_fit, s, held, config).dynamics({}, "KMN") for s in both]
+    if turning[0] is not None and turning[1] is not None:
+        squares.append((turning[0], turning[1]))
+    for_bias, for_drift = (any(surely_less(*x[::step]) for x in squares) for step in (1, -1))
+    if for_bias != for_drift:
+        return Agreed(drifts if for_drift else biased, late)
+    note = "; or the heading drifts: sensors and thrust do not agree on which"
+    biased = dataclasses.replace(biased, notes=(*biased.notes[:-1], biased.notes[-1] + note))
+    return Agreed(biased, late, may_drift=True)
+
+
+def _drift(streams: Streams, body: Sequence[Array]) -> float:
+    """The drift [rad/s] of the heading that explains all that the rates (beside being late) have
+    beside the turns of the attitude; 0 if none does."""
+    down = quaternion_to_matrix(streams.orientation)[:, 2]
+    drift = -float(_apart(streams, [down])[0])
+    return drift if drift and not _apart(_turned(streams, -drift), body)[:3].any() else 0.0
+
+
+def _turned(streams: Streams, rate: float) -> Streams:
+    """The streams with an attitude that is turned about world down at a rate [rad/s]."""
+    yaw = quaternion_from_euler(0.0, 0.0, rate * streams.t)
+    return dataclasses.replace(streams, orientation=quaternion_multiply(yaw, streams.orientation))
+
+
+def _noted(streams: Streams, rates: Array, note: str) -> Streams:
+    nu = np.hstack([streams.nu[:, :3], rates])
+    return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note))
+
+
+def _apart(streams: Streams, errors: Sequence[Array]) -> Array:
+    """How much of each of P rate ``errors`` (N, 3) [rad/s] the angular velocities have beside the
+    turns of the attitude, and how late they are [s]: (P + 1,), zero where that is not sure."""
+    t, turn = streams.t, _turns(streams.orientation)
+    value, std, nothing = (np.zeros(len(errors) + 1) for _ in range(3))
+    if t[-1] - t[0] < _FEWEST_CLUSTERS * CLUSTER or not turn.any():
+        return nothing
+    turned = np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
+    grows = [integral(t, error) for error in errors]
+    for _ in range(ROUNDS):
+        rate = _rates(streams, errors, value)
+        apart = integral(t, rate) - turned
+        at, r, columns, _ = whitened(t, apart, [*grows, rate[0] - rate], walk=True)
+        if len(at) < FEWEST:
+            return nothing
+        cluster = (at // CLUSTER).astype(int)
+        normal, gradient = columns.T @ columns, np.zeros((cluster.max() + 1, len(value)))
+        np.add.at(gradient, cluster, columns * r[:, None])
+        change = scaled_solve(normal, gradient.sum(axis=0), 1e-9)
+        np.add.at(gradient, cluster, -columns * (columns @ change)[:, None])
+        # scores of whole clusters, as what differs otherwise lasts for seconds (White 1980)
+        std = np.sqrt((scaled_solve(normal, gradient.T, 1e-9) ** 2).sum(axis=1))
+        value = value + change
+    value = np.where(np.abs(value) > _BIASED * std, value, 0.0)
+    value[-1] = np.clip(value[-1], 0.0, _LATEST)  # a late attitude is no fault of the rates
+    return value
+
+
+def _rates(streams: Streams, errors: Sequence[Array], value: Array) -> Array:
+    """Angular velocities (N, 3) without errors of sizes (P + 1,), of which the last is lateness."""
+    measured, ahead = streams.nu[:, 3:], streams.t + value[-1]
+    out: Array = interpolated(streams.t, measured, ahead) - np.tensordot(value[:-1], errors, 1)
+    return out
+
+
+def _turns(q: Array) -> Array:
+    """Rotation vectors (N - 1, 3) from each attitude (N, 4) to the next, in the body."""
+    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
+    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, between[:, :1])
+    out: Array = angle * between[:, 1:] / np.maximum(size, 1e-12)
+    return out
