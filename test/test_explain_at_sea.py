@@ -13,8 +13,12 @@ from bench.studies import at_sea
 from bench.studies.at_sea import dive_of
 from bench.studies.explain_at_sea import CASES
 from rov_ident import config as configuration
-from rov_ident.core.frames import quaternion_from_rotation_vector, quaternion_multiply
-from rov_ident.discrepancy import patterns, search, sensor_consistency
+from rov_ident.core.frames import (
+    quaternion_from_euler,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+)
+from rov_ident.discrepancy import patterns, rates_and_attitude, search, sensor_consistency
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import split
 from rov_ident.discrepancy.linearisation import linearise
@@ -22,7 +26,6 @@ from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
-from rov_ident.discrepancy import rates_and_attitude
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.sampling.raw_streams import Streams, gather
@@ -68,37 +71,77 @@ def turning(bias=(0.0, 0.0, 0.0), late=0.0, noise=1.0, seconds=60.0):
 @pytest.mark.parametrize("late", [0.0, 0.1])
 def test_rates_are_those_of_the_attitude(bias, late):
     streams, true = turning(bias, late)
-    mended, filtered = with_rates_of_the_attitude(streams)
-    assert filtered == (late > 0.0)
-    error = (mended.nu[:, 3:] - true)[2:-3]
+    found = rates_and_attitude.agreed(streams, a_configuration())
+    assert found.late == (late > 0.0) and not found.may_drift
+    error = (found.streams.nu[:, 3:] - true)[2:-3]
     assert np.abs(error.mean(axis=0)).max() < 5e-4
     assert error.std() < 1.2 * 0.004
-    (note,) = mended.notes
+    (note,) = found.streams.notes
     assert "attitude" in note and f"{late:.2g} s late" in note
 
 
+def a_configuration():
+    return configuration.from_parameters(dive_of("clean", "pilot", 1, 60.0).parameters)
+
+
+@pytest.mark.parametrize(("driving", "rate"), [("pilot", 0.02), *more(("six-axis", -0.003))])
+def test_a_heading_that_drifts_is_no_bias_of_the_gyro(driving, rate):
+    _, streams, config = streams_of("", driving, 0, 150.0, lambda *_: {"heading_drift": rate})
+    found = rates_and_attitude.agreed(streams, config)
+    np.testing.assert_array_equal(found.streams.nu, streams.nu)
+    back = quaternion_from_euler(0.0, 0.0, -rate * streams.t)
+    true = quaternion_multiply(back, streams.orientation)
+    between = quaternion_multiply(true * [1.0, -1.0, -1.0, -1.0], found.streams.orientation)
+    assert np.abs(between[:, 1:]).max() < 0.5 * 3e-4 * 150.0
+    assert not found.may_drift and "drifts" in found.streams.notes[-1]
+
+
+@pytest.mark.parametrize("bias", [0.01, *more(-0.003)])
+def test_a_bias_of_the_gyro_is_no_drift_of_the_heading(bias):
+    sea = {"gyro_bias": (0.0, 0.0, bias), "gyro_is_shared": True}
+    _, streams, config = streams_of("", "pilot", 3, 150.0, lambda *_: sea)
+    found = rates_and_attitude.agreed(streams, config)
+    np.testing.assert_array_equal(found.streams.orientation, streams.orientation)
+    taken = np.mean(streams.nu[:, 5] - found.streams.nu[:, 5])
+    assert taken == pytest.approx(bias, abs=3e-4) and not found.may_drift
+
+
+@pytest.mark.study
+def test_nothing_is_sure_where_position_and_thrust_contradict_each_other():
+    """The position is reckoned along the heading that drifts, and shows it to be right."""
+    sea = {"heading_drift": 0.01, "dead_reckoned": True}
+    _, streams, config = streams_of("", "pilot", 0, 150.0, lambda *_: sea)
+    findings = explain([streams], config).findings
+    assert "or the heading drifts" in " ".join(findings.notes)
+    assert not any(f.separable for f in findings.effects)
+
+
 def test_rates_that_agree_with_the_attitude_are_left_alone():
+    config = a_configuration()
+
+    def agreed(streams):
+        return rates_and_attitude.agreed(streams, config).streams
+
     streams, _ = turning()
-    assert with_rates_of_the_attitude(streams)[0] is streams
+    assert agreed(streams) is streams
     early, _ = turning(late=-0.1)  # it is the attitude that is late
-    np.testing.assert_array_equal(with_rates_of_the_attitude(early)[0].nu, early.nu)
+    np.testing.assert_array_equal(agreed(early).nu, early.nu)
     none = dataclasses.replace(
         turning((0.02, 0.0, 0.0))[0], orientation=np.tile([1.0, 0.0, 0.0, 0.0], (1200, 1))
     )
-    assert with_rates_of_the_attitude(none)[0] is none
+    assert agreed(none) is none
     short = turning((0.02, 0.0, 0.0), seconds=20.0)[0]
-    assert with_rates_of_the_attitude(short)[0] is short
+    assert agreed(short) is short
     seldom = turning((0.02, 0.0, 0.0))[0]
     seldom = dataclasses.replace(
         seldom, t=seldom.t[::20], orientation=seldom.orientation[::20], nu=seldom.nu[::20]
     )
-    assert with_rates_of_the_attitude(seldom)[0] is seldom
+    assert agreed(seldom) is seldom
 
 
 def test_without_pose_and_imu_no_sensor_is_judged():
     streams, _ = turning()
-    config = configuration.from_parameters(dive_of("clean", "pilot", 1, 60.0).parameters)
-    assert sensors_of(streams, config)[0] == {}
+    assert sensors_of(streams, a_configuration())[0] == {}
 
 
 # ------------------------------------------------------------------ clocks
@@ -146,7 +189,7 @@ def test_late_velocities_show_in_a_few_reversals(driving):
 def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy):
     """An autopilot passes on the noise of its gyro. Neglecting it would hide a trim."""
     _, streams, config = streams_of(case, driving, 0, 150.0, CASES[case][0])
-    streams, _ = with_rates_of_the_attitude(streams)
+    streams = rates_and_attitude.agreed(streams, config).streams
     there = Search(streams, config, split(streams.duration)[0])
     assert there.problem.reading_std[3:5].all()
     assert bool(noise_of_wrench(there, there.start())) == noisy
