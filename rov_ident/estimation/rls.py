@@ -656,16 +656,18 @@ def _update(task, state, work, sample, side, info):
     if anew:
         _restart(state, work, sample)
         return
-    _absorb(state, work, n)
+    _absorb(task, state, work, n, effects)
     stack(work.root, work.rows, state.scalars[0].free, 6, 0, work.line)
 
 
 @reordered
-def _absorb(state, work, n):
+def _absorb(task, state, work, n, effects):
     """Take in the measured velocities, one after the other; their rows (6, columns) of the root.
 
     What a row owes to coefficients that are held is noise to it: at its full weight it would tie
-    the free ones to them, and undo what is known of the free ones.
+    the free ones to them, and undo what is known of the free ones. So is what it owes to what
+    shapes the thrust (a lag) where noise of the wrench's reading is too large: a lag would smooth
+    that away. ``effects`` is the first of their parameters.
     """
     s, nu, p = work.scratch[0], state.nu, state.p
     sensitivity, rows = work.sensitivity, work.rows
@@ -674,15 +676,19 @@ def _absorb(state, work, n):
         if s.z[i] != s.z[i]:
             continue
         row, total, e = rows[q], p[i, i] + s.r[i], s.z[i] - nu[i]
-        weight = 1.0 / np.sqrt(total + s.spread[2, i])
-        goal = e
         for k in range(columns):
             row[k] = sensitivity[i, k] + work.direct[i, k]
-        for a in range(n):
-            goal += row[a] * state.deviation[a]
         for a in range(6):
             s.cross[a] = p[a, i]
         correct(nu, p, sensitivity, row, s.cross, total, e)
+        variance, goal = total + s.spread[2, i], e
+        for a in range(n):
+            j = work.estimated[a] - effects
+            if work.noisy[i] and j >= 0 and not (task.absolute[j] or task.scaled[j, i]):
+                variance += row[a] ** 2  # as uncertain as before any data, in these units
+                row[a] = 0.0
+            goal += row[a] * state.deviation[a]
+        weight = 1.0 / np.sqrt(variance)
         for k in range(columns):
             row[k] *= weight
         row[n] = weight * goal

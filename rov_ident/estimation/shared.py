@@ -135,8 +135,16 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
         noisy[i] = noise > 0.0 and monitor[i].density > FOLLOWED * noise
-    in_motion(task.structure, moving, moves)
-    first = len(task.structure.mass_row) + len(task.structure.row)
+    structure = task.structure
+    in_motion(structure, moving, moves)
+    count = len(structure.mass_row)
+    for c in range(count):
+        if noisy[structure.mass_row[c]] or noisy[structure.mass_column[c]]:
+            moves[c] = False
+    for term in range(len(structure.row)):
+        if noisy[structure.row[term]]:
+            moves[count + term] = False
+    first = count + len(structure.row)
     for e in range(first, len(moves)):
         moves[e] = True
         for i in range(6):
