@@ -24,7 +24,7 @@ from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
-from rov_ident.estimation.shared import INFO, noisy_axes, too_noisy
+from rov_ident.estimation.shared import INFO, noisy_axes, teachers_of, too_noisy
 from rov_ident.sampling.sample import believed, joined
 from rov_ident.sampling.sampler import Sampler
 
@@ -447,14 +447,14 @@ class OnlineEstimator:
         )
 
     def _waiting(self, values: Array) -> dict[int, str]:
-        """Why factors of the thrust, by their place, are not learnt now, at coefficients values."""
+        """Why some, by their place, are not learnt now, at coefficients of these values."""
         if not self._reading_noise.any():
             return {}
         coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))
         mass = self.config.dynamics.with_values(coefficients).mass_matrix
-        noisy = noisy_axes(mass, self._reading_noise, self._state.monitor["density"])
-        factors = enumerate(self._task.scaled & noisy, len(coefficients))
-        return {i: too_noisy(axes) for i, axes in factors if axes.any()}
+        noisy = noisy_axes(mass, self._reading_noise, self._state.monitor)
+        held = enumerate(teachers_of(self.config) & noisy)
+        return {i: too_noisy(axes) for i, axes in held if axes.any()}
 
     def _unexplained(self) -> Array:
         """(6,): force that the model lacks over the working wrench, NaN where that is not known."""

@@ -10,6 +10,7 @@ from rov_ident.config.prior import THRUST_SCALE, drift_of, moves_with_thrust, pr
 from rov_ident.core.jit import inlined, inner, lean, record
 from rov_ident.core.messages import Array
 from rov_ident.effects import EFFECTS, parameter
+from rov_ident.estimation.innovation_monitor import TIME
 from rov_ident.estimation.process_noise import process
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Structure, in_motion
@@ -106,8 +107,19 @@ def factors_of(config: Config) -> NDArray[np.bool_]:
     return factors
 
 
+def teachers_of(config: Config) -> NDArray[np.bool_]:
+    """(n, 6): the axes from which each estimated coefficient or factor of the thrust is learnt, and
+    from no other than all of these; none of other parameters of effects."""
+    structure = config.dynamics.structure
+    rows = np.concatenate([structure.mass_row, structure.row])
+    on_axis = np.zeros((len(rows), 6), dtype=bool)
+    on_axis[np.arange(len(rows)), rows] = True
+    on_axis[np.arange(len(structure.mass_row)), structure.mass_column] = True
+    return np.vstack([on_axis[prior_of(config).estimated], factors_of(config)])
+
+
 def too_noisy(axes: NDArray[np.bool_]) -> str:
-    """Why a factor of the thrust is not learnt, and what to do, from the noisy axes (6,)."""
+    """Why something is not learnt, and what to do, from the noisy axes (6,)."""
     names = " ".join(name for name, noisy in zip(AXES, axes, strict=True) if noisy)
     return (
         f"noise of the wrench's reading is not far below the wrench on {names}: drive harder "
@@ -115,36 +127,38 @@ def too_noisy(axes: NDArray[np.bool_]) -> str:
     )
 
 
-def noisy_axes(mass: Array, reading_noise: Array, density: Array) -> NDArray[np.bool_]:
-    """(6,) on which axes noise of the wrench's reading forbids to learn a factor of the thrust, as
-    :func:`learnt` decides it; ``mass`` (6, 6), ``density`` (6,) of the monitor."""
+def noisy_axes(mass: Array, reading_noise: Array, monitor: NDArray[np.void]) -> NDArray[np.bool_]:
+    """(6,) on which axes noise of the wrench's reading is too large to learn from, as
+    :func:`learnt` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
     noise = np.diag(np.linalg.inv(mass)) ** 2 * reading_noise
-    return (noise > 0.0) & (density > FOLLOWED * noise)
+    follows = (monitor["seen"] > TIME) & (monitor["density"] <= FOLLOWED * noise)
+    return (noise > 0.0) & ~follows
 
 
 @lean
 def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     """moves (m,): which of theta a motion teaches. Work space: noisy (6,).
 
-    A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor;
-    a factor of the thrust if on all axes that it is for the wrench is far above the noise of its
-    reading. What looks like noise may be a command that trembles, which the vehicle follows: then
-    the unexplained acceleration, as ``monitor`` (6,) of MONITOR knows it, is far below it.
-    ``inverse`` (6, 6) is that of the mass matrix.
+    A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor,
+    and on which the wrench is far above the noise of its reading; a factor of the thrust if that is
+    so on all axes that it is for. What looks like noise may be a command that trembles, which the
+    vehicle follows: then the unexplained acceleration, once ``monitor`` (6,) of MONITOR knows it,
+    is far below it. ``inverse`` (6, 6) is that of the mass matrix.
     """
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
-        noisy[i] = noise > 0.0 and monitor[i].density > FOLLOWED * noise
+        follows = monitor[i].seen > TIME and monitor[i].density <= FOLLOWED * noise
+        noisy[i] = noise > 0.0 and not follows
     structure = task.structure
     in_motion(structure, moving, moves)
-    count = len(structure.mass_row)
-    for c in range(count):
+    first, rows = len(structure.mass_row), structure.row
+    for c in range(first):
         if noisy[structure.mass_row[c]] or noisy[structure.mass_column[c]]:
             moves[c] = False
-    for term in range(len(structure.row)):
-        if noisy[structure.row[term]]:
-            moves[count + term] = False
-    first = count + len(structure.row)
+    for term in range(len(rows)):
+        if noisy[rows[term]]:
+            moves[first + term] = False
+    first += len(rows)
     for e in range(first, len(moves)):
         moves[e] = True
         for i in range(6):

@@ -447,8 +447,9 @@ def _update(task, state, work, sample, side, out):
     s, scratch = task.settings[0], work.scratch[0]
     x, p, z, r = state.x, work.p, scratch.z, scratch.r
     measure(sample, z, r)
-    moving, anew = False, False
+    moving, anew, noisy = False, False, False
     for i in range(6):
+        noisy |= work.noisy[i]
         for j in range(side.shape[1]):
             z[i] += side[6 + i, j] * side[12, j]
         state.monitor[i].since += sample.dt
@@ -474,6 +475,8 @@ def _update(task, state, work, sample, side, out):
         anew |= lost(state.monitor, first, outlier)
         if outlier:
             out.reason = GATED
+        elif noisy:
+            _absorb_beside_noise(task, x, work, side, first)
         else:
             _absorb(task, x, work, side, first)
     if anew:
@@ -535,6 +538,43 @@ def _absorb(task, x, work, side, first):
         f, g, h = cross[0, i], cross[1, i], cross[2, i]
         for k in range(columns):
             p[i, k] -= f * w[0, k] + g * w[1, k] + h * w[2, k]
+
+
+@reordered
+def _absorb_beside_noise(task, x, work, side, first):
+    """The same where noise of the wrench's reading is too large on some axis, which holds the scale
+    of the thrust.
+
+    Coefficients are nearly proportional to that: to gain as if its error were noise, which it is in
+    no two measurements alike, would hardly teach them. So they are learnt given the scale, as RLS
+    does it, and what shapes the thrust (a lag), which would smooth the noise away, from the other
+    axes. For a gain k that is not the best, and w the covariance with the innovation of variance v,
+    p loses ``k w' + w k' - v k k'`` (Joseph's form).
+    """
+    p, w, k, free = work.p, work.cross[0], work.gain[0], work.free
+    s, size = work.scratch[0], p.shape[0]
+    last, scale = size - side.shape[1], 6 + task.thrust
+    given = task.thrust >= 0 and free[scale] == 0.0
+    for i in range(first, first + 3):
+        predicted, v = _seen(task, x, p, side, i)
+        v += s.r[i]
+        for a in range(size):
+            w[a] = p[i, a]
+            for j in range(side.shape[1]):
+                w[a] += side[6 + i, j] * task.scale[last - 6 + j] * p[last + j, a]
+        share = w[scale] / p[scale, scale] if given else 0.0
+        left = v - share * w[scale] if given else v
+        for a in range(size):
+            k[a] = free[a] * (w[a] - share * p[scale, a]) / left
+        for j in range(side.shape[1]):
+            if work.noisy[i] and not (task.absolute[j] or task.scaled[j, i]):
+                k[last + j] = 0.0
+        for a in range(size):
+            x[a] += k[a] * (s.z[i] - predicted)
+        for a in range(size):
+            for b in range(a + 1):
+                p[a, b] -= k[a] * w[b] + w[a] * k[b] - v * k[a] * k[b]
+                p[b, a] = p[a, b]
 
 
 # ---------------------------------------------------------------- looking back

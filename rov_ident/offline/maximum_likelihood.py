@@ -61,9 +61,9 @@ from rov_ident.estimation.observer import (
 from rov_ident.estimation.shared import (
     FOLLOWED,
     drive_sides,
-    factors_of,
     measure,
     steps_of,
+    teachers_of,
     wrench_of,
 )
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
@@ -408,7 +408,7 @@ def maximise(
     looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
     of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
-    taught = np.vstack([_rows(model.structure)[estimated[own]], factors_of(config)])
+    taught = teachers_of(config)
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
         say(f"step {next(looks)}")
@@ -446,15 +446,6 @@ def maximise(
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
     bound, covariance = _considered(at.information, at.scatter, precision, held)
     return Likelihood(theta, covariance, bound, noise, at, lasting, held, noisy, steps, converged)
-
-
-def _rows(structure: Structure) -> NDArray[np.bool_]:
-    """(m, 6): the axes that each of theta acts on."""
-    rows = np.concatenate([structure.mass_row, structure.row])
-    out = np.zeros((len(rows), 6), dtype=bool)
-    out[np.arange(len(rows)), rows] = True
-    out[np.arange(len(structure.mass_row)), structure.mass_column] = True
-    return out
 
 
 def _considered(
