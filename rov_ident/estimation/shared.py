@@ -128,11 +128,11 @@ def too_noisy(axes: NDArray[np.bool_]) -> str:
 
 
 def noisy_axes(mass: Array, reading_noise: Array, monitor: NDArray[np.void]) -> NDArray[np.bool_]:
-    """(6,) on which axes noise of the wrench's reading is too large to learn from, as
+    """(6,) on which axes noise of the wrench's reading is known to be too large to learn from, as
     :func:`learnt` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
     noise = np.diag(np.linalg.inv(mass)) ** 2 * reading_noise
     follows = (monitor["seen"] > TIME) & (monitor["density"] <= FOLLOWED * noise)
-    return (noise > 0.0) & ~follows
+    return (noise > 0.0) & (noise < np.inf) & ~follows
 
 
 @lean
@@ -147,7 +147,7 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     """
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
-        follows = monitor[i].seen > TIME and monitor[i].density <= FOLLOWED * noise
+        follows = monitor[i].seen > TIME and monitor[i].density <= FOLLOWED * noise < np.inf
         noisy[i] = noise > 0.0 and not follows
     structure = task.structure
     in_motion(structure, moving, moves)

@@ -472,7 +472,8 @@ def _wrench_densities(samples: Samples) -> Array:
     of the wrench itself, and the number of samples."""
     samples, _ = parts(samples)
     power = samples["wrench"] ** 2 * samples["hold"][:, None]
-    densities = (samples["reading_noise"], power, np.ones_like(power))
+    noise = np.where(np.isfinite(samples["reading_noise"]), samples["reading_noise"], 0.0)
+    densities = (noise, power, np.ones_like(power))
     return np.array([np.sum(density, axis=0) for density in densities])
 
 

@@ -71,8 +71,10 @@ class ActingWrench:
 
     @property
     def reading_noise(self) -> Array:
-        """Variance density (6,) [N2 s, (N m)2 s] of noise, where the wrench is not far above it."""
-        return self._noise.variance * self.hold
+        """Variance density (6,) [N2 s, (N m)2 s] of noise, where the wrench is not far above it;
+        infinite until that is known."""
+        variance = self._noise.variance
+        return variance * self.hold if self.hold else variance
 
     def over(
         self,

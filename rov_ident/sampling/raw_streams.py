@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_multiply, to_core
+from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, to_core
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
 from rov_ident.model.coefficients import INPUTS
 from rov_ident.sampling.despiking import largest_usual, measured_values
@@ -23,6 +23,9 @@ from rov_ident.sampling.dropped_commands import SILENCE, completed
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
 _USUAL = 2.0  # times what 99 % of the messages keep to
+# of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
+# a tenth as noisy; without noise the sum of true velocities is a fifth of it off
+_RECKONED = 0.1
 _PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
 
 
@@ -34,7 +37,8 @@ class Streams:
     IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
     wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; dropped ones are estimated.
     fins and shafts: ``inputs_t`` (I,), inputs (I, 4) of INPUTS, straight from each to the next.
-    ``has_pose`` tells whether the positions mean anything; ``notes`` say what was left out.
+    ``has_pose`` tells whether the positions say anything beside the velocities; ``notes`` say what
+    was left out.
     """
 
     t: Array
@@ -52,7 +56,19 @@ class Streams:
 
     @property
     def has_pose(self) -> bool:
-        return bool(np.ptp(self.position, axis=0).max() > 0.0)
+        return bool(np.ptp(self.position, axis=0).max() > 0.0) and not self._is_reckoned
+
+    @property
+    def _is_reckoned(self) -> bool:
+        """Whether the position is the sum of the velocities along the attitude, their noise
+        included: it then agrees with them whatever is wrong. Depth may be measured all the same."""
+        v = np.einsum("kij,kj->ki", quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
+        dt = np.diff(self.t)[:, None]
+        step = np.diff(self.position[:, :2], axis=0)
+        noise = np.median(np.abs(np.diff(v, 2, axis=0)), axis=0) / np.sqrt(6.0) * np.median(dt)
+        rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
+        left = [np.median(np.abs(step - dt * rule), axis=0) for rule in rules]
+        return bool((np.min(left, axis=0) < _RECKONED * noise).all())
 
     @property
     def guided(self) -> NDArray[np.bool_]:

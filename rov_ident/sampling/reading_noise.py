@@ -72,15 +72,14 @@ class ReadingNoise:
     """Says, as readings come, on which axes noise is not far below the wrench itself.
 
     ``relative`` is the noise in proportion to the wrench that is known of; ``variance`` (6,) that
-    of what is found beside it, zero where it has less than ``SHARE`` of the power of late. Until a
-    block of readings tells, all of them may be noise.
+    of what is found beside it, zero where it has less than ``SHARE`` of the power of late, and
+    infinite until a block of readings tells.
     """
 
     def __init__(self, relative: float = 0.0) -> None:
         self.relative = relative
-        self.variance = np.zeros(6)
+        self.variance = np.full(6, np.inf)
         self._power = np.zeros(6)
-        self._known = False
         self._t: list[float] = []
         self._readings: list[Array] = []
 
@@ -91,10 +90,10 @@ class ReadingNoise:
         self._t.append(t)
         self._readings.append(reading)
         if len(self._t) < _BLOCK + 2:
-            if not self._known:
-                self.variance += (reading**2 - self.variance) / len(self._t)
+            if t - self._t[0] > _RECENT:  # commands that come seldom are not waited for
+                self.variance[np.isinf(self.variance)] = 0.0
             return
-        self._known, block = True, np.array(self._readings)
+        block = np.array(self._readings)
         share = 1.0 if not self._power.any() else -math.expm1((self._t[0] - t) / _RECENT)
         self._power += share * (np.mean(block**2, axis=0) - self._power)
         variance = np.nan_to_num(scatter(block, self.relative)[0]) ** 2
