@@ -44,6 +44,13 @@ def test_who_only_runs_kernels_loads_no_linear_algebra(heavy_path):
     subprocess.run([sys.executable, "-c", _ONLY_RUN, heavy_path], check=True)
 
 
+@pytest.mark.parametrize("name", ["kernel", "lean", "released", "inner", "reordered"])
+def test_a_function_inherits_neither_rounding_nor_counting_from_its_first_caller(name):
+    """numba would hand these two down, and the last bits of a fit depend on what ran before it."""
+    function = getattr(jit, name)(lambda x: x)
+    assert {"fastmath", "_nrt"} <= function.targetoptions.keys()
+
+
 _WARM = """
 import sys
 from numba.core import event

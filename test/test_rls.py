@@ -70,7 +70,7 @@ def test_fold_is_step_after_step(heavy, noisy, forgetting):
     stepped = np.concatenate(infos)
     for a, b in zip(folded, state, strict=True):
         assert all(x.tobytes() == y.tobytes() for x, y in zip(*map(textbook.arrays, ([a], [b]))))
-    for name in rls.INFO.names:
+    for name in info.dtype.names:
         assert np.array_equal(info[name], stepped[name], equal_nan=name not in ("reason",))
     halves, _ = rls.fold(task, rls.init(task), rows[:333])
     halves, _ = rls.fold(task, halves, rows[333:])

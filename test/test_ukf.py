@@ -201,7 +201,7 @@ def test_fold_is_step_after_step(heavy, noisy):
     for a, b in zip(textbook.arrays(folded), textbook.arrays(state), strict=True):
         assert a.tobytes() == b.tobytes()
     stepped = np.concatenate(infos)
-    for name in ukf.INFO.names:
+    for name in info.dtype.names:
         assert np.array_equal(info[name], stepped[name], equal_nan=name != "reason")
     after = textbook.arrays((*task, rows))
     assert all(a.tobytes() == b.tobytes() for a, b in zip(before, after, strict=True))

@@ -120,7 +120,7 @@ def unflatten(parameters: Mapping[str, Any]) -> dict[str, Any]:
     Raises UserError if a name is given twice, or both as a value and as a section.
     """
     nested: dict[str, Any] = {}
-    for path, value in _leaves(parameters):
+    for path, value in leaves(parameters):
         section = nested
         for place, name in enumerate(path[:-1], start=1):
             section = section.setdefault(name, {})
@@ -133,12 +133,12 @@ def unflatten(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return nested
 
 
-def _leaves(parameters: Mapping[str, Any], above: Names = ()) -> Iterator[tuple[Names, Any]]:
+def leaves(parameters: Mapping[str, Any], above: Names = ()) -> Iterator[tuple[Names, Any]]:
     """Every value, and every empty section, with the path of names that leads to it."""
     for name, value in parameters.items():
         path = (*above, *str(name).split("."))
         if isinstance(value, Mapping) and value:
-            yield from _leaves(value, path)
+            yield from leaves(value, path)
         else:
             yield path, {} if isinstance(value, Mapping) else value
 

@@ -3,12 +3,12 @@
 import dataclasses
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import yaml
 
-from rov_ident.config.reading import estimated
+from rov_ident.config.reading import estimated, leaves
 from rov_ident.config.schema import PARAMETERS, VEHICLE_PARAMETERS, Config
 from rov_ident.core.files import write_file
 from rov_ident.core.yaml_file import Dumper
@@ -73,7 +73,7 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
     meanings = {c.name: f"{c.unit}: {c.meaning}" for c in catalogue()}
     meanings |= {c.name: f"{c.unit}: {c.meaning}" for c in input_catalogue()}
     sections: dict[str, dict[str, str]] = {"vehicle": {}, "coefficients": {}}
-    given = dict(_flat(parameters))
+    given = {".".join(path): value for path, value in leaves(parameters) if value != {}}
     for p in VEHICLE_PARAMETERS + PARAMETERS:
         section, _, name = p.key.rpartition(".")
         value = given.pop(p.key, p.default)
@@ -122,14 +122,6 @@ def _line(name: str, value: Any, meaning: str, remark: str) -> str:
     text = text.removesuffix(" null")
     words = "; ".join(filter(None, (meaning, f"from {remark}" if remark else "")))
     return f"{text:<40}  # {words}" if words else text
-
-
-def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{above}{name}.")
-        else:
-            yield above + name, value
 
 
 def _changed(section: Any) -> dict[str, Any]:

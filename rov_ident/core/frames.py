@@ -9,7 +9,7 @@ broadcast over leading dimensions.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,19 +50,32 @@ class FrameDefaults:
 ROS_DEFAULTS = FrameDefaults()
 
 
+def product(pw: Any, px: Any, py: Any, pz: Any, qw: Any, qx: Any, qy: Any, qz: Any) -> Any:
+    """The four components of the Hamilton product p q, of numbers or of arrays."""
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+def rotation_rows(w: Any, x: Any, y: Any, z: Any) -> Any:
+    """The rows of R, body -> world, of a unit quaternion, as tuples; the last is "down"."""
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+def _components(q: ArrayLike) -> Array:
+    return np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+
+
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Hamilton product p q of (..., 4) quaternions: first q is applied, then p."""
-    pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
-    qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    return np.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
+    return np.stack(product(*_components(p), *_components(q)), axis=-1)
 
 
 def quaternion_normalise(q: ArrayLike) -> Array:
@@ -74,12 +87,7 @@ def quaternion_normalise(q: ArrayLike) -> Array:
 
 def quaternion_to_matrix(q: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3), body -> world, of unit quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
+    rows = rotation_rows(*_components(q))
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
@@ -104,7 +112,7 @@ def quaternion_to_euler(q: ArrayLike) -> Array:
     From half the sum and half the difference of roll and yaw, so that precision holds up to pitch
     +-90 degrees, where only one of these exists and the other is taken as zero.
     """
-    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    w, x, y, z = _components(q)
     half_sum = np.arctan2(x + z, w - y)
     half_difference = np.arctan2(x - z, w + y)
     pitch = 2.0 * np.arctan2(np.hypot(x - z, w + y), np.hypot(x + z, w - y)) - 0.5 * np.pi

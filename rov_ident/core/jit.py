@@ -87,15 +87,16 @@ def _decorator(**options: Any) -> Callable[[F], F]:
 
 
 # `_nrt` is numba's reference counting: whenever an array is taken out of a tuple or a record, and
-# given back, it counts with locked instructions of 6 ns (docs/speed.md). It is set in every case:
-# otherwise a function inherits it from whichever caller is compiled first.
+# given back, it counts with locked instructions of 6 ns (docs/speed.md). `fastmath` is the licence
+# to round otherwise. Both are set in every case: otherwise a function inherits them from whichever
+# caller is compiled first, and the last bits of a fit would depend on which command ran before it.
 _LEAN: dict[str, bool] = {"cache": True, "_nrt": False}
 _INNER: dict[str, bool] = {**_LEAN, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
-kernel = _decorator(cache=True, _nrt=True)
-lean = _decorator(**_LEAN)
-released = _decorator(nogil=True, **_LEAN)
-inner = _decorator(**_INNER)
+kernel = _decorator(cache=True, _nrt=True, fastmath=False)
+lean = _decorator(fastmath=False, **_LEAN)
+released = _decorator(nogil=True, fastmath=False, **_LEAN)
+inner = _decorator(fastmath=False, **_INNER)
 reordered = _decorator(fastmath={"contract", "reassoc", "nsz"}, **_INNER)
 inlined = _decorator(inline="always", cache=True)  # cached for those who call it from Python
 

@@ -4,17 +4,11 @@ import math
 
 import numpy as np
 
+from rov_ident.core import frames
 from rov_ident.core.jit import inlined, kernel
 
-
-@inlined
-def rotation_of(w, x, y, z):
-    """The rows of R, body -> world, of a unit quaternion, as tuples; the last is "down"."""
-    return (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
+product = inlined(frames.product)
+rotation_of = inlined(frames.rotation_rows)
 
 
 @inlined
@@ -39,11 +33,7 @@ def turned(q, angle):
     half = 0.5 * math.sqrt(angle[0] ** 2 + angle[1] ** 2 + angle[2] ** 2)
     s = 0.5 * (math.sin(half) / half if half > 1e-9 else 1.0 - half * half / 6.0)
     c, x, y, z = math.cos(half), s * angle[0], s * angle[1], s * angle[2]
-    p = np.empty(4)
-    p[0] = q[0] * c - q[1] * x - q[2] * y - q[3] * z
-    p[1] = q[0] * x + q[1] * c + q[2] * z - q[3] * y
-    p[2] = q[0] * y - q[1] * z + q[2] * c + q[3] * x
-    p[3] = q[0] * z + q[1] * y - q[2] * x + q[3] * c
+    p = np.array(product(q[0], q[1], q[2], q[3], c, x, y, z))
     length = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2 + p[3] ** 2)
     for i in range(4):
         p[i] /= length

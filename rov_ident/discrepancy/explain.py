@@ -377,11 +377,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     if name != empirical_term.NAME:
         others = (*others, Alternative(empirical_term.NAME, "fits this bag as well"))
     model.final = best
-    model.found.append(
-        dataclasses.replace(
-            gain, separable=False, manoeuvre=EFFECTS[name].manoeuvre, alternatives=others
-        )
-    )
+    model.found.append(dataclasses.replace(unsure(gain), alternatives=others))
 
 
 def _supports_another(search: Search, judge: Judge, model: _Model, name: str) -> bool:

@@ -125,8 +125,7 @@ def possibly_earlier(found: Finding) -> Finding:
     kept = tuple(a for a in found.alternatives if a.why_not == _EQUAL)
     equal = {a.effect for a in kept}
     earlier = tuple(Alternative(name, _EARLIER) for name in lasting if name not in equal)
-    run, others = EFFECTS[found.effect].manoeuvre, kept + earlier
-    return dataclasses.replace(found, separable=False, manoeuvre=run, alternatives=others)
+    return dataclasses.replace(unsure(found), alternatives=kept + earlier)
 
 
 def unsure(found: Finding) -> Finding:

@@ -14,9 +14,10 @@ from rov_ident.config import Config
 from rov_ident.config.prior import typical
 from rov_ident.config.schema import missing_inputs
 from rov_ident.discrepancy.multiple_shooting import Equations, equations
-from rov_ident.effects import EFFECTS, compiled
+from rov_ident.effects import EFFECTS, compiled, rigid_body
+from rov_ident.effects import parameter as effect_parameter
 from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.model.coefficients import AXES, parse
+from rov_ident.model.coefficients import AXES, Coefficient, parse
 from rov_ident.model.equations import Array, Model
 
 Key = tuple[str, str]
@@ -92,14 +93,9 @@ class Hypothesis:
     def model(self) -> Model:
         """The equations of motion; unphysical values are not refused here."""
         values = self.coefficients
-        found = sorted((parse(n) for n in values), key=lambda c: not c.is_added_mass)
-        body = self.config.model.body
-        for name, parameters in self.effects.items():
-            change = EFFECTS[name].body
-            if change is not None:
-                body = change(body, **parameters)
+        found = in_order(values)
         theta = np.array([values[c.name] for c in found])
-        return Model(body, tuple(found), theta)
+        return Model(rigid_body(self.config.model.body, self.effects), found, theta)
 
     @cached_property
     def equations(self) -> Equations:
@@ -122,7 +118,12 @@ def bounds(key: Key) -> tuple[float, float, float]:
 
 
 def parameter(key: Key) -> EffectParameter:
-    return next(p for p in EFFECTS[key[0]].parameters if p.name == key[1])
+    return effect_parameter(*key)
+
+
+def in_order(names: Iterable[str]) -> tuple[Coefficient, ...]:
+    """The coefficients as a model wants them: the added masses first."""
+    return tuple(sorted(map(parse, names), key=lambda c: not c.is_added_mass))
 
 
 def centre(config: Config, key: Key) -> float:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.core.jit import copy, inner, record, released
+from rov_ident.core.jit import copy, floats, inner, record, released
 from rov_ident.core.runge_kutta import NODES, runge_kutta
 from rov_ident.effects import Acting, act, add_surroundings, memory, surrounds
 from rov_ident.model.coefficients import EXTENDED_SIZE
@@ -189,24 +189,16 @@ _LANES = 8  # six axes, none, and one more to fill the vectors
 
 _SCRATCH = record(
     [
-        ("nu", "f8", (6, 1)),
-        ("thrust", "f8", (6,)),  # wrench of the thrusters
-        ("push", "f8", (6,)),  # and of weight and effects
+        # wrench of the thrusters, and of weight and effects; nu at both ends of the step
+        *floats((6,), "thrust push velocity begin end"),
         ("slope", "f8", (4, 6)),  # of Runge and Kutta's stages
-        ("h", "f8", (6, 1)),
+        *floats((6, 1), "nu h"),
+        *floats((6, 6, 1), "mass inverse"),
         ("extended", "f8", (EXTENDED_SIZE, 1)),
-        ("mass", "f8", (6, 6, 1)),
-        ("inverse", "f8", (6, 6, 1)),
-        ("velocity", "f8", (6,)),
-        ("begin", "f8", (6,)),  # of the step: nu
-        ("end", "f8", (6,)),
-        ("nearby", "f8", (6, _LANES)),
-        ("nearby_h", "f8", (6, _LANES)),
-        ("nearby_extended", "f8", (EXTENDED_SIZE, _LANES)),
+        *floats((6, _LANES), "nearby nearby_h"),
         ("nearby_mass", "f8", (6, 6, _LANES)),
-        ("by_velocity", "f8", (6, 6)),
-        ("jacobian", "f8", (6, 6)),
-        ("square", "f8", (6, 6)),
+        ("nearby_extended", "f8", (EXTENDED_SIZE, _LANES)),
+        *floats((6, 6), "by_velocity jacobian square"),
         ("current", CURRENT),
     ]
 )

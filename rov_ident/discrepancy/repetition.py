@@ -14,7 +14,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.findings import parameters_of
+from rov_ident.discrepancy.findings import parameters_of, unsure
 from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
 from rov_ident.discrepancy.hypothesis import role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
@@ -23,7 +23,6 @@ from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import PENALTY
 from rov_ident.discrepancy.sensor_choice import HEADING
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import EFFECTS
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
 
@@ -139,12 +138,8 @@ def _with(f: Finding, repetition: Repetition) -> Finding:
         words = f" The records differ: {told}."
     if repetition.repeats is False:
         words += " Fitted to the others, it does not predict a record that was left out."
-    separable = f.separable and repetition.repeats is not False
-    manoeuvre = None if separable else f.manoeuvre or EFFECTS[f.effect].manoeuvre
-    return dataclasses.replace(
-        f, repetition=repetition, separable=separable, manoeuvre=manoeuvre,
-        sentence=f.sentence + words,
-    )  # fmt: skip
+    f = unsure(f) if repetition.repeats is False else f
+    return dataclasses.replace(f, repetition=repetition, sentence=f.sentence + words)
 
 
 def _left_out(

@@ -20,8 +20,9 @@ from rov_ident.reports import html as report
 from rov_ident.reports import plots
 from rov_ident.reports.result import NORMAL
 from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate, number
+from rov_ident.sampling import records
 
-UNITS = dict(zip(VELOCITIES, ("m/s",) * 3 + ("rad/s",) * 3))
+UNITS = dict(zip(VELOCITIES, records.UNITS))
 _SIDES = ("to port", "to starboard")
 _SENSES = (("astern", "forward"), _SIDES, ("up", "down"), _SIDES, ("bow down", "bow up"), _SIDES)
 SENSES = dict(zip(VELOCITIES, _SENSES))  # what a negative and a positive velocity mean

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import interpolated
-from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, parameter
+from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
 from rov_ident.discrepancy.multiple_shooting import (
     Motion,
     Steps,
@@ -31,7 +31,7 @@ from rov_ident.discrepancy.multiple_shooting import (
 from rov_ident.discrepancy.reading_noise import SMALL, draws
 from rov_ident.effects import EFFECTS, compiled, steered
 from rov_ident.effects.base import Effect, EffectParameter
-from rov_ident.model.coefficients import AXES, INPUTS, parse
+from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
 from rov_ident.sampling.reading_noise import resting_noise
@@ -228,8 +228,8 @@ class WindowedProblem:
         place = {key: i for i, key in enumerate(keys)}
         names = [n for section, n in keys if section == COEFFICIENTS]
         if names:
-            found = sorted((parse(n) for n in names), key=lambda c: not c.is_added_mass)
-            model = Model(h.model.body, tuple(found), np.zeros(len(found)))
+            found = in_order(names)
+            model = Model(h.model.body, found, np.zeros(len(found)))
             at, eq = [place[COEFFICIENTS, c.name] for c in found], h.equations.acting
             own = regressors(
                 equations(model, eq), self.driven(h.effects), self._relative(h, motion)

@@ -35,8 +35,7 @@ Constant forgetting, where it is asked for, touches only directions that the pre
 (subspace-of-information forgetting, Lai and Bernstein 2024). So nothing winds up.
 
 *Standard deviations* do not assume white innovations: the covariance of the accumulated score
-``sum of phi' e / s``, with its correlation in time, stands between two inverse informations (the
-sandwich of Newey and West 1987, with an exponential lag window).
+``sum of phi' e / s`` (`shared.add_scatter`) stands between two inverse informations.
 """
 
 from collections import namedtuple
@@ -72,14 +71,15 @@ from rov_ident.estimation.physical import Estimate, calibrated
 from rov_ident.estimation.process_noise import wrench_noise
 from rov_ident.estimation.shared import (
     FASTEST,
-    INFO,
+    LAG,
     REACH,
     RELEARNING_TIME,
     WALK_PERIOD,
     Problem,
-    add_score,
+    add_scatter,
     begin,
     drive_sides,
+    folded,
     learnt,
     measure,
     problem_of,
@@ -101,7 +101,6 @@ from rov_ident.estimation.square_root import (
 )
 from rov_ident.estimation.wrench_residual import filtered_residual
 from rov_ident.model.equations import add_added_mass, momentum_columns
-from rov_ident.sampling.sample import parts
 
 USED, RESTARTED, WAITING, GATED, NOT_FINITE, UNPREDICTABLE = range(6)
 REASONS = (
@@ -196,10 +195,7 @@ def init(task: Problem) -> State:
 
 def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
     """:func:`step` over samples (k,) of SAMPLE; info (k,) of INFO. The given state is unchanged."""
-    state = State(*(part.copy() for part in state))
-    info = np.zeros(len(samples), dtype=INFO)
-    _fold(task, state, *parts(samples), info)
-    return state, info
+    return folded(_fold, task, state, samples)
 
 
 def fold_about(
@@ -209,13 +205,11 @@ def fold_about(
 
     None if the velocities run away with it.
     """
-    state = State(*(part.copy() for part in state))
-    info = np.zeros(len(samples), dtype=INFO)
     deviation = np.clip(solution, -task.reach, task.highest)[state.order]
-    state.nu[:] += state.sensitivity @ (deviation - state.deviation)
-    state.deviation[:] = deviation
-    state.scalars["pinned"] = True
-    _fold(task, state, *parts(samples), info)
+    pinned = state.scalars.copy()
+    pinned["pinned"] = True
+    nu = state.nu + state.sensitivity @ (deviation - state.deviation)
+    state, info = fold(task, state._replace(nu=nu, deviation=deviation, scalars=pinned), samples)
     state.scalars["pinned"] = False
     return None if (info["reason"] == UNPREDICTABLE).any() else state
 
@@ -754,7 +748,7 @@ def _add_up(task, state, work, since):
             moved += root[a, b] * change[b]
         for b in range(a, n):
             gradient[b] += root[a, b] * moved
-    add_score(gradient, state.lagged, work.score, since)
+    add_scatter(gradient, np.exp(-since / LAG), work.score, state.lagged)
 
 
 # ---------------------------------------------------------------- forgetting

@@ -1,6 +1,7 @@
 """What the two recursive estimators share beside their process noise and the published residual."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from rov_ident.estimation.innovation_monitor import TIME
 from rov_ident.estimation.process_noise import process
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Structure, in_motion
+from rov_ident.sampling.sample import parts
 
 MAX_STEP = 0.05  # s; of one step of the prediction
 LIGHTEST = 0.2  # of the rigid body's own inertia: no model that is tried is lighter
@@ -166,6 +168,20 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
                 moves[e] = False
 
 
+_State = TypeVar("_State", bound=tuple[Any, ...])
+
+
+def folded(
+    kernel: Callable[..., None], task: Problem, state: _State, samples: NDArray[np.void]
+) -> tuple[_State, NDArray[np.void]]:
+    """A ``kernel`` of either estimator over samples (k,) of SAMPLE; info (k,) of INFO. The given
+    state is unchanged."""
+    state = type(state)(*(part.copy() for part in state))
+    info = np.zeros(len(samples), dtype=INFO)
+    kernel(task, state, *parts(samples), info)
+    return state, info
+
+
 @inner
 def begin(info, sample):
     """Nothing has happened yet to the sample: whether nothing in it would spoil a state.
@@ -233,17 +249,18 @@ def steps_of(dt):
 
 
 @inlined
-def add_score(g, lagged, score, since):
-    """Add g (n,) to the covariance (n, n) of the summed score, its correlation in time included.
+def add_scatter(score, fade, total, lagged):
+    """Add to the covariance total (n, n) of a summed score what one more of it, (n,), adds, its
+    correlation in time included.
 
-    With an exponential lag window (Newey and West 1987), of which ``lagged`` (n,) holds the past;
-    the last g was ``since`` seconds ago.
+    With an exponential lag window (Newey and West 1987): ``lagged`` (n,) is the sum of those before
+    it, which fades by the factor ``fade`` from one to the next.
     """
-    n, decay = len(lagged), np.exp(-since / LAG)
+    n = len(lagged)
     for a in range(n):
-        lagged[a] *= decay
+        lagged[a] *= fade
     for a in range(n):
         for b in range(n):
-            score[a, b] += g[a] * (g[b] + lagged[b]) + lagged[a] * g[b]
+            total[a, b] += score[a] * (score[b] + lagged[b]) + lagged[a] * score[b]
     for a in range(n):
-        lagged[a] += g[a]
+        lagged[a] += score[a]

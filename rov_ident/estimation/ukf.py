@@ -22,8 +22,7 @@ evidence: while the innovations are larger than they should be, variances grow, 
 (``ukf.random_walk`` lets them walk all the time.)
 
 *Standard deviations* do not assume white innovations: the covariance of their summed influence on
-the coefficients, with its correlation in time, stands between two covariances of the filter (the
-sandwich of Newey and West 1987, with an exponential lag window).
+the coefficients (`shared.add_scatter`) stands between two covariances of the filter.
 """
 
 from collections import namedtuple
@@ -50,12 +49,13 @@ from rov_ident.estimation.physical import Estimate, calibrated
 from rov_ident.estimation.process_noise import wrench_noise
 from rov_ident.estimation.shared import (
     FASTEST,
-    INFO,
+    LAG,
     RELEARNING_TIME,
     WALK_PERIOD,
     Problem,
-    add_score,
+    add_scatter,
     begin,
+    folded,
     learnt,
     measure,
     problem_of,
@@ -71,7 +71,6 @@ from rov_ident.model.equations import (
     generalized_force,
     symmetric_product,
 )
-from rov_ident.sampling.sample import parts
 
 USED, RESTARTED, GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE = range(6)
 REASONS = (
@@ -132,10 +131,7 @@ def init(task: Problem) -> State:
 
 def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
     """:func:`step` over samples (k,) of SAMPLE; info (k,) of INFO. The given state is unchanged."""
-    state = State(*(part.copy() for part in state))
-    info = np.zeros(len(samples), dtype=INFO)
-    _fold(task, state, *parts(samples), info)
-    return state, info
+    return folded(_fold, task, state, samples)
 
 
 def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
@@ -614,7 +610,7 @@ def _sum_up(state, work, since):
         g[j] = state.x[6 + j] - state.before[j]
         state.before[j] = state.x[6 + j]
     cholesky_solve(root, n, g)
-    add_score(g, state.lagged, state.score, since)
+    add_scatter(g, np.exp(-since / LAG), state.score, state.lagged)
 
 
 @reordered

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rov_ident.config import Config
-from rov_ident.config.prior import prior_of
+from rov_ident.config.prior import THRUST_SCALE, prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.linalg import interpolated
@@ -34,7 +34,7 @@ from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import fit_batch
-from rov_ident.offline.fit import IDENTIFIABLE, SCALE, Fit, fit_online, thrust_or_mass
+from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online, thrust_or_mass
 from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
@@ -256,7 +256,7 @@ def _model(quick: Fit) -> Iterator[Remark]:
         text = ", ".join(f"{own} {told} (configured: {mean:g})" for _, own, told, mean in parts)
         text += "; a fit estimates it along, but the simulation as configured lacks it"
         if effect == "thrust_scale":
-            text += f". Weigh the vehicle: {thrust_or_mass(values[SCALE])}"
+            text += f". Weigh the vehicle: {thrust_or_mass(values[THRUST_SCALE])}"
         yield Remark(effect.replace("_", " "), WARNING, text)
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.jit import inlined, kernel, lean, record
+from rov_ident.core.jit import floats, inlined, kernel, lean, record
 from rov_ident.model.coefficients import (
     ABSOLUTE,
     EXTENDED_SIZE,
@@ -458,9 +458,7 @@ def coriolis(p, nu):
 CURRENT = record(
     [
         ("relative", "f8", (6,)),  # nu through the water
-        ("nu", "f8", (6, 1)),
-        ("h", "f8", (6, 1)),
-        ("through_water", "f8", (6, 1)),
+        *floats((6, 1), "nu h through_water"),
         ("extended", "f8", (EXTENDED_SIZE, 1)),
     ]
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config, dump
+from rov_ident.config.prior import THRUST_SCALE
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
@@ -31,7 +32,6 @@ TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum 
 _SHOWN = 60.0  # s of motion in the picture of a fit
 
 
-SCALE = "thrust_scale.scale"
 _NOTICED = 0.1  # of the scale's prior standard deviation: 1.5 % of thrust
 
 
@@ -95,7 +95,7 @@ class Fit(Shown, Result):
     @property
     def to_weigh(self) -> tuple[str, ...]:
         """That the vehicle should be weighed, where its mass may be off instead of the thrust."""
-        scale = float(dict(zip(self.names, self.values)).get(SCALE, 1.0))
+        scale = float(dict(zip(self.names, self.values)).get(THRUST_SCALE, 1.0))
         if abs(scale - 1.0) <= _NOTICED * self.given.wrench.scale_std:
             return ()
         return (f"Weigh the vehicle: {thrust_or_mass(scale)}.",)

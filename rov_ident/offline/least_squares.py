@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from rov_ident.config import Config
-from rov_ident.core.jit import inlined, kernel
+from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
 from rov_ident.effects import Acting, compiled
+from rov_ident.estimation.shared import add_scatter
 from rov_ident.model.equations import Array, Model
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
@@ -181,23 +182,6 @@ def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
 def _scatter(score, fade, total, lagged):
     for k in range(len(score)):
         add_scatter(score[k], fade, total, lagged)
-
-
-@inlined
-def add_scatter(score, fade, total, lagged):
-    """Add to total (n, n) the products of a score (n,) with itself and with those before it.
-
-    ``lagged`` (n,) is the sum of these, which fades by the factor ``fade`` from one to the next.
-    """
-    n = len(lagged)
-    for i in range(n):
-        lagged[i] *= fade
-    for i in range(n):
-        f, h = score[i], lagged[i]
-        for j in range(n):
-            total[i, j] += f * (score[j] + lagged[j]) + h * score[j]
-    for i in range(n):
-        lagged[i] += score[i]
 
 
 # ------------------------------------------------------------------ what a bag can tell

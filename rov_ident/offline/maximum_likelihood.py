@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
-from rov_ident.core.jit import inlined, kernel, record
+from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
 from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME
 from rov_ident.effects import EFFECTS
@@ -60,6 +60,7 @@ from rov_ident.estimation.observer import (
 )
 from rov_ident.estimation.shared import (
     FOLLOWED,
+    add_scatter,
     drive_sides,
     measure,
     steps_of,
@@ -69,7 +70,6 @@ from rov_ident.estimation.shared import (
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
-from rov_ident.offline.least_squares import add_scatter
 from rov_ident.sampling.reading_noise import SHARE
 from rov_ident.sampling.sample import NO_SIDES, parts
 
@@ -86,6 +86,7 @@ _SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better t
 _SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
 _NONE = np.zeros(0)
+_NO_ROWS = np.zeros((3, 0, 6))
 LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
 
 
@@ -167,15 +168,35 @@ def one_pass(
     free: NDArray[np.bool_] | None = None,
     gate: float = np.inf,
     effects: Array = _NONE,
+    out: Array = _NO_ROWS,
 ) -> Pass:
     """The likelihood of samples (k,) of SAMPLE at the model's values, with its derivatives.
 
     ``estimated`` (n,) are indices into theta, behind which come the values (p,) of parameters of
     ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
-    measurement.
+    measurement. ``out`` (3, k, 6), unless it is empty, is filled with :class:`Innovations`.
     """
-    nothing = np.zeros((3, 0, 6))
-    return _passed(parts(samples), model, estimated, noise, free, gate, effects, nothing)
+    free = np.ones(6, dtype=bool) if free is None else free
+    samples, sides = parts(samples)
+    if not len(effects):
+        sides = NO_SIDES
+    elif noise.untaught.any():
+        sides = sides.copy()
+        sides[:, :6][:, noise.untaught.T] = 0.0
+    mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
+    inverse, at = np.zeros((6, 6)), np.ix_(free, free)
+    inverse[at] = np.linalg.inv(mass[at])
+    equations = _Equations(
+        model.structure, mass, inverse, np.repeat(theta, LANES, axis=1),
+        np.ascontiguousarray(theta), model.body.restoring, estimated, free,
+    )  # fmt: skip
+    n = len(estimated)
+    information, score, scatter, sums = np.zeros((n, n)), np.zeros(n), np.zeros((n, n)), np.zeros(3)
+    _filter(
+        equations, samples, sides, noise.process(samples), noise.measurement, gate,
+        information, score, scatter, sums, out,
+    )  # fmt: skip
+    return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
 
 
 class Innovations(NamedTuple):
@@ -196,19 +217,8 @@ def innovations(
     effects: Array = _NONE,
 ) -> Innovations:
     """What the filter finds in each sample."""
-    return _innovations(parts(samples), model, noise, free, gate, effects)
-
-
-def _innovations(
-    split: tuple[Samples, Array],
-    model: Model,
-    noise: Noise,
-    free: NDArray[np.bool_] | None,
-    gate: float,
-    effects: Array,
-) -> Innovations:
-    out, nothing = np.full((3, len(split[0]), 6), np.nan), np.zeros(0, dtype=np.int64)
-    _passed(split, model, nothing, noise, free, gate, effects, out)
+    out, nothing = np.full((3, len(samples), 6), np.nan), np.zeros(0, dtype=np.int64)
+    one_pass(samples, model, nothing, noise, free, gate, effects, out)
     return Innovations(*out)
 
 
@@ -229,37 +239,6 @@ def whiteness(
     out = np.zeros((2, 6))
     _add_power(found.e / np.sqrt(found.s), samples, out)
     return out
-
-
-def _passed(
-    split: tuple[Samples, Array],
-    model: Model,
-    estimated: NDArray[np.int64],
-    noise: Noise,
-    free: NDArray[np.bool_] | None,
-    gate: float,
-    effects: Array,
-    out: Array,
-) -> Pass:
-    free = np.ones(6, dtype=bool) if free is None else free
-    samples, sides = split if len(effects) else (split[0], NO_SIDES)
-    if len(effects) and noise.untaught.any():
-        sides = sides.copy()
-        sides[:, :6][:, noise.untaught.T] = 0.0
-    mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
-    inverse, at = np.zeros((6, 6)), np.ix_(free, free)
-    inverse[at] = np.linalg.inv(mass[at])
-    equations = _Equations(
-        model.structure, mass, inverse, np.repeat(theta, LANES, axis=1),
-        np.ascontiguousarray(theta), model.body.restoring, estimated, free,
-    )  # fmt: skip
-    n = len(estimated)
-    information, score, scatter, sums = np.zeros((n, n)), np.zeros(n), np.zeros((n, n)), np.zeros(3)
-    _filter(
-        equations, samples, sides, noise.process(samples), noise.measurement, gate,
-        information, score, scatter, sums, out,
-    )  # fmt: skip
-    return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
 
 
 # ------------------------------------------------------------------ noise
@@ -295,8 +274,8 @@ def noise_slope(
 
     Without ``process`` only the measurements' are looked at.
     """
-    split, levels = parts(samples[:_NOISE_SAMPLES]), _levels(noise)
-    base = _innovations(split, model, noise, free, _GATE, effects)
+    samples, levels = samples[:_NOISE_SAMPLES], _levels(noise)
+    base = innovations(samples, model, noise, free, _GATE, effects)
     keep = np.isfinite(base.e)
     e, s = base.e[keep], base.s[keep]
     free_levels = np.concatenate([free, free & process, [process]])
@@ -304,7 +283,8 @@ def noise_slope(
     for i in np.flatnonzero(free_levels):
         moved = levels.copy()
         moved[i] += _STEP_NOISE
-        there = _innovations(split, model, _at_levels(noise, moved, process), free, np.inf, effects)
+        moved_noise = _at_levels(noise, moved, process)
+        there = innovations(samples, model, moved_noise, free, np.inf, effects)
         slopes[i, 0] = (there.e[keep] - e) / (_STEP_NOISE * np.sqrt(s))
         slopes[i, 1] = np.log(there.s[keep] / s) / _STEP_NOISE
     unit = e / np.sqrt(s)
@@ -562,10 +542,8 @@ _SCRATCH = record(
     [
         *OBSERVER,
         ("noise", "f8", (6, 6)),  # variance density of the acceleration
-        ("wrench", "f8", (6,)),  # that acts
-        ("z", "f8", (6,)),  # nu as measured
-        ("r", "f8", (6,)),  # its variance
-        ("cross", "f8", (6,)),  # covariance of nu with the depth
+        # that acts; nu as measured, its variance; covariance of nu with the depth
+        *floats((6,), "wrench z r cross"),
     ]
 )
 
@@ -695,13 +673,8 @@ def _filter(
         if samples[k].depth_variance > 0.0:
             size = 7
             break
-    x, old, p, sensitivity = (
-        np.zeros(size),
-        np.zeros(6),
-        np.zeros((size, size)),
-        np.zeros((size, n)),
-    )
-    cross = np.zeros(size)
+    x, old, cross = np.zeros(size), np.zeros(6), np.zeros(size)
+    p, sensitivity = np.zeros((size, size)), np.zeros((size, n))
     now, lagged, row, scale = np.zeros(n), np.zeros(n), np.zeros(n), np.ones(n)
     s = work.scratch[0]
     for i in range(6):

@@ -18,7 +18,7 @@ from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.messages import Array, Imu, Odometry
-from rov_ident.core.quaternions import rotation, turned
+from rov_ident.core.quaternions import product, rotation, turned
 from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME, averaged
 from rov_ident.effects import affects_sensors, compiled, correct, heading_error
 from rov_ident.effects.base import Reading
@@ -91,7 +91,7 @@ _ZERO = np.zeros(3)
 
 CHANCES = 4  # odometry that is never confirmed within so many messages is all there is
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
-_UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
+UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
 _SUREST = 1e-4  # of the configured variance: no message is believed to be surer (docs/trust.md)
 _DRIFT = 1e-8  # rad2/s; of an attitude by all that is no noise of the rate: 6 mrad in an hour
 _POWER_TIME = 5.0  # s; over which it is judged whether a component of nu moves
@@ -319,13 +319,9 @@ def _correct_attitude(k, s, q):
     total = k.attitude_variance + s.attitude_variance
     gain = k.attitude_variance / total
     # vector part of conj(k.q) * q: half the rotation from one to the other
-    a, b = k.q, q
-    e = np.empty(3)
-    e[0] = a[0] * b[1] - a[1] * b[0] - a[2] * b[3] + a[3] * b[2]
-    e[1] = a[0] * b[2] + a[1] * b[3] - a[2] * b[0] - a[3] * b[1]
-    e[2] = a[0] * b[3] - a[1] * b[2] + a[2] * b[1] - a[3] * b[0]
-    sign = 1.0 if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] >= 0.0 else -1.0
-    e *= 2.0 * sign
+    a, e = k.q, np.empty(3)
+    cosine, e[0], e[1], e[2] = product(a[0], -a[1], -a[2], -a[3], q[0], q[1], q[2], q[3])
+    e *= 2.0 if cosine >= 0.0 else -2.0
     nis = _compare(k, _ATTITUDE, e, total)
     credible, anew = nis < s.gate**2, False
     if not credible and k.chances > 0:
@@ -477,7 +473,7 @@ def fuse(
     _assign(out.gyro_bias, k.gyro_bias)
     variance = np.empty(6)
     for i in range(6):
-        given = has_odometry and 0.0 < m.variance[i] < _UNKNOWN
+        given = has_odometry and 0.0 < m.variance[i] < UNKNOWN
         least = _SUREST * s.odometry_variance[i]
         variance[i] = max(m.variance[i], least) if given else s.odometry_variance[i]
         out.odometry_variance[i] = variance[i]
@@ -488,9 +484,9 @@ def fuse(
     has_velocity, has_rates = has_odometry, has_odometry
     if has_odometry:
         for i in range(3):
-            if _UNKNOWN <= m.variance[i] < np.inf:
+            if UNKNOWN <= m.variance[i] < np.inf:
                 has_velocity = False
-            if _UNKNOWN <= m.variance[3 + i] < np.inf:
+            if UNKNOWN <= m.variance[3 + i] < np.inf:
                 has_rates = False
                 if not has_imu:
                     has_velocity = has_odometry = False

@@ -23,9 +23,9 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import Coefficient
 from rov_ident.model.equations import force_of_one
 from rov_ident.model.scales import WORKING_SPEED
+from rov_ident.sampling.kinematic_filter import UNKNOWN
 
 DEPTH_STD = 0.01  # m; only where a fit of its noise begins
-_UNKNOWN = 1e3  # a variance from which drivers mean "not measured", as in the kinematic filter
 _MAX_STEP = 0.05  # s; a tenth of the time in which drag stops a small vehicle
 _FASTEST = 10.0  # m/s; a model that goes faster is wrong
 
@@ -82,7 +82,7 @@ def refusal(name: str) -> UserError:
 
 def _is_measured(message: Odometry) -> bool:
     variance = message.twist_variance[:3]
-    if not np.isfinite(message.linear).all() or not (variance < _UNKNOWN).all():
+    if not np.isfinite(message.linear).all() or not (variance < UNKNOWN).all():
         return False
     return bool((variance >= 0.0).all() or message.linear.any())
 

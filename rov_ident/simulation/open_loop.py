@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.jit import inner, lean, record
+from rov_ident.core.jit import floats, inner, lean, record
 from rov_ident.core.quaternions import rotate, rotation_of
 from rov_ident.core.runge_kutta import NODES, runge_kutta
 from rov_ident.effects import Acting, add_surroundings, compiled, surrounds
@@ -142,19 +142,12 @@ _NOTHING = compiled({})
 
 _SCRATCH = record(
     [
-        ("state", "f8", (13,)),  # position, quaternion, nu
-        ("stage", "f8", (13,)),
-        ("slope", "f8", (13,)),
-        ("end", "f8", (13,)),  # of a step
-        ("thrust", "f8", (6,)),  # wrench of the thrusters
-        ("push", "f8", (6,)),  # and of effects
-        ("guide_nu_dot", "f8", (6,)),  # of the components that are not free
-        ("nu", "f8", (6, 1)),
-        ("h", "f8", (6, 1)),
+        *floats((13,), "state stage slope end"),  # position, quaternion, nu; end: of a step
+        # wrench of the thrusters, and of effects; nu_dot of the components that are not free
+        *floats((6,), "thrust push guide_nu_dot velocity"),
+        *floats((6, 1), "nu h"),
+        *floats((6, 6, 1), "mass inverse"),  # the inverse among the free components
         ("extended", "f8", (EXTENDED_SIZE, 1)),
-        ("mass", "f8", (6, 6, 1)),
-        ("inverse", "f8", (6, 6, 1)),  # among the free components
-        ("velocity", "f8", (6,)),
         ("rotation", "f8", (3, 3)),
         ("current", CURRENT),
     ]

@@ -18,6 +18,12 @@ from rov_ident.steering.nomoto_model import (
 from rov_ident.steering.zigzag import Zigzag
 
 
+def heading_noise(headings: Sequence[Array]) -> float:
+    """Standard deviation [rad] of white noise on even headings, from their third differences."""
+    third = np.concatenate([np.diff(heading, 3) for heading in headings])
+    return max(float(np.sqrt(np.mean(third**2) / 20.0)), 1e-6)  # 1 + 9 + 9 + 1
+
+
 class Filter:
     """State ``[psi, x1 (, x2), theta / sizes]`` of a model, from sample to sample.
 
@@ -86,8 +92,7 @@ def unscented(runs: Sequence[Zigzag], model: Nomoto) -> Nomoto:
     sizes = np.maximum(np.abs(model.theta), 1e-9)
     sizes[-1] = 0.1 * max(float(np.std(run.rudder)) for run in runs)
     rate = max(float(np.std(np.diff(r.heading[r.known]) / np.diff(r.t[r.known]))) for r in runs)
-    third = np.concatenate([np.diff(run.heading[run.known], 3) for run in runs])
-    noise = max(float(np.sqrt(np.mean(third**2) / 20.0)), 1e-6)  # 1 + 9 + 9 + 1
+    noise = heading_noise([run.heading[run.known] for run in runs])
 
     def filtered(log_drive: float) -> Filter:
         f = Filter(

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rov_ident.core.messages import Array
-from rov_ident.steering.nomoto_filter import Filter
+from rov_ident.steering.nomoto_filter import Filter, heading_noise
 
 STEP = 0.1  # s between the samples used: a tenth of the least T in docs/nomoto.md
 GAP = 3.0  # s without a sample, after which the motion before is unknown
@@ -171,7 +171,7 @@ class RecursiveNomoto:
         theta = np.array([1.0 / time, k / time, 0.0])
         sizes = np.array([*np.abs(theta[:2]), 0.1 * max(float(np.std(rudder)), 1e-6)])
         rate = max(float(np.std(np.diff(heading) / np.diff(t))), 1e-9)
-        noise = max(float(np.sqrt(np.mean(np.diff(heading, 3) ** 2) / 20.0)), 1e-6)
+        noise = heading_noise([heading])
         return [Filter(1, False, 0.5 * theta, sizes, rate, noise, rate * d) for d in _DRIVES]
 
     def _advance(self, sample: tuple[float, float, float], begins: bool) -> None:
