@@ -165,7 +165,7 @@ def test_noise_of_the_reading_is_not_taken_for_a_fault(seed):
 
 
 def test_noise_of_the_reading_is_named_with_its_size():
-    case = draw(2, conditions=NOISY)
+    case = draw(2, conditions=dataclasses.replace(NOISY, duration=75.0))
     explanation = explain([streams_of(case)], case.config)
     (found,) = explanation.findings.effects  # and nothing else is taken for a cause of it
     assert found.effect == "wrench_noise"

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import math
 import os
 import re
 import subprocess
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 from conftest import HEAVY
 from matplotlib.figure import Figure
+from program import lay_out_shipped
 from threadpoolctl import threadpool_info
+from tiers import more
 
 import rov_ident as ri
 from rov_ident.cli.program import main
@@ -389,11 +392,11 @@ def test_the_lines_in_the_readme_run(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # the first use of anything compiles it
-def test_the_notebook_runs(tmp_path):
-    """In a kernel of its own, from top to bottom, as the reader runs it."""
+@pytest.mark.parametrize("seconds", [25.0, *more(math.inf)])
+def test_the_notebook_runs(tmp_path, seconds):
+    """In a kernel of its own, from top to bottom, as the reader runs it; with so much of the bag"""
     (tmp_path / "examples").mkdir()
-    for folder in ("bags", "config"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
+    lay_out_shipped(tmp_path, seconds)
     notebook = nbformat.read(ROOT / "examples" / "first_fit.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "shipped without output"
     where = {"metadata": {"path": str(tmp_path / "examples")}}
