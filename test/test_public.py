@@ -380,8 +380,7 @@ def test_bad_files_are_refused_in_a_sentence(tmp_path, capsys, text):
 
 @pytest.mark.slow
 def test_the_lines_in_the_readme_run(tmp_path, monkeypatch, capsys):
-    for folder in ("bags", "config"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
+    lay_out_shipped(tmp_path, 25.0)
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "README.md").read_text()
     code = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
