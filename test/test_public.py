@@ -216,8 +216,19 @@ def results(bag, fit):
     }
 
 
-@pytest.mark.parametrize("name", ["fit", "check", "beside", "manoeuvre", "plan", "comparison"])
-def test_a_result_shows_itself(results, name, tmp_path):
+# All are drawn and saved by the same functions (reports/result.py): each ending once, then all.
+PICTURES = {".png": b"\x89PNG", ".pdf": b"%PDF", ".html": b"<!doctype"}
+KINDS = ["fit", "check", "beside", "manoeuvre", "plan", "comparison"]
+
+
+@pytest.mark.parametrize(
+    ("name", "endings"),
+    [
+        *((name, [[*PICTURES][i % 3]]) for i, name in enumerate(KINDS)),
+        *more(*((name, [*PICTURES]) for name in KINDS)),
+    ],
+)
+def test_a_result_shows_itself(results, name, endings, tmp_path):
     result = results[name]
     assert isinstance(result.plot(), Figure)
     assert str(result) == str(result.table())
@@ -227,9 +238,9 @@ def test_a_result_shows_itself(results, name, tmp_path):
     assert shown.count("<table>") >= 1 and "<svg" in shown and "<script" not in shown
     result.save(tmp_path / "new" / "result.json")
     assert json.loads((tmp_path / "new" / "result.json").read_text()) == document
-    for ending, magic in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".html", b"<!doctype")):
+    for ending in endings:
         result.save(tmp_path / f"result{ending}")
-        assert (tmp_path / f"result{ending}").read_bytes().startswith(magic)
+        assert (tmp_path / f"result{ending}").read_bytes().startswith(PICTURES[ending])
     with pytest.raises(ri.UserError, match="is saved as"):
         result.save(tmp_path / "result.docx")
     with pytest.raises(ri.UserError, match="cannot be written"):
