@@ -104,7 +104,7 @@ def test_nothing_readable_is_refused(paths, off, jobs):
 def test_the_command(paths, tmp_path, heavy_path):
     out, report, saved = tmp_path / "fit.json", tmp_path / "fit.html", tmp_path / "fitted.yaml"
     done = run(
-        "fit", *paths, "--config", heavy_path, "--estimator", "ls",
+        "fit", *paths, "--config", heavy_path, "--estimator", "ls", "--jobs", 1,
         "--json", out, "--report", report, "--save", saved, "--quiet",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
