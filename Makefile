@@ -19,8 +19,8 @@ demo: .venv/demo.stamp
 # tests of live nodes wait for half of their time.
 PYTEST := $(BIN)/python -m pytest -n 3 --dist worksteal
 
-## style, types, then all tests but the studies (11 to 15 min on two idle cores with nothing compiled,
-## as fast as these are; 1,116 s of processor once compiled, before the last 30 tests; bar: 8 minutes)
+## style, types, then all tests but the studies (once all is compiled some 1,020 s of processor in one
+## process, the sum over files; workers load modules and kernels anew; bar: 8 minutes on two cores)
 test: check
 	$(PYTEST) --timeout 900 -m "not study"
 

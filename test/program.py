@@ -12,7 +12,10 @@ import subprocess
 import sys
 import warnings
 
+from bench import ROOT
 from rov_ident.cli import main
+from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_writer import BagWriter
 
 _QUIET = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 
@@ -56,3 +59,15 @@ def run_alone(*arguments, cwd=None):
     """The finished program, in a process of its own."""
     command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=cwd)
+
+
+def lay_out_shipped(folder, seconds):
+    """The shipped bags and configurations, of the bag no more than so much of its beginning."""
+    (folder / "config").symlink_to(ROOT / "config")
+    (folder / "bags").mkdir()
+    first = None
+    with BagWriter(folder / "bags" / "demo.mcap") as writer:
+        for raw in Bag(ROOT / "bags" / "demo.mcap").iter_raw():
+            first = raw.log_time if first is None else first
+            if raw.log_time - first < 1e9 * seconds:
+                writer.write(raw.topic, raw.type_name, raw.log_time, raw.data)

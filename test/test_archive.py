@@ -11,6 +11,7 @@ from rov_ident.io.write_messages import write_messages
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import fit_batch
 from rov_ident.sampling import records
+from rov_ident.sampling.sample import joined
 from rov_ident.sampling.smoothing import smoothed
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -103,7 +104,7 @@ def test_nothing_readable_is_refused(paths, off, jobs):
 def test_the_command(paths, tmp_path, heavy_path):
     out, report, saved = tmp_path / "fit.json", tmp_path / "fit.html", tmp_path / "fitted.yaml"
     done = run(
-        "fit", *paths, "--config", heavy_path, "--estimator", "ls", "--jobs", 2,
+        "fit", *paths, "--config", heavy_path, "--estimator", "ls", "--jobs", 1,
         "--json", out, "--report", report, "--save", saved, "--quiet",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -141,7 +142,7 @@ def test_options_that_would_not_be_heeded_are_refused(paths, heavy_path, options
 def test_smoothing_knows_bias_and_attitude_better(heavy):
     suite = sensors.Suite(gyro_bias_std=0.005)
     run = sensors.dive(heavy, duration=60.0, suite=suite, seed=1)
-    live = np.concatenate(list(records.samples_of(heavy, run)))
+    live = joined(list(records.samples_of(heavy, run)))
     after = smoothed(live)
     origin = min(m.stamp for *_, m in run.messages)
     t = live["t"] + (origin - sensors.START) * 1e-9

@@ -287,7 +287,7 @@ def surge_only(heavy, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def proposal(heavy, surge_only):
-    return propose(heavy, surge_only, 30.0, Limits((4.0, 4.0, 1.5)))
+    return propose(heavy, surge_only, 15.0, Limits((4.0, 4.0, 1.5)))
 
 
 def test_the_proposal_is_safe_and_shrinks_the_worst(heavy, proposal):

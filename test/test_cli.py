@@ -112,8 +112,10 @@ def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator
     assert "X_udot" in done.stdout
 
 
-def test_live_estimators_replay_a_bag(tmp_path, bag, compiled):
-    out = tmp_path / "replayed.mcap"
+def test_live_estimators_replay_a_bag(tmp_path, compiled):
+    bag, out = tmp_path / "dive.mcap", tmp_path / "replayed.mcap"
+    made = run("simulate", "--config", HEAVY, "--manoeuvre", "steps", "--duration", 6, "--out", bag)
+    assert made.returncode == 0, made.stderr
     done = run_alone("replay", bag, "--config", HEAVY, "--rate", 0, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "rls" in done.stdout and "ukf" in done.stdout

@@ -8,6 +8,7 @@ from test_samples import moments
 
 from rov_ident.core.messages import WRENCH
 from rov_ident.sampling.dropped_commands import CommandPeriod, completed, estimated
+from rov_ident.sampling.sample import joined
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -115,7 +116,7 @@ def test_the_wrench_is_not_late(heavy, seed):
         sampler = Sampler(heavy)
         sampler.commands = []
         parts = [sampler.push(role, message) for _, role, message in messages]
-        taken = np.concatenate([*parts, sampler.flush()])
+        taken = joined([*parts, sampler.flush()])
         late = (sampler.origin - sensors.START) * 1e-9
         taken["t"] += late
         commands = [(round(t + late, 6), wrench) for t, wrench in sampler.commands]

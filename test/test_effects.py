@@ -25,6 +25,7 @@ from rov_ident.model.coefficients import INPUTS, parse
 from rov_ident.model.equations import RigidBody, build
 from rov_ident.sampling import records
 from rov_ident.sampling.records import score
+from rov_ident.sampling.sample import joined
 from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.open_loop import simulate
 
@@ -181,7 +182,7 @@ def simulated(config, values, duration=12.0, noise=0.0):
 
 
 def samples_of(config, dive):
-    return np.concatenate(list(records.samples_of(config, dive)))
+    return joined(list(records.samples_of(config, dive)))
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ LEAN = Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 PLACES = {
     "a minute": LEAN,
     "a minute, off 50 %": dataclasses.replace(LEAN, off=0.5),
-    "a minute, no IMU": dataclasses.replace(MINUTE, imu_rate=0.0),
+    "a minute, no IMU": dataclasses.replace(LEAN, imu_rate=0.0),
 }
 
 

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import tempfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -45,19 +46,29 @@ def streams_of(case, driving, seed, seconds=60.0, draw=None):
 # ------------------------------------------------------------------ rates and attitude
 
 
-def turning(bias=(0.0, 0.0, 0.0), late=0.0, noise=1.0, seconds=60.0):
-    """A vehicle that turns about all axes; odometry at 20 Hz whose rates are those of a gyro."""
-    rng, fine = np.random.default_rng(5), 0.005
-    t = np.arange(0.0, seconds, fine)
-    phase = rng.uniform(0.0, 6.0, (3, 1)) + np.outer([0.9, 1.3, 0.4], t)
+FINE = 0.005  # s, between the instants of a motion
+
+
+@cache
+def motion(seconds):
+    """A vehicle that turns about all axes: instants, rates and attitudes."""
+    t = np.arange(0.0, seconds, FINE)
+    begin = np.random.default_rng(5).uniform(0.0, 6.0, (3, 1))
+    phase = begin + np.outer([0.9, 1.3, 0.4], t)
     rate = (np.array([[0.3], [0.2], [0.5]]) * np.sin(phase)).T
     q = [np.array([1.0, 0.0, 0.0, 0.0])]
-    for step in 0.5 * fine * (rate[1:] + rate[:-1]):
+    for step in 0.5 * FINE * (rate[1:] + rate[:-1]):
         q.append(quaternion_multiply(q[-1], quaternion_from_rotation_vector(step)))
-    attitude, k = np.array(q)[::10], np.arange(0, len(t), 10)
+    return t, rate, np.array(q)
+
+
+def turning(bias=(0.0, 0.0, 0.0), late=0.0, noise=1.0, seconds=60.0):
+    """Such a motion as odometry at 20 Hz whose rates are those of a gyro."""
+    (t, rate, attitude), rng = motion(seconds), np.random.default_rng(6)
+    attitude, k = attitude[::10], np.arange(0, len(t), 10)
     small = noise * 0.002 * rng.standard_normal((len(k), 3))
     attitude = quaternion_multiply(attitude, quaternion_from_rotation_vector(small))
-    measured = rate[np.clip(k - round(late / fine), 0, len(t) - 1)] + bias
+    measured = rate[np.clip(k - round(late / FINE), 0, len(t) - 1)] + bias
     measured = measured + noise * 0.004 * rng.standard_normal(measured.shape)
     none, nu = np.zeros((len(k), 3)), np.hstack([np.zeros((len(k), 3)), measured])
     empty, three, four = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4))

@@ -20,6 +20,7 @@ from rov_ident.simulation.virtual_sensors import Suite, dive
 
 MINUTE = Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 NOISY = Conditions(duration=120.0, excitation="pilot", reading=(0.5, 0.06))
+LEAN = Suite(odometry_rate=10.0, imu_rate=50.0)
 
 
 def hidden(name, rng):
@@ -48,7 +49,7 @@ def world_and_belief(heavy, name, values, coefficients, rng):
 
 
 def findings_of(world, config, suite=None, seed=0, name="steps"):
-    run = dive(world, name, 60.0, suite or Suite(), seed)
+    run = dive(world, name, 60.0, suite or LEAN, seed)
     return explain([gather(((r, m) for _, r, m in run.messages), config)], config).findings
 
 
@@ -115,7 +116,7 @@ def test_late_velocities_are_said_to_be_late(seed):
 # ------------------------------------------------------------------ sensors
 
 
-NO_IMU = dataclasses.replace(Suite(), imu_rate=0.0)
+NO_IMU = dataclasses.replace(LEAN, imu_rate=0.0)
 
 
 @pytest.mark.parametrize("yaw", [0.3, *more(-0.6)])
@@ -165,7 +166,7 @@ def test_noise_of_the_reading_is_not_taken_for_a_fault(seed):
 
 
 def test_noise_of_the_reading_is_named_with_its_size():
-    case = draw(2, conditions=NOISY)
+    case = draw(2, conditions=dataclasses.replace(NOISY, duration=75.0))
     explanation = explain([streams_of(case)], case.config)
     (found,) = explanation.findings.effects  # and nothing else is taken for a cause of it
     assert found.effect == "wrench_noise"

@@ -28,16 +28,16 @@ def hidden(effect, seed):
     return values | drawn, drawn
 
 
-def explained(config, effects, path, seed):
+def explained(config, effects, path, seed, seconds=120.0):
     world = dataclasses.replace(config, effects=effects)
-    dive = ri.simulate(world, manoeuvre="waypoints", duration=120.0, seed=seed, sensors=LEAN)
+    dive = ri.simulate(world, manoeuvre="waypoints", duration=seconds, seed=seed, sensors=LEAN)
     dive.save(path)
     return ri.explain(path, config).findings
 
 
 def test_nothing_is_named_where_the_file_is_right(tmp_path):
     """All six axes are judged: fins turn the vehicle, though the wrench holds no moment."""
-    found = explained(configuration.load(REMUS), {}, tmp_path / "dive.mcap", 1)
+    found = explained(configuration.load(REMUS), {}, tmp_path / "dive.mcap", 1, 80.0)
     assert not found.effects and found.verdict in ("agrees", "retuned")
     assert np.isfinite(list(found.baseline.values())).all() and len(found.baseline) == 6
 
@@ -60,7 +60,7 @@ def test_a_fin_without_its_coefficient_is_named(tmp_path):
     for name in ("Y_uudr", "N_uudr"):
         del plain["coefficients"][name]
     path = tmp_path / "dive.mcap"
-    ri.simulate(true, manoeuvre="waypoints", duration=120.0, seed=1).save(path)
+    ri.simulate(true, manoeuvre="waypoints", duration=120.0, seed=1, sensors=LEAN).save(path)
     found = ri.explain(path, configuration.from_parameters(plain)).findings
     names = {name for f in found.effects if f.effect == "fin_lift" for name in f.parameters}
     assert "N_uudr" in names

@@ -24,8 +24,8 @@ VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in (""
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    """The next manoeuvre that is planned lasts 20 s, not a minute: a third of the search."""
-    monkeypatch.setattr(identification, "plan", partial(ri.plan, duration=20.0))
+    """The next manoeuvre that is planned lasts 10 s, not a minute: a sixth of the search."""
+    monkeypatch.setattr(identification, "plan", partial(ri.plan, duration=10.0))
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def dives(tmp_path_factory):
     """Two dives, the second the shorter one, and one at rest."""
     folder = tmp_path_factory.mktemp("dives")
     for name, manoeuvre, duration in (
-        ("long", "steps", 40.0),
-        ("short", "steps", 30.0),
+        ("long", "steps", 30.0),
+        ("short", "steps", 20.0),
         ("rest", "rest", 12.0),
     ):
         made = ri.simulate(VEHICLE, manoeuvre=manoeuvre, duration=duration, seed=len(name))

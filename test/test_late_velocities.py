@@ -9,6 +9,7 @@ from rov_ident.core.frames import quaternion_from_euler
 from rov_ident.core.messages import Odometry
 from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.records import samples_of
+from rov_ident.sampling.sample import joined
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
 
@@ -56,7 +57,7 @@ def test_samples_have_the_velocity_of_their_own_time(heavy, delay, imu_rate):
     run = dive(config, "steps", 20.0, suite, 2)
     errors = []
     for told in (config, heavy):
-        samples = np.concatenate(list(samples_of(told, run)))
+        samples = joined(list(samples_of(told, run)))
         samples = samples[samples["measured"] & (samples["t"] > 1.0)]
         first = min(m.stamp for _, _, m in run.messages) - 1_000_000_000
         truth = [np.interp(samples["t"] + 1e-9 * first, run.truth.t, v) for v in run.truth.nu.T]

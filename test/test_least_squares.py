@@ -9,6 +9,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.offline import least_squares as ls
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.sampling import records
+from rov_ident.sampling.sample import joined
 from rov_ident.simulation import virtual_sensors as sensors
 
 
@@ -18,7 +19,7 @@ def in_one(samples):
 
 def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1):
     run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
-    return np.concatenate(list(records.samples_of(config, run)))
+    return joined(list(records.samples_of(config, run)))
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +44,14 @@ def test_rows_of_the_filtered_regression(heavy, off):
     assert np.all(rows[:, :, -1].std(axis=0) > 2e-2 * size)
 
 
+@pytest.fixture(scope="module")
+def two_minutes(heavy):
+    return samples_of(heavy, 120.0)
+
+
 @pytest.mark.parametrize("options", [{}, {"weighted": False}, {"instrumental": True}])
-def test_coefficients_are_found(heavy, off, options):
-    samples = samples_of(heavy, 120.0)
-    found = ls.solve(in_one(samples), off, **options)
+def test_coefficients_are_found(heavy, off, two_minutes, options):
+    found = ls.solve(in_one(two_minutes), off, **options)
     error = np.abs(found.values / heavy.model.theta - 1.0)
     assert np.median(error) < 0.01
     assert error.max() < 0.1
@@ -107,9 +112,8 @@ def test_one_speed_tells_a_combination_only(heavy):
     assert found.collinear[0][:2] == ("X_uu", "X_u")
 
 
-def test_a_rich_dive_tells_everything(heavy):
-    samples = samples_of(heavy, 60.0)
-    found = ls.solve(in_one(samples), heavy)
+def test_a_rich_dive_tells_everything(heavy, two_minutes):
+    found = ls.solve(in_one(two_minutes[: len(two_minutes) // 2]), heavy)
     base = ls.base_parameters(heavy.model.names, found.information, prior_of(heavy).std)
     assert base.unidentified == ()
     assert 1.0 < base.condition < 1e4

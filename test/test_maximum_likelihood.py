@@ -13,6 +13,7 @@ from rov_ident.offline.archive import of_records
 from rov_ident.offline.batch_fit import Settings, fit_batch, open_loop_rmse
 from rov_ident.sampling import records
 from rov_ident.sampling.records import predicted, read_record
+from rov_ident.sampling.sample import joined
 from rov_ident.sampling.smoothing import smoothed
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -25,7 +26,7 @@ def in_one(samples):
 
 def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1, velocity=True):
     run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
-    return smoothed(np.concatenate(list(records.samples_of(config, run, velocity))))
+    return smoothed(joined(list(records.samples_of(config, run, velocity))))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from rov_ident.estimation import observer
 from rov_ident.model.equations import momentum_columns
 
 
-@numba.njit
+@numba.njit(cache=True)
 def pendulum(x, dt):
     reached, end, slope = x.copy(), x.copy(), np.empty(2)
     for stage in range(4):
@@ -29,7 +29,7 @@ def test_the_runge_kutta_step_is_the_textbooks():
     np.testing.assert_allclose(pendulum(x, 0.1), wanted, rtol=1e-14)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def stepped(structure, theta, one_theta, nu, dt, estimated, scale, work, drive):
     s = work.scratch[0]
     observer.linearised_step(structure, theta, one_theta, nu, -0.5 * dt, dt, s)
@@ -92,7 +92,7 @@ def test_the_linearisation_is_the_derivative_of_the_step(parts):
         np.testing.assert_allclose(columns[:, i] * shift[i], slope, atol=0.01 * size)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def corrected(x, p, sensitivity, row, cross, total, innovation):
     observer.correct(x, p, sensitivity, row, cross, total, innovation)
 

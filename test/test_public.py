@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import math
 import os
 import re
 import subprocess
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 from conftest import HEAVY
 from matplotlib.figure import Figure
+from program import lay_out_shipped
 from threadpoolctl import threadpool_info
+from tiers import more
 
 import rov_ident as ri
 from rov_ident.cli.program import main
@@ -213,8 +216,19 @@ def results(bag, fit):
     }
 
 
-@pytest.mark.parametrize("name", ["fit", "check", "beside", "manoeuvre", "plan", "comparison"])
-def test_a_result_shows_itself(results, name, tmp_path):
+# All are drawn and saved by the same functions (reports/result.py): each ending once, then all.
+PICTURES = {".png": b"\x89PNG", ".pdf": b"%PDF", ".html": b"<!doctype"}
+KINDS = ["fit", "check", "beside", "manoeuvre", "plan", "comparison"]
+
+
+@pytest.mark.parametrize(
+    ("name", "endings"),
+    [
+        *((name, [[*PICTURES][i % 3]]) for i, name in enumerate(KINDS)),
+        *more(*((name, [*PICTURES]) for name in KINDS)),
+    ],
+)
+def test_a_result_shows_itself(results, name, endings, tmp_path):
     result = results[name]
     assert isinstance(result.plot(), Figure)
     assert str(result) == str(result.table())
@@ -224,9 +238,9 @@ def test_a_result_shows_itself(results, name, tmp_path):
     assert shown.count("<table>") >= 1 and "<svg" in shown and "<script" not in shown
     result.save(tmp_path / "new" / "result.json")
     assert json.loads((tmp_path / "new" / "result.json").read_text()) == document
-    for ending, magic in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".html", b"<!doctype")):
+    for ending in endings:
         result.save(tmp_path / f"result{ending}")
-        assert (tmp_path / f"result{ending}").read_bytes().startswith(magic)
+        assert (tmp_path / f"result{ending}").read_bytes().startswith(PICTURES[ending])
     with pytest.raises(ri.UserError, match="is saved as"):
         result.save(tmp_path / "result.docx")
     with pytest.raises(ri.UserError, match="cannot be written"):
@@ -377,8 +391,7 @@ def test_bad_files_are_refused_in_a_sentence(tmp_path, capsys, text):
 
 @pytest.mark.slow
 def test_the_lines_in_the_readme_run(tmp_path, monkeypatch, capsys):
-    for folder in ("bags", "config"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
+    lay_out_shipped(tmp_path, 25.0)
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "README.md").read_text()
     code = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
@@ -389,11 +402,11 @@ def test_the_lines_in_the_readme_run(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # the first use of anything compiles it
-def test_the_notebook_runs(tmp_path):
-    """In a kernel of its own, from top to bottom, as the reader runs it."""
+@pytest.mark.parametrize("seconds", [25.0, *more(math.inf)])
+def test_the_notebook_runs(tmp_path, seconds):
+    """In a kernel of its own, from top to bottom, as the reader runs it; with so much of the bag"""
     (tmp_path / "examples").mkdir()
-    for folder in ("bags", "config"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
+    lay_out_shipped(tmp_path, seconds)
     notebook = nbformat.read(ROOT / "examples" / "first_fit.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "shipped without output"
     where = {"metadata": {"path": str(tmp_path / "examples")}}

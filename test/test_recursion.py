@@ -21,7 +21,7 @@ def noisy(heavy):
     return np.concatenate([part for part in parts if len(part)])
 
 
-@numba.njit
+@numba.njit(cache=True)
 def watched(monitor, constants, i, innovations, moving, considered=0.0):
     """Normalised innovations of axis i, twenty a second; how many were outliers."""
     count = 0
@@ -98,7 +98,7 @@ def test_what_lasts_a_second_in_motion_is_told_from_noise(heavy):
         assert monitor["nis"][3] < 2.5
 
 
-@numba.njit
+@numba.njit(cache=True)
 def counted(monitor, first, outlier):
     return lost(monitor, first, outlier)
 

@@ -125,7 +125,7 @@ def test_no_samples(heavy):
 @pytest.fixture(scope="module")
 def fine(heavy):
     """Samples without noise so close together that the observer's integration is exact."""
-    return textbook.rows_of(*driven(heavy, 20.0, 11, dt=0.005))[-200:]
+    return textbook.rows_of(*driven(heavy, 20.0, 11, dt=0.005))[-100:]
 
 
 @pytest.mark.parametrize("slope", [False, True])

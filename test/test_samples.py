@@ -14,7 +14,7 @@ from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
 from rov_ident.sampling.raw_streams import gather
-from rov_ident.sampling.sample import SAMPLE, believed
+from rov_ident.sampling.sample import SAMPLE, believed, joined
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import NEW_FRAME, describe
 from rov_ident.simulation import virtual_sensors as sensors
@@ -28,7 +28,7 @@ def taken(config, messages):
     """All samples of (role, message) in this order, and the sampler."""
     sampler = Sampler(config)
     parts = [sampler.push(role, message) for role, message in messages]
-    return np.concatenate([*parts, sampler.flush()]), sampler
+    return joined([*parts, sampler.flush()]), sampler
 
 
 def without_arrival(dive):

@@ -183,7 +183,7 @@ def test_workers_take_no_code_from_the_current_folder(tmp_path, hostile, heavy_p
     [
         ("import", "--out", "dive.mcap", "--config", fuzz.CORPUS / "configuration/thrusters.yaml",
          fuzz.CORPUS / "log/dive.bin"),
-        ("nomoto", fuzz.CORPUS / "zigzag/run.csv", "--report", "zigzag.html"),
+        ("nomoto", fuzz.CORPUS / "zigzag/run.csv", "--order", "1", "--report", "zigzag.html"),
         ("forces", fuzz.CORPUS / "forces/drift.csv", "--report", "forces.html"),
         ("import-model", fuzz.CORPUS / "model/robot.urdf", "--config", HEAVY,
          "--out", "robot.yaml"),

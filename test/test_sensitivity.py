@@ -76,7 +76,7 @@ def test_jacobian_is_that_of_samples_made_with_other_values(heavy, effect):
     fins = EFFECTS[effect].steer is not None
     config = having(finned(heavy) if fins else heavy, {effect: GIVEN[effect]})
     # What is sensed is differentiated sample by sample, seven times here.
-    seconds = 10.0 if EFFECTS[effect].sense is None else 5.0
+    seconds = 6.0 if EFFECTS[effect].sense is None else 4.0
     run = steered_dive(config, seconds, EXACT, 1)
     samples = joined(list(samples_of(config, run)))
     _, sides = parts(samples)
@@ -165,7 +165,7 @@ def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
     off = 1.0 + 0.08 * np.random.default_rng(5).uniform(-1.0, 1.0, len(theta))
     config = dataclasses.replace(config, model=config.model.with_theta(theta * off))
     online = OnlineEstimator(config, kind)
-    for _, role, message in steered_dive(world, 120.0, Suite(), 4).messages:
+    for _, role, message in steered_dive(world, 90.0, Suite(), 4).messages:
         online.push(role, message)
     online.flush()
     report = online.report()

@@ -89,7 +89,7 @@ def test_a_command_that_trembles_is_told_from_noise_of_the_reading(heavy, acts):
     noisy = dataclasses.replace(heavy, effects={"wrench_noise": noise})
     if acts:
         demand = demand + std * rng.standard_normal(demand.shape)
-    suite = Suite(wrench_std=0.0)
+    suite = Suite(wrench_std=0.0, **LEAN)
     run = measure(heavy if acts else noisy, t, demand, 75.0, suite, rng)
     online = watching(heavy)
     assert not any(play(online, run.messages))
@@ -130,12 +130,12 @@ def test_what_ends_is_forgotten(heavy):
         heavy, effects={"constant_force": {"fx": 6.0, "fy": 0.0, "fz": 0.0}}
     )
     online = watching(heavy)
-    first = play(online, dive(pulled, "steps", 70.0, Suite(), 1).messages)
+    first = play(online, dive(pulled, "steps", 70.0, Suite(**LEAN), 1).messages)
     assert first[-1] and "constant_force" in (first[-1][0].effect, *first[-1][0].rivals)
     memory = MEMORY * WINDOW
     later = [
         (arrival, role, message._replace(stamp=message.stamp + 80_000_000_000))
-        for arrival, role, message in dive(heavy, "steps", memory + 20.0, Suite(), 2).messages
+        for arrival, role, message in dive(heavy, "steps", memory + 20.0, Suite(**LEAN), 2).messages
     ]
     assert not play(online, later)[-1]
 

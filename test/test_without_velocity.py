@@ -146,15 +146,15 @@ def dive(folder, driving, seed, seconds):
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory):
     """Heave and all rotations driven, surge and sway at rest."""
-    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 20.0)
+    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 13.0)
 
 
 @pytest.fixture(scope="module")
 def identified(turning):
-    """The next manoeuvre that is planned lasts 20 s, not a minute: a third of the search."""
+    """The next manoeuvre that is planned lasts 10 s, not a minute: a sixth of the search."""
     bag, file, _ = turning
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identification, "plan", partial(ri.plan, duration=20.0))
+        patch.setattr(identification, "plan", partial(ri.plan, duration=10.0))
         return ri.identify(bag, file)
 
 
@@ -226,7 +226,7 @@ def test_check_and_identify_go_the_same_way(identified, tmp_path):
 def test_plan_lets_surge_and_sway_rest(turning):
     """And what no manoeuvre can show is not what it aims at."""
     bag, file, _ = turning
-    found = ri.plan(file, [bag], duration=20.0)
+    found = ri.plan(file, [bag], duration=10.0)
     assert found.candidates
     assert not any(any(c.manoeuvre.amplitude[:2]) for c in found.candidates)
     assert any("surge and sway have to rest" in reason for reason in found.left_out)

@@ -15,6 +15,7 @@ from rov_ident.model.coefficients import INPUTS
 from rov_ident.model.equations import skew
 from rov_ident.sampling import records
 from rov_ident.sampling.sample import SAMPLE
+from rov_ident.sampling.sample import joined as one_array
 from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.manoeuvres import manoeuvre
 from rov_ident.simulation.open_loop import simulate
@@ -295,7 +296,7 @@ def prior_and_samples(config, seeds, duration):
         parts = list(records.samples_of(config, run))
         rng = np.random.default_rng(1000 + seed)
         factors = np.clip(1.0 + 0.2 * rng.standard_normal(len(config.model.theta)), 0.4, 1.6)
-        out.append((off(config, factors), np.concatenate(parts)))
+        out.append((off(config, factors), one_array(parts)))
     return out
 
 

@@ -1,7 +1,7 @@
 """A vehicle at sea: motion, thrusters and sensors with what no configuration file knows.
 
 Written from Fossen (Handbook of Marine Craft Hydrodynamics and Motion Control, 2nd ed. 2021)
-without a look at the estimators, in plain NumPy, so that its data share none of their assumptions.
+without a look at the estimators, so that its data share none of their assumptions and no code.
 A BlueROV2 Heavy with random coefficients is driven by its eight thrusters; each field of
 :class:`Sea` is one thing that differs from what its file says. SI; body axes forward, starboard,
 down; world north, east, down; t = 0 at the first command. Messages are in ROS axes.
@@ -10,8 +10,9 @@ down; world north, east, down; t = 0 at the first command. Messages are in ROS a
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
@@ -190,16 +191,179 @@ def skew(a: Array) -> Array:
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
-def _cross(a: list[float], b: list[float]) -> list[float]:
-    """Of two short lists: faster than NumPy's."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+class Body(NamedTuple):
+    """The vehicle and the sea as the kernels take them; forces are +coefficient * velocities."""
+
+    rigid: Array  # M_RB (6, 6)
+    added: Array  # M_A (6, 6)
+    inverse: Array  # of their sum
+    linear: Array  # (6,) damping on the diagonal
+    square: Array  # (6,) likewise, times |v| v
+    weight: float
+    buoyancy: float
+    cog: Array
+    cob: Array
+    current: Array  # (2, 2) mean and amplitude of the current's north and east, m/s
+    pace: float  # rad/s of its slow change
+    advance: float  # s/m
+
+
+_fast = numba.njit(cache=True, error_model="numpy")
+
+
+@_fast
+def _cross(a, b):
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+@_fast
+def _times(matrix, a):
+    """A matrix times a vector, without the BLAS that numba would load."""
+    out = np.zeros(matrix.shape[0])
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            out[i] += matrix[i, j] * a[j]
+    return out
+
+
+@_fast
+def _put(a, out):
+    for i in range(len(a)):
+        out[i] = a[i]
+
+
+@_fast
+def _further(a, share, b):
+    """a + share * b."""
+    out = a.copy()
+    for i in range(len(a)):
+        out[i] += share * b[i]
+    return out
+
+
+@_fast
+def _rotation(q):
+    """Body to world."""
+    a, b, c, d = q[0], q[1], q[2], q[3]
+    return np.array([
+        [1.0 - 2.0 * (c * c + d * d), 2.0 * (b * c - a * d), 2.0 * (b * d + a * c)],
+        [2.0 * (b * c + a * d), 1.0 - 2.0 * (b * b + d * d), 2.0 * (c * d - a * b)],
+        [2.0 * (b * d - a * c), 2.0 * (c * d + a * b), 1.0 - 2.0 * (b * b + c * c)],
+    ])  # fmt: skip
+
+
+@_fast
+def _water(body, t):
+    """Velocity and acceleration of the water in the world."""
+    mean, swing = body.current[0], body.current[1]
+    c, s = math.cos(body.pace * t), math.sin(body.pace * t)
+    flow = np.array([mean[0] + swing[0] * s, mean[1] + swing[1] * c, 0.0])
+    return flow, np.array([body.pace * swing[0] * c, -body.pace * swing[1] * s, 0.0])
+
+
+@_fast
+def _through(body, t, state):
+    """Velocity (6,) through the water."""
+    through, water = state[7:].copy(), _times(_rotation(state[3:7]).T, _water(body, t)[0])
+    for i in range(3):
+        through[i] -= water[i]
+    return through
+
+
+@_fast
+def _wrench(body, thrust, through):
+    """(6,) of the thrusters (8,), each of which loses thrust with the speed along it."""
+    acting, along = thrust.copy(), _times(ALLOCATION.T, through)
+    for i in range(len(thrust)):
+        acting[i] -= body.advance * abs(thrust[i]) * along[i]
+    return _times(ALLOCATION, acting)
+
+
+@_fast
+def _rates(body, t, state, thrust):
+    """d/dt (13,) of position, attitude and nu."""
+    a, b, c, d = state[3], state[4], state[5], state[6]
+    v, omega = state[7:10], state[10:]
+    R = _rotation(state[3:7])
+    down = R[2]
+    flow, gust = _water(body, t)
+    through = _through(body, t, state)
+    # Of the water in body axes: its derivative there is R' gust - omega x water.
+    turn, change = _cross(omega, _times(R.T, flow)), _times(R.T, gust)
+
+    # C(nu) nu = [omega x p; omega x h + v x p] with momenta p and h (Kirchhoff; Fossen 3.62)
+    rigid, fluid = _times(body.rigid, state[7:]), _times(body.added, through)
+    both = rigid.copy()
+    for i in range(6):
+        both[i] += fluid[i]
+    one, two = _cross(omega, both[:3]), _cross(omega, both[3:])
+    three, four = _cross(v, rigid[:3]), _cross(through[:3], fluid[:3])
+    heavy, light = _cross(body.cog, down), _cross(body.cob, down)
+    force = _wrench(body, thrust, through)
+    for i in range(6):
+        force[i] += (body.linear[i] + body.square[i] * abs(through[i])) * through[i]
+        for j in range(3):
+            force[i] += body.added[i, j] * (change[j] - turn[j])
+    for i in range(3):
+        force[i] += (body.weight - body.buoyancy) * down[i] - one[i]
+        force[3 + i] += body.weight * heavy[i] - body.buoyancy * light[i]
+        force[3 + i] -= two[i] + three[i] + four[i]
+
+    out = np.empty(13)
+    _put(_times(R, v), out[:3])
+    x, y, z = omega[0], omega[1], omega[2]
+    out[3] = -0.5 * (b * x + c * y + d * z)
+    out[4] = 0.5 * (a * x + c * z - d * y)
+    out[5] = 0.5 * (a * y + d * x - b * z)
+    out[6] = 0.5 * (a * z + b * y - c * x)
+    _put(_times(body.inverse, force), out[7:])
+    return out
+
+
+@_fast
+def _step(body, t, state, k1, middle, last):
+    """(13,) a STEP later by the classical Runge-Kutta method; ``k1`` are the rates now, the
+    others the thrusts (8,) in the middle and at the end."""
+    half = 0.5 * STEP
+    k2 = _rates(body, t + half, _further(state, half, k1), middle)
+    k3 = _rates(body, t + half, _further(state, half, k2), middle)
+    k4 = _rates(body, t + STEP, _further(state, STEP, k3), last)
+    after, square = state.copy(), 0.0
+    for i in range(13):
+        after[i] += STEP / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+    for i in range(3, 7):
+        square += after[i] * after[i]
+    for i in range(3, 7):
+        after[i] /= math.sqrt(square)
+    return after
+
+
+@_fast
+def _follow(body, steps, held, keep, reached, state, begin, end, acting):
+    """The steps of one command into the rows of :class:`Truth`; the thrust (8,) after them.
+
+    Thrust goes from ``reached`` to ``held``; half a step leaves the share ``keep`` of the way.
+    """
+    for k in range(steps[0], steps[1]):
+        t, x = k * STEP, state[k]
+        middle = _further(held, keep, _further(reached, -1.0, held))
+        last = _further(held, keep, _further(middle, -1.0, held))
+        # The command may have jumped: then the last end is no begin.
+        k1 = _rates(body, t, x, reached) if k == steps[0] else end[k - 1]
+        _put(k1, begin[k])
+        _put(_wrench(body, reached, _through(body, t, x)), acting[k])
+        _put(_step(body, t, x, k1, middle, last), state[k + 1])
+        reached = last
+        _put(_rates(body, t + STEP, state[k + 1], reached), end[k])
+    return reached
 
 
 class Plant:
     """M_RB nu_dot + C_RB(nu) nu + M_A nu_r_dot + C_A(nu_r) nu_r + D(nu_r) nu_r + g = tau."""
 
     def __init__(self, vehicle: Vehicle, sea: Sea) -> None:
-        self.sea = sea
         cog = vehicle.cog + sea.cog
         S = skew(cog)
         self.rigid = np.zeros((6, 6))  # Fossen 3.57
@@ -213,77 +377,27 @@ class Plant:
             return np.array([vehicle.theta[name] for name in names])
 
         self.added = -np.diag(diagonal("{0}_{1}dot"))
-        self.inverse = np.linalg.inv(self.rigid + self.added)
         self.linear, self.square = diagonal("{0}_{1}"), diagonal("{0}_{1}{1}")
-        self.weight, self.cog = GRAVITY * vehicle.mass, cog.tolist()
-        self.buoyancy, self.cob = vehicle.buoyancy + sea.lift, vehicle.cob.tolist()
+        self.weight, self.cog = GRAVITY * vehicle.mass, cog
+        self.buoyancy, self.cob = vehicle.buoyancy + sea.lift, vehicle.cob
+        self.body = Body(
+            self.rigid, self.added, np.linalg.inv(self.rigid + self.added),
+            self.linear, self.square, self.weight, self.buoyancy, self.cog, self.cob,
+            np.array([sea.current, sea.current_swing], float),
+            2.0 * math.pi / sea.current_period, float(sea.advance),
+        )  # fmt: skip
 
-    def water(self, t: float) -> tuple[list[float], list[float]]:
+    def water(self, t: float) -> tuple[Array, Array]:
         """Velocity and acceleration of the water in the world."""
-        (n, e), (dn, de) = self.sea.current, self.sea.current_swing
-        rate = 2.0 * math.pi / self.sea.current_period
-        c, s = math.cos(rate * t), math.sin(rate * t)
-        return [n + dn * s, e + de * c, 0.0], [rate * dn * c, -rate * de * s, 0.0]
-
-    def wrench(self, thrust: Array, through: Array) -> Array:
-        """(6,) of the thrusters (8,), each of which loses thrust with the speed along it."""
-        if self.sea.advance:
-            thrust = thrust - self.sea.advance * np.abs(thrust) * (ALLOCATION.T @ through)
-        return ALLOCATION @ thrust
+        return _water(self.body, t)
 
     def rates(self, t: float, state: Array, thrust: Array) -> Array:
-        """d/dt (13,) of position, attitude and nu."""
-        a, b, c, d, *nu = state[3:].tolist()
-        v, omega = nu[:3], nu[3:]
-        R = (
-            (1.0 - 2.0 * (c * c + d * d), 2.0 * (b * c - a * d), 2.0 * (b * d + a * c)),
-            (2.0 * (b * c + a * d), 1.0 - 2.0 * (b * b + d * d), 2.0 * (c * d - a * b)),
-            (2.0 * (b * d - a * c), 2.0 * (c * d + a * b), 1.0 - 2.0 * (b * b + c * c)),
-        )
-        down = R[2]
-        flow, gust = self.water(t)
-        # of the water in body axes, whose derivative there is R' gust - omega x water
-        water = [R[0][i] * flow[0] + R[1][i] * flow[1] for i in range(3)]
-        turn = _cross(omega, water)
-        change = [R[0][i] * gust[0] + R[1][i] * gust[1] - turn[i] for i in range(3)]
-        through = np.array([*(v[i] - water[i] for i in range(3)), *omega])
-
-        force = self.wrench(thrust, through)
-        force += (self.linear + self.square * np.abs(through)) * through
-        net = self.weight - self.buoyancy
-        upright = [self.weight * g - self.buoyancy * h for g, h in zip(self.cog, self.cob)]
-        force += [*(net * x for x in down), *_cross(upright, list(down))]
-        # C(nu) nu = [omega x p; omega x h + v x p] with momenta p and h (Kirchhoff; Fossen 3.62)
-        rigid = (self.rigid @ state[7:]).tolist()
-        fluid = (self.added @ through).tolist()
-        p = [rigid[i] + fluid[i] for i in range(3)]
-        h = [rigid[i] + fluid[i] for i in range(3, 6)]
-        one, two = _cross(omega, h), _cross(v, rigid[:3])
-        three = _cross(through[:3].tolist(), fluid[:3])
-        force -= [*_cross(omega, p), *(one[i] + two[i] + three[i] for i in range(3))]
-        force += self.added[:, :3] @ change
-
-        out = np.empty(13)
-        out[:3] = [R[i][0] * v[0] + R[i][1] * v[1] + R[i][2] * v[2] for i in range(3)]
-        x, y, z = omega
-        out[3:7] = (
-            -0.5 * (b * x + c * y + d * z),
-            0.5 * (a * x + c * z - d * y),
-            0.5 * (a * y + d * x - b * z),
-            0.5 * (a * z + b * y - c * x),
-        )
-        out[7:] = self.inverse @ force
-        return out
+        """d/dt (13,) of position, attitude and nu under the thrusts (8,)."""
+        return _rates(self.body, t, state, thrust)
 
     def step(self, t: float, state: Array, k1: Array, middle: Array, last: Array) -> Array:
-        """(13,) a STEP later by the classical Runge-Kutta method; ``k1`` are the rates now, the
-        others the thrusts (8,) in the middle and at the end."""
-        k2 = self.rates(t + 0.5 * STEP, state + 0.5 * STEP * k1, middle)
-        k3 = self.rates(t + 0.5 * STEP, state + 0.5 * STEP * k2, middle)
-        k4 = self.rates(t + STEP, state + STEP * k3, last)
-        after = state + STEP / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-        after[3:7] /= math.sqrt(after[3:7] @ after[3:7])
-        return after
+        """(13,) a STEP later: :func:`_step`."""
+        return _step(self.body, t, state, k1, middle, last)
 
     def energy(self, state: Array) -> float:
         """Kinetic, of vehicle and water at rest, and potential, in J."""
@@ -434,28 +548,11 @@ def dive(
         held = sea.thrust_scale * (volts / VOLTS) ** 2 * single
         if not sea.lag:
             reached = held
-        for k in range(i * per_command, (i + 1) * per_command):
-            t = k * STEP
-            middle = held + keep * (reached - held)
-            last = held + keep * (middle - held)
-            if k == i * per_command:  # the command may have jumped: the last end is no begin
-                k1 = plant.rates(t, x, reached)
-            else:
-                k1 = end[k - 1]
-            # only the loss with speed needs the velocity through the water
-            through = _through(plant, t, x) if sea.advance else state[k, 7:]
-            begin[k], acting[k] = k1, plant.wrench(reached, through)
-            state[k + 1] = x = plant.step(t, x, k1, middle, last)
-            reached = last
-            end[k] = plant.rates(t + STEP, x, reached)
+        steps = i * per_command, (i + 1) * per_command
+        reached = _follow(plant.body, steps, held, keep, reached, state, begin, end, acting)
+        x = state[steps[1]]
     t = STEP * np.arange(count + 1)
     return Truth(t, state, begin, end, command_t, command, acting)
-
-
-def _through(plant: Plant, t: float, state: Array) -> Array:
-    """Velocity (6,) through the water."""
-    water = rotations(state[None, 3:7])[0].T @ plant.water(t)[0]
-    return np.concatenate([state[7:10] - water, state[10:13]])
 
 
 # ------------------------------------------------------------------ sensors and messages

@@ -548,7 +548,7 @@ def _resting(config: Config, seed: int) -> tuple[np.ndarray, Suite]:
     rng, sampler = np.random.default_rng([2, seed]), Sampler(config)
     messages = [(role, m) for _, role, m in dived(0) if at(m) < 40.0]
     parts = [sampler.push(role, still(m, rng)) for role, m in messages]
-    return np.concatenate([*parts, sampler.flush()]), Suite().scaled(0.0)
+    return joined([*parts, sampler.flush()]), Suite().scaled(0.0)
 
 
 def _surging(config: Config, seed: int) -> tuple[np.ndarray, Suite]:
@@ -593,7 +593,7 @@ def _driving(config: Config, before: str) -> np.ndarray:
 
 def _sampled(config: Config, messages: Messages) -> np.ndarray:
     sampler = Sampler(config)
-    return np.concatenate([*(sampler.push(role, m) for _, role, m in messages), sampler.flush()])
+    return joined([*(sampler.push(role, m) for _, role, m in messages), sampler.flush()])
 
 
 def still(m: Message, rng: np.random.Generator) -> Message:
