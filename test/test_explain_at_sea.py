@@ -118,10 +118,11 @@ def test_a_bias_of_the_gyro_is_no_drift_of_the_heading(bias):
 
 
 @pytest.mark.study
-def test_nothing_is_sure_where_position_and_thrust_contradict_each_other():
+def test_nothing_is_sure_where_position_and_thrust_contradict_each_other(monkeypatch):
     """The position is reckoned along the heading that drifts, and shows it to be right."""
     sea = {"heading_drift": 0.01, "dead_reckoned": True}
     _, streams, config = streams_of("", "pilot", 0, 150.0, lambda *_: sea)
+    monkeypatch.setattr(Streams, "_is_reckoned", False)
     findings = explain([streams], config).findings
     assert "or the heading drifts" in " ".join(findings.notes)
     assert not any(f.separable for f in findings.effects)
@@ -148,6 +149,26 @@ def test_rates_that_agree_with_the_attitude_are_left_alone():
         seldom, t=seldom.t[::20], orientation=seldom.orientation[::20], nu=seldom.nu[::20]
     )
     assert agreed(seldom) is seldom
+
+
+def test_a_position_that_is_reckoned_from_the_velocities_says_nothing_of_them():
+    """It would show them to be late by half an interval of the odometry, whatever is right."""
+    _, streams, config = streams_of("clean", "pilot", 0, 90.0)
+    assert streams.has_pose
+    sea = {"dead_reckoned": True}
+    _, streams, config = streams_of("", "pilot", 0, 90.0, lambda *_: sea)
+    assert not streams.has_pose
+    assert "velocity_latency" not in sensors_of(streams, config)[0]
+    # without any noise a position is not that sum but for what the rule of integration leaves out
+    t = np.arange(0.0, 60.0, 0.05)
+    v = np.stack([np.sin(0.7 * t), 0.4 * np.cos(1.1 * t), 0.0 * t], axis=1)
+    way = np.stack([-np.cos(0.7 * t) / 0.7, 0.4 * np.sin(1.1 * t) / 1.1, 0.0 * t], axis=1)
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
+    nu = np.hstack([v, np.zeros_like(v)])
+    streams = dataclasses.replace(streams, t=t, position=way, orientation=level, nu=nu)
+    assert streams.has_pose
+    reckoned = np.cumsum(0.05 * v, axis=0)
+    assert not dataclasses.replace(streams, position=reckoned).has_pose
 
 
 def test_without_pose_and_imu_no_sensor_is_judged():
