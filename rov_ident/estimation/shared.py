@@ -15,6 +15,7 @@ from rov_ident.estimation.innovation_monitor import TIME
 from rov_ident.estimation.process_noise import process
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Structure, in_motion
+from rov_ident.sampling.reading_noise import RECENT
 from rov_ident.sampling.sample import parts
 
 MAX_STEP = 0.05  # s; of one step of the prediction
@@ -142,15 +143,18 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     """moves (m,): which of theta a motion teaches. Work space: noisy (6,).
 
     A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor,
-    and on which the wrench is far above the noise of its reading; a factor of the thrust if that is
-    so on all axes that it is for. What looks like noise may be a command that trembles, which the
-    vehicle follows: then the unexplained acceleration, once ``monitor`` (6,) of MONITOR knows it,
-    is far below it. ``inverse`` (6, 6) is that of the mass matrix.
+    and on which the wrench is surely far above the noise of its reading; a factor of the thrust if
+    that is so on all axes that it is for. What looks like noise may be a command that trembles,
+    which the vehicle follows: then the unexplained acceleration, once ``monitor`` (6,) of MONITOR
+    knows it, is far below it. ``inverse`` (6, 6) is that of the mass matrix.
     """
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
-        follows = monitor[i].seen > TIME and monitor[i].density <= FOLLOWED * noise < np.inf
+        seen = monitor[i].seen
+        follows = seen > TIME and monitor[i].density <= FOLLOWED * noise
         noisy[i] = noise > 0.0 and not follows
+        if noise == np.inf and seen > RECENT:  # of one who goes on with what another has learnt
+            noisy[i] = False
     structure = task.structure
     in_motion(structure, moving, moves)
     first, rows = len(structure.mass_row), structure.row

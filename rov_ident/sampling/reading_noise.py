@@ -20,7 +20,7 @@ _OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of 
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
-_RECENT = 5.0  # s; over which the power of a component is averaged: a few moves of a stick
+RECENT = 5.0  # s; over which the power of a component is averaged: a few moves of a stick
 # of that power, which noise may be: the same section has the study
 SHARE = 0.01
 
@@ -90,11 +90,11 @@ class ReadingNoise:
         self._t.append(t)
         self._readings.append(reading)
         if len(self._t) < _BLOCK + 2:
-            if t - self._t[0] > _RECENT:  # commands that come seldom are not waited for
+            if t - self._t[0] > RECENT:  # commands that come seldom are not waited for
                 self.variance[np.isinf(self.variance)] = 0.0
             return
         block = np.array(self._readings)
-        share = 1.0 if not self._power.any() else -math.expm1((self._t[0] - t) / _RECENT)
+        share = 1.0 if not self._power.any() else -math.expm1((self._t[0] - t) / RECENT)
         self._power += share * (np.mean(block**2, axis=0) - self._power)
         variance = np.nan_to_num(scatter(block, self.relative)[0]) ** 2
         self.variance = np.where(variance > SHARE * self._power, variance, 0.0)
