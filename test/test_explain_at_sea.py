@@ -117,12 +117,24 @@ def test_a_bias_of_the_gyro_is_no_drift_of_the_heading(bias):
     assert taken == pytest.approx(bias, abs=3e-4) and not found.may_drift
 
 
+def test_a_position_is_reckoned_along_the_right_heading():
+    """One that drifts is found without it, and then it is that of the heading set right."""
+    sea = {"heading_drift": 0.01, "dead_reckoned": True}
+    _, streams, config = streams_of("", "pilot", 0, 90.0, lambda *_: sea)
+    found = rates_and_attitude.agreed(streams, config)
+    assert "drifts" in found.streams.notes[-1] and not found.may_drift
+    assert not streams.has_pose and not found.streams.has_pose
+    assert "heading_offset" not in sensors_of(found.streams, config)[0]
+    late = {"velocity_latency": {"delay": 0.1}}  # it stays the sum of what was recorded
+    assert "pose" not in [c.name for c in sensor_consistency.comparisons(streams, config, late)]
+
+
 @pytest.mark.study
 def test_nothing_is_sure_where_position_and_thrust_contradict_each_other(monkeypatch):
     """The position is reckoned along the heading that drifts, and shows it to be right."""
     sea = {"heading_drift": 0.01, "dead_reckoned": True}
     _, streams, config = streams_of("", "pilot", 0, 150.0, lambda *_: sea)
-    monkeypatch.setattr(Streams, "_is_reckoned", False)
+    monkeypatch.setattr(Streams, "is_reckoned", False)
     findings = explain([streams], config).findings
     assert "or the heading drifts" in " ".join(findings.notes)
     assert not any(f.separable for f in findings.effects)

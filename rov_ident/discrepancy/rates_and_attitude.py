@@ -95,9 +95,14 @@ def _drift(streams: Streams, body: Sequence[Array]) -> float:
 
 
 def _turned(streams: Streams, rate: float) -> Streams:
-    """The streams with an attitude that is turned about world down at a rate [rad/s]."""
+    """The streams with an attitude that is turned about world down at a rate [rad/s], and with a
+    position that is reckoned along it, if it was before."""
     yaw = quaternion_from_euler(0.0, 0.0, rate * streams.t)
-    return dataclasses.replace(streams, orientation=quaternion_multiply(yaw, streams.orientation))
+    orientation, position = quaternion_multiply(yaw, streams.orientation), streams.position
+    if streams.is_reckoned:
+        world = np.einsum("kij,kj->ki", quaternion_to_matrix(orientation), streams.nu[:, :3])
+        position = position[0] + integral(streams.t, world)
+    return dataclasses.replace(streams, orientation=orientation, position=position)
 
 
 def _noted(streams: Streams, rates: Array, note: str) -> Streams:

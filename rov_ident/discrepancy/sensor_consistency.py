@@ -98,6 +98,8 @@ def comparisons(
     from scipy.ndimage import gaussian_filter1d  # here, as all of it: fits do not need 30 MB
 
     keys = sensor_parameters()
+    if not streams.has_pose:  # nor has it one because it is corrected
+        streams = dataclasses.replace(streams, position=np.zeros_like(streams.position))
     streams = _in_place(streams, effects)
     here, there, rate = _corrected_readings(streams, config, effects)
     r = quaternion_to_matrix(streams.orientation)

@@ -24,10 +24,10 @@ keeps half the digits that the covariance form loses), in coefficients scaled by
 standard deviation about their prior value: the prior is the unit matrix.
 
 *Coefficients whose motion is not well above its noise* are not learnt, or it would be from the
-noise; nor is a factor of the thrust while the wrench is little above that of its reading. But their
-uncertainty is that of the others, too. With their columns behind the others', R holds the
-distribution of the others *given* them, and that alone takes new rows (consider parameters, Bierman
-1977, ch. VIII).
+noise; nor are those of an axis, or a factor of the thrust, while the wrench there is little above
+that of its reading. But their uncertainty is that of the others, too. With their columns behind the
+others', R holds the distribution of the others *given* them, and that alone takes new rows
+(consider parameters, Bierman 1977, ch. VIII).
 
 *Forgetting* waits for evidence: while the innovations of an axis are larger than they should be,
 the coefficients that would show there gain variance as on a random walk, up to the prior's.

@@ -17,9 +17,10 @@ Update: odometry and gyro measure nu with independent noise, so one component af
 same as all at once; the covariance takes three of them together.
 
 Coefficients whose motion is not well above its noise are *considered*, not estimated (Schmidt
-1966): they stay what they are, their uncertainty is carried along. The others walk only on
-evidence: while the innovations are larger than they should be, variances grow, up to the prior's.
-(``ukf.random_walk`` lets them walk all the time.)
+1966): they stay what they are, their uncertainty is carried along. So are those of an axis, and a
+factor of the thrust, where the wrench is little above the noise of its reading. The others walk
+only on evidence: while the innovations are larger than they should be, variances grow, up to the
+prior's. (``ukf.random_walk`` lets them walk all the time.)
 
 *Standard deviations* do not assume white innovations: the covariance of their summed influence on
 the coefficients (`shared.add_scatter`) stands between two covariances of the filter.

@@ -56,10 +56,10 @@ class Streams:
 
     @property
     def has_pose(self) -> bool:
-        return bool(np.ptp(self.position, axis=0).max() > 0.0) and not self._is_reckoned
+        return bool(np.ptp(self.position, axis=0).max() > 0.0) and not self.is_reckoned
 
     @property
-    def _is_reckoned(self) -> bool:
+    def is_reckoned(self) -> bool:
         """Whether the position is the sum of the velocities along the attitude, their noise
         included: it then agrees with them whatever is wrong. Depth may be measured all the same."""
         v = np.einsum("kij,kj->ki", quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
