@@ -464,10 +464,12 @@ def _update(task, state, work, sample, side, out):
                 if work.free[j] == 0.0:
                     considered += p[i, j] * p[i, j] / (p[j, j] * spread)
             out.nis[i] = innovation**2
-            own = sample.moving[i] != 0
+            own, ratio = sample.moving[i] != 0, 1.0
+            if work.noisy[i]:
+                ratio = np.sqrt(spread / _given_held(task, p, work.free, side, i, spread, r[i]))
             outlier |= watch(
-                state.monitor[i], task.process[0], i, _ROOM, moving, own, s.gate, innovation,
-                np.sqrt(considered),
+                state.monitor[i], task.process[0], i, _ROOM, moving, own, ratio * s.gate,
+                ratio * innovation, np.sqrt(considered),
             )  # fmt: skip
         anew |= lost(state.monitor, first, outlier)
         if outlier:
@@ -478,6 +480,18 @@ def _update(task, state, work, sample, side, out):
             _absorb(task, x, work, side, first)
     if anew:
         _restart(state, p, sample)
+
+
+@inlined
+def _given_held(task, p, free, side, i, spread, least):
+    """The variance of an innovation, of ``spread`` in all, given the coefficients that are held:
+    what noise of the wrench's reading does must not pass for their uncertainty, or it would seem
+    that the vehicle follows it. Not below ``least``."""
+    left = spread
+    for j in range(6, 6 + len(task.scale) - side.shape[1]):
+        if free[j] == 0.0:
+            left -= p[i, j] * p[i, j] / p[j, j]
+    return max(left, least)
 
 
 @inlined
