@@ -25,10 +25,11 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.selection import PENALTY, scores_of
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, reading_noise
 from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
+from rov_ident.sampling.reading_noise import SHARE
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -113,10 +114,10 @@ class Screening:
         return sorted(candidates, key=lambda c: (-c.score, -c.white_score))
 
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
-        """Parameters of an effect that h lacks, on axes that are simulated, in the groups in which
-        they may join."""
+        """Parameters of an effect that h lacks, on axes that show them, in the groups in which they
+        may join."""
         groups = [] if effect.of_sensors else units(effect, h, ("amplitude",))
-        return [unit for unit in groups if all(map(self._is_simulated, unit))]
+        return [unit for unit in groups if all(self._is_shown(k, h) for k in unit)]
 
     def lacks_plainer(self, name: str, h: Hypothesis) -> bool:
         """Whether an effect imitates another that every vehicle has (``Effect.beyond``), and the
@@ -124,6 +125,18 @@ class Screening:
         plainer = EFFECTS[name].beyond if name in EFFECTS else ""
         own = [(COEFFICIENTS, c) for c in EFFECTS[plainer].coefficients[:3]] if plainer else []
         return any(k[1] not in h.coefficients and self._is_simulated(k) for k in own)
+
+    def _is_shown(self, key: Key, h: Hypothesis) -> bool:
+        """Whether its axis is simulated, and most that is read of the thrust there is thrust: where
+        noise of the reading is believed and not far below it, it is not."""
+        if not self._is_simulated(key):
+            return False
+        axis = axis_of(key)
+        if not axis or key[0] not in EFFECTS or EFFECTS[key[0]].act is None:
+            return True
+        i = AXES.index(axis)
+        noise = reading_noise(h.config.effects)[i] ** 2
+        return bool(noise <= SHARE * np.mean(self._problem.streams.demand[:, i] ** 2))
 
     def _is_simulated(self, key: Key) -> bool:
         axis = axis_of(key)
@@ -187,9 +200,9 @@ class Screening:
         return Candidate(effect.name, start, score, white) if start else None
 
     def _own(self, effect: Effect, h: Hypothesis) -> list[Key]:
-        """All parameters that h lacks of an effect, on axes that are simulated."""
+        """All parameters that h lacks of an effect, on axes that show them."""
         own = units(effect, h, ("amplitude", "limit", "fixed", "place", "onset"))
-        return [k for unit in own for k in unit if self._is_simulated(k)]
+        return [k for unit in own for k in unit if self._is_shown(k, h)]
 
     def _best_shape(
         self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]

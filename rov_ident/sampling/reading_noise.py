@@ -26,13 +26,11 @@ SHARE = 0.01
 
 
 def resting_noise(demand: Array) -> Array:
-    """Standard deviation (6,) of readings (K, 6) of the wrench where commands rest: that of the
-    quietest blocks, 13 % below what :func:`resting` finds (docs/explain-bench.md is of this one).
-    """
+    """Standard deviation (6,) of readings (K, 6) of the wrench where commands rest."""
     if len(demand) < _BLOCK + 2:
         return np.zeros(6)
-    std: Array = np.quantile(_medians(demand, _BLOCK), RESTING, axis=0)
-    return np.where(std > _ROUNDING * np.abs(demand).max(axis=0), _OF_MEDIAN * std, 0.0)
+    std = resting(scatter(demand))
+    return np.where(std > _ROUNDING * np.abs(demand).max(axis=0), std, 0.0)
 
 
 def _medians(demand: Array, size: int) -> Array:
