@@ -150,11 +150,8 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     """
     for i in range(6):
         noise = inverse[i, i] ** 2 * sample.reading_noise[i]
-        seen = monitor[i].seen
-        follows = seen > TIME and monitor[i].density <= FOLLOWED * noise
-        noisy[i] = noise > 0.0 and not follows
-        if noise == np.inf and seen > RECENT:  # of one who goes on with what another has learnt
-            noisy[i] = False
+        follows = monitor[i].seen > TIME and monitor[i].density <= FOLLOWED * noise
+        noisy[i] = 0.0 < noise < np.inf and not follows
     structure = task.structure
     in_motion(structure, moving, moves)
     first, rows = len(structure.mass_row), structure.row
@@ -168,7 +165,9 @@ def learnt(task, moving, sample, monitor, inverse, noisy, moves):
     for e in range(first, len(moves)):
         moves[e] = True
         for i in range(6):
-            if task.scaled[e - first, i] and noisy[i]:
+            # not known yet, unless another has learnt before
+            unknown = sample.reading_noise[i] == np.inf and monitor[i].seen <= RECENT
+            if task.scaled[e - first, i] and (noisy[i] or unknown):
                 moves[e] = False
 
 

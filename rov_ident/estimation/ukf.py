@@ -465,7 +465,7 @@ def _update(task, state, work, sample, side, out):
                     considered += p[i, j] * p[i, j] / (p[j, j] * spread)
             out.nis[i] = innovation**2
             own, ratio = sample.moving[i] != 0, 1.0
-            if work.noisy[i] and sample.reading_noise[i] < np.inf:
+            if work.noisy[i]:
                 ratio = np.sqrt(spread / _given_held(task, p, work.free, side, i, spread, r[i]))
             outlier |= watch(
                 state.monitor[i], task.process[0], i, _ROOM, moving, own, ratio * s.gate,
