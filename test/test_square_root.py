@@ -11,57 +11,15 @@ from rov_ident.estimation import square_root as kernels
 N, COLUMNS = 7, 32  # as square_root.columns_of(N)
 
 
-# Kernels for kernels have no wrapper: called from Python they end the process.
+def callable_from_python(kernel):
+    """Kernels for kernels have no wrapper: called from Python they end the process."""
+    return numba.njit(lambda *arguments: kernel(*arguments))
 
 
-@numba.njit(cache=True)
-def cholesky(*arguments):
-    return kernels.cholesky(*arguments)
-
-
-@numba.njit(cache=True)
-def cholesky_solve(*arguments):
-    return kernels.cholesky_solve(*arguments)
-
-
-@numba.njit(cache=True)
-def whiten(*arguments):
-    return kernels.whiten(*arguments)
-
-
-@numba.njit(cache=True)
-def solve(*arguments):
-    return kernels.solve(*arguments)
-
-
-@numba.njit(cache=True)
-def one_norm(*arguments):
-    return kernels.one_norm(*arguments)
-
-
-@numba.njit(cache=True)
-def stack(*arguments):
-    return kernels.stack(*arguments)
-
-
-@numba.njit(cache=True)
-def reorder(*arguments):
-    return kernels.reorder(*arguments)
-
-
-@numba.njit(cache=True)
-def forget(*arguments):
-    return kernels.forget(*arguments)
-
-
-@numba.njit(cache=True)
-def add_variance(*arguments):
-    return kernels.add_variance(*arguments)
-
-
-INNER = (cholesky, cholesky_solve, whiten, solve, one_norm, stack, reorder, forget, add_variance)
+INNER = ("cholesky", "cholesky_solve", "whiten", "solve", "one_norm", "stack", "reorder")
+INNER += ("forget", "add_variance")
 square_root = SimpleNamespace(
-    **{wrapped.__name__: wrapped for wrapped in INNER},
+    **{name: callable_from_python(getattr(kernels, name)) for name in INNER},
     inverse_of=kernels.inverse_of,
     columns_of=kernels.columns_of,
 )
