@@ -71,6 +71,7 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
 
 _REACH = 3.0  # of 1000 normal deviates, three are further off
 _CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
+_ATTITUDE_TIME = 15.0  # s; how long the error of an AHRS's tilt lasts: until gravity corrects it
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
@@ -92,11 +93,25 @@ def first_centre(config: Config) -> dict[str, float]:
 def drift_of(config: Config, names: tuple[str, ...]) -> Array:
     """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's.
 
-    Only that of a current: it turns, and differs from place to place, unless the file says that it
-    is known (``current_std: 0``).
+    That of a current: it turns, and differs from place to place. And that of a trim: an attitude
+    is off by ``odometry.attitude_std`` for many seconds, and a righting moment with it, which a
+    vehicle at rest does not tell from a centre of gravity that moves. Neither where the file says
+    that it is known (``current_std: 0`` ...).
     """
-    drifting = {".".join(key) for key in config.nuisance_std if key[0] == "ocean_current"}
-    return np.array([1.0 / _CURRENT_TIME if name in drifting else 0.0 for name in names])
+    supposed = {".".join(key): std for key, std in config.nuisance_std.items()}
+    body, tilt = config.model.body, config.odometry.attitude_std
+    weight = body.mass * config.gravity
+    arm = {"dx": body.restoring[4, 0] / weight, "dy": body.restoring[3, 1] / weight}  # m
+
+    def rate(name: str) -> float:
+        effect, _, own = name.partition(".")
+        if name in supposed and effect == "ocean_current":
+            return 1.0 / _CURRENT_TIME
+        if name in supposed and effect == "cog_offset" and own in arm:
+            return 2.0 * float((arm[own] * tilt / supposed[name]) ** 2) / _ATTITUDE_TIME
+        return 0.0
+
+    return np.array([rate(name) for name in names])
 
 
 def rigid_body_covariance(

@@ -10,9 +10,9 @@ motion and the measured velocity become::
 ``J`` (6, k) is the change of the wrench: difference quotients of the input effects, run beside the
 configured ones, of effects on fins in what the configured fins make, and of the wrench effects, at
 the measured motion; of effects on the rigid body
-``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration of the model as it is estimated, so
-that what the trim does to it is in there. ``V`` (6, k) is the change of the measured velocity: of
-moving water, and of effects on the velocity sensors.
+``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration that the IMU measures ("Trim" in
+docs/accuracy.md). ``V`` (6, k) is the change of the measured velocity: of moving water, and of
+effects on the velocity sensors.
 """
 
 from typing import NamedTuple
@@ -46,6 +46,7 @@ from rov_ident.model.equations import Structure, coriolis, force_of_one
 
 _ZERO = np.zeros(3)
 _FOLLOWING_TIME = 1.0  # s; longer than a thruster takes, shorter than a vehicle rests
+_ACCELERATION_TIME = 0.2  # s; over which the noise of a measured acceleration is averaged
 _ASTRAY = 10.0  # m/s from what is measured: the present model runs away
 
 
@@ -133,6 +134,7 @@ class EffectJacobians:
         self._around = np.zeros((count, 6))
         self._time = 0.0
         self._followed = np.zeros((2, 3))
+        self._lacking, self._rate = np.zeros(6), np.zeros(3)
         self._steering = np.zeros((len(self._steers), 2, *steering_memory().shape))
         self._steered = np.zeros((len(self._steers), 2, 2, len(INPUTS)))
 
@@ -153,10 +155,10 @@ class EffectJacobians:
         """The same of a configuration with other values of the parameters; what is known stays.
 
         So do the values that the columns of the rigid body are about, as the estimator's own body
-        stays: these columns are linear, but for the acceleration.
+        stays: these columns are linear.
         """
         new = EffectJacobians(config)
-        names = "_memory _around _impulse _time _velocity _followed _steering"
+        names = "_memory _around _impulse _time _velocity _followed _lacking _rate _steering"
         for name in names.split():
             setattr(new, name, getattr(self, name))
         new._about[new._bodies] = self._about[self._bodies]
@@ -174,13 +176,18 @@ class EffectJacobians:
             change = np.concatenate([before.linear - after.linear, rate])
             self._velocity[:, i] = change / self._width[i]
 
-    def extend(self, sample: NDArray[np.void], sides: Array) -> None:
-        """Fill sides (13, k) of the sample (1,) with J, V and p0; what has acted is used up."""
+    def extend(self, sample: NDArray[np.void], sides: Array, acceleration: Array) -> None:
+        """Fill sides (13, k) of the sample (1,) with J, V and p0; what has acted is used up.
+
+        ``acceleration`` (3,) [m/s2] is that over ground, in body axes, by the IMU; it is not read
+        where the sample has no gyro.
+        """
         if self._surrounded:
             self._surround(sample[0])
         _fill(
             self._motion, sample, self._acts, self._impulse, self._time, self._scale,
-            self._velocity, self._about, self._followed, sides,
+            self._velocity, self._about, self._followed, acceleration, self._lacking, self._rate,
+            sides,
         )  # fmt: skip
         for k, (i, *_) in enumerate(self._steers):
             low, high = (_force(self._motion, sample, inputs) for inputs in self._steered[k, :, 0])
@@ -272,8 +279,37 @@ def _follow(motion, sample, followed):
     return v_dot
 
 
+@inlined
+def _measured_acceleration(motion, sample, acceleration, lacking, rate):
+    """nu_dot (6,) through the water; by the configured model alone where there is no IMU.
+
+    ``lacking`` (6,) is what the model lacked of it of late, ``rate`` (3,) that of the sample
+    before; now of this. What is quicker than _ACCELERATION_TIME is the model's, the rest measured.
+    """
+    nu_dot, nu = _acceleration(motion, sample, sample.nu), sample.nu
+    inertial = np.isfinite(sample.gyro[0])
+    if inertial and sample.dt > 0.0 and not sample.restart:
+        blend = sample.dt / (_ACCELERATION_TIME + sample.dt)
+        for i in range(3):
+            j, m = (i + 1) % 3, (i + 2) % 3
+            turned = nu[3 + j] * sample.water[m] - nu[3 + m] * sample.water[j]
+            lacking[i] += blend * (acceleration[i] + turned - nu_dot[i] - lacking[i])
+            measured = (nu[3 + i] - rate[i]) / sample.dt
+            lacking[3 + i] += blend * (measured - nu_dot[3 + i] - lacking[3 + i])
+    for i in range(6):
+        if not inertial:
+            lacking[i] = 0.0
+        nu_dot[i] += lacking[i]
+    for i in range(3):
+        rate[i] = nu[3 + i]
+    return nu_dot
+
+
 @kernel
-def _fill(motion, samples, acts, impulse, time, scale, velocity, about, followed, sides):
+def _fill(
+    motion, samples, acts, impulse, time, scale, velocity, about, followed, acceleration, lacking,
+    rate, sides,
+):  # fmt: skip
     """sides (13, k): rows of the wrench, of the measured velocity, and the values they are about.
 
     Of a change of the rigid body ``dG down - dM nu_dot - C(dM nu) nu``; of a later velocity
@@ -297,7 +333,7 @@ def _fill(motion, samples, acts, impulse, time, scale, velocity, about, followed
             for a in range(3):
                 sides[6 + i, j] += to_world[a, i] * motion.water[a, j]
     if len(motion.bodies) > 0:
-        nu_dot = _acceleration(motion, sample, sample.nu)
+        nu_dot = _measured_acceleration(motion, sample, acceleration, lacking, rate)
         down = sample.down - 0.5 * sample.dt * sample.down_slope  # as the estimators take it
         for b in range(len(motion.bodies)):
             change = motion.of_restoring[b] @ down - motion.of_mass[b] @ nu_dot

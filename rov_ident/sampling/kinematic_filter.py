@@ -161,6 +161,12 @@ class KinematicFilter:
         self.state["inertial"] = False
 
     @property
+    def acceleration(self) -> Array:
+        """Of the origin over ground (3,) [m/s2], in body axes, when the IMU last measured."""
+        acceleration: Array = self.state["acceleration"][0]
+        return acceleration
+
+    @property
     def test_ratios(self) -> dict[str, float]:
         """Test ratios of the parts of the odometry against the IMU, of late; 1 is expected."""
         return dict(zip(_PARTS, self.state["test_ratio"][0].tolist(), strict=True))

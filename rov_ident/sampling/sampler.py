@@ -252,5 +252,5 @@ class Sampler:
             return None
         self._acting.surround(sample)
         if self._jacobians is not None:
-            self._jacobians.extend(sample, sides)
+            self._jacobians.extend(sample, sides, self.kinematic_filter.acceleration)
         return whole
