@@ -161,13 +161,14 @@ def test_a_fit_says_so_and_widens_its_intervals(tmp_path):
 
 def test_each_question_has_its_limit(heavy):
     parameters = configuration.to_parameters(heavy)
-    parameters["wrench"].pop("scale_std", None)
+    for known in ("scale_std", "lag_std"):
+        parameters["wrench"].pop(known, None)
     config = configuration.from_parameters(parameters).with_nuisance
     prior, quiet = prior_of(config, effects=True), np.full(6, 0.001)
     names = prior.names
 
-    def failed(values=prior.mean, unexplained=quiet, lasting=None, sensors=None):
-        found = consistency_of(config, prior, values, unexplained, lasting, sensors)
+    def failed(values=prior.mean, unexplained=quiet, lasting=None, sensors=None, std=None):
+        found = consistency_of(config, prior, values, unexplained, lasting, sensors, std)
         return [test.name for test in found.tests if not test.passed]
 
     assert failed() == []
@@ -179,6 +180,10 @@ def test_each_question_has_its_limit(heavy):
     far[names.index("thrust_scale.scale")] -= 3.0 * 0.15
     far[names.index("X_uu")] *= 3.0  # nobody has said that a coefficient is well known
     assert failed(values=far) == ["prior of thrust_scale.scale"]
+    early, std = prior.mean.copy(), 0.01 * prior.std
+    early[names.index("thruster_lag.time_constant")] = -0.02  # s
+    assert failed(values=early, std=4.0 * std) == []
+    assert failed(values=early, std=std) == ["bound of thruster_lag.time_constant"]
 
 
 def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):

@@ -24,6 +24,7 @@ _PRIOR = "prior of "  # begins the name of such a test
 _SUPPOSED = (
     2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
 )
+_BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
@@ -122,10 +123,12 @@ def consistency_of(
     unexplained: Array,
     lasting: Array | None = None,
     sensors: Mapping[str, float] | None = None,
+    std: Array | None = None,
 ) -> Consistency:
     """Judge an estimate.
 
-    ``values`` (n,) are not yet drawn to what is physically possible. ``unexplained`` (6,) is the
+    ``values`` (n,) are not yet drawn to what is physically possible; ``std`` (n,) are their
+    standard deviations, None where bounds have held them. ``unexplained`` (6,) is the
     force that lasts a second and that the model does not have, relative to the working wrench; NaN
     where it is not known. ``lasting`` (6,), of RLS, UKF and ML, is the power of
     innovations added up over a second in motion: 1 is expected, NaN where it is not known.
@@ -163,6 +166,17 @@ def consistency_of(
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
         )  # fmt: skip
+        if std is None:
+            continue
+        beyond = max(prior.lower[i] - values[i], values[i] - prior.upper[i]) / std[i]
+        if beyond > 0.0:
+            tests.append(
+                Test(
+                    f"bound of {name}", float(beyond), _BEYOND,
+                    f"the data ask for {name} = {values[i]:.3g} {prior.units[i]}, which cannot be: "
+                    "check that wrench, odometry and IMU are stamped by one clock, when measured",
+                )
+            )  # fmt: skip
     for part, ratio in (sensors or {}).items():
         tests.append(
             Test(

@@ -404,7 +404,7 @@ class OnlineEstimator:
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         consistency = consistency_of(
             self.config, self.prior, raw.values, self._unexplained(), self._lasting(),
-            self.sampler.kinematic_filter.contradictions,
+            self.sampler.kinematic_filter.contradictions, raw.std,
         )  # fmt: skip
         gain = gain_of(raw.covariance, self.prior.std)
         covariance = raw.covariance + rigid_body_covariance(
