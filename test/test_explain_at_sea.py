@@ -19,7 +19,13 @@ from rov_ident.core.frames import (
     quaternion_from_rotation_vector,
     quaternion_multiply,
 )
-from rov_ident.discrepancy import patterns, rates_and_attitude, search, sensor_consistency
+from rov_ident.discrepancy import (
+    patterns,
+    rates_and_attitude,
+    search,
+    sensor_choice,
+    sensor_consistency,
+)
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import split
 from rov_ident.discrepancy.linearisation import linearise
@@ -237,6 +243,24 @@ def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy)
     there = Search(streams, config, split(streams.duration)[0])
     assert there.problem.reading_std[3:5].all()
     assert bool(noise_of_wrench(there, there.start())) == noisy
+
+
+# ------------------------------------------------------------------ accelerometer and attitude
+
+
+@pytest.mark.parametrize(
+    ("sea", "sure"),
+    [({"tilt": (0.03, -0.03)}, False), ({"accelerometer_bias": (0.06, -0.08, 0.05)}, True)],
+    ids=["a tilted attitude", "a bias"],
+)
+def test_a_level_accelerometer_reads_a_bias_as_an_attitude_reads_a_tilt(sea, sure):
+    """A bias far beyond what the configuration supposes of the IMU is not sure."""
+    _, streams, config = streams_of(str(sea), "pilot", 1, 60.0, lambda *_: sea)
+    spans = split(streams.duration)
+    choice = sensor_choice.chosen(streams, spans[0], streams, spans[1], config)
+    assert "imu_bias" in choice.sensors
+    assert ("imu_bias" not in choice.unsure) == sure
+    assert any("tilted" in note for note in choice.notes) != sure
 
 
 # ------------------------------------------------------------------ thrust

@@ -118,6 +118,7 @@ class Sea:
     velocity_delay: float = 0.0  # s, age of the linear velocity at its stamp
     smoothing: float = 0.0  # s, time constant of the filter whose output the odometry is
     wrench_floor: tuple[float, ...] = (0.0,) * 6  # N, N m, std of the reading at any wrench
+    wander: float = 0.0  # rad, std of an error of the odometry's attitude that lasts
     gyro_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # rad/s
     accelerometer_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # m/s2
     gyro_is_shared: bool = False  # odometry copies its angular velocity from the IMU
@@ -464,6 +465,17 @@ def axis_by_axis(rng: np.random.Generator, t: Array) -> Array:
     return six_axes(rng, t) * (driven[:, None] == np.arange(6))
 
 
+def heeling_pilot(rng: np.random.Generator, t: Array) -> Array:
+    """:func:`pilot` who now and then heels the vehicle for some seconds, to look up or below."""
+    demand, begin = pilot(rng, t), rng.uniform(5.0, 20.0)
+    while begin < t[-1]:
+        end = begin + rng.uniform(3.0, 8.0)
+        axis, size = rng.integers(3, 5), rng.uniform(0.5, 1.5) * rng.choice([-1.0, 1.0])
+        demand[(t >= begin) & (t < end), axis] += size  # N m
+        begin = end + rng.uniform(5.0, 30.0)
+    return demand
+
+
 def slow_pilot(rng: np.random.Generator, t: Array) -> Array:
     """:func:`pilot` who rests the sticks longer, whose middle fifth does nothing."""
     return pilot(rng, t, pauses=(5.0, 15.0), deadband=0.2)
@@ -472,6 +484,7 @@ def slow_pilot(rng: np.random.Generator, t: Array) -> Array:
 DRIVING: dict[str, Callable[[np.random.Generator, Array], Array]] = {
     "six-axis": six_axes,
     "pilot": pilot,
+    "heeling pilot": heeling_pilot,
 }
 PARTIAL = {
     "four-axis": only(2, 3, 4, 5),
@@ -484,7 +497,7 @@ SPARSE = {"axis by axis": axis_by_axis, "slow pilot": slow_pilot}
 # against the excitation of roll and pitch, so its gain is low there.
 LEVELLING = {
     **dict.fromkeys(("six-axis", "axis by axis", *PARTIAL), (2.0, 0.3)),
-    **dict.fromkeys(("pilot", "slow pilot"), (4.0, 1.0)),
+    **dict.fromkeys(("pilot", "slow pilot", "heeling pilot"), (4.0, 1.0)),
 }
 
 
@@ -574,6 +587,9 @@ def _smoothed(x: Array, constant: float) -> Array:
     return lfilter([share], [1.0, share - 1.0], x, axis=0, zi=first)[0]
 
 
+WANDER_TIME = 15.0  # s; that the error of an AHRS lasts, until gravity corrects it
+
+
 def _coloured(rng: np.random.Generator, shape: tuple[int, int], std: float, time: float) -> Array:
     """Noise (N, k) at the IMU's rate, correlated over ``time`` s."""
     keep = math.exp(-1.0 / IMU_RATE / time)
@@ -641,6 +657,9 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
     if (frozen := t >= sea.frozen_from).any():  # a position that is dead reckoning stands, too
         linear[frozen] = 0.003 * rng.standard_normal((frozen.sum(), 3))
         position[frozen] = position[frozen][0]
+    if sea.wander:
+        error = _coloured(rng, gyro.shape, sea.wander, WANDER_TIME)
+        attitude = _tilted(attitude, error[np.clip(np.searchsorted(imu_t, t), 0, len(imu_t) - 1)])
     if any(sea.tilt):
         attitude = _tilted(attitude, np.broadcast_to([*sea.tilt, 0.0], (len(t), 3)))
     if sea.heading or sea.heading_drift:

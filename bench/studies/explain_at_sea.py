@@ -114,7 +114,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
 """What the file does not say, and the names that are right for it."""
 NOTHING = tuple(CASES)[:7]
 """Cases in which the vehicle moves as the file says, but for its coefficients."""
-KINDS = (*DRIVING, *SPARSE)
+KINDS = tuple(kind for kind in (*DRIVING, *SPARSE) if kind != "heeling pilot")
 
 
 # ------------------------------------------------------------------ one dive

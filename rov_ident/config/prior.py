@@ -71,7 +71,7 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
 
 _REACH = 3.0  # of 1000 normal deviates, three are further off
 _CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
-_ATTITUDE_TIME = 15.0  # s; how long the error of an AHRS's tilt lasts: until gravity corrects it
+_ATTITUDE_TIME = 1500.0  # s; a lasting error of the attitude wanders by its deviation in half of it
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
@@ -93,10 +93,10 @@ def first_centre(config: Config) -> dict[str, float]:
 def drift_of(config: Config, names: tuple[str, ...]) -> Array:
     """Rate [1/s] at which the variance of each of the ``names`` (n,) grows back to its prior's.
 
-    That of a current: it turns, and differs from place to place. And that of a trim: an attitude
-    is off by ``odometry.attitude_std`` for many seconds, and a righting moment with it, which a
-    vehicle at rest does not tell from a centre of gravity that moves. Neither where the file says
-    that it is known (``current_std: 0`` ...).
+    That of a current: it turns, and differs from place to place. And that of a trim: the error of
+    an attitude lasts, and that of the righting moment with it, which a vehicle at rest does not
+    tell from a centre of gravity that moves ("Trim" in docs/accuracy.md). Neither where the file
+    says that it is known (``current_std: 0`` ...).
     """
     supposed = {".".join(key): std for key, std in config.nuisance_std.items()}
     body, tilt = config.model.body, config.odometry.attitude_std

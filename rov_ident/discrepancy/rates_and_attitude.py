@@ -46,10 +46,12 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     if not value.any():
         return Agreed(streams)
     late = bool(value[3] > 0.5 * np.median(np.diff(streams.t)))
-    told = ", ".join(f"{bias:.2g}" for bias in value[:3])
+    biases = ", ".join(f"{bias:.2g}" for bias in value[:3])
+    told = [f"{biases} rad/s too much"] if value[:3].any() else []
+    told += [f"{value[3]:.2g} s late"] if value[3] else []
     note = (
-        f"the odometry's angular velocities are not those of its attitude: {told} rad/s too much, "
-        f"{value[3]:.2g} s late; set right"
+        f"the odometry's angular velocities are not those of its attitude: {', '.join(told)}; "
+        "set right"
     )
     biased = _noted(streams, _rates(streams, body, value), note)
     drift = _drift(streams, body) if value[:3].any() else 0.0

@@ -31,7 +31,9 @@ from rov_ident.sampling.raw_streams import Streams
 from rov_ident.sampling.reading_noise import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
+BIAS = "imu_bias"
 _YAW = (MOUNTING, "yaw")
+_TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
 
 Sensors = dict[str, dict[str, float]]
@@ -41,7 +43,8 @@ Sensors = dict[str, dict[str, float]]
 class Choice:
     """The sensor effects that are believed, the standard deviations of their parameters, those that
     the data cannot tell from the choice, by effect, and what was not believed, in words; ``fixed``
-    are parameters that were held at their null, ``unsure`` effects that only the pose asks for."""
+    are parameters that were held at their null, ``unsure`` effects that something without a name
+    may be behind."""
 
     sensors: Sensors
     std: Mapping[Key, float]
@@ -101,7 +104,22 @@ def chosen(
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
-    return _without_refuted(data, choice)
+    return _bias_or_tilt(config, _without_refuted(data, choice))
+
+
+def _bias_or_tilt(config: Config, choice: Choice) -> Choice:
+    """A level accelerometer reads a bias as an attitude reads a tilt; a bias that is larger than
+    the configuration supposes of the IMU is not sure."""
+    bias = choice.sensors.get(BIAS, {"ax": 0.0, "ay": 0.0})
+    level = float(np.hypot(bias["ax"], bias["ay"]))
+    if level <= _TILTED * config.imu.accelerometer_bias_std:
+        return choice
+    tilt = 1e3 * level / config.gravity
+    words = (
+        f"{BIAS}: {level:.2g} m/s2 along x and y are more than imu.accelerometer_bias_std "
+        f"supposes; attitude or IMU may be tilted by {tilt:.0f} mrad instead"
+    )
+    return dataclasses.replace(choice, notes=(*choice.notes, words), unsure=choice.unsure | {BIAS})
 
 
 def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:

@@ -9,8 +9,8 @@ standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mea
   noise weighs too much for ever. Innovations are added up over a second: what they have in common
   is process noise, while each alone is nearly all the sensor's.
 * *Whiteness.* Noise that comes down where the vehicle rests is not what it does in motion: the
-  power of the sums, averaged over a minute of motion, says whether the model explains that, too, but
-  for a force that is negligible beside the working wrench.
+  power of the sums, averaged over a minute of motion, says whether the model explains that, too,
+  but for a force that is negligible beside the working wrench.
 * *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
   average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
