@@ -133,7 +133,7 @@ def test_a_vehicle_at_rest_in_its_trim_does_not_accelerate(heavy):
     sample["wrench"] = -moved.dynamics.body.restoring @ sample["down"][0]
     columns = EffectJacobians(config).about(moved)
     sides = np.zeros((13, columns.size))
-    columns.extend(sample, sides)
+    columns.extend(sample, sides, np.zeros(3))
     for own, axis in (("dx", 0), ("dy", 1), ("dz", 2)):
         i = config.effect_names.index(f"cog_offset.{own}")
         weight = np.cross(np.eye(3)[axis], body.weight * sample["down"][0])

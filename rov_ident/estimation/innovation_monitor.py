@@ -9,8 +9,7 @@ standard deviations; its square (NIS, Bar-Shalom 2001, sec. 5.4) is 1 in the mea
   noise weighs too much for ever. Innovations are added up over a second: what they have in common
   is process noise, while each alone is nearly all the sensor's.
 * *Whiteness.* Noise that comes down where the vehicle rests is not what it does in motion: the
-  power of the sums, averaged over a minute of motion, says whether the model explains that, too,
-  but for a force that is negligible beside the working wrench.
+  power of the sums, averaged over a minute of motion, says whether the model explains that, too.
 * *A change of the vehicle* is a NIS that stays large in the average over two seconds, against the
   average of the last minute: that of a rough model is large at all times.
 * *An outlier* is a NIS beyond the gate. One alone is the sensor's, and refused. After a second one
@@ -99,9 +98,7 @@ def watch(m, process, i, room, moving, own, gate, innovation, considered):
         expected = m.expected + m.lasting * m.lasting
         if m.seen > TIME and m.driven > _LESSON:
             m.judged += m.since
-            # a force that lasts adds to sums as process noise does
-            allowed = process.negligible[i] / m.acting if m.acting > 0.0 else 0.0
-            m.power = averaged(m.power, m.judged, m.since, m.summed, expected * (1.0 + allowed))
+            m.power = averaged(m.power, m.judged, m.since, m.summed, expected)
         excess = min(m.summed * m.summed / expected, STEADY) - room
         blend = min(m.since / min(FIRST_TIME + 0.25 * m.seen, TIME), _FASTEST)
         density = max(m.density + blend * excess * m.acting, process.floor[i])

@@ -14,7 +14,6 @@ from rov_ident.model.scales import authority
 
 # docs/accuracy.md: "The floor of the process noise and its first value"
 FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
-NEGLIGIBLE_FORCE = 0.001  # of it: no test is failed for less ("Does the model explain the data?")
 LARGEST_FORCE = 0.3  # at most: with more, 30 % of a coefficient would not show in a second
 
 PROCESS = record(
@@ -22,7 +21,6 @@ PROCESS = record(
         ("first", "f8", (6,)),  # variance density of the unexplained acceleration to begin with
         ("floor", "f8", (6,)),  # its least
         ("largest", "f8", (6,)),  # and its most
-        ("negligible", "f8", (6,)),  # what may be lacking unnoticed
         ("relative", "f8"),  # variance of the wrench relative to its square
         ("least", "f8", (6,)),  # its variance at zero wrench
         ("restoring", "f8", (6, 3)),  # N, N m: times the unit vector down, the wrench of weight
@@ -40,7 +38,6 @@ def process(config: Config) -> NDArray[np.void]:
     working = authority(model) / np.diag(model.mass_matrix)
     out["first"] = np.square(FIRST_FORCE * working)
     out["floor"] = np.square(config.process_std)
-    out["negligible"] = np.square(NEGLIGIBLE_FORCE * working)
     out["largest"] = np.maximum(out["floor"], np.square(LARGEST_FORCE * working))
     out["relative"] = wrench.relative_std**2
     out["least"] = np.square(wrench.floor_std)
