@@ -150,8 +150,8 @@ def test_the_thrust_is_learnt_from_clean_readings(seed: int) -> None:
     ("kind", "seed"), [("rls", 0), ("ukf", 0), *more(*itertools.product(("rls", "ukf"), (1, 2)))]
 )
 def test_what_is_driven_is_learnt_beside_the_noise(kind: Kind, seed: int) -> None:
-    """Taught by the noise, most were off by 20 to 50 %. What is off by more than chance, of roll and
-    pitch, is said to be in doubt."""
+    """Taught by the noise, most were off by 20 to 50 %. What is off by more than chance (roll and
+    pitch) is said to be in doubt."""
     dive = dive_of("wrench noise", "pilot", seed, 80.0)
     config = configuration.from_parameters(dive.parameters)
     online = OnlineEstimator(config, kind)
