@@ -30,7 +30,7 @@ import numpy as np
 import rov_ident as ri
 from bench.harness import Bars, Line, announce, digest, lines_of, table
 from bench.simulators import sea
-from bench.simulators.sea import DRIVING, SPARSE, Vehicle
+from bench.simulators.sea import SPARSE, Vehicle
 from bench.studies import at_sea
 from bench.studies.at_sea import ALONE, Draw, answered, chosen, dive_of
 
@@ -114,7 +114,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
 """What the file does not say, and the names that are right for it."""
 NOTHING = tuple(CASES)[:7]
 """Cases in which the vehicle moves as the file says, but for its coefficients."""
-KINDS = tuple(kind for kind in (*DRIVING, *SPARSE) if kind != "heeling pilot")
+KINDS = ("six-axis", "pilot", *SPARSE)
 
 
 # ------------------------------------------------------------------ one dive
