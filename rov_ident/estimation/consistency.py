@@ -166,15 +166,17 @@ def consistency_of(
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
         )  # fmt: skip
-        if std is None:
-            continue
-        beyond = max(prior.lower[i] - values[i], values[i] - prior.upper[i]) / std[i]
-        if beyond > 0.0:
+    if std is not None:
+        upper = np.where(prior.negative, np.minimum(prior.upper, 0.0), prior.upper)
+        beyond = np.maximum(prior.lower - values, values - upper) / std
+        for i in np.flatnonzero(beyond > 0.0).tolist():
+            name = prior.names[i]
             tests.append(
                 Test(
-                    f"bound of {name}", float(beyond), _BEYOND,
+                    f"bound of {name}", float(beyond[i]), _BEYOND,
                     f"the data ask for {name} = {values[i]:.3g} {prior.units[i]}, which cannot be: "
-                    "check that wrench, odometry and IMU are stamped by one clock, when measured",
+                    "check that wrench, odometry and IMU are stamped by one clock, when measured; "
+                    f"{CAUSE}",
                 )
             )  # fmt: skip
     for part, ratio in (sensors or {}).items():
