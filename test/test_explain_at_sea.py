@@ -2,9 +2,7 @@
 
 import copy
 import dataclasses
-import tempfile
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,20 +31,13 @@ from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
-from rov_ident.io import topics as inputs
-from rov_ident.io.bag_reader import Bag
 from rov_ident.sampling.raw_streams import Streams, gather
 
 
 def streams_of(case, driving, seed, seconds=60.0, draw=None):
     dive = dive_of(case, driving, seed, seconds, draw)
     config = configuration.from_parameters(dive.parameters)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "dive.mcap"
-        path.write_bytes(dive.bag)
-        bag = Bag(path)
-        topics = inputs.select(bag, config)
-        return dive, gather(inputs.messages(bag, topics, config), config), config
+    return dive, gather(at_sea.messages_of(dive, config), config), config
 
 
 # ------------------------------------------------------------------ rates and attitude

@@ -4,10 +4,8 @@ The dives come from a simulator that shares no code with the estimators (bench/s
 """
 
 import itertools
-import tempfile
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,13 +14,11 @@ from tiers import more
 
 import rov_ident as ri
 from bench.simulators import sea
-from bench.studies.at_sea import dive_of
+from bench.studies import at_sea
 from rov_ident import config as configuration
 from rov_ident.config.prior import drift_of, prior_of, rigid_body_covariance
 from rov_ident.core.states import State
 from rov_ident.estimation.online import OnlineEstimator
-from rov_ident.io import topics as inputs
-from rov_ident.io.bag_reader import Bag
 from rov_ident.io.write_messages import write_messages
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.sample import SAMPLE
@@ -152,14 +148,10 @@ def test_a_vehicle_at_rest_in_its_trim_does_not_accelerate(heavy):
 def test_an_attitude_that_wanders_teaches_no_thrust(seed, kind):
     """An error that lasts is no righting moment; of the first of these dives 22 % of the intervals
     held, while model and data were said to agree."""
-    dive = dive_of("ordinary sensors", "pilot", seed, 120.0)
+    dive = at_sea.dive_of("ordinary sensors", "pilot", seed, 120.0)
     config = configuration.from_parameters(dive.parameters)
     online = OnlineEstimator(config, kind)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "dive.mcap"
-        path.write_bytes(dive.bag)
-        bag = Bag(path)
-        online.follow(inputs.messages(bag, inputs.select(bag, config), config))
+    online.follow(at_sea.messages_of(dive, config))
     report = online.report()
     at = [report.names.index(name) for name in dive.vehicle.theta]
     off = np.abs(report.values[at] - list(dive.vehicle.theta.values())) / report.std[at]

@@ -1,7 +1,6 @@
 """Noise of the wrench's reading: found, and not learnt from."""
 
 import itertools
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +8,11 @@ import pytest
 from tiers import more
 
 from bench.simulators import hidden
-from bench.studies.at_sea import dive_of
+from bench.studies.at_sea import dive_of, messages_of
 from bench.studies.watch import by_default
 from rov_ident import config as configuration
 from rov_ident.config.prior import prior_of
 from rov_ident.estimation.online import Kind, OnlineEstimator
-from rov_ident.io import topics as inputs
-from rov_ident.io.bag_reader import Bag
 from rov_ident.io.write_messages import write_messages
 from rov_ident.offline import batch_fit
 from rov_ident.offline.archive import of_records
@@ -155,11 +152,7 @@ def test_what_is_driven_is_learnt_beside_the_noise(kind: Kind, seed: int) -> Non
     dive = dive_of("wrench noise", "pilot", seed, 80.0)
     config = configuration.from_parameters(dive.parameters)
     online = OnlineEstimator(config, kind)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "dive.mcap"
-        path.write_bytes(dive.bag)
-        bag = Bag(path)
-        online.follow(inputs.messages(bag, inputs.select(bag, config), config))
+    online.follow(messages_of(dive, config))
     report = online.report()
     error, off = [], []
     for name, true in dive.vehicle.theta.items():

@@ -43,7 +43,11 @@ import rov_ident as ri
 from bench.harness import Bars, Line, announce, digest, lines_of, table
 from bench.simulators import sea
 from bench.simulators.sea import DRIVING, Sea, Vehicle
+from rov_ident.config import Config
 from rov_ident.config.schema import BY_KEY
+from rov_ident.core.messages import Message
+from rov_ident.io import topics as inputs
+from rov_ident.io.bag_reader import Bag
 from rov_ident.io.write_messages import write_messages
 
 ESTIMATORS = ("rls", "ukf", "ml")
@@ -244,6 +248,15 @@ def dive_of(case: str, driving: str, seed: int, seconds: float, draw: Draw | Non
         path = Path(folder) / "dive.mcap"
         write_messages(path, messages)
         return Dive(vehicle, unknown, path.read_bytes(), parameters)
+
+
+def messages_of(dive: Dive, config: Config) -> list[tuple[str, Message]]:
+    """Role and message of all that the dive's bag holds, as a fit reads it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "dive.mcap"
+        path.write_bytes(dive.bag)
+        bag = Bag(path)
+        return list(inputs.messages(bag, inputs.select(bag, config), config))
 
 
 def answered(dive: Dive, question: Callable[[Path, Path], Line]) -> Line:
