@@ -1,6 +1,6 @@
 """Long and wide: a day of a dive, ten nodes of five vehicles, clock steps, a disk that fills.
 
-    python -m bench.studies.endurance [day] [fleet] [clock] [disk] [--hours H] [--seconds S]
+    python -m bench.studies.endurance [day] [fleet] [clock] [disk] [--help]
 
 A part of `make torture`. Exit status 1 where a bar is missed. docs/trust.md has the figures.
 """
@@ -43,7 +43,7 @@ def day(options: argparse.Namespace) -> Iterator[Row]:
     config = configuration.load(HEAVY)
     suite = Suite(odometry_rate=200.0, imu_rate=200.0, wrench_rate=200.0)
     once = dive(config, "steps", 60.0, suite=suite, seed=6).messages
-    for kind in ESTIMATORS:
+    for kind in options.estimators:
         online = OnlineEstimator(config, kind)
         messages = _repeated(once, options.hours * 3600.0)
         each = int(options.hours * 3600.0 * 600.0) // _PARTS
@@ -217,6 +217,9 @@ def main() -> int:
     )
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], metavar="STUDY")
     parser.add_argument("--hours", type=float, default=24.0, help="of the day")
+    parser.add_argument(
+        "--estimators", nargs="+", choices=ESTIMATORS, default=[*ESTIMATORS], help="of the day"
+    )
     parser.add_argument("--seconds", type=float, default=600.0, help="of the fleet")
     options = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
