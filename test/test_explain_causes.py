@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from tiers import more
 
 from bench.simulators.hidden import LINEAR_STD, Conditions, draw
@@ -111,6 +112,20 @@ def test_late_velocities_are_said_to_be_late(seed):
     (found,) = findings.effects
     assert found.effect == "velocity_latency"
     assert found.parameters["delay"].value == pytest.approx(0.12, abs=0.006)
+
+
+def test_what_is_left_is_told():
+    """Tugs at the bow that nothing measures: no fit predicts the yaw, so nothing is right."""
+    case = draw(2, conditions=MINUTE)
+    streams = streams_of(case)
+    before = explain([streams], case.config).findings
+    assert not any("is left" in note for note in before.notes)
+    tugs = lfilter([1.0], [1.0, -0.98], np.random.default_rng(2).normal(size=len(streams.demand)))
+    demand = streams.demand.copy()
+    demand[:, 5] += demand[:, 5].std() * tugs / tugs.std()
+    findings = explain([dataclasses.replace(streams, demand=demand)], case.config).findings
+    assert findings.verdict == "unexplained"
+    assert any("is left" in note and "yaw rate" in note for note in findings.notes)
 
 
 # ------------------------------------------------------------------ sensors

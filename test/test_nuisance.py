@@ -16,7 +16,12 @@ import rov_ident as ri
 from bench.simulators import sea
 from bench.studies import at_sea
 from rov_ident import config as configuration
-from rov_ident.config.prior import drift_of, prior_of, rigid_body_covariance
+from rov_ident.config.prior import (
+    drift_of,
+    prior_of,
+    righting_arm_covariance,
+    rigid_body_covariance,
+)
 from rov_ident.core.states import State
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
@@ -24,7 +29,9 @@ from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.sample import SAMPLE
 
 KNOWN = {
-    "vehicle": {"mass_std": 0.0, "inertia_std": 0.0, "buoyancy_std": 0.0, "cog_std": 0.0},
+    "vehicle": dict.fromkeys(
+        ("mass_std", "inertia_std", "buoyancy_std", "cog_std", "cob_std"), 0.0
+    ),
     "wrench": {"scale_std": 0.0, "lag_std": 0.0},
     "odometry": {"latency_std": 0.0},
     "current_std": 0.0,
@@ -195,7 +202,7 @@ def test_what_is_known_is_not_estimated(heavy):
     parameters = configuration.to_parameters(heavy)
     for key in KNOWN:
         parameters.pop(key, None) if key != "vehicle" else [
-            parameters["vehicle"].pop(name) for name in KNOWN["vehicle"]
+            parameters["vehicle"].pop(name, None) for name in KNOWN["vehicle"]
         ]
     usual = configuration.from_parameters(parameters).with_nuisance
     assert len(usual.effect_names) == 9
@@ -240,6 +247,35 @@ def test_where_the_thrust_is_not_known_the_mass_scales_everything(heavy):
             assert change == pytest.approx(abs(value[name] - moment))
         elif "." not in name or name.startswith("thrust_scale"):
             assert change == pytest.approx(abs(value[name]))
+
+
+@pytest.mark.parametrize("factor", [1.05, 0.97])
+def test_the_righting_arm_is_what_thrust_is_compared_with(heavy, factor):
+    """A centre of buoyancy that is higher than in the file makes thrust, drag and all inertia, own
+    and added, seem smaller: with that, the equations of motion are those of the file."""
+    parameters = configuration.to_parameters(heavy)
+    parameters["vehicle"] |= {"cob_std": 0.001}
+    parameters["wrench"].pop("scale_std", None)
+    config = configuration.from_parameters(parameters).with_nuisance
+    prior, body = prior_of(config, effects=True), config.model.body
+    covariance = righting_arm_covariance(config, prior.names, prior.mean)
+    arm = -body.cob[2] * body.buoyancy / body.weight
+    moved = np.sqrt(np.diag(covariance)) / (0.001 / arm)
+    theta = dict(zip(heavy.model.names, heavy.model.theta.tolist(), strict=True))
+    smaller = {n: v * factor for n, v in theta.items()}
+    own = dict(zip(("X_udot", "Y_vdot", "Z_wdot"), [body.mass] * 3))
+    own |= dict(zip(("K_pdot", "M_qdot", "N_rdot"), np.diag(body.inertia).tolist()))
+    smaller |= {n: (theta[n] - i) * factor + i for n, i in own.items()}
+    for name, change in zip(prior.names, moved):
+        if name in theta:
+            assert change == pytest.approx(abs((smaller[name] - theta[name]) / (factor - 1.0)))
+    # and these do move alike: M nu_dot + D(nu) nu = factor (thrust - righting moment)
+    there = heavy.model.with_theta(np.array([smaller[n] for n in heavy.model.names]))
+    rng = np.random.default_rng(5)
+    nu, tau = rng.uniform(-0.5, 0.5, 6), rng.uniform(-5.0, 5.0, 6)
+    nu[3:] = 0.0  # the moment of inertia about the origin is that about the CG, which is there
+    level, accelerated = np.zeros(3), heavy.model.acceleration(nu, tau, np.zeros(3))
+    np.testing.assert_allclose(there.acceleration(nu, factor * tau, level), accelerated, rtol=1e-9)
 
 
 def test_a_current_may_turn_unless_it_is_known(heavy):
@@ -289,3 +325,23 @@ def test_pilots_show_no_delay_where_there_is_none(seed, kind):
     for _, role, message in sea.measured(truth, unknown, rng):
         online.push(role, message)
     assert online.report().by_name["velocity_latency.delay"] < 0.01
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+def test_the_thrust_is_as_uncertain_as_the_righting_arm(seed):
+    """A centre of buoyancy that is off by about a millimetre: all is wrong, and nothing sure."""
+    dive = at_sea.dive_of("clean", "six-axis", seed, 60.0)
+    rng = np.random.default_rng(seed)
+    off = rng.choice([-1.0, 1.0]) * rng.uniform(0.0005, 0.0015)
+    dive.parameters["vehicle"]["cob"][2] += off
+    config = configuration.from_parameters(dive.parameters)
+    online = OnlineEstimator(config, "rls")
+    online.follow(at_sea.messages_of(dive, config))
+    report = online.report()
+    at = [report.names.index(name) for name in dive.vehicle.theta]
+    true = np.array(list(dive.vehicle.theta.values()))
+    wrong = np.abs(report.values[at] / true - 1.0)
+    assert np.median(wrong) > 0.7 * abs(off / dive.parameters["vehicle"]["cob"][2])
+    inside = (report.lower[at] <= true) & (true <= report.upper[at])
+    assert inside.mean() > 0.85
+    assert report.consistency.consistent

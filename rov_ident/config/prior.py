@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.effects import EFFECTS, parameter
-from rov_ident.model.equations import Array, Model
+from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.model.scales import WORKING_SPEED, authority
 
 
@@ -128,20 +128,65 @@ def rigid_body_covariance(
     stay the same with mass, inertia, weight, buoyancy, thrust and all coefficients times k.
     """
     known, body = config.vehicle_uncertainty, config.model.body
-    value = dict(zip(names, values.tolist(), strict=True))
-    moments = dict(zip(("K_pdot", "M_qdot", "N_rdot"), np.diag(body.inertia).tolist()))
-    if THRUST_SCALE in names:
-        scaled = {n: v for n, v in value.items() if n == THRUST_SCALE or moves_with_thrust(n)}
+    masses, moments = _own_inertia(body)
+    if scaled := _scaled(names, values):
         # relative to the inertia that the file gives and that does not change with the mass
         of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
     else:
-        of_mass = dict.fromkeys(("X_udot", "Y_vdot", "Z_wdot"), body.mass)
+        of_mass = masses
     sources = [{n: known.mass_std * v for n, v in of_mass.items()}]
     sources += [{n: known.inertia_std * moment} for n, moment in moments.items()]
+    return _considered(sources, names, gain)
+
+
+def righting_arm_covariance(
+    config: Config, names: tuple[str, ...], values: Array, gain: Array | None = None
+) -> Array:
+    """What an uncertain height of the centre of buoyancy adds to the same; nothing where the scale
+    of the thrust is known.
+
+    The equations of motion stay the same with the righting moment, thrust, drag and all inertia,
+    added and own, times k. So it is the arm of that moment which tells the scale, and a height that
+    is off moves all of these. No driving mends it: whether a coefficient has converged is asked
+    without it.
+    """
+    body, std = config.model.body, config.vehicle_uncertainty.cob_std
+    arm = abs(body.restoring[3, 1]) / body.weight
+    # no more than is supposed of the scale: a body without an arm tells nothing of it
+    share = min(std / max(arm, 1e-9), config.wrench.scale_std)
+    masses, moments = _own_inertia(body)
+    own = masses | moments
+    moved = {n: share * (v - own.get(n, 0.0)) for n, v in _scaled(names, values).items()}
+    return _considered([moved], names, gain)
+
+
+def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
+    """The mass and the moments of inertia, by the name of the added mass that a motion shows with
+    it."""
+    moments = np.diag(body.inertia).tolist()
+    return (
+        dict.fromkeys(("X_udot", "Y_vdot", "Z_wdot"), body.mass),
+        dict(zip(("K_pdot", "M_qdot", "N_rdot"), moments, strict=True)),
+    )
+
+
+def _scaled(names: tuple[str, ...], values: Array) -> dict[str, float]:
+    """What is proportional to the thrust in the same motion, if its scale is estimated."""
+    if THRUST_SCALE not in names:
+        return {}
+    of_all = zip(names, values.tolist(), strict=True)
+    return {n: v for n, v in of_all if n == THRUST_SCALE or moves_with_thrust(n)}
+
+
+def _considered(
+    sources: list[dict[str, float]], names: tuple[str, ...], gain: Array | None
+) -> Array:
+    """The covariance (n, n) of what sources of unit variance do to the estimates."""
     rows = np.array([[source.get(name, 0.0) for name in names] for source in sources])
     if gain is not None:
         rows = rows @ gain.T
-    return rows.T @ rows
+    covariance: Array = rows.T @ rows
+    return covariance
 
 
 def gain_of(covariance: Array, std: Array) -> Array:

@@ -62,7 +62,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
-_NEAR_NOISE = 3.0  # times what fitted windows leave: a prediction of twice the time drifts further
+_SLIGHT = 0.1  # of the same: 99 % of its power are explained
+_NEAR_NOISE = 3.0  # times what noise makes of a prediction: coefficients are not exact, either
 _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
@@ -227,9 +228,12 @@ def explain(
     compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
-    far = _far_off(judged, rmse[2], model.final.noise)
-    if far and verdict != "unexplained":
+    left = _left(judged, rmse[2], judge.rmse_of_noise(best))
+    only_sensors = all(EFFECTS[f.effect].of_sensors for f in found)
+    if any(share > _FAR_OFF or only_sensors for share in left.values()):
         verdict = "unexplained"
+    # what is left there may have made it
+    found = [unsure(f) if _acts_on(f, left) else f for f in found]
     extended = config
     if written.model is not None:
         values = extension.without_rows(last.hypothesis, written.axes)
@@ -239,7 +243,7 @@ def explain(
         lasting = {n: v for n, v in sensors.items() if not (n == HEADING and any(headings))}
         extended = _extended(values, lasting)
     everything = WindowedProblem(streams, blocks(streams))
-    notes = [*choice.notes, *notes, *filter(None, [written.note, far])]
+    notes = [*choice.notes, *notes, *filter(None, [written.note, _told(left)])]
     notes += [_OWN_HEADINGS] if any(headings) else []
     notes += [_FILTERED] if late else []
     notes += [_NO_TORQUE] if streams.guided.any() else []
@@ -290,19 +294,29 @@ def _with_reading(search: Search, spans: Spans) -> tuple[Search, Fitted | None]:
     return there, there.start()
 
 
-def _far_off(streams: Streams, rmse: Mapping[str, float], noise: Array) -> str:
-    """In words, which velocities the extended model leaves far off: by more than half of the
-    motion, and by more than the windows that were fitted leave in the mean."""
+def _left(streams: Streams, rmse: Mapping[str, float], noise: Array) -> dict[str, float]:
+    """The velocities that the extended model predicts far worse than their ``noise`` (6,) allows:
+    the error as a share of the motion."""
     motion = np.nanstd(streams.nu, axis=0)
-    off = {
-        MOTIONS[c]: rmse[c] / m
-        for c, m, own in zip(VELOCITIES, motion, noise, strict=True)
-        if m > 0.0 and rmse[c] > max(_FAR_OFF * m, _NEAR_NOISE * own)
+    return {
+        c: rmse[c] / m
+        for c, m, own in zip(VELOCITIES, motion.tolist(), noise.tolist(), strict=True)
+        if m > 0.0 and rmse[c] > max(_SLIGHT * m, _NEAR_NOISE * own)
     }
-    if not off:
-        return ""
-    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in off.items())
-    return f"much is left that no model explains, of the motion on held-out data: {shares}"
+
+
+def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
+    """Whether an effect, not of a sensor, acts on an axis whose velocity is not predicted."""
+    axes = {AXES[VELOCITIES.index(c)] for c in left}
+    return not EFFECTS[found.effect].of_sensors and not axes.isdisjoint(found.axes)
+
+
+def _told(left: Mapping[str, float]) -> str:
+    """What is left, in words; nothing where that is nothing."""
+    far = any(share > _FAR_OFF for share in left.values())
+    shares = ", ".join(f"{MOTIONS[c]} {100.0 * share:.0f} %" for c, share in left.items())
+    begin = "much is left that no model explains" if far else "what is left"
+    return f"{begin}, of the motion on held-out data: {shares}" if left else ""
 
 
 def _searched(

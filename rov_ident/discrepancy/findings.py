@@ -6,6 +6,7 @@ from collections.abc import Container, Mapping, Sequence
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.config.prior import rigid_body_covariance
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved
 from rov_ident.discrepancy.hypothesis import (
@@ -202,11 +203,13 @@ def without_most_favourable(before: Array, after: Array) -> tuple[Array, Array]:
 
 def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
     """The coefficients that refitting moves by more than two standard deviations."""
-    changed, stds = {}, np.sqrt(np.diag(retuned.covariance)).tolist()
-    for ((_, name), value), std in zip(retuned.hypothesis.values.items(), stds, strict=True):
+    changed, names = {}, tuple(name for _, name in retuned.hypothesis.values)
+    values = np.array(list(retuned.hypothesis.values.values()))
+    covariance = retuned.covariance + rigid_body_covariance(config, names, values)
+    for name, value, std in zip(names, values, np.sqrt(np.diag(covariance)), strict=True):
         before = float(config.model.theta[config.model.names.index(name)])
         if abs(value - before) > 2.0 * std:
-            changed[name] = Change(before, float(value), std, parse(name).unit)
+            changed[name] = Change(before, float(value), float(std), parse(name).unit)
     return changed
 
 

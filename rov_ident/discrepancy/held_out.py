@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.discrepancy.hypothesis import Hypothesis
+from rov_ident.discrepancy.reading_noise import draws
 from rov_ident.discrepancy.results import Gain, Together
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import sense
@@ -109,6 +110,17 @@ class Judge:
     def rmse(self, h: Hypothesis) -> dict[str, float]:
         error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
+
+    def rmse_of_noise(self, h: Hypothesis) -> Array:
+        """What the errors (6,) are where nothing but noise is wrong: that of the velocities, and
+        what that of each window's first state and of the wrench's reading makes of the motion."""
+        problem, std, random = self._problem, self._problem.noise_std(), np.random.default_rng(0)
+        here, squares = problem.errors(h), []
+        for taken in draws(problem.reading_std, len(problem.streams.demand)):
+            aside = std * random.standard_normal((len(problem.first), len(std)))
+            squares.append((problem.with_less(taken).errors(h, aside) - here) ** 2)
+        made = np.concatenate(squares)
+        return np.sqrt(std[3:] ** 2 + np.where(np.isfinite(made), made, 0.0).mean(axis=0))
 
     def gain(
         self,

@@ -46,8 +46,8 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     if not value.any():
         return Agreed(streams)
     late = bool(value[3] > 0.5 * np.median(np.diff(streams.t)))
-    biases = ", ".join(f"{bias:.2g}" for bias in value[:3])
-    told = [f"{biases} rad/s too much"] if value[:3].any() else []
+    biases = [f"{c} {bias:.2g}" for c, bias in zip("pqr", value) if bias]
+    told = [f"{', '.join(biases)} rad/s too much"] if biases else []
     told += [f"{value[3]:.2g} s late"] if value[3] else []
     note = (
         f"the odometry's angular velocities are not those of its attitude: {', '.join(told)}; "

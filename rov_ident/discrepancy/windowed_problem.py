@@ -15,7 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_to_matrix
+from rov_ident.core.frames import (
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from rov_ident.core.linalg import interpolated
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
 from rov_ident.discrepancy.multiple_shooting import (
@@ -34,7 +38,7 @@ from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
-from rov_ident.sampling.reading_noise import resting_noise
+from rov_ident.sampling.reading_noise import OF_MEDIAN, resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
 MAX_STEP = 0.05  # s; of integration, where odometry is slower
@@ -328,14 +332,21 @@ class WindowedProblem:
         inputs = np.abs(self.steps.inputs).max(axis=0)
         return float(inputs[INPUTS.index(p.input)] if p.input else 4.0 * inputs[:3].max())
 
-    def errors(self, h: Hypothesis) -> Array:
+    def errors(self, h: Hypothesis, aside: Array | None = None) -> Array:
         """Measured minus simulated velocity (N, 6) in open loop, each window from its measured
-        state; NaN where that diverges."""
+        state, or from so far ``aside`` (W, 9) of its attitude [rad] and velocity; NaN where that
+        diverges."""
         (mean, slope), inputs = self.thrust(h.effects), self.driven(h.effects).inputs
         acting, guide = compiled(h.effects), None
         nu = self._measured_at(self.steps.t)
         simulated = np.full((len(self.steps.t), 6), np.nan)
-        for first, last, start in zip(self.first, self.last, self.measured_starts(), strict=True):
+        starts, attitudes = self.measured_starts(), self.orientation[self.first]
+        if aside is not None:
+            turn = quaternion_from_rotation_vector(aside[:, :3])
+            starts, attitudes = starts + aside[:, 3:], quaternion_multiply(attitudes, turn)
+        for first, last, start, attitude in zip(
+            self.first, self.last, starts, attitudes, strict=True
+        ):
             nodes = slice(first, last + 1)
             at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
             if self.guided.any():
@@ -343,10 +354,20 @@ class WindowedProblem:
             with contextlib.suppress(UserError):
                 simulated[nodes] = simulate(
                     h.model, self.steps.t[nodes], mean[at], start, self.steps.position[at[0]],
-                    orientation=self.orientation[first], wrench_slope=slope[at], guide=guide,
+                    orientation=attitude, wrench_slope=slope[at], guide=guide,
                     effects=acting, inputs=inputs[at],
                 ).nu  # fmt: skip
         return self.measured - simulated[self.nodes]
+
+    def noise_std(self) -> Array:
+        """Standard deviations (9,) of the noise of attitude [rad] and velocities, from second
+        differences: steady motion adds nothing to these, and quick motion is rare."""
+        good = np.isfinite(self.streams.nu).all(axis=1)
+        q, nu = self.streams.orientation[good], self.streams.nu[good]
+        turns = 2.0 * quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])[:, 1:]
+        second = np.hstack([np.diff(turns, axis=0), np.diff(nu, 2, axis=0)]) / np.sqrt(6.0)
+        out: Array = OF_MEDIAN * np.median(np.abs(second), axis=0)
+        return out
 
     def measured_starts(self) -> Array:
         """The measured velocity (W, 6) at the beginning of each window."""

@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config, load
-from rov_ident.config.prior import first_centre, gain_of, prior_of, rigid_body_covariance
+from rov_ident.config.prior import (
+    first_centre,
+    gain_of,
+    prior_of,
+    righting_arm_covariance,
+    rigid_body_covariance,
+)
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
@@ -427,6 +433,10 @@ class OnlineEstimator:
             else self._judge(i, values, std, raw.values, excitation, consistency, waiting.get(i))
             for i in range(len(values))
         ]
+        if not diverged:
+            arm = righting_arm_covariance(self.config, raw.names, raw.values, gain)
+            covariance = covariance + arm
+            std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
         upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
         upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import Prior, first_centre, gain_of, prior_of, rigid_body_covariance
+from rov_ident.config.prior import (
+    Prior,
+    first_centre,
+    gain_of,
+    prior_of,
+    righting_arm_covariance,
+    rigid_body_covariance,
+)
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONTRADICTED, State, of_fit
@@ -323,11 +330,12 @@ def _stage(
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
+    arm = righting_arm_covariance(config, names, found, gain)
     # What moments and tilt suggest of these is in the values, but the intervals are the prior's.
     own = _coefficients(config).items()
     impossible = [n for n, c in own if unmeasured and is_impossible(c)]
     for i in (names.index(n) for n in impossible):
-        covariance[i] = covariance[:, i] = 0.0
+        covariance[i] = covariance[:, i] = arm[i] = arm[:, i] = 0.0
         covariance[i, i] = prior.std[i] ** 2
     more |= {"impossible": impossible} if unmeasured else {}
     removed = 1.0 - np.diag(covariance) / prior.std**2
@@ -349,7 +357,7 @@ def _stage(
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
     if free[0] and not any(archive.each(_pushes_ahead)):
         notes += _said_of_scale(config, names, covariance)
-    return _Stage(names, values, covariance, states, more, unexplained, lasting, noise)
+    return _Stage(names, values, covariance + arm, states, more, unexplained, lasting, noise)
 
 
 def _pushes_ahead(samples: Samples) -> bool:

@@ -16,7 +16,7 @@ from rov_ident.core.messages import Array
 
 _BLOCK = 50  # commands in which noise is measured, to a fifth
 _ROUNDING = 1e-6  # of the largest command: 32 bits round by less
-_OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
+OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
@@ -47,7 +47,7 @@ def scatter(demand: Array, relative: float = 0.0) -> Array:
     """Standard deviation (B, 6) of the noise of readings (K, 6) in each block. NaN where a noise
     ``relative`` to the wrench, which is known of, makes as much by chance."""
     size = min(_BLOCK, max(len(demand) - 2, 1))
-    std = _OF_MEDIAN * _medians(demand, size)
+    std = OF_MEDIAN * _medians(demand, size)
     level = demand[: len(std) * size].reshape(len(std), size, 6)
     known = relative * np.sqrt(np.mean(level**2, axis=1))
     std[(std > 0.0) & (std <= _AS_LOUD * known)] = np.nan
