@@ -206,3 +206,13 @@ def test_a_fit_that_predicts_worse_than_its_file_is_said_to(heavy):
     assert not found.consistent and "predicts v worse" in found.sentence
     uncertain = Consistency(()).with_open_loop(before, after, np.full(6, 0.05))
     assert uncertain.consistent  # 0.2 is within 0.1 and twice 0.05
+    ruined = Consistency(()).with_open_loop(before, 4.0 * before, np.full(6, 10.0))
+    assert not any(test.passed for test in ruined.tests)  # no uncertainty excuses that
+
+
+def test_it_is_said_where_no_motion_was_judged(heavy):
+    prior, nothing = prior_of(heavy), np.full(6, np.nan)
+    silent = consistency_of(heavy, prior, prior.mean, nothing, nothing)
+    assert silent.consistent and not silent.judged and "too little motion" in silent.sentence
+    asked = consistency_of(heavy, prior, prior.mean, np.zeros(6), np.ones(6))
+    assert asked.judged and asked.sentence == "model and data agree"

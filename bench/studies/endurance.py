@@ -54,6 +54,8 @@ def day(options: argparse.Namespace) -> Iterator[Row]:
                 online.push(role, message)
             times.append((time.process_time() - begun) / each)
             sizes.append(_memory(os.getpid()))
+            told = f"{kind}: {len(times)} of {_PARTS} parts, {1e6 * times[-1]:.0f} us each"
+            print(f"  {told}, {sizes[-1]:.0f} MiB", file=sys.stderr, flush=True)
         what = f"{_PARTS * each} messages, {options.hours:g} h of a dive: time per message"
         yield Row(what, kind, 1e6 * times[-1], "us", 400.0)
         # Two busy cores share caches: a single part may take a third longer.

@@ -21,6 +21,7 @@ from rov_ident.sampling.records import VELOCITIES
 
 CAUSE = "rov-ident explain looks for the cause"
 _PRIOR = "prior of "  # begins the name of such a test
+_LEFT = "unexplained: "  # likewise
 _SUPPOSED = (
     2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
 )
@@ -28,6 +29,8 @@ _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
+_RUINED = 3.0  # times the error before, whatever the uncertainty: clean dives fitted from the right
+# file reach 2.0 ("What is asked", docs/live.md)
 _CHANCE = 2.0  # standard deviations: what 5 % of fits exceed if one direction decides
 
 
@@ -61,6 +64,11 @@ class Consistency:
         """Whether what no vehicle's file knows is within what the configuration supposes of it."""
         return all(test.passed for test in self.tests if test.name.startswith(_PRIOR))
 
+    @property
+    def judged(self) -> bool:
+        """Whether it was asked of any motion what it has beside the model."""
+        return any(test.name.startswith(_LEFT) for test in self.tests)
+
     def widened(self, covariance: Array, prior: Array) -> Array:
         """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``.
 
@@ -75,6 +83,11 @@ class Consistency:
     def sentence(self) -> str:
         """What the worst test says, and what to do; nothing where all are passed."""
         failed = [test for test in self.tests if not test.passed]
+        if not failed and not self.judged:
+            return (
+                "nothing contradicts the model, but there was too little motion to ask what it "
+                "leaves unexplained"
+            )
         if not failed:
             return "model and data agree"
         return max(failed, key=lambda test: test.value / test.limit).failure
@@ -89,9 +102,12 @@ class Consistency:
 
         ``before`` and ``after`` (6,) are errors of the open-loop simulation, NaN where not known;
         ``chance`` (6,) is the part of the latter that the uncertainty of the fit explains. Without
-        it, no fit could stand beside a configuration that is right already.
+        it, no fit could stand beside a configuration that is right already; but what has been
+        fitted to these very data does not miss them by far.
         """
-        tests, allowed = list(self.tests), before + _CHANCE * chance  # the triangle inequality
+        tests = list(self.tests)
+        allowed = before + _CHANCE * chance  # the triangle inequality
+        allowed = np.minimum(allowed, _RUINED / _WORSE * before)
         columns = before.tolist(), after.tolist(), allowed.tolist()
         for component, old, new, most in zip(VELOCITIES, *columns, strict=True):
             if np.isfinite([old, new]).all() and old > 0.0:
@@ -139,7 +155,7 @@ def consistency_of(
         if np.isfinite(share):
             tests.append(
                 Test(
-                    f"unexplained: {axis}", share, FIRST_FORCE,
+                    f"{_LEFT}{axis}", share, FIRST_FORCE,
                     f"something acts along {axis} that the model does not have: {share:.1%} of "
                     f"the working wrench; {CAUSE}",
                 )

@@ -83,14 +83,23 @@ class Fit(Shown, Result):
             f"{TITLES[self.estimator].capitalize()} on {bags} bag{'s' * (bags != 1)}, "
             f"{self.duration:.0f} s: the data determine {known} of {len(self.names)} coefficients."
         )
-        if not self.consistency.consistent:
-            return f"{told} Data and model disagree: {self.consistency.sentence}."
+        if doubt := self.doubt:
+            return f"{told} {doubt[0].upper()}{doubt[1:]}."
         if judged := self.more.get("validation"):
             where, before = judged["bags"][0]["file"], judged["rmse_before"]
             return f"{told} On {where}, {falls(before, judged['rmse'])}."
         if before := self.more.get("open_loop_before"):
             return f"{told} On what was fitted, {falls(before['rmse'], numbers(self.rmse))}."
         return told
+
+    @property
+    def doubt(self) -> str:
+        """In what data and model disagree, or that it is not known; empty where they agree, and of
+        least squares, which does not ask."""
+        if not self.consistency.consistent:
+            return f"data and model disagree: {self.consistency.sentence}"
+        asked = self.estimator in ("ml", *ESTIMATORS)
+        return self.consistency.sentence if asked and not self.consistency.judged else ""
 
     @property
     def to_weigh(self) -> tuple[str, ...]:
@@ -126,6 +135,8 @@ class Fit(Shown, Result):
         states = [state.value for state in self.states]
         configured = [f"{self.given.value(name):.5g}" for name in self.names]
         title = f"{self.estimator}: {self.samples} samples, {self.duration:.1f} s"
+        if not self.consistency.consistent:
+            title += "; data and model disagree"
         parts = [self.numbers(title, {"configured": configured, "state": states})]
         if judged := self.more.get("validation"):
             rows = [
