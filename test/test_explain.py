@@ -146,11 +146,11 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
     assert "not all tried" in _card(findings.effects[0])
 
 
-def test_an_interrupt_does_not_wait_for_the_fits(dive):
+def test_an_interrupt_does_not_wait_for_the_fits():
     """All that is under way, and in the queue, is dropped."""
-    messages, config = dive
-    streams = gather(messages, config)
-    search = Search(streams, config, split(streams.duration)[0])
+    case = draw(3, ("quadratic_damping",), STRENGTH, conditions=LEAN)  # more than one candidate
+    streams = streams_of(case)
+    search = Search(streams, case.config, split(streams.duration)[0])
     start = fit(search.problem, search.given)
     candidates = search.screening.candidates(start)
     begun = search.problem.steps_simulated

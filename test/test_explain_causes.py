@@ -183,8 +183,9 @@ def test_noise_of_the_reading_is_not_taken_for_a_fault(seed):
 def test_noise_of_the_reading_is_named_with_its_size():
     case = draw(2, conditions=dataclasses.replace(NOISY, duration=75.0))
     explanation = explain([streams_of(case)], case.config)
-    (found,) = explanation.findings.effects  # and nothing else is taken for a cause of it
-    assert found.effect == "wrench_noise"
+    found, *others = explanation.findings.effects
+    assert found.effect == "wrench_noise" and found.separable
+    assert not any(f.separable for f in others)  # nothing else is taken for a cause of it
     for name, value in found.parameters.items():
         assert value.value == pytest.approx(0.06 if name[-1] in "KMN" else 0.5, rel=0.2)
     assert "wrench_noise" in explanation.extended.effects

@@ -54,8 +54,10 @@ def test_what_is_missing_is_named(effect, axes):
         plain = "residual in surge follows |u|u: quadratic damping missing?"
         assert plain in [suspicion.sentence for suspicion in found]
     truth = case.effects[effect]
+    # To first order: linear damping, which is estimated, has taken up some of the quadratic.
+    lowest = 0.5 if effect == "quadratic_damping" else 0.7
     for name, value in found[0].parameters.items():
-        assert value == pytest.approx(truth[name], rel=0.3, abs=0.3 * max(map(abs, truth.values())))
+        assert lowest < value / truth[name] < 1.3
 
 
 @pytest.mark.parametrize("kind", ["rls", *more("ukf")])  # both have the same monitor

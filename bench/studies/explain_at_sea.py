@@ -67,6 +67,16 @@ def _stamps(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
     return {"odometry_clock": rng.uniform(0.02, 0.1)}
 
 
+def _wandering(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """An attitude whose error lasts for a quarter of a minute."""
+    return {"wander": rng.uniform(0.001, 0.003)}
+
+
+def _wandering_and_biased(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    biased: dict[str, Any] = at_sea.ALONE["biases"](rng, vehicle)
+    return {**_wandering(rng, vehicle), **biased}
+
+
 def both(*names: str) -> Draw:
     return lambda rng, vehicle: {k: v for n in names for k, v in ALONE[n](rng, vehicle).items()}
 
@@ -79,6 +89,8 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     "clocks": (ALONE["clocks"], ()),
     "delays to the recorder": (_on_the_way, ()),
     "dead reckoning": (_dead_reckoned, ()),
+    "attitude that wanders": (_wandering, ()),
+    "attitude that wanders, and biases": (_wandering_and_biased, ("imu_bias",)),
     "wrench noise": (ALONE["wrench noise"], ("wrench_noise",)),
     "biases": (ALONE["biases"], ("imu_bias",)),
     "thrust scale": (ALONE["thrust scale"], SCALE),
@@ -112,7 +124,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     ),
 }  # fmt: skip
 """What the file does not say, and the names that are right for it."""
-NOTHING = tuple(CASES)[:7]
+NOTHING = tuple(CASES)[:9]
 """Cases in which the vehicle moves as the file says, but for its coefficients."""
 KINDS = ("six-axis", "pilot", *SPARSE)
 

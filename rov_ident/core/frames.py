@@ -128,6 +128,15 @@ def quaternion_from_rotation_vector(vector: ArrayLike) -> Array:
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1)
 
 
+def turns(q: Array) -> Array:
+    """Rotation vectors (N - 1, 3) [rad] from each attitude (N, 4) to the next, in the body."""
+    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
+    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, between[:, :1])
+    out: Array = angle * between[:, 1:] / np.maximum(size, 1e-12)
+    return out
+
+
 def quaternion_between(p: Array, q: Array, share: float) -> Array:
     """The unit quaternion (4,) a share of the way from p to q, along the shortest rotation."""
     cosine = float(p @ q)

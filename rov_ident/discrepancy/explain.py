@@ -178,7 +178,10 @@ def explain(
     validate = None if validate is None else turned[-1]
     streams, to_fit, held = _divided(bags, validate)
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
-    choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config, any(headings))
+    rates_std = np.max([r.std for r in rates], axis=0)
+    choice = sensor_choice.chosen(
+        streams, to_fit, judged, to_judge, config, rates_std, any(headings)
+    )
     of_sensors = sensor_findings(
         streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
         choice.alternatives, choice.fixed, as_headed, choice.unsure,

@@ -2,7 +2,9 @@
 
 The initial velocity of each window is a nuisance. It is eliminated here (residuals and
 sensitivities are projected on the complement of what it explains), so that any number of further
-parameters can be tried on a :class:`Linearisation` without simulating again.
+parameters can be tried on a :class:`Linearisation` without simulating again. So is an error of the
+attitude that lasts as long as a window: its moment is in the residuals of the whole window, which
+are whitened with what ``odometry.attitude_std`` lets expect of it.
 """
 
 import itertools
@@ -45,8 +47,8 @@ class LinearProblem:
 
 
 class MoreNoise(NamedTuple):
-    """Noise of a single window beside that of its velocities, in units of which ``whitening`` (6 N,
-    6 N) makes both together white; ``taken`` (K, 6) is the wrench of it that was taken off what
+    """Noise of a single window beside that of its velocities and attitude, which ``whitening`` (6
+    N, 6 N) makes white with those; ``taken`` (K, 6) is the wrench of it that was taken off what
     moves the vehicle, so that residuals are as if it were still in."""
 
     whitening: Array
@@ -73,23 +75,18 @@ class Linearisation:
         spread = 1.4826 * np.median(np.abs(error), axis=0)  # the standard deviation if normal
         self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
         self._weight[:, problem.guided] = 0.0
-        error = error * (self._weight > 0.0)
+        error = (error * (self._weight > 0.0)).reshape(-1, 1)
         self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
-        j0 = tangent(motion, problem.first, problem.last, problem.nodes)
-        j0 = j0[:, :, ~problem.guided] * self._weight[:, :, None]
         if more is not None:
-            j0 = (more.whitening @ j0.reshape(error.size, -1)).reshape(j0.shape)
-            moved = tangent(
-                motion, problem.first, problem.last, problem.nodes, more.taken[..., None]
-            )
-            error = error - moved[:, :, 0] * self._weight
-            error = (more.whitening @ error.ravel()).reshape(error.shape)
+            error -= self._moved(more.taken[..., None])
+        self._tilts = self._of_tilts()
+        error = self._whitened(error)
+        j0 = self._whitened(self._moved()).reshape(-1, 6)[:, ~problem.guided]
         self._q, self._r = [], []
         for a, b in self._spans():
-            q, r = np.linalg.qr(j0[a:b].reshape(6 * (b - a), -1))
+            q, r = np.linalg.qr(j0[6 * a : 6 * b])
             self._q.append(q)
             self._r.append(r)
-        error = error.reshape(-1, 1)
         self._start_error = [x[:, 0] for x in self._eliminate(error)]
         self.error = error[:, 0]
         self._squares = np.add.reduceat(self.error**2, self.first)
@@ -151,8 +148,7 @@ class Linearisation:
     def over_variance(self, error: Array) -> tuple[Array, Array]:
         """Of a single window with more noise: the residuals (N, 6) over the variance of that noise
         and their own, and the square that is expected of them."""
-        assert self.more is not None
-        back = self.more.whitening.copy()
+        back = self._whitened(np.eye(len(self.error)))
         self._eliminate(back)
         return (back.T @ error).reshape(-1, 6), np.sum(back**2, axis=0).reshape(-1, 6)
 
@@ -169,10 +165,40 @@ class Linearisation:
 
     def unprojected(self, force: Array) -> Array:
         """The same (6 N, C) with the initial velocities held."""
+        return self._whitened(self._moved(force))
+
+    def _moved(self, force: Array | None = None) -> Array:
+        """The same in units of the noise of the velocities; without wrenches, of the starts."""
         e = self.problem
-        j = tangent(self.motion, e.first, e.last, e.nodes, force)
-        j = (j * self._weight[:, :, None]).reshape(-1, force.shape[2])
-        return j if self.more is None else self.more.whitening @ j
+        moved = tangent(self.motion, e.first, e.last, e.nodes, force)
+        return (moved * self._weight[:, :, None]).reshape(moved[..., 0].size, -1)
+
+    def _of_tilts(self) -> list[tuple[Array, Array]]:
+        """For each window J (6 n, 6), what errors of its attitude of one standard deviation make of
+        the residuals, and M (6, 6), by which I - J M J' is the inverse root of their covariance I +
+        J J'. They are those along the first motion that was simulated, as a covariance that changes
+        with what is fitted would make errors larger instead of fits better."""
+        problem, config = self.problem, self.hypothesis.config
+        tilted = problem.tilted(lambda: self._tilted(problem.tilting(config.model.body)))
+        columns = config.odometry.attitude_std * tilted * self._weight[:, :, None]
+        found = []
+        for a, b in self._spans():
+            j = columns[a:b].reshape(-1, columns.shape[2])
+            power, axes = np.linalg.eigh(j.T @ j)
+            power = np.maximum(power, 1e-12)
+            found.append((j, axes * ((1.0 - (1.0 + power) ** -0.5) / power) @ axes.T))
+        return found
+
+    def _tilted(self, force: Array) -> Array:
+        e = self.problem
+        return tangent(self.motion, e.first, e.last, e.nodes, force)
+
+    def _whitened(self, columns: Array) -> Array:
+        """Columns (6 N, P) in units of the noise of the velocities in those of all noise."""
+        for (j, matrix), (a, b) in zip(self._tilts, self._spans(), strict=True):
+            part = columns[6 * a : 6 * b]
+            part -= j @ (matrix @ (j.T @ part))
+        return columns if self.more is None else self.more.whitening @ columns
 
     def having(self, keys: Sequence[Key], columns: Array) -> LinearProblem:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
@@ -211,10 +237,12 @@ class Linearisation:
         return starts
 
     def residual_std(self) -> Array:
-        """Standard deviation (6,) of the residuals, outliers left out."""
+        """Standard deviation (6,) of the residuals, less what errors of the attitude explain of
+        them (whitened twice they are those over the covariance); outliers are left out."""
         good = self._weight > 0.0
-        residual = self.problem.measured - self.motion.nu[self.problem.nodes]
-        power = np.sum(np.where(good, residual, 0.0) ** 2, axis=0)
+        error = (self.problem.measured - self.motion.nu[self.problem.nodes]) * self._weight
+        residual = self._whitened(self._whitened(error.reshape(-1, 1))).reshape(-1, 6) * self.noise
+        power = np.sum(residual**2, axis=0)
         std: Array = np.sqrt(np.maximum(power / np.maximum(good.sum(axis=0), 1), 1e-16))
         return std
 
@@ -223,7 +251,7 @@ class Linearisation:
         peaks, over the median of their neighbourhood, in the spectrum of the gradient of the
         squared residuals with respect to a wrench at each step (by the adjoint equations)."""
         e = self.problem
-        error = self.error.reshape(-1, 6) * self._weight
+        error = self._whitened(self.error[:, None].copy()).reshape(-1, 6) * self._weight
         wrench = adjoint(self.motion, e.first, e.last, error, e.nodes)
         in_world = np.einsum("kij,kj->ki", e.steps.middle, wrench[:, :3])
         force = in_world if axis is None else wrench[:, axis : axis + 1]

@@ -32,14 +32,7 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.multiple_shooting import Motion
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
-from rov_ident.discrepancy.wrench_smoothing import (
-    Known,
-    Reading,
-    Smoothed,
-    matters,
-    smoothed,
-    tilts,
-)
+from rov_ident.discrepancy.wrench_smoothing import Known, Reading, Smoothed, matters, smoothed
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import parse
@@ -171,7 +164,7 @@ def step(
     theta, smooth = np.array(list(h.values.values())), None
     if matters(plain):
         known = _known(task, state.windows, theta)
-        smooth, reading = smoothed(plain, reading, task.config.odometry.attitude_std, known)
+        smooth, reading = smoothed(plain, reading, known)
     best = _scored(task, plain if smooth is None else smooth.smooth)
     window = Window(
         float(streams.t[-1]),
@@ -195,13 +188,9 @@ def _known(task: Task, windows: Sequence[Window], theta: Array) -> Known:
 def _scored(task: Task, linearisation: Linearisation) -> Scored:
     force = _columns(task, linearisation.problem, linearisation.hypothesis, linearisation.motion)
     columns = linearisation.sensitivity_to(force)
-    if linearisation.more is None:
-        linear, left = _without_tilt(task, linearisation, force)
-    else:
-        linear = linearisation.having(task.watched, columns)
-        over, expected = linearisation.over_variance(linearisation.error)
-        ratio = np.mean(over**2, axis=0) / np.mean(expected, axis=0)
-        left = linearisation.noise * np.sqrt(ratio)
+    linear = linearisation.having(task.watched, columns)
+    over, expected = linearisation.over_variance(linearisation.error)
+    left = linearisation.noise * np.sqrt(np.mean(over**2, axis=0) / np.mean(expected, axis=0))
     return Scored(linear, np.hstack([linearisation.columns, columns]), left, force)
 
 
@@ -217,30 +206,6 @@ def _sums(linear: LinearProblem, theta: Array) -> Sums:
     through = linear.normal[:, :b] @ theta
     power = float(linear.rss[0] + 2.0 * gradient[:b] @ theta + theta @ through[:b])
     return Sums(linear.normal, gradient + through, power)
-
-
-def _without_tilt(
-    task: Task, linearisation: Linearisation, force: Array
-) -> tuple[LinearProblem, Array]:
-    """A window with an error of its attitude eliminated, and the size (6,) of its residuals. A
-    filtered attitude is off by about as much throughout a window, and the righting moment of that
-    turns a vehicle that is lightly damped: each window has a rotation of unknown size, with the
-    attitude's noise as its prior, beside what is watched, whose wrenches ``force`` are (K, 6, C).
-    """
-    problem, h = linearisation.problem, linearisation.hypothesis
-    both = np.concatenate([force, tilts(problem, h)], axis=2)
-    columns = linearisation.sensitivity_to(both)
-    whole = linearisation.having((*task.watched, *(("tilt", a) for a in "xyz")), columns)
-    p = len(whole.keys) - 3
-    kept = np.eye(3) / task.config.odometry.attitude_std**2 + whole.normal[p:, p:]
-    onto = np.linalg.solve(kept, whole.normal[p:, :p])
-    turn = np.linalg.solve(kept, whole.gradient[0, p:])
-    left = (linearisation.error - columns[:, -3:] @ turn).reshape(-1, 6) * linearisation.noise
-    normal = whole.normal[:p, :p] - whole.normal[:p, p:] @ onto
-    gradient = whole.gradient[:, :p] - whole.gradient[:, p:] @ onto
-    rss = whole.rss - whole.gradient[0, p:] @ turn
-    linear = LinearProblem(whole.keys[:p], normal, gradient, rss, whole.count)
-    return linear, np.sqrt(np.mean(left**2, axis=0))
 
 
 def _columns(task: Task, problem: WindowedProblem, h: Hypothesis, motion: Motion) -> Array:

@@ -36,7 +36,7 @@ _STEP_FACTOR = 0.4  # by which a step that gains nothing is shortened ...
 _SHORTEST = 0.05  # ... until it is so short: then the minimum is reached within rounding
 _NOISE_UPDATES = 4  # of the noise in turn with the parameters, and ...
 _NOISE_SETTLED = 0.05  # ... the relative change of it that ends them: far below its own error
-_FIRST_NOISE = 0.02  # m/s and rad/s, before the first estimate of it; its size hardly matters
+FIRST_NOISE = 0.02  # m/s and rad/s, before the first estimate of it; its size hardly matters
 _ONSET_RANGE = 14.0  # s to either side in which a better onset is looked for: a window and a
 # held-out block beside it (5 + 10 s) may hide it
 _ONSET_TRIALS = 7  # to either side, every 2 s: as far apart as two onsets look alike
@@ -123,7 +123,7 @@ class Fitted:
 def fit(problem: WindowedProblem, h: Hypothesis) -> Fitted | None:
     """Fit a hypothesis from its own values and the measured initial velocities, with its noise;
     None where it cannot be simulated."""
-    begin = linearise(problem, h, problem.measured_starts(), np.full(6, _FIRST_NOISE))
+    begin = linearise(problem, h, problem.measured_starts(), np.full(6, FIRST_NOISE))
     return None if begin is None else _with_noise(_gauss_newton(begin))
 
 

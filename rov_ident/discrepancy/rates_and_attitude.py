@@ -15,7 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rov_ident.config import Config
-from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply, quaternion_to_matrix
+from rov_ident.core.frames import (
+    quaternion_from_euler,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    turns,
+)
 from rov_ident.core.linalg import interpolated, scaled_solve
 from rov_ident.discrepancy import sensor_choice, sensor_consistency
 from rov_ident.discrepancy.held_out import split, surely_less
@@ -30,10 +35,12 @@ _LATEST = 1.0  # s; as late as velocities may be
 
 @dataclass(frozen=True)
 class Agreed:
-    """Streams whose angular velocities are those of the attitude; whether they were later than the
-    odometry's rate can hide; and whether a bias was taken off that may be a heading's drift."""
+    """Streams whose angular velocities are those of the attitude, but for a bias of ``std`` (3,)
+    [rad/s]; whether they were later than the odometry's rate can hide; and whether a bias was taken
+    off that may be a heading's drift."""
 
     streams: Streams
+    std: Array
     late: bool = False
     may_drift: bool = False
 
@@ -41,10 +48,11 @@ class Agreed:
 def agreed(streams: Streams, config: Config) -> Agreed:
     """The streams with what surely differs set right: the rates, or the heading."""
     body = [np.broadcast_to(axis, (len(streams.t), 3)) for axis in np.eye(3)]
-    value = _apart(streams, body)
+    value, std = _apart(streams, body)
     value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
+    std = std[:3]
     if not value.any():
-        return Agreed(streams)
+        return Agreed(streams, std)
     late = bool(value[3] > 0.5 * np.median(np.diff(streams.t)))
     biases = [f"{c} {bias:.2g}" for c, bias in zip("pqr", value) if bias]
     told = [f"{', '.join(biases)} rad/s too much"] if biases else []
@@ -56,17 +64,18 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     biased = _noted(streams, _rates(streams, body, value), note)
     drift = _drift(streams, body) if value[:3].any() else 0.0
     if not drift:
-        return Agreed(biased, late)
+        return Agreed(biased, std, late)
     turned = _turned(streams, -drift)
     note = (
         f"the heading of the odometry's attitude drifts by {drift:.2g} rad/s beside its angular "
         "velocities and the other sensors; set right"
     )
     drifts = _noted(turned, _rates(turned, body, value * [0.0, 0.0, 0.0, 1.0]), note)
-    return _chosen(biased, drifts, late, config)
+    streams, may_drift = _chosen(biased, drifts, config)
+    return Agreed(streams, std, late, may_drift)
 
 
-def _chosen(biased: Streams, drifts: Streams, late: bool, config: Config) -> Agreed:
+def _chosen(biased: Streams, drifts: Streams, config: Config) -> tuple[Streams, bool]:
     """Of rates with a bias and a heading that drifts what the sensors or the dynamics surely
     prefer; where none does, or one contradicts another, the bias, which is the commoner: a position
     may be reckoned along the very heading, and a tether may turn the vehicle as a bias would."""
@@ -82,18 +91,18 @@ def _chosen(biased: Streams, drifts: Streams, late: bool, config: Config) -> Agr
         squares.append((turning[0], turning[1]))
     for_bias, for_drift = (any(surely_less(*x[::step]) for x in squares) for step in (1, -1))
     if for_bias != for_drift:
-        return Agreed(drifts if for_drift else biased, late)
+        return drifts if for_drift else biased, False
     note = "; or the heading drifts: sensors and thrust do not agree on which"
     biased = dataclasses.replace(biased, notes=(*biased.notes[:-1], biased.notes[-1] + note))
-    return Agreed(biased, late, may_drift=True)
+    return biased, True
 
 
 def _drift(streams: Streams, body: Sequence[Array]) -> float:
     """The drift [rad/s] of the heading that explains all that the rates (beside being late) have
     beside the turns of the attitude; 0 if none does."""
     down = quaternion_to_matrix(streams.orientation)[:, 2]
-    drift = -float(_apart(streams, [down])[0])
-    return drift if drift and not _apart(_turned(streams, -drift), body)[:3].any() else 0.0
+    drift = -float(_apart(streams, [down])[0][0])
+    return drift if drift and not _apart(_turned(streams, -drift), body)[0][:3].any() else 0.0
 
 
 def _turned(streams: Streams, rate: float) -> Streams:
@@ -112,13 +121,14 @@ def _noted(streams: Streams, rates: Array, note: str) -> Streams:
     return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note))
 
 
-def _apart(streams: Streams, errors: Sequence[Array]) -> Array:
+def _apart(streams: Streams, errors: Sequence[Array]) -> tuple[Array, Array]:
     """How much of each of P rate ``errors`` (N, 3) [rad/s] the angular velocities have beside the
-    turns of the attitude, and how late they are [s]: (P + 1,), zero where that is not sure."""
-    t, turn = streams.t, _turns(streams.orientation)
+    turns of the attitude, and how late they are [s]: (P + 1,), zero where that is not sure; and the
+    standard deviations of that, with what was set to zero."""
+    t, turn = streams.t, turns(streams.orientation)
     value, std, nothing = (np.zeros(len(errors) + 1) for _ in range(3))
     if t[-1] - t[0] < _FEWEST_CLUSTERS * CLUSTER or not turn.any():
-        return nothing
+        return nothing, nothing
     turned = np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
     grows = [integral(t, error) for error in errors]
     for _ in range(ROUNDS):
@@ -126,7 +136,7 @@ def _apart(streams: Streams, errors: Sequence[Array]) -> Array:
         apart = integral(t, rate) - turned
         at, r, columns, _ = whitened(t, apart, [*grows, rate[0] - rate], walk=True)
         if len(at) < FEWEST:
-            return nothing
+            return nothing, nothing
         cluster = (at // CLUSTER).astype(int)
         normal, gradient = columns.T @ columns, np.zeros((cluster.max() + 1, len(value)))
         np.add.at(gradient, cluster, columns * r[:, None])
@@ -135,22 +145,14 @@ def _apart(streams: Streams, errors: Sequence[Array]) -> Array:
         # scores of whole clusters, as what differs otherwise lasts for seconds (White 1980)
         std = np.sqrt((scaled_solve(normal, gradient.T, 1e-9) ** 2).sum(axis=1))
         value = value + change
-    value = np.where(np.abs(value) > _BIASED * std, value, 0.0)
-    value[-1] = np.clip(value[-1], 0.0, _LATEST)  # a late attitude is no fault of the rates
-    return value
+    sure = np.where(np.abs(value) > _BIASED * std, value, 0.0)
+    std = np.hypot(std, value - sure)
+    sure[-1] = np.clip(sure[-1], 0.0, _LATEST)  # a late attitude is no fault of the rates
+    return sure, std
 
 
 def _rates(streams: Streams, errors: Sequence[Array], value: Array) -> Array:
     """Angular velocities (N, 3) without errors of sizes (P + 1,), of which the last is lateness."""
     measured, ahead = streams.nu[:, 3:], streams.t + value[-1]
     out: Array = interpolated(streams.t, measured, ahead) - np.tensordot(value[:-1], errors, 1)
-    return out
-
-
-def _turns(q: Array) -> Array:
-    """Rotation vectors (N - 1, 3) from each attitude (N, 4) to the next, in the body."""
-    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
-    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, between[:, :1])
-    out: Array = angle * between[:, 1:] / np.maximum(size, 1e-12)
     return out

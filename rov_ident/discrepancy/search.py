@@ -28,7 +28,7 @@ from rov_ident.discrepancy.hypothesis import (
     onsets,
 )
 from rov_ident.discrepancy.linearisation import linearise
-from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
+from rov_ident.discrepancy.output_error import FIRST_NOISE, Fitted, fit, refit, with_best_onsets
 from rov_ident.discrepancy.patterns import INTERPLAY, PatternSearch, choice_penalty
 from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening, Workers
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
@@ -111,6 +111,10 @@ class Search:
         with contextlib.suppress(UserError):  # too little odometry in any
             short = fit(WindowedProblem(self.problem.streams, spans), self.given)
             begins += [] if short is None else [short.hypothesis]
+        # What errors of the attitude make is taken along the first motion that is simulated: that
+        # of the configuration, if it can be, and not of what a thread happens to simulate first.
+        measured = self.problem.measured_starts(), np.full(6, FIRST_NOISE)
+        next(filter(None, (linearise(self.problem, h, *measured) for h in begins)), None)
         fits = self._workers.map(lambda h: fit(self.problem, h), begins)
         free = ~self.problem.guided
         there = [f for f in fits if f is not None]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
@@ -33,6 +34,7 @@ from rov_ident.sampling.reading_noise import RESTING
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 BIAS = "imu_bias"
 _YAW = (MOUNTING, "yaw")
+_SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
 
@@ -95,31 +97,54 @@ def chosen(
     judged: Streams,
     held: Spans,
     config: Config,
+    rates_std: Array,
     turned: bool = False,
 ) -> Choice:
     """The effects that the streams support in the ``spans``, by what they do in the spans ``held``
-    of the streams ``judged``. ``turned``: the heading is off, by what several records say."""
+    of the streams ``judged``. The attitude knows angular rates to ``rates_std`` (3,) [rad/s].
+    ``turned``: the heading is off, by what several records say."""
     data = Data(streams, spans, judged, held, config)
     found, std = sensor_consistency.search(streams, config, spans)
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
-    return _bias_or_tilt(config, _without_refuted(data, choice))
+    return _bias_or_tilt(data, _without_refuted(data, choice), rates_std)
 
 
-def _bias_or_tilt(config: Config, choice: Choice) -> Choice:
-    """A level accelerometer reads a bias as an attitude reads a tilt; a bias that is larger than
-    the configuration supposes of the IMU is not sure."""
-    bias = choice.sensors.get(BIAS, {"ax": 0.0, "ay": 0.0})
-    level = float(np.hypot(bias["ax"], bias["ay"]))
-    if level <= _TILTED * config.imu.accelerometer_bias_std:
+def _bias_or_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
+    """A bias is known as well as the attitude that it is compared with: tilted by delta, that
+    finds delta x f in the accelerometer, and delta x omega in a gyro, of the mean f and omega. So
+    a bias is sure if it is more than that, and no more than the configuration supposes."""
+    if BIAS not in choice.sensors:
         return choice
-    tilt = 1e3 * level / config.gravity
-    words = (
-        f"{BIAS}: {level:.2g} m/s2 along x and y are more than imu.accelerometer_bias_std "
-        f"supposes; attitude or IMU may be tilted by {tilt:.0f} mrad instead"
-    )
-    return dataclasses.replace(choice, notes=(*choice.notes, words), unsure=choice.unsure | {BIAS})
+    config, streams, bias = data.config, data.streams, choice.sensors[BIAS]
+    tilt = config.odometry.attitude_std
+    force = config.gravity * quaternion_to_matrix(streams.orientation)[:, 2].mean(axis=0)
+    turning = tilt * _across(streams.nu[:, 3:].mean(axis=0))
+    wider = [*(tilt * _across(force)), *np.hypot(rates_std, turning)]
+    std = dict(choice.std)
+    for name, more in zip(bias, wider, strict=True):
+        std[BIAS, name] = float(np.hypot(std[BIAS, name], more))
+    choice = dataclasses.replace(choice, std=std)
+    level = float(np.hypot(bias["ax"], bias["ay"]))
+    if level > _TILTED * config.imu.accelerometer_bias_std:
+        words = (
+            f"{BIAS}: {level:.2g} m/s2 along x and y are more than imu.accelerometer_bias_std "
+            f"supposes; attitude or IMU may be tilted by {1e3 * level / config.gravity:.0f} mrad "
+            "instead"
+        )
+        return dataclasses.replace(
+            choice, notes=(*choice.notes, words), unsure=choice.unsure | {BIAS}
+        )
+    if all(abs(value) < _SURE * std[BIAS, name] for name, value in bias.items()):
+        return dataclasses.replace(choice, unsure=choice.unsure | {BIAS})
+    return choice
+
+
+def _across(x: Array) -> Array:
+    """The size of what is across each axis of a vector (3,)."""
+    out: Array = np.sqrt(x @ x - x**2)
+    return out
 
 
 def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:

@@ -19,6 +19,7 @@ from rov_ident.core.frames import (
     quaternion_from_rotation_vector,
     quaternion_multiply,
     quaternion_to_matrix,
+    turns,
 )
 from rov_ident.core.linalg import interpolated
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
@@ -135,6 +136,7 @@ class WindowedProblem:
         self._simulations = 0  # of all windows, so far
         self._stopped = False
         self._driven = _Remembered(_REMEMBERED_THRUSTS)
+        self._tilted: Array | None = None
         self._forget()
         self._counting = threading.Lock()
 
@@ -323,6 +325,23 @@ class WindowedProblem:
             change = self._wrenches(h, after, motion) - self._wrenches(h, before, motion)
         return change
 
+    def tilted(self, make: Callable[[], Array]) -> Array:
+        """The sensitivities (N, 6, 6) to :meth:`tilting`, made once."""
+        if self._tilted is None:
+            self._tilted = make()
+        return self._tilted
+
+    def tilting(self, body: RigidBody) -> Array:
+        """What an error of the attitude about each body axis adds to the wrench, (K, 6, 6): three
+        that fade over each window, and three that grow."""
+        down = np.cross(self.steps.middle[:, 2, None], np.eye(3))  # how it turns, an axis a row
+        wrench = np.swapaxes(down @ body.restoring.T, 1, 2)
+        grown = np.zeros((len(wrench), 1, 1))
+        for first, last in zip(self.first, self.last, strict=True):
+            grown[first:last, 0, 0] = (np.arange(last - first) + 0.5) / (last - first)
+        out: Array = np.concatenate([(1.0 - grown) * wrench, grown * wrench], axis=2)
+        return out
+
     def largest(self, key: Key) -> float:
         """Of what is commanded, where a parameter is a limit of it; of a rate, at which a fin would
         turn from side to side in half a second."""
@@ -364,8 +383,7 @@ class WindowedProblem:
         differences: steady motion adds nothing to these, and quick motion is rare."""
         good = np.isfinite(self.streams.nu).all(axis=1)
         q, nu = self.streams.orientation[good], self.streams.nu[good]
-        turns = 2.0 * quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])[:, 1:]
-        second = np.hstack([np.diff(turns, axis=0), np.diff(nu, 2, axis=0)]) / np.sqrt(6.0)
+        second = np.hstack([np.diff(turns(q), axis=0), np.diff(nu, 2, axis=0)]) / np.sqrt(6.0)
         out: Array = OF_MEDIAN * np.median(np.abs(second), axis=0)
         return out
 

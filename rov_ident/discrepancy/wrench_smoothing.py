@@ -6,7 +6,7 @@ gain, a dead band or a payload seems to be missing. To first order the residual 
 
     r = e - S n,   e the noise of the velocities, n that of the reading, of variances R and Q
 
-The commands, initial velocity and tilt that agree best with reading and motion, in the sense of
+The commands, initial velocity and attitude that agree best with reading and motion, in the sense of
 least squares, are not correlated with what contradicts them, the residual whitened by R + S Q S'
 (Gauss and Markov). So sensitivities along them make scores without bias (the conditional score of
 Stefanski and Carroll 1987). What that takes off the reading is - Q S' (R + S Q S')^-1 r.
@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.core.messages import Array
-from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.linearisation import Linearisation, MoreNoise, linearise
 from rov_ident.discrepancy.reading_noise import jitter
-from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.reading_noise import resting, scatter
 
 _BLOCKS = 180  # of readings, in which their noise is measured: three minutes at 50 Hz
@@ -93,14 +91,14 @@ class Smoothed(NamedTuple):
 
 
 def smoothed(
-    plain: Linearisation, reading: Reading, attitude_std: float, known: Known
+    plain: Linearisation, reading: Reading, known: Known
 ) -> tuple[Smoothed | None, Reading]:
     """The window ``plain`` smoothed, None where nothing is noise or where it diverges, and what is
     known of the reading then."""
     problem, h = plain.problem, plain.hypothesis
     response = problem.response(h.effects)
     looks = _thrust(response, jitter(problem.streams.demand, problem.reading_std))
-    as_read, white = _whitened(plain, response, problem.reading_std, attitude_std)
+    as_read, white = _whitened(plain, response, problem.reading_std)
     trembling = np.concatenate([_along(i, looks[:, [i]]) for i in range(6)], axis=2)
     columns = white.sensitivity_to(trembling)
     weight = 1.0 / max(white.rss / len(white.error), 1.0)  # where more than noise is left, less
@@ -112,7 +110,7 @@ def smoothed(
     if not std.any():
         return None, reading
     if (std != problem.reading_std).any():
-        as_read, white = _whitened(plain, response, std, attitude_std)
+        as_read, white = _whitened(plain, response, std)
 
     def noise_in(error: Array) -> Array:
         """The noise (D, 6) of the reading that whitened residuals tell."""
@@ -135,13 +133,11 @@ def smoothed(
     return Smoothed(white, smooth, drawn), reading
 
 
-def _whitened(
-    plain: Linearisation, response: Array, std: Array, attitude_std: float
-) -> tuple[MoreNoise, Linearisation]:
+def _whitened(plain: Linearisation, response: Array, std: Array) -> tuple[MoreNoise, Linearisation]:
     """The window ``plain`` whitened, where the readings have noise of standard deviations (6,)."""
     problem, h, motion = plain.problem, plain.hypothesis, plain.motion
     roots = [_along(i, std[i] * _root(response[:, i])) for i in range(6) if std[i] > 0.0]
-    force = np.concatenate([*roots, attitude_std * tilts(problem, h)], axis=2)
+    force = np.concatenate([np.zeros((*motion.middle.shape, 0)), *roots], axis=2)
     more = MoreNoise(_whitening(plain.unprojected(force)), np.zeros_like(motion.middle))
     return more, Linearisation(problem, h, plain.starts, plain.noise, motion, more)
 
@@ -149,13 +145,6 @@ def _whitened(
 def _thrust(response: Array, readings: Array) -> Array:
     """Mean thrust (K, 6) of readings (D, 6)."""
     return np.einsum("kid,di->ki", response, readings)
-
-
-def tilts(problem: WindowedProblem, h: Hypothesis) -> Array:
-    """The wrenches (K, 6, 3) of an attitude that is off by a radian."""
-    down = problem.steps.middle[:, 2, :]
-    tilted = np.cross(np.eye(3)[None], down[:, None, :]) @ h.model.body.restoring.T
-    return tilted.transpose(0, 2, 1)
 
 
 def _whitening(root: Array) -> Array:
