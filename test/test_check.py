@@ -18,7 +18,7 @@ from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
 from rov_ident.experiment.data_quality import check
 from rov_ident.experiment.design import propose
-from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING
+from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _together
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import of_records
@@ -107,6 +107,38 @@ def test_wrong_signs_are_named(checked, change, subject, said):
     assert remark.level == BAD or (subject == "pose against velocity" and remark.level != GOOD)
     assert said in remark.text
     assert not found.fit or remark.level == WARNING
+
+
+@pytest.mark.parametrize("factor", [180.0 / np.pi, 1e-7, -1.0])
+def test_angular_velocities_that_are_not_those_of_the_attitude(checked, factor):
+    """Degrees, a driver that leaves the field nearly empty, a sign; without a gyro to compare."""
+
+    def change(role, m):
+        if role == "odom":
+            return m._replace(angular=factor * m.angular)
+        return None if role == "imu" else m
+
+    said = of(checked(change), "angular velocity against attitude")
+    assert said.level == BAD and "yaw" in said.text
+    if abs(factor) <= 1.0:  # degrees are so fast that some messages count as outliers
+        assert f"{factor:.2g} times" in said.text
+
+
+def test_a_wrench_that_stays_shows_no_inertia(checked):
+    def change(role, m):
+        return m._replace(force=np.array([30.0, *m.force[1:]])) if role == "wrench" else m
+
+    said = of(checked(change), "excitation of surge")
+    assert said.level == WARNING and "hardly changes" in said.text
+
+
+def test_a_controller_that_pushes_as_the_vehicle_slows_is_no_wrong_sign():
+    rng = np.random.default_rng(1)
+    speed = 1.0 + 0.1 * rng.standard_normal(400)
+    wrench = 30.0 * (2.0 - speed)
+    assert np.corrcoef(wrench, speed)[0, 1] < -0.99 and _together(wrench, speed) > 0.9
+    pushed = 30.0 * speed
+    assert _together(pushed, speed) > 0.9 and _together(-pushed, speed) < -0.9
 
 
 def test_a_late_wrench_is_noticed(checked):

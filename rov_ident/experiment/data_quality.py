@@ -270,11 +270,14 @@ def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
         low, high = np.quantile(streams.nu[:, i], [0.02, 0.98])
         measured = i >= 3 or streams.nu[:, :3].any()
         driven = float(np.sqrt(np.mean(streams.demand[:, i] ** 2) + np.mean(steered[:, i] ** 2)))
+        varied = float(np.hypot(streams.demand[:, i].std(), steered[:, i].std()))
         text = f"from {low:.2f} to {high:.2f} {unit}" if measured else "velocity not measured"
         text += f", wrench {driven:.2g} {force} rms"
         level = GOOD
         if driven < DRIVEN * limits[i]:
             level, text = WARNING, text + ": not driven"
+        elif varied < DRIVEN * limits[i]:
+            level, text = WARNING, text + ": it hardly changes, so inertia does not show"
         elif measured and min(-low, high) < _ONE_WAY * max(-low, high):
             level, text = WARNING, text + ": one direction only, what is asymmetric does not show"
         yield Remark(f"excitation of {axis}", level, text)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix, turns
 from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
@@ -37,6 +37,7 @@ _SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
 _REVERSED = -0.3  # correlation of two measurements of one thing; below it the sign is wrong
 _ANGULAR_LEAST, _LINEAR_LEAST, _MOTION_LEAST = 0.7, 0.5, 0.5  # correlation that good sensors reach:
 # half of the variance is common; of position and motion, which are noisier, a quarter
+_UNITS = 2.0  # times too large or small; noise and lateness do not make a rate twice the turn
 _UNMOVED = 0.1  # of the wrench; neither a guess nor a thrust scale is ten times off
 _STILL = 1e-4  # m or rad/s; nothing moves
 _MOVES = 0.05  # m or rad/s RMS, from which a poor correlation is worth a word
@@ -114,8 +115,9 @@ def _frames(streams: Streams, config: Config) -> list[Remark]:
         gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
         rate = streams.nu[:, 3:]
         remarks.append(_signs("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
+    step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
+    remarks += _rates_and_turns(streams, step)
     if streams.has_pose and streams.nu[:, :3].any():
-        step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
         moved = streams.position[step:] - streams.position[:-step]
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
         told, axes = way[step:] - way[:-step], ("north", "east", "down")
@@ -125,6 +127,24 @@ def _frames(streams: Streams, config: Config) -> list[Remark]:
         lag = _lag(streams.t[known], gyro[known], rate[known])
         remarks.append(_late("odometry behind the IMU", *lag))
     return remarks
+
+
+def _rates_and_turns(streams: Streams, step: int) -> list[Remark]:
+    """Whether the odometry's angular velocities are as large as the turns of its attitude, of which
+    one is over ``step`` messages."""
+    way = integral(streams.t, streams.nu[:, 3:])
+    turned = np.vstack([np.zeros(3), np.cumsum(turns(streams.orientation), axis=0)])
+    rates, real = (x[step:] - x[:-step] for x in (way, turned))
+    power = np.sum(real**2, axis=0)
+    turns_much = power > _MOVES**2 * len(real)
+    share = np.sum(rates * real, axis=0) / np.maximum(power, 1e-300)
+    wrong = turns_much & ((share < 1.0 / _UNITS) | (share > _UNITS))
+    subject = "angular velocity against attitude"
+    if not wrong.any():
+        return [Remark(subject, GOOD, "signs and sizes agree")] if turns_much.any() else []
+    told = ", ".join(f"{share[i]:.2g} times in {MOTIONS[3 + i]}" for i in np.flatnonzero(wrong))
+    text = f"the odometry's angular velocities are the turns of its attitude {told}"
+    return [Remark(subject, BAD, f"{text}: check units (rad/s), signs and frame ids")]
 
 
 def _signs(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
@@ -184,10 +204,7 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
         text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
         return [Remark(subject, BAD, text, hopeless=True)]
-    by_name = {
-        MOTIONS[i]: float(np.corrcoef(wrench[:, i], moved[:, i])[0, 1])
-        for i in np.flatnonzero(driven)
-    }
+    by_name = {MOTIONS[i]: _together(wrench[:, i], moved[:, i]) for i in np.flatnonzero(driven)}
     push = _correlated(
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
@@ -196,6 +213,14 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         "the vehicle goes where it is pushed",
     )  # fmt: skip
     return [push, _late("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
+
+
+def _together(a: Array, b: Array) -> float:
+    """The correlation of two signals (k,) about their means or about zero, whichever is larger. A
+    wrong sign turns both; a controller that pushes harder as a vehicle slows turns only the first.
+    """
+    about_zero = float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300)
+    return max(about_zero, float(np.corrcoef(a, b)[0, 1]))
 
 
 def samples_of(streams: Streams) -> NDArray[np.void]:

@@ -173,11 +173,12 @@ class KinematicFilter:
 
     @property
     def contradictions(self) -> dict[str, float]:
-        """The same, or the power of what differs for a second in the last minute if it is more."""
+        """The same, or the power of what differs for a second in the last minute if it is more; of
+        parts that have been compared."""
         known = self.state["judged"][0] > JUDGED_TIME
         powers = np.where(known, self.state["lasting"][0].max(axis=1), 0.0)
         largest = np.maximum(self.state["test_ratio"][0], powers)
-        return dict(zip(_PARTS, largest.tolist(), strict=True))
+        return {part: x for part, x in zip(_PARTS, largest.tolist(), strict=True) if x > 0.0}
 
     def step(
         self,
