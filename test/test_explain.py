@@ -37,6 +37,7 @@ from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import mean_inflation
+from rov_ident.model.scales import semi_axes
 from rov_ident.sampling.raw_streams import gather
 
 STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
@@ -340,6 +341,27 @@ def test_a_failure_at_the_first_moment_is_a_gain(fitted):
 
     assert not search.is_determined(start, failing(0.0))
     assert search.is_determined(start, failing(20.0))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_nothing_hangs_farther_out_than_an_arm_as_long_as_the_hull(fitted, axis):
+    search, start = fitted
+    half = semi_axes(search.config.model.body)[axis]
+
+    def hanging(far):
+        place = {("payload", n): far if i == axis else 0.0 for i, n in enumerate("xyz")}
+        values = {("payload", "mass_wet"): 0.3, **place, ("payload", "onset"): 20.0}
+        there = refit(start.hypothesis.having(values), start.linearisation, iterations=0)
+        vars(there)["covariance"] = 1e-4 * np.eye(len(there.linear.keys))  # as if it fitted
+        return there
+
+    assert search.is_determined(start, hanging(half))
+    assert not search.is_determined(start, hanging(4.0 * half))
+
+
+def test_the_size_of_a_hull_from_its_mass_and_inertia(heavy):
+    """Of a BlueROV2 Heavy, 457 x 575 x 254 mm."""
+    assert semi_axes(heavy.model.body) == pytest.approx([0.229, 0.288, 0.127], rel=0.25)
 
 
 def test_a_model_that_diverges_where_no_fit_has_seen_it_keeps_its_values(fitted):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rov_ident.model.equations import Array, Model
+from rov_ident.model.equations import Array, Model, RigidBody
 
 WORKING_SPEED = np.array([0.5, 0.5, 0.5, 0.8, 0.8, 0.8])  # m/s, rad/s
 _RISE_TIME = 2.0  # s; in which a vehicle without damping reaches its working speed
@@ -15,3 +15,12 @@ def authority(model: Model) -> Array:
         [model.damping_matrix(WORKING_SPEED * axis)[i, i] for i, axis in enumerate(np.eye(6))]
     )
     return np.maximum(damping * WORKING_SPEED, inertia)
+
+
+def semi_axes(body: RigidBody) -> Array:
+    """Semi-axes (3,) [m] of the homogeneous ellipsoid of the body's mass and inertia, of which I_x
+    = m (b^2 + c^2) / 5: half of the length, width and height of a hull, within some 20 %."""
+    moments = np.diag(body.inertia)
+    squares = 2.5 * (moments.sum() - 2.0 * moments) / body.mass
+    out: Array = np.sqrt(np.maximum(squares, 0.0))
+    return out
