@@ -113,6 +113,7 @@ class Sea:
     advance: float = 0.0  # s/m, share of the thrust lost per m/s along it
     mass_factor: float = 1.0  # of the file over that of the vehicle
     inertia_factor: tuple[float, ...] = (1.0, 1.0, 1.0)
+    cob_off: float = 0.0  # m, height of the centre of buoyancy in the file less the vehicle's
 
     odometry_rate: float = 20.0  # Hz
     velocity_delay: float = 0.0  # s, age of the linear velocity at its stamp
@@ -149,7 +150,7 @@ def told(vehicle: Vehicle, sea: Sea, rng: np.random.Generator, off: float = 0.25
             "mass": mass,
             "buoyancy": vehicle.buoyancy + GRAVITY * (mass - vehicle.mass),
             "cog": vehicle.cog.tolist(),
-            "cob": vehicle.cob.tolist(),
+            "cob": (vehicle.cob + [0.0, 0.0, sea.cob_off]).tolist(),
             "inertia": [*inertia, 0.0, 0.0, 0.0],
         },
         "coefficients": {

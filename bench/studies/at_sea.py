@@ -4,8 +4,9 @@
                                    [--dives N] [--seconds T] [--jobs N] [--minutes T] [--folder DIR]
 
 Each case is something that a vehicle does and its configuration file does not say, with a strength
-drawn by seed; the file's coefficients are off by up to 25 % besides. The simulator (sea.py) shares
-no code with the package. A dive is fitted as a user would do it: a bag, a file, `ri.fit`.
+drawn by seed; besides, the file's coefficients are off by up to 25 %, and its righting arm by as
+much as it is taken to be (but in the case "known"). The simulator (sea.py) shares no code with the
+package. A dive is fitted as a user would do it: a bag, a file, `ri.fit`.
 
 Bars (exit status 1 where one is missed), of each case, driving and estimator:
 
@@ -31,7 +32,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -185,6 +186,16 @@ def _stamps(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
     return {"odometry_clock": 0.2}
 
 
+@cache  # a dive is remembered by what drew it
+def _with_arm(draw: Draw) -> Draw:
+    """The righting arm is besides as uncertain as the file takes it to be."""
+
+    def both(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+        return {**draw(rng, vehicle), "cob_off": 0.001 * rng.standard_normal()}
+
+    return both
+
+
 CASES: dict[str, Draw] = {
     "known": _clean, "clean": _clean, **ALONE, "ordinary sensors": _ordinary,
     "all together": _everything,
@@ -278,7 +289,9 @@ def answered(dive: Dive, question: Callable[[Path, Path], Line]) -> Line:
 
 def measure(trial: Trial) -> Line:
     """The line of one fit."""
-    dive = dive_of(trial.case, trial.driving, trial.seed, trial.seconds)
+    draw = CASES.get(trial.case) or LIES[trial.case]
+    draw = draw if trial.case == "known" else _with_arm(draw)
+    dive = dive_of(trial.case, trial.driving, trial.seed, trial.seconds, draw)
     return answered(dive, lambda bag, file: _fitted(dive, bag, file, trial.estimator))
 
 
