@@ -177,7 +177,7 @@ def consistency_of(
         tests.append(
             Test(
                 f"{_PRIOR}{name}", float(off), _SUPPOSED,
-                f"the data ask for {name} = {values[i]:.3g} {prior.units[i]}, which the "
+                f"the data ask for {name} = {_told(values[i], prior.units[i])}, which the "
                 f"configuration takes for impossible ({prior.mean[i]:.3g} ± {prior.std[i]:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
@@ -190,8 +190,9 @@ def consistency_of(
             tests.append(
                 Test(
                     f"bound of {name}", float(beyond[i]), _BEYOND,
-                    f"the data ask for {name} = {values[i]:.3g} {prior.units[i]}, which cannot be: "
-                    "check that wrench, odometry and IMU are stamped by one clock, when measured; "
+                    f"the data ask for {name} = {_told(values[i], prior.units[i])}, which cannot "
+                    "be: check that wrench, odometry and IMU are stamped by one clock, when "
+                    "measured; "
                     f"{CAUSE}",
                 )
             )  # fmt: skip
@@ -204,3 +205,8 @@ def consistency_of(
             )
         )  # fmt: skip
     return Consistency(tuple(tests))
+
+
+def _told(value: float, unit: str) -> str:
+    """A value with its unit, if it has one."""
+    return f"{value:.3g} {unit}".removesuffix(" 1")

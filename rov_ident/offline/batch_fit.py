@@ -210,10 +210,11 @@ def _relinearised(
         settings = replace(settings, readings=settings.readings - 1)
         std = np.sqrt(np.diag(found.covariance))[first:]
         # what is left out is of second order in this
-        settled = (np.abs(found.values[first:] - before) < 0.3 * std).all()
-        if settings.readings == 0 or settled:
-            if not settled:
-                told.append("parameters of effects have not settled: give a better configuration")
+        moved = np.abs(found.values[first:] - before) >= 0.3 * std
+        if settings.readings == 0 or not moved.any():
+            if moved.any():
+                which = ", ".join(n for n, far in zip(centre, moved.tolist(), strict=True) if far)
+                told.append(f"{which} not settled: begin with a configuration that is nearer")
             notes += told
             return samples, found
         centre = dict(zip(centre, found.values[first:].tolist(), strict=True))
