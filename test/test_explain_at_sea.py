@@ -43,12 +43,13 @@ def streams_of(case, driving, seed, seconds=60.0, draw=None):
 # ------------------------------------------------------------------ an attitude whose error lasts
 
 
-@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+@pytest.mark.parametrize("seed", [1, *more(0, 2, 3)])
 def test_an_attitude_that_wanders_is_no_fault_of_the_model(seed):
     """The moment of the error, integrated over a window, passed for damping and waves, and for a
-    term without a name; retuned, roll and pitch were predicted worse than by the file."""
+    term without a name, and the error itself for a bias of the IMU; retuned, roll and pitch were
+    predicted worse than by the file."""
     wander = {"wander": 0.002}
-    _, streams, config = streams_of("wander", "pilot", seed, 150.0, lambda *_: wander)
+    _, streams, config = streams_of("wander", "pilot", seed, 80.0, lambda *_: wander)
     findings = explain([streams], config).findings
     assert findings.effects == ()
     assert all(findings.retuned[c] < 1.2 * findings.baseline[c] for c in "pq")

@@ -114,7 +114,8 @@ def chosen(
 def _bias_or_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
     """A bias is known as well as the attitude that it is compared with: tilted by delta, that
     finds delta x f in the accelerometer, and delta x omega in a gyro, of the mean f and omega. So
-    a bias is sure if it is more than that, and no more than the configuration supposes."""
+    a bias is none if it is no more than that, and not sure if it is more than the configuration
+    supposes."""
     if BIAS not in choice.sensors:
         return choice
     config, streams, bias = data.config, data.streams, choice.sensors[BIAS]
@@ -137,7 +138,9 @@ def _bias_or_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
             choice, notes=(*choice.notes, words), unsure=choice.unsure | {BIAS}
         )
     if all(abs(value) < _SURE * std[BIAS, name] for name, value in bias.items()):
-        return dataclasses.replace(choice, unsure=choice.unsure | {BIAS})
+        words = f"{BIAS}: IMU and attitude differ by no more than odometry.attitude_std explains"
+        rest = {n: values for n, values in choice.sensors.items() if n != BIAS}
+        return dataclasses.replace(choice, sensors=rest, notes=(*choice.notes, words))
     return choice
 
 
