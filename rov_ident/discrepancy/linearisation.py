@@ -168,10 +168,15 @@ class Linearisation:
         return self._whitened(self._moved(force))
 
     def _moved(self, force: Array | None = None) -> Array:
-        """The same in units of the noise of the velocities; without wrenches, of the starts."""
-        e = self.problem
-        moved = tangent(self.motion, e.first, e.last, e.nodes, force)
+        """Sensitivities (6 N, C) to wrenches, without to the initial velocities, in units of the
+        noise of the velocities alone."""
+        moved = self._tangent(force)
         return (moved * self._weight[:, :, None]).reshape(moved[..., 0].size, -1)
+
+    def _tangent(self, force: Array | None = None) -> Array:
+        """The same (N, 6, C) in m/s and rad/s."""
+        e = self.problem
+        return tangent(self.motion, e.first, e.last, e.nodes, force)
 
     def _of_tilts(self) -> list[tuple[Array, Array]]:
         """For each window J (6 n, 6), what errors of its attitude of one standard deviation make of
@@ -179,7 +184,7 @@ class Linearisation:
         J J'. They are those along the first motion that was simulated, as a covariance that changes
         with what is fitted would make errors larger instead of fits better."""
         problem, config = self.problem, self.hypothesis.config
-        tilted = problem.tilted(lambda: self._tilted(problem.tilting(config.model.body)))
+        tilted = problem.tilted(lambda: self._tangent(problem.tilting(config.model.body)))
         columns = config.odometry.attitude_std * tilted * self._weight[:, :, None]
         found = []
         for a, b in self._spans():
@@ -188,10 +193,6 @@ class Linearisation:
             power = np.maximum(power, 1e-12)
             found.append((j, axes * ((1.0 - (1.0 + power) ** -0.5) / power) @ axes.T))
         return found
-
-    def _tilted(self, force: Array) -> Array:
-        e = self.problem
-        return tangent(self.motion, e.first, e.last, e.nodes, force)
 
     def _whitened(self, columns: Array) -> Array:
         """Columns (6 N, P) in units of the noise of the velocities in those of all noise."""
