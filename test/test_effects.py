@@ -42,7 +42,7 @@ CONTRACT = {
     "thruster_deadband": "width_X width_Y width_Z width_K width_M width_N",
     "thruster_lag": "time_constant", "actuation_delay": "delay",
     "thruster_failure": "gain_X gain_Y gain_Z gain_K gain_M gain_N onset",
-    "battery_sag": "end_loss", "sensor_lever_arm": "x y z",
+    "battery_resistance": "loss", "battery_sag": "end_loss", "sensor_lever_arm": "x y z",
     "sensor_misalignment": "roll pitch yaw", "velocity_scale": "scale",
     "imu_bias": "ax ay az gx gy gz", "velocity_latency": "delay", "heading_offset": "yaw",
     "wrench_noise": "std_X std_Y std_Z std_K std_M std_N",
@@ -379,7 +379,8 @@ def test_input_effects_act_one_after_the_other(heavy):
     """Delayed, dead below the width, weaker astern, amplified, in part lost, sagging, lagged."""
     order = (
         "wrench_noise actuation_delay thruster_deadband thruster_asymmetry thrust_scale "
-        "thruster_gain thruster_failure battery_sag thruster_saturation thruster_lag"
+        "thruster_gain thruster_failure battery_sag battery_resistance thruster_saturation "
+        "thruster_lag"
     )
     assert [e.name for e in sorted(INPUT, key=lambda e: e.order)] == order.split()
     t = np.linspace(0.0, 1.5, 301)
@@ -504,6 +505,13 @@ def sagging(t: Array, demands: Array, end_loss: float, duration: float) -> Array
     return demands * (1.0 - end_loss * mean / duration)[:, None]
 
 
+def loaded(t: Array, demands: Array, loss: float) -> Array:
+    """By the current of a battery, which grows with thrust^1.5."""
+    shares = np.abs(demands) / np.repeat([50.0, 10.0], 3)
+    current = np.sum(shares**1.5, axis=1, keepdims=True)
+    return demands * np.clip(1.0 - loss * current, 0.0, 1.0)
+
+
 def of_axes(values: dict[str, float]) -> Array:
     return np.array(list(values.values()))
 
@@ -513,6 +521,7 @@ INPUT_FORMS = {
     "thruster_lag": lagged,
     "thruster_failure": failed,
     "battery_sag": sagging,
+    "battery_resistance": loaded,
     "thruster_gain": lambda t, d, **gains: d * of_axes(gains),
     "wrench_noise": lambda t, d, **std: np.where(np.abs(d) <= 3.0 * of_axes(std), 0.0, d),
     "thruster_saturation": lambda t, d, **limits: (

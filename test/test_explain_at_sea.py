@@ -291,6 +291,13 @@ def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy)
 # ------------------------------------------------------------------ accelerometer and attitude
 
 
+def choice_of(sea, seed):
+    """What is believed of the sensors of a pilot's dive."""
+    _, streams, config = streams_of(str(sea), "pilot", seed, 80.0, lambda *_: sea)
+    spans = split(streams.duration)
+    return sensor_choice.chosen(streams, spans[0], streams, spans[1], config, np.zeros(3))
+
+
 @pytest.mark.parametrize(
     ("sea", "sure"),
     [({"tilt": (0.03, -0.03)}, False), ({"accelerometer_bias": (0.06, -0.08, 0.05)}, True)],
@@ -298,12 +305,31 @@ def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy)
 )
 def test_a_level_accelerometer_reads_a_bias_as_an_attitude_reads_a_tilt(sea, sure):
     """A bias far beyond what the configuration supposes of the IMU is not sure."""
-    _, streams, config = streams_of(str(sea), "pilot", 1, 60.0, lambda *_: sea)
-    spans = split(streams.duration)
-    choice = sensor_choice.chosen(streams, spans[0], streams, spans[1], config, np.zeros(3))
+    choice = choice_of(sea, 1)
     assert "imu_bias" in choice.sensors
     assert ("imu_bias" not in choice.unsure) == sure
     assert any("tilted" in note for note in choice.notes) != sure
+
+
+@pytest.mark.parametrize("seed", [1, *more(2, 3, 4)])
+@pytest.mark.parametrize("size", [0.008, 0.02])
+def test_a_pose_that_is_tilted_is_no_velocity_sensor_that_is_turned(size, seed):
+    rng = np.random.default_rng(seed)
+    tilt = size * rng.choice([-1.0, 1.0], 2) * rng.uniform(0.7, 1.0, 2)
+    choice = choice_of({"tilt": tuple(tilt), "wander": 0.002}, seed)
+    assert "sensor_misalignment" not in choice.sensors.keys() - choice.unsure
+    assert choice.sensors.keys() <= {"imu_bias", *choice.unsure}
+
+
+@pytest.mark.parametrize("seed", [1, *more(2, 3, 4)])
+def test_a_velocity_sensor_that_is_turned_is_no_pose_that_is_tilted(seed):
+    rng = np.random.default_rng(seed)
+    angles = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.05, 0.1, 3)
+    choice = choice_of({"velocity_turned": tuple(angles)}, seed)
+    assert choice.sensors.keys() == {"sensor_misalignment"} and not choice.unsure
+    for name, true in zip(("roll", "pitch", "yaw"), angles, strict=True):
+        key = "sensor_misalignment", name
+        assert abs(choice.sensors[key[0]][name] - true) < 3.5 * choice.std[key] + 0.5 * 0.1**2
 
 
 # ------------------------------------------------------------------ thrust

@@ -31,6 +31,7 @@ def hidden(name, rng):
         "thrust_scale": ({"scale": 1.0 - u(0.1, 0.3)}, {}),
         "thrust_advance": ({"k": u(0.2, 0.5)}, {}),
         "thruster_saturation": ({"limit_X": u(18.0, 28.0), "limit_Z": u(35.0, 50.0)}, {}),
+        "battery_resistance": ({"loss": u(0.15, 0.35)}, {}),
         "velocity_latency": ({"delay": u(0.06, 0.2)}, {}),
         "heading_offset": ({"yaw": u(0.1, 0.6)}, {}),
         "coriolis": ({}, {"X_vr": u(15.0, 25.0), "Y_ur": -u(10.0, 20.0), "X_wq": -u(10.0, 20.0)}),
@@ -59,6 +60,7 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
     "name",
     [
         "thruster_saturation",
+        "battery_resistance",
         "coriolis",
         # the first three are found in a test of their own, too
         *more(

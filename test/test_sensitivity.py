@@ -30,6 +30,7 @@ GIVEN = {
     "fin_offset": {"delta_s": 0.02, "delta_r": -0.03},
     "fin_lag": {"time_constant": 0.1},
     "fin_saturation": {"delta_r": 0.2, "rate": 0.6},
+    "battery_resistance": {"loss": 0.2},
     "battery_sag": {"end_loss": 0.2},
     "ocean_current": {"north": 0.1, "east": -0.1, "down": 0.02},
     "constant_force": {"fx": 3.0, "fy": -2.0, "fz": 1.0},
@@ -132,6 +133,7 @@ TRUTH = {
     "thrust_scale": {"scale": 0.8},
     "thrust_advance": {"k": 0.3},
     "thruster_saturation": {"limit_X": 25.0, "limit_Z": 50.0},
+    "battery_resistance": {"loss": 0.25},
     "thruster_lag": {"time_constant": 0.13},
     "actuation_delay": {"delay": 0.13},
     "fin_offset": {"delta_s": 0.03, "delta_r": -0.045},
@@ -150,7 +152,7 @@ _BOTH = [(effect, kind) for effect in TRUTH for kind in ("rls", "ukf")]
 @pytest.mark.parametrize(
     ("effect", "kind"),
     # of thrust, of fins, of the body; a current and a lag come back in test_nuisance.py, too
-    [*(_BOTH[i] if i in (5, 12, 24) else more(_BOTH[i])[0] for i in range(len(_BOTH)))],
+    [*(_BOTH[i] if i in (5, 14, 26) else more(_BOTH[i])[0] for i in range(len(_BOTH)))],
 )
 def test_effects_come_back_to_the_truth_live(heavy, effect, kind):
     """Configured 20 to 40 % off, the coefficients 8 %; three standard deviations at most.

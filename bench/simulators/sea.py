@@ -117,6 +117,7 @@ class Sea:
 
     odometry_rate: float = 20.0  # Hz
     velocity_delay: float = 0.0  # s, age of the linear velocity at its stamp
+    velocity_turned: tuple[float, ...] = (0.0,) * 3  # rad, of its sensor
     smoothing: float = 0.0  # s, time constant of the filter whose output the odometry is
     wrench_floor: tuple[float, ...] = (0.0,) * 6  # N, N m, std of the reading at any wrench
     wander: float = 0.0  # rad, std of an error of the odometry's attitude that lasts
@@ -658,6 +659,8 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
     if (frozen := t >= sea.frozen_from).any():  # a position that is dead reckoning stands, too
         linear[frozen] = 0.003 * rng.standard_normal((frozen.sum(), 3))
         position[frozen] = position[frozen][0]
+    level = np.array([[1.0, 0.0, 0.0, 0.0]])
+    linear = linear @ rotations(_tilted(level, np.array([sea.velocity_turned])))[0]
     if sea.wander:
         error = _coloured(rng, gyro.shape, sea.wander, WANDER_TIME)
         attitude = _tilted(attitude, error[np.clip(np.searchsorted(imu_t, t), 0, len(imu_t) - 1)])

@@ -77,6 +77,16 @@ def _wandering_and_biased(rng: np.random.Generator, vehicle: Vehicle) -> dict[st
     return {**_wandering(rng, vehicle), **biased}
 
 
+def _slightly_tilted(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    return {**_wandering(rng, vehicle), "tilt": tuple(rng.uniform(-0.02, 0.02, 2).tolist())}
+
+
+def _turned(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """A velocity sensor that is mounted at an angle."""
+    angles = rng.uniform(0.05, 0.15, 3) * rng.choice([-1.0, 1.0], 3)
+    return {"velocity_turned": tuple(angles.tolist())}
+
+
 def both(*names: str) -> Draw:
     return lambda rng, vehicle: {k: v for n in names for k, v in ALONE[n](rng, vehicle).items()}
 
@@ -100,13 +110,17 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     "late velocities": (ALONE["late velocities"], ("velocity_latency",)),
     "smoothed odometry": (ALONE["smoothed odometry"], ("velocity_latency",)),
     # voltage falls with the load and with time
-    "sag and advance": (ALONE["sag and advance"], ("battery_sag", "thrust_advance", *SCALE)),
+    "sag and advance": (
+        ALONE["sag and advance"], ("battery_resistance", "battery_sag", "thrust_advance", *SCALE),
+    ),
     "heading": (_heading, ("heading_offset",)),
     "heading that drifts": (_drift, ("heading_offset",)),
     # where the attitude is tilted, velocities and IMU are turned against it, and so is the weight
     "tilted heading": (
         _pose, ("heading_offset", "sensor_misalignment", "imu_bias", "cog_offset"),
     ),
+    "attitude slightly tilted": (_slightly_tilted, ("imu_bias", "cog_offset")),
+    "velocity sensor turned": (_turned, ("sensor_misalignment",)),
     "late stamps": (_stamps, ("actuation_delay", "velocity_latency")),
     "lag under wrench noise": (
         both("thruster lag", "wrench noise"), ("thruster_lag", "wrench_noise"),
@@ -119,7 +133,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
         at_sea.CASES["all together"],
         (
             *SCALE, "thruster_lag", "ocean_current", "buoyancy", "cog_offset", "velocity_latency",
-            "battery_sag", "thrust_advance", "wrench_noise", "imu_bias",
+            "battery_resistance", "battery_sag", "thrust_advance", "wrench_noise", "imu_bias",
         ),
     ),
 }  # fmt: skip

@@ -19,12 +19,14 @@ from rov_ident.effects import parameter as effect_parameter
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, Coefficient, parse
 from rov_ident.model.equations import Array, Model
+from rov_ident.model.scales import semi_axes
 
 Key = tuple[str, str]
 COEFFICIENTS = "coefficients"
 
 _WIDE = 10.0  # times the size of a coefficient: one that is configured as zero, on an axis without
 # other damping, has a size of 2 N s/m where drag is 80, and would be held near zero
+_FARTHEST_ARM = 2.0  # half lengths of the hull from the origin: an arm or a skid as long as it
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,16 @@ def precision(h: Hypothesis) -> Array:
     """Prior precision (P,): wide, so that it decides only where the data say nothing."""
     width = {key: _WIDE * size for key, size in coefficient_sizes(h.config.model).items()}
     width |= {key: 1e3 * parameter(key).typical for key in h.keys if key[0] in EFFECTS}
+    width |= reach(h.config, h.keys)
     return np.array([width.get(key, np.inf) for key in h.keys]) ** -2.0
+
+
+def reach(config: Config, keys: Iterable[Key]) -> dict[Key, float]:
+    """How far [m] from the origin that may be, by coordinate, which is attached to the hull at a
+    place among the keys."""
+    far = dict(zip("xyz", (_FARTHEST_ARM * semi_axes(config.model.body)).tolist(), strict=True))
+    places = [k for k in keys if role_of(k) == "place" and k[1] in far]
+    return {k: max(far[k[1]], parameter(k).typical) for k in places}  # also of a plate
 
 
 def largest_step(key: Key) -> float:

@@ -26,7 +26,7 @@ from rov_ident.discrepancy.hypothesis import (
     bounds,
     effect_of,
     onsets,
-    role_of,
+    reach,
 )
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import FIRST_NOISE, Fitted, fit, refit, with_best_onsets
@@ -36,7 +36,6 @@ from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_infla
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import parse
-from rov_ident.model.scales import semi_axes
 from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
@@ -51,7 +50,6 @@ HULL_DAMPING_ASKED = 0.0  # penalised score; of other effects VERY_STRONG is ask
 _MORE_THAN_DAMPING = 0.5  # of what hull damping explains: a rival of it must explain as much more
 _MORE_THAN_NAMED = 0.05  # of what a named effect explains: a pattern must explain as much more
 _NOISE_STD = 2.0  # standard deviations of the squares that noise of the reading makes, of one draw
-_FARTHEST_ARM = 2.0  # half lengths of the hull from the origin: an arm or a skid as long as it
 _OWN_DRAG = 0.5  # of the hull's drag that must remain beside an effect that imitates it
 
 # Effort: the times and rates in docs/explain-bench.md were measured with these.
@@ -371,9 +369,8 @@ class Search:
         is_gain = any(h.values[k] <= 0.0 for k in begun)
         mass = np.diag(h.model.mass_matrix)[:3].max()  # no product of velocities has more
         is_absurd = any(abs(h.values[k]) > mass for k in new if effect_of(k, new) == "coriolis")
-        reach = dict(zip("xyz", _FARTHEST_ARM * semi_axes(self.config.model.body)))
-        places = [k for k in new if role_of(k) == "place" and k[1] in reach]
-        is_absurd |= any(abs(h.values[k]) - 2.0 * std[k] > reach[k[1]] for k in places)
+        arms = reach(self.config, new).items()
+        is_absurd |= any(abs(h.values[k]) - 2.0 * std[k] > far for k, far in arms)
         return not (
             is_drag or is_gain or is_absurd or any(at_bound(k, h.values[k], std[k]) for k in new)
         )

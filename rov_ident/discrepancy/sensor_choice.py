@@ -18,7 +18,7 @@ from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
-from rov_ident.discrepancy.hypothesis import Hypothesis, Key
+from rov_ident.discrepancy.hypothesis import Hypothesis, Key, bounds
 from rov_ident.discrepancy.output_error import Fitted, fit
 from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.search import Search
@@ -33,7 +33,7 @@ from rov_ident.sampling.reading_noise import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 BIAS = "imu_bias"
-_YAW = (MOUNTING, "yaw")
+_YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
@@ -108,40 +108,69 @@ def chosen(
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
-    return _bias_or_tilt(data, _without_refuted(data, choice), rates_std)
+    return _beside_tilt(data, _without_refuted(data, choice), rates_std)
 
 
-def _bias_or_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
-    """A bias is known as well as the attitude that it is compared with: tilted by delta, that
-    finds delta x f in the accelerometer, and delta x omega in a gyro, of the mean f and omega. So
-    a bias is none if it is no more than that, and not sure if it is more than the configuration
-    supposes."""
-    if BIAS not in choice.sensors:
-        return choice
-    config, streams, bias = data.config, data.streams, choice.sensors[BIAS]
+def _beside_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
+    """What the attitude is needed for is known as well as the attitude: tilted by delta, it makes
+    delta x f of a bias of the accelerometer and delta x omega of a gyro's, of the mean f and omega,
+    and turns a velocity sensor that is compared with positions. So an effect is none if it is no
+    more than that, and not sure if the pose may be tilted instead."""
+    config, streams, std = data.config, data.streams, dict(choice.std)
     tilt = config.odometry.attitude_std
-    force = config.gravity * quaternion_to_matrix(streams.orientation)[:, 2].mean(axis=0)
     turning = tilt * _across(streams.nu[:, 3:].mean(axis=0))
-    wider = [*(tilt * _across(force)), *np.hypot(rates_std, turning)]
-    std = dict(choice.std)
-    for name, more in zip(bias, wider, strict=True):
-        std[BIAS, name] = float(np.hypot(std[BIAS, name], more))
+    wider = {
+        BIAS: [*(tilt * _across(_weight(data))), *np.hypot(rates_std, turning)],
+        MOUNTING: [tilt * streams.has_pose] * 2 + [0.0],
+    }
+    for name, values in choice.sensors.items():
+        keys = [(name, parameter) for parameter in values]
+        for key, more in zip(keys, wider.get(name, ())):
+            std[key] = float(np.hypot(std.get(key, 0.0), more))
+        if all(abs(values[k[1]] - bounds(k)[0]) <= _SURE * std.get(k, 0.0) for k in keys):
+            words = f"{name}: the sensors differ by no more than odometry.attitude_std explains"
+            rest = {n: of for n, of in choice.sensors.items() if n != name}
+            choice = dataclasses.replace(choice, sensors=rest, notes=(*choice.notes, words))
     choice = dataclasses.replace(choice, std=std)
-    level = float(np.hypot(bias["ax"], bias["ay"]))
-    if level > _TILTED * config.imu.accelerometer_bias_std:
-        words = (
-            f"{BIAS}: {level:.2g} m/s2 along x and y are more than imu.accelerometer_bias_std "
-            f"supposes; attitude or IMU may be tilted by {1e3 * level / config.gravity:.0f} mrad "
-            "instead"
-        )
-        return dataclasses.replace(
-            choice, notes=(*choice.notes, words), unsure=choice.unsure | {BIAS}
-        )
-    if all(abs(value) < _SURE * std[BIAS, name] for name, value in bias.items()):
-        words = f"{BIAS}: IMU and attitude differ by no more than odometry.attitude_std explains"
-        rest = {n: values for n, values in choice.sensors.items() if n != BIAS}
-        return dataclasses.replace(choice, sensors=rest, notes=(*choice.notes, words))
-    return choice
+    if _is_tilt(data, choice):
+        choice = _unsure(choice, MOUNTING, f"{MOUNTING}: the pose may be tilted instead")
+    bias = choice.sensors.get(BIAS, {})
+    level = float(np.hypot(bias.get("ax", 0.0), bias.get("ay", 0.0)))
+    if level <= _TILTED * config.imu.accelerometer_bias_std:
+        return choice
+    words = (
+        f"{BIAS}: {level:.2g} m/s2 along x and y are more than imu.accelerometer_bias_std "
+        f"supposes; attitude or IMU may be tilted by {1e3 * level / config.gravity:.0f} mrad "
+        "instead"
+    )
+    return _unsure(choice, BIAS, words)
+
+
+def _weight(data: Data) -> Array:
+    """The mean specific force (3,) [m/s2] of a vehicle at rest, by the attitude, in body axes."""
+    down = quaternion_to_matrix(data.streams.orientation)[:, 2]
+    out: Array = -data.config.gravity * down.mean(axis=0)
+    return out
+
+
+def _is_tilt(data: Data, choice: Choice) -> bool:
+    """Whether the pose may be tilted against the body instead of the velocity sensor: the
+    accelerometer, which would be tilted against the pose as the velocities are, had only such a
+    bias then as the configuration supposes. (Where there is none, thrust alone can tell.)"""
+    angles, bias = choice.sensors.get(MOUNTING, {}), choice.sensors.get(BIAS, {})
+    surely = [abs(angles.get(n, 0.0)) > _SURE * choice.std.get((MOUNTING, n), 0.0) for n in _LEVEL]
+    sense, weight = EFFECTS[MOUNTING].sense, _weight(data)
+    if not (any(surely) and len(data.streams.imu_t) and sense is not None):
+        return False
+    reading = a_reading()._replace(linear=weight[None])
+    tilted = sense(reading, **{**angles, "yaw": 0.0}).linear[0]
+    own = np.array([bias.get("ax", 0.0), bias.get("ay", 0.0)]) - (tilted - weight)[:2]
+    return bool(np.hypot(*own) <= _TILTED * data.config.imu.accelerometer_bias_std)
+
+
+def _unsure(choice: Choice, name: str, words: str) -> Choice:
+    notes, unsure = (*choice.notes, words), choice.unsure | {name}
+    return dataclasses.replace(choice, notes=notes, unsure=unsure)
 
 
 def _across(x: Array) -> Array:
@@ -207,8 +236,7 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
         ):
             # the pose may be tilted against the velocities instead: nothing ties it to gravity
             words = f"{name}: the pose may be tilted instead; the thrust cannot tell"
-            notes, unsure = (*choice.notes, words), choice.unsure | {name}
-            choice = dataclasses.replace(choice, notes=notes, unsure=unsure)
+            choice = _unsure(choice, name, words)
     return choice
 
 
