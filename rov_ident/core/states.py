@@ -62,9 +62,10 @@ def is_known(value: float, std: float, prior_std: float) -> bool:
 def of_fit(
     value: float, std: float, prior_std: float, identifiable: bool, at_bound: bool = False
 ) -> State:
-    """The state after a fit of all data at once: the prior decides what is not identifiable."""
-    if not identifiable:
-        return State.HELD
+    """The state after a fit of all data at once: the prior decides what is not identifiable, and a
+    bound what the data contradict, however uncertain that has made it."""
     if at_bound:
         return State.AT_BOUND
+    if not identifiable:
+        return State.HELD
     return State.CONVERGED if is_known(value, std, prior_std) else State.CONVERGING

@@ -161,10 +161,11 @@ def _signs(subject: str, a: Array, b: Array, names: Sequence[str], least: float)
 
 
 def _correlated(
-    subject: str, by_name: dict[str, float], least: Array, bad: str, weak: str, good: str
-) -> Remark:
+    subject: str, by_name: dict[str, float], least: Array, bad: str, weak: str, good: str,
+    reversed_below: float = _REVERSED,
+) -> Remark:  # fmt: skip
     """The sentence for correlations of which some are reversed, or less than the least (n,)."""
-    reverse = [name for name, c in by_name.items() if c < _REVERSED]
+    reverse = [name for name, c in by_name.items() if c < reversed_below]
     low = [f"{n} ({c:.2f})" for (n, c), x in zip(by_name.items(), least, strict=True) if c < x]
     if reverse:
         text = bad.format(", ".join(reverse))
@@ -208,9 +209,10 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     push = _correlated(
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
-        "frames.body)",
+        "frames.body); or a controller works there against what the model lacks",
         "motion and wrench hardly go together in {}: check axes and units",
         "the vehicle goes where it is pushed",
+        -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
     return [push, _late("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
 
