@@ -12,6 +12,7 @@ import rov_ident as ri
 from bench.simulators import sea
 from rov_ident import config as configuration
 from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
 from rov_ident.core.messages import Imu, Odometry, Wrench
 from rov_ident.core.states import State
 from rov_ident.experiment import closed_loop_manoeuvres
@@ -122,6 +123,23 @@ def test_angular_velocities_that_are_not_those_of_the_attitude(checked, factor):
     assert said.level == BAD and "yaw" in said.text
     if abs(factor) <= 1.0:  # degrees are so fast that some messages count as outliers
         assert f"{factor:.2g} times" in said.text
+
+
+@pytest.mark.parametrize("seed", [1, *more(2, 3, 4)])
+def test_a_velocity_sensor_that_is_wrong_is_told(checked, seed):
+    """By pose and IMU, as the dynamics would take it for other coefficients."""
+    rng = np.random.default_rng(seed)
+    scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.02, 0.06)
+    turn = quaternion_to_matrix(quaternion_from_euler(*rng.uniform(0.05, 0.1, 3)))
+
+    def by(matrix):
+        return lambda role, m: m._replace(linear=matrix @ m.linear) if role == "odom" else m
+
+    scaled = of(checked(by(scale * np.eye(3))), "velocity sensor")
+    assert scaled.level == BAD and "factor" in scaled.text
+    assert abs(float(scaled.text.split("scale ")[1].split()[0]) - scale) < 0.01
+    turned = of(checked(by(turn)), "velocity sensor")
+    assert turned.level == BAD and "turned against the IMU" in turned.text
 
 
 def test_a_wrench_that_stays_shows_no_inertia(checked):

@@ -5,6 +5,7 @@ squares fit with all that is estimated by default says whether a model can expla
 the configuration lacks, and how well each coefficient is known after it.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -18,6 +19,8 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.states import CONVERGED, State, of_fit
+from rov_ident.discrepancy.sensor_consistency import search
+from rov_ident.effects import parameter
 from rov_ident.experiment.messages_alone import (
     BAD,
     DRIVEN,
@@ -49,6 +52,7 @@ _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
 _SEEN = 2.8  # standard deviations: of nine suppositions one seems further off in 5 % of dives
 _MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
+_SCALED = 0.01  # about as well as a velocity sensor is calibrated, and the speed of sound known
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
 
 
@@ -188,7 +192,7 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     notes = [Remark("messages", WARNING, note) for note in record.notes]
     frames = inputs.first_frames(bag, topics, config)
     remarks = [*of_messages(streams, config), *notes, *_excitation(streams, config)]
-    remarks += _mountings(inputs.mounting(bag, frames), config)
+    remarks += [*_mountings(inputs.mounting(bag, frames), config), *_velocity(streams, config)]
     motion, quick = of_dynamics(record.samples, config), None
     if not any(remark.level == BAD for remark in motion):
         say("a quick fit")
@@ -227,6 +231,29 @@ def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
                 f"{bag} by /tf_static of the bag, {file} in the configuration (forward, starboard, "
                 "down): correct the wrong one",
             )  # fmt: skip
+
+
+def _velocity(streams: Streams, config: Config) -> Iterator[Remark]:
+    """Whether pose and IMU say that the velocity sensor reads a factor too much, or that it is
+    turned: to the dynamics that is as if the coefficients were others.
+
+    A mounting by the IMU alone, as the heading of a pose is often wrong, or its attitude tilted.
+    """
+    if not streams.nu[:, :3].any():
+        return
+    alone = dataclasses.replace(streams, position=np.zeros_like(streams.position))
+    for name, sensors, harmless, told in (
+        ("velocity_scale", streams, _SCALED, "it reads wrong by a factor, unless a filter does"),
+        ("sensor_misalignment", alone, _MOUNTED, "it is turned against the IMU"),
+    ):
+        found, std = search(sensors, config, [(0.0, streams.duration)])
+        given = found.get(name, {}).items()
+        apart = [(parameter(name, own), x, std[name, own]) for own, x in given]
+        far = any(abs(x - p.null) > harmless + _SEEN * s for p, x, s in apart)
+        if far and name not in config.effects:
+            sizes = ", ".join(f"{p.name} {x:.3f} ± {NORMAL * s:.2g}" for p, x, s in apart)
+            text = f"{told}, {sizes} (95 %): calibrate it, or enter this under effects.{name}"
+            yield Remark("velocity sensor", BAD, text)
 
 
 def _angle(a: Array, b: Array) -> float:
