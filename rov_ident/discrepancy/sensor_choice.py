@@ -229,7 +229,11 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
                 f"{name}: the sensors would agree better with it, but the motion would not follow "
             )
             notes = (*choice.notes, words + "the thrust: it is not applied")
-            choice = dataclasses.replace(rest, alternatives=choice.alternatives, notes=notes)
+            # what made the sensors disagree is there all the same, and may have made the others
+            unsure = choice.unsure | rest.sensors.keys()
+            choice = dataclasses.replace(
+                rest, alternatives=choice.alternatives, notes=notes, unsure=unsure
+            )
             squares = without
         elif name == MOUNTING and not (
             len(data.streams.imu_t) or (without is not None and surely_less(squares, without))

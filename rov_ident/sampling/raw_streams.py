@@ -56,7 +56,20 @@ class Streams:
 
     @property
     def has_pose(self) -> bool:
-        return bool(np.ptp(self.position, axis=0).max() > 0.0) and not self.is_reckoned
+        moved = bool(np.ptp(self.position, axis=0).max() > 0.0)
+        return moved and not self.is_reckoned and not self.is_held
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the horizontal position is that of a slower sensor, such as an acoustic fix, and
+        held in between: most messages repeat it, while the vehicle moves on by more than a grid to
+        which positions are rounded. Held, it says that the vehicle rests."""
+        step = np.abs(np.diff(self.position[:, :2], axis=0))
+        fixed = np.flatnonzero(step.any(axis=1))
+        if not 1 < len(fixed) < 0.5 * len(step):
+            return False
+        way = np.append(0.0, np.cumsum(np.hypot(*self.nu[1:, :2].T) * np.diff(self.t)))
+        return bool(np.median(np.diff(way[fixed])) > 3.0 * step[step > 0.0].min())
 
     @property
     def is_reckoned(self) -> bool:
