@@ -85,8 +85,9 @@ class Consistency:
         failed = [test for test in self.tests if not test.passed]
         if not failed and not self.judged:
             return (
-                "nothing contradicts the model, but there was too little motion to ask what it "
-                "leaves unexplained"
+                "nothing contradicts the model, but there was too little motion, throughout or "
+                "since all was learnt anew about another lag or delay, to ask what it leaves "
+                "unexplained"
             )
         if not failed:
             return "model and data agree"

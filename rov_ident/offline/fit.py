@@ -39,7 +39,9 @@ def thrust_or_mass(scale: float) -> str:
     """What a thrust that is ``scale`` times the configured one may be instead."""
     return (
         f"thrust is {scale:.2f} times what the configuration says, or mass, inertia and buoyancy "
-        f"are {1.0 / scale:.2f} times that: motion alone cannot tell the one from the other"
+        f"are {1.0 / scale:.2f} times that, or the height of the centre of buoyancy above that of "
+        "gravity is (hang a weight to one side: docs/live.md): motion alone cannot tell the one "
+        "from the other"
     )
 
 
@@ -262,6 +264,8 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     assert report.consistency is not None
     predicts = Consistency(()).with_open_loop(before, after, chance)
     consistency = Consistency(report.consistency.tests + predicts.tests)
+    if not consistency.judged:  # nobody has asked whether the model explains what was learnt last
+        states = [State.CONVERGING if s is State.CONVERGED else s for s in states]
     return Fit(
         estimator=kind,
         names=report.names,
