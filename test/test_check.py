@@ -129,7 +129,7 @@ def test_angular_velocities_that_are_not_those_of_the_attitude(checked, factor):
 def test_a_velocity_sensor_that_is_wrong_is_told(checked, seed):
     """By pose and IMU, as the dynamics would take it for other coefficients."""
     rng = np.random.default_rng(seed)
-    scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.02, 0.06)
+    scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.03, 0.06)
     turn = quaternion_to_matrix(quaternion_from_euler(*rng.uniform(0.05, 0.1, 3)))
 
     def by(matrix):

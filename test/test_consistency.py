@@ -216,3 +216,11 @@ def test_it_is_said_where_no_motion_was_judged(heavy):
     assert silent.consistent and not silent.judged and "too little motion" in silent.sentence
     asked = consistency_of(heavy, prior, prior.mean, np.zeros(6), np.ones(6))
     assert asked.judged and asked.sentence == "model and data agree"
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_nothing_has_converged_where_nothing_was_judged(heavy, short_dive, tmp_path, kind):
+    write_messages(tmp_path / "short.mcap", short_dive)
+    fit = ri.fit(tmp_path / "short.mcap", heavy, kind)
+    assert not fit.consistency.judged and "too little motion" in fit.doubt
+    assert State.CONVERGED not in fit.states

@@ -232,6 +232,32 @@ def test_a_position_that_is_reckoned_from_the_velocities_says_nothing_of_them():
     assert not dataclasses.replace(streams, position=reckoned).has_pose
 
 
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+def test_a_position_that_is_held_between_fixes_is_no_pose(seed):
+    """It would say that the vehicle rests, and jumps. Rounded, it is repeated at rest alone."""
+    _, streams, _ = streams_of("clean", "pilot", seed, 90.0)
+    fix = np.floor(streams.t * 1.0).astype(int)
+    first = np.searchsorted(fix, np.unique(fix))
+    held = streams.position[first][fix - fix[0]]
+    held[:, 2] = streams.position[:, 2]  # depth has a sensor of its own
+    assert not dataclasses.replace(streams, position=held).has_pose
+    for grid in (0.01, 0.1):
+        rounded = np.round(streams.position / grid) * grid
+        assert dataclasses.replace(streams, position=rounded).has_pose
+
+
+def test_what_is_found_beside_a_refuted_correction_is_not_sure():
+    """What made the sensors disagree is there all the same, and may have made the other."""
+    _, streams, config = streams_of("late", "pilot", 0, 80.0, lambda *_: {"velocity_delay": 0.1})
+    spans = split(streams.duration)
+    data = sensor_choice.Data(streams, spans[0], streams, spans[1], config)
+    choice = data.fitted(["velocity_latency", "sensor_lever_arm"], frozenset())
+    lever = choice.sensors["sensor_lever_arm"]
+    wrong = {**choice.sensors, "sensor_lever_arm": {**lever, "z": lever["z"] + 0.3}}
+    left = sensor_choice._without_refuted(data, dataclasses.replace(choice, sensors=wrong))
+    assert left.sensors.keys() == {"velocity_latency"} == left.unsure
+
+
 def test_without_pose_and_imu_no_sensor_is_judged():
     streams, _ = turning()
     assert sensors_of(streams, a_configuration())[0] == {}

@@ -309,9 +309,11 @@ def _left(streams: Streams, rmse: Mapping[str, float], noise: Array) -> dict[str
 
 
 def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
-    """Whether an effect, not of a sensor, acts on an axis whose velocity is not predicted."""
+    """Whether an effect, not of a sensor, acts on an axis whose velocity is not predicted; or on
+    any, where one is far off, as that moves the others."""
+    far = any(share > _FAR_OFF for share in left.values())
     axes = {AXES[VELOCITIES.index(c)] for c in left}
-    return not EFFECTS[found.effect].of_sensors and not axes.isdisjoint(found.axes)
+    return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
 
 
 def _told(left: Mapping[str, float]) -> str:

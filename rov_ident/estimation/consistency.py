@@ -202,7 +202,8 @@ def consistency_of(
             Test(
                 f"odometry and IMU: {part}", float(np.sqrt(ratio)), _SENSORS,
                 f"the {part} of the odometry and the IMU contradict each other (they differ by "
-                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings, stamps, biases",
+                f"{np.sqrt(ratio):.1f} times their noise): check frames, mountings, stamps and "
+                "biases, and whether the attitude wanders",
             )
         )  # fmt: skip
     return Consistency(tuple(tests))

@@ -52,7 +52,7 @@ _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
 _SEEN = 2.8  # standard deviations: of nine suppositions one seems further off in 5 % of dives
 _MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
-_SCALED = 0.01  # about as well as a velocity sensor is calibrated, and the speed of sound known
+_SCALED = 0.02  # half of what fresh water in place of the sea makes of the speed of sound
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
 
 
