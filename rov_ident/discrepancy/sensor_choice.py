@@ -128,7 +128,7 @@ def _beside_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
         for key, more in zip(keys, wider.get(name, ())):
             std[key] = float(np.hypot(std.get(key, 0.0), more))
         if all(abs(values[k[1]] - bounds(k)[0]) <= _SURE * std.get(k, 0.0) for k in keys):
-            words = f"{name}: the sensors differ by no more than odometry.attitude_std explains"
+            words = f"{name}: no more than chance, or odometry.attitude_std, explains"
             rest = {n: of for n, of in choice.sensors.items() if n != name}
             choice = dataclasses.replace(choice, sensors=rest, notes=(*choice.notes, words))
     choice = dataclasses.replace(choice, std=std)
