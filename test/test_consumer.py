@@ -22,6 +22,7 @@ from rov_ident.core.states import Level
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.estimation.physical import is_passive
 from rov_ident.model.equations import build
+from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.open_loop import simulate
 
 HEAVY_CONFIG = config.load(HEAVY)
@@ -154,13 +155,13 @@ def test_unphysical_as_a_whole(heavy, name, value, reason):
     assert not hydrodynamics.fresh(2.1)
 
 
-def test_what_the_nodes_publish(hydrodynamics, heavy, short_dive):
+def test_what_the_nodes_publish(hydrodynamics, heavy):
     """From an estimator through its message, to the last bit."""
     from rov_ident.nodes.conversions import to_diagnostics
 
     online = OnlineEstimator(heavy, "rls")
-    for _, role, incoming in short_dive[: len(short_dive) // 4]:  # of them, two converge later
-        online.push(role, incoming)
+    for _, role, incoming in sensors.dive(heavy, "pilot", 40.0, seed=1).messages:
+        online.push(role, incoming)  # two coefficients would converge later
     report = online.report()
     converged = [level == Level.OK for level in report.levels]
     assert any(converged) and not all(converged)

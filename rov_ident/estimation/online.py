@@ -503,6 +503,8 @@ class OnlineEstimator:
             return State.HELD, f"held: {waiting}"
         if not consistency.consistent and (excited or known):
             return State.CONVERGING, "converging: data and model disagree"
+        if known and not consistency.judged:
+            return State.CONVERGING, "converging: too little motion yet to judge the model"
         if known:
             return State.CONVERGED, "converged" if excited else "converged: not excited now"
         if excited:
