@@ -1,8 +1,9 @@
 """Is this bag fit for identification: messages, excitation, and a quick fit that is judged.
 
-The messages are looked at first (`messages_alone`). Unless they are hopeless, a recursive least
-squares fit with all that is estimated by default says whether a model can explain the motion, what
-the configuration lacks, and how well each coefficient is known after it.
+The messages are looked at first (`messages_alone`), and whether pose and IMU contradict the
+velocity sensor. Unless the vehicle moves against the wrench, which a fit may take for other
+coefficients, a recursive least squares fit with all that is estimated by default says whether a
+model can explain the motion, what the configuration lacks, and how well each coefficient is known.
 """
 
 import dataclasses
