@@ -359,20 +359,21 @@ class Monitor:
         return rows, told
 
     def look(
-        self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], possible: bool
+        self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], credible: bool
     ) -> None:
         """Judge a window by the coefficients as they are now, when there is time for it.
 
-        Nothing is named unless they are ``possible``: what is left over where thrust, trim or
-        current are taken for what they cannot be is not what the model lacks.
+        Nothing is named unless they are ``credible``: what is left over where thrust, trim or
+        current are taken for what they cannot be, or before any motion has judged what was learnt,
+        is not what the model lacks.
         """
-        self._run(self._judge, *window, values, possible)
+        self._run(self._judge, *window, values, credible)
 
     def _judge(
-        self, samples: NDArray[np.void], demands: Array, values: Mapping[str, float], possible: bool
+        self, samples: NDArray[np.void], demands: Array, values: Mapping[str, float], credible: bool
     ) -> None:
         self._state = step(self._task, self._state, samples, demands, values)
-        self.suspicions = suspicions(self._task, self._state) if possible else []
+        self.suspicions = suspicions(self._task, self._state) if credible else []
 
 
 def _latest(demands: list[tuple[float, Array]], t: float) -> list[tuple[float, Array]]:

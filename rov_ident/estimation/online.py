@@ -123,7 +123,7 @@ class Monitor(Protocol):
         self, samples: NDArray[np.void], commands: list[tuple[float, Array]]
     ) -> tuple[NDArray[np.void], Array] | None: ...
     def look(
-        self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], possible: bool
+        self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], credible: bool
     ) -> None: ...
 
 
@@ -280,8 +280,9 @@ class OnlineEstimator:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:
                 report = self.report()
-                possible = report.consistency is None or report.consistency.possible
-                self.monitor.look(window, report.by_name, possible)
+                asked = report.consistency
+                credible = asked is None or (asked.possible and asked.judged)
+                self.monitor.look(window, report.by_name, credible)
         return info
 
     def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
