@@ -51,6 +51,7 @@ CONTRACT = {
     "fin_saturation": "delta_s delta_r delta_a rate",
     "empirical": "scale axis first second first_low first_high second_low second_high",
     "thruster_saturation": "limit_X limit_Y limit_Z limit_K limit_M limit_N",
+    "thrust_curve": " ".join(f"curvature_{axis}" for axis in AXES),
 }  # fmt: skip
 
 CURRENT_ALONG = {"ocean_current": {"north": 0.3, "east": 0.0, "down": 0.0}}
@@ -379,8 +380,8 @@ def test_input_effects_act_one_after_the_other(heavy):
     """Delayed, dead below the width, weaker astern, amplified, in part lost, sagging, lagged."""
     order = (
         "wrench_noise actuation_delay thruster_deadband thruster_asymmetry thrust_scale "
-        "thruster_gain thruster_failure battery_sag battery_resistance thruster_saturation "
-        "thruster_lag"
+        "thruster_gain thruster_failure battery_sag thrust_curve battery_resistance "
+        "thruster_saturation thruster_lag"
     )
     assert [e.name for e in sorted(INPUT, key=lambda e: e.order)] == order.split()
     t = np.linspace(0.0, 1.5, 301)
@@ -512,6 +513,12 @@ def loaded(t: Array, demands: Array, loss: float) -> Array:
     return demands * np.clip(1.0 - loss * current, 0.0, 1.0)
 
 
+def bent(t: Array, demands: Array, **curvatures: float) -> Array:
+    """Either branch by itself, and which of them acts by the sign."""
+    x = np.abs(demands) / np.repeat([50.0, 10.0], 3) * of_axes(curvatures)
+    return demands * np.where(x > 0.0, 1.0 / (1.0 + np.abs(x)), 1.0 + np.abs(x))
+
+
 def of_axes(values: dict[str, float]) -> Array:
     return np.array(list(values.values()))
 
@@ -528,6 +535,7 @@ INPUT_FORMS = {
         np.sign(d) * np.minimum(np.abs(d), of_axes(limits))
     ),
     "thrust_scale": lambda t, d, scale: d * scale,
+    "thrust_curve": bent,
     "thruster_asymmetry": lambda t, d, **gains: np.where(d < 0.0, d * of_axes(gains), d),
     "thruster_deadband": lambda t, d, **widths: (
         np.sign(d) * np.maximum(np.abs(d) - of_axes(widths), 0.0)

@@ -421,6 +421,26 @@ def test_thrust_of_other_axes_is_a_rival_of_drag_and_of_nothing_else(begun, monk
     assert search.INTERPLAY is patterns.INTERPLAY
 
 
+@pytest.mark.parametrize(
+    "driving, seed",
+    [("six-axis", 4), *more(("six-axis", 3), ("six-axis", 6), ("pilot", 3), ("pilot", 4))],
+)
+def test_thrust_that_falls_short_of_large_commands_does_not_fall_with_speed(driving, seed):
+    """Another bend than that of the library's effect: fast is where thrust is large."""
+    _, streams, config = streams_of("clean", driving, seed, 100.0)
+    given = np.linspace(0.0, 6.0, 60_001)  # of 60 N and 12 N m
+    gets = given * (1.0 - 0.3 * np.minimum(given, 1.2))
+    largest = np.repeat([60.0, 12.0], 3)
+    acts = streams.demand / largest
+    read = np.sign(acts) * np.interp(np.abs(acts), gets, given) * largest
+    findings = explain([dataclasses.replace(streams, demand=read)], config).findings
+    sure = {f.effect: f.parameters for f in findings.effects if f.separable}
+    assert set(sure) <= {"thrust_curve"}
+    assert driving == "pilot" or all(
+        0.25 < value.value < 0.45 for value in sure["thrust_curve"].values()
+    )
+
+
 @pytest.mark.study
 def test_drag_that_thrusters_make_is_not_sure():
     """One at an angle loses thrust with the speed along it, for whichever axis it works."""

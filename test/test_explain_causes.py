@@ -29,6 +29,7 @@ def hidden(name, rng):
     u = rng.uniform
     return {
         "thrust_scale": ({"scale": 1.0 - u(0.1, 0.3)}, {}),
+        "thrust_curve": ({"curvature_X": u(0.2, 0.4), "curvature_Z": u(0.2, 0.4)}, {}),
         "thrust_advance": ({"k": u(0.2, 0.5)}, {}),
         "thruster_saturation": ({"limit_X": u(18.0, 28.0), "limit_Z": u(35.0, 50.0)}, {}),
         "battery_resistance": ({"loss": u(0.15, 0.35)}, {}),
@@ -61,6 +62,7 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
     [
         "thruster_saturation",
         "battery_resistance",
+        "thrust_curve",
         "coriolis",
         # the first three are found in a test of their own, too
         *more(

@@ -20,6 +20,7 @@ EXACT = Suite().scaled(0.0)
 GIVEN = {
     "thruster_gain": {"gain_X": 0.9, "gain_N": 1.2},
     "thrust_scale": {"scale": 0.9},
+    "thrust_curve": {"curvature_X": 0.3, "curvature_K": -0.2},
     "thrust_advance": {"k": 0.2},
     "thruster_saturation": {"limit_X": 20.0, "limit_Z": 40.0},
     "thruster_asymmetry": {"gain_X": 0.8},
@@ -131,6 +132,7 @@ def test_without_estimated_effects_samples_are_what_they_were(heavy):
 TRUTH = {
     "thruster_gain": {"gain_X": 1.15, "gain_N": 0.9},
     "thrust_scale": {"scale": 0.8},
+    "thrust_curve": {"curvature_X": 0.4, "curvature_K": -0.3},
     "thrust_advance": {"k": 0.3},
     "thruster_saturation": {"limit_X": 25.0, "limit_Z": 50.0},
     "battery_resistance": {"loss": 0.25},
