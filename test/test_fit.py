@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from rov_ident.api.functions import fit
 from rov_ident.config import from_parameters, to_parameters
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import gravity_direction
@@ -239,3 +240,23 @@ def test_a_value_that_a_bound_made_is_not_what_the_data_tell(fits):
     states[known] = State.AT_BOUND
     told = json.loads(dataclasses.replace(found, states=tuple(states)).to_json())
     assert told["coefficients"][found.names[known]]["identifiable"] is False
+
+
+@pytest.mark.parametrize("estimator", ["rls", "ml"])
+def test_a_velocity_sensor_that_pose_and_imu_contradict_is_told(folder, heavy, estimator):
+    """To the dynamics it is as if the coefficients were others."""
+    found = []
+    for name, factor in (("right", 1.0), ("scaled", 1.05)):
+        messages = [
+            (arrival, role, m._replace(linear=factor * m.linear) if role == "odom" else m)
+            for arrival, role, m in sensors.dive(heavy, duration=60.0, seed=1).messages
+        ]
+        write_messages(folder / f"{name}_{estimator}.mcap", messages)
+        found.append(fit(folder / f"{name}_{estimator}.mcap", heavy, estimator))
+    right, scaled = found
+    assert right.consistency.consistent and not scaled.consistency.consistent
+    assert State.CONVERGED in right.states and State.CONVERGED not in scaled.states
+    assert "velocity sensor reads wrong by a factor" in scaled.doubt
+    failed = {test.name for test in scaled.consistency.tests if not test.passed}
+    assert "velocity sensor: velocity_scale" in failed
+    assert "velocity sensor: sensor_misalignment" not in failed

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,8 +18,10 @@ from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.threads import one_blas_thread
+from rov_ident.discrepancy import velocity_sensor
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.explain import explain as explain_streams
+from rov_ident.estimation.consistency import Test
 from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.experiment import data_quality, design, messages_alone
 from rov_ident.experiment.data_quality import Check
@@ -34,10 +37,13 @@ from rov_ident.offline.prediction_error import curves
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import (
+    has_velocity,
     is_without_velocity,
     refusal,
     refuse_without_velocity,
 )
+
+_COMPARED = 100_000  # messages of a bag by which its sensors are compared: ten minutes
 
 File = str | os.PathLike[str]
 Files = File | Sequence[File]
@@ -223,6 +229,8 @@ def fit(
             many = stack.enter_context(_opened(paths, given, say, jobs, dask))
             _check(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
+        say("comparing the sensors")
+        found = found.asked(_of_velocity([bag.path for bag in many.bags], given))
         if table:
             found = _beside_the_table(found, given, table)
         if validate is None:
@@ -233,6 +241,20 @@ def fit(
         more = {"validation": batch_fit.validation(*how)}
         judged = tuple(curves(*how))
         return dataclasses.replace(found, more=found.more | more, judged=judged)
+
+
+def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
+    """What is asked of the velocity sensor by the first messages of each bag: the worst answers."""
+    worst: dict[str, Test] = {}
+    for path in paths:
+        bag = Bag(path)
+        chosen = topics.select(bag, config)
+        if has_velocity(bag, chosen, config):
+            first = itertools.islice(topics.messages(bag, chosen, config), _COMPARED)
+            for test in velocity_sensor.tests_of(gather(first, config), config):
+                before = worst.get(test.name, test)
+                worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
+    return list(worst.values())
 
 
 def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:

@@ -22,9 +22,8 @@ from rov_ident.sampling.records import VELOCITIES
 CAUSE = "rov-ident explain looks for the cause"
 _PRIOR = "prior of "  # begins the name of such a test
 _LEFT = "unexplained: "  # likewise
-_SUPPOSED = (
-    2.8  # prior standard deviations: of nine suppositions one is further off in 5 % of dives
-)
+SUPPOSED = 2.8
+"""Standard deviations: of nine suppositions one seems, or is, further off in 5 % of dives."""
 _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
@@ -177,7 +176,7 @@ def consistency_of(
         off = abs(values[i] - prior.mean[i]) / prior.std[i]
         tests.append(
             Test(
-                f"{_PRIOR}{name}", float(off), _SUPPOSED,
+                f"{_PRIOR}{name}", float(off), SUPPOSED,
                 f"the data ask for {name} = {_told(values[i], prior.units[i])}, which the "
                 f"configuration takes for impossible ({prior.mean[i]:.3g} ± {prior.std[i]:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",

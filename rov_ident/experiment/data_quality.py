@@ -6,7 +6,6 @@ coefficients, a recursive least squares fit with all that is estimated by defaul
 model can explain the motion, what the configuration lacks, and how well each coefficient is known.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -20,8 +19,8 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.states import CONVERGED, State, of_fit
-from rov_ident.discrepancy.sensor_consistency import search
-from rov_ident.effects import parameter
+from rov_ident.discrepancy.velocity_sensor import tests_of
+from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import (
     BAD,
     DRIVEN,
@@ -51,9 +50,7 @@ Tell = Callable[..., None]
 UNITS = (("m/s", "N"),) * 3 + (("rad/s", "N m"),) * 3  # of velocity and wrench on each axis
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
-_SEEN = 2.8  # standard deviations: of nine suppositions one seems further off in 5 % of dives
 _MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
-_SCALED = 0.02  # half of what fresh water in place of the sea makes of the speed of sound
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
 
 
@@ -193,7 +190,9 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
     notes = [Remark("messages", WARNING, note) for note in record.notes]
     frames = inputs.first_frames(bag, topics, config)
     remarks = [*of_messages(streams, config), *notes, *_excitation(streams, config)]
-    remarks += [*_mountings(inputs.mounting(bag, frames), config), *_velocity(streams, config)]
+    remarks += _mountings(inputs.mounting(bag, frames), config)
+    failed = (test for test in tests_of(streams, config) if not test.passed)
+    remarks += [Remark("velocity sensor", BAD, test.failure) for test in failed]
     motion, quick = of_dynamics(record.samples, config), None
     if not any(remark.level == BAD for remark in motion):
         say("a quick fit")
@@ -234,29 +233,6 @@ def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
             )  # fmt: skip
 
 
-def _velocity(streams: Streams, config: Config) -> Iterator[Remark]:
-    """Whether pose and IMU say that the velocity sensor reads a factor too much, or that it is
-    turned: to the dynamics that is as if the coefficients were others.
-
-    A mounting by the IMU alone, as the heading of a pose is often wrong, or its attitude tilted.
-    """
-    if not streams.nu[:, :3].any():
-        return
-    alone = dataclasses.replace(streams, position=np.zeros_like(streams.position))
-    for name, sensors, harmless, told in (
-        ("velocity_scale", streams, _SCALED, "it reads wrong by a factor, unless a filter does"),
-        ("sensor_misalignment", alone, _MOUNTED, "it is turned against the IMU"),
-    ):
-        found, std = search(sensors, config, [(0.0, streams.duration)])
-        given = found.get(name, {}).items()
-        apart = [(parameter(name, own), x, std[name, own]) for own, x in given]
-        far = any(abs(x - p.null) > harmless + _SEEN * s for p, x, s in apart)
-        if far and name not in config.effects:
-            sizes = ", ".join(f"{p.name} {x:.3f} ± {NORMAL * s:.2g}" for p, x, s in apart)
-            text = f"{told}, {sizes} (95 %): calibrate it, or enter this under effects.{name}"
-            yield Remark("velocity sensor", BAD, text)
-
-
 def _angle(a: Array, b: Array) -> float:
     """Of the rotation [rad] that leads from roll, pitch, yaw (3,) to others. The angles themselves
     may differ where it is nothing: pi and -pi, or roll and yaw of a sensor that looks up."""
@@ -278,7 +254,7 @@ def _model(quick: Fit) -> Iterator[Remark]:
     seen = [
         (*name.split("."), f"{x:.3g} ± {NORMAL * std:.2g} {unit}".removesuffix(" 1"), mean)
         for name, unit, x, std, mean, wide in zip(quick.names, quick.units, *columns, strict=True)
-        if "." in name and abs(x - mean) > max(_SEEN * std, _MATTERS * wide)
+        if "." in name and abs(x - mean) > max(SUPPOSED * std, _MATTERS * wide)
     ]
     for effect, parts in groupby(seen, key=lambda part: part[0]):
         text = ", ".join(f"{own} {told} (configured: {mean:g})" for _, own, told, mean in parts)

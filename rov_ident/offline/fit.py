@@ -1,19 +1,19 @@
 """Offline fits, all with one type of result."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rov_ident.config import Config, dump
-from rov_ident.config.prior import THRUST_SCALE
+from rov_ident.config.prior import THRUST_SCALE, prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
-from rov_ident.estimation.consistency import Consistency
+from rov_ident.estimation.consistency import Consistency, Test
 from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -102,6 +102,20 @@ class Fit(Shown, Result):
             return f"data and model disagree: {self.consistency.sentence}"
         asked = self.estimator in ("ml", *ESTIMATORS)
         return self.consistency.sentence if asked and not self.consistency.judged else ""
+
+    def asked(self, tests: Sequence[Test]) -> "Fit":
+        """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
+        nothing has converged."""
+        prior = prior_of(self.given, effects=True)
+        known = dict(zip(prior.names, prior.std.tolist(), strict=True))
+        std = np.array([known[name] for name in self.names])
+        consistency = Consistency((*self.consistency.tests, *tests))
+        return replace(
+            self,
+            consistency=consistency,
+            covariance=Consistency(tuple(tests)).widened(self.covariance, std),
+            states=consistency.of_states(self.states),
+        )
 
     @property
     def to_weigh(self) -> tuple[str, ...]:
@@ -262,24 +276,22 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     after = open_loop_rmse(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
     assert report.consistency is not None
-    predicts = Consistency(()).with_open_loop(before, after, chance)
-    consistency = Consistency(report.consistency.tests + predicts.tests)
-    if not consistency.judged:  # nobody has asked whether the model explains what was learnt last
+    if not report.consistency.judged:  # nobody has asked what it leaves of what was learnt last
         states = [State.CONVERGING if s is State.CONVERGED else s for s in states]
     return Fit(
         estimator=kind,
         names=report.names,
         units=report.units,
         values=report.values,
-        covariance=predicts.widened(report.covariance, estimator.prior.std),
-        states=consistency.of_states(states),
+        covariance=report.covariance,
+        states=report.consistency.of_states(states),
         given=config,
         fitted=found,
         samples=read.samples,
         duration=read.duration,
         rmse=after,
-        consistency=consistency,
+        consistency=report.consistency,
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=tuple(curves(read, config, judged, found)),
-    )
+    ).asked(Consistency(()).with_open_loop(before, after, chance).tests)

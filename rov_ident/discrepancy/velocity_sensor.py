@@ -1,0 +1,46 @@
+"""Whether pose and IMU contradict the velocity sensor: to the dynamics a factor, or a mounting, is
+as if the coefficients were others, so that nothing that is asked of a fit shows it."""
+
+import dataclasses
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.discrepancy.sensor_consistency import search
+from rov_ident.effects import parameter
+from rov_ident.estimation.consistency import SUPPOSED, Test
+from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.raw_streams import Streams
+
+_MOUNTED = 0.02  # rad: about as well as a mounting is measured by hand
+_SCALED = 0.02  # half of what fresh water in place of the sea makes of the speed of sound
+
+
+def tests_of(streams: Streams, config: Config) -> list[Test]:
+    """What is asked of a bag's messages; nothing without velocities, or of what the configuration
+    corrects. The value of a test is that of the parameter that is furthest off.
+
+    A mounting is judged by the IMU alone, as the heading of a pose is often wrong, or its attitude
+    tilted.
+    """
+    if streams.duration < 1.0 or not streams.nu[:, :3].any():
+        return []
+    alone = dataclasses.replace(streams, position=np.zeros_like(streams.position))
+    tests = []
+    for name, sensors, harmless, told in (
+        ("velocity_scale", streams, _SCALED, "reads wrong by a factor, unless a filter does"),
+        ("sensor_misalignment", alone, _MOUNTED, "is turned against the IMU"),
+    ):
+        if name in config.effects:
+            continue
+        found, std = search(sensors, config, [(0.0, streams.duration)])
+        of = [(parameter(name, own), x, std[name, own]) for own, x in found.get(name, {}).items()]
+        apart = [(abs(x - p.null), harmless + SUPPOSED * s) for p, x, s in of] or [(0.0, harmless)]
+        sizes = ", ".join(f"{p.name} {x:.3f} ± {NORMAL * s:.2g}" for p, x, s in of)
+        failure = (
+            f"pose and IMU say that the velocity sensor {told}, {sizes} (95 %): calibrate it, or "
+            f"enter this under effects.{name}"
+        )
+        value, limit = max(apart, key=lambda pair: pair[0] / pair[1])
+        tests.append(Test(f"velocity sensor: {name}", value, limit, failure))
+    return tests
