@@ -1,4 +1,4 @@
-"""The third tier: what `make studies` runs and `make test` leaves out."""
+"""The last tier: what `make studies` runs and `make full` leaves out."""
 
 import pytest
 
