@@ -30,7 +30,7 @@ from rov_ident.offline import archive, batch_fit
 from rov_ident.offline.batch_fit import CHANNELS, KINDS, Settings
 from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
-from rov_ident.offline.prediction_error import curves
+from rov_ident.offline.prediction_error import curves, open_loop
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import (
@@ -229,10 +229,10 @@ def fit(
             return found
         judge = stack.enter_context(_opened([_existing(validate)], given, say))
         say("simulating in open loop")
-        how = judge, given, judge.as_read_by(found.fitted, given), found.fitted
-        more = {"validation": batch_fit.validation(*how)}
-        judged = tuple(curves(*how))
-        return dataclasses.replace(found, more=found.more | more, judged=judged)
+        reread = judge.as_read_by(found.fitted, given)
+        runs = judge.bags, open_loop(judge, given), open_loop(reread, found.fitted)
+        more = {"validation": batch_fit.validation(*runs)}
+        return dataclasses.replace(found, more=found.more | more, judged=curves(*runs))
 
 
 def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:

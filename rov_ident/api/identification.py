@@ -34,6 +34,7 @@ from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
+from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, numbers
@@ -277,7 +278,8 @@ def identify(
     if judge is not None:
         with _opened([judge], given, say) as held_back:
             reread = held_back.as_read_by(fitted.fitted, given)
-            judged = validation(held_back, given, reread, fitted.fitted)
+            after = open_loop(reread, fitted.fitted)
+            judged = validation(held_back.bags, open_loop(held_back, given), after)
     proposal, why = None, list(fitted.notes)
     try:  # what is planned drives surge and sway
         proposal = plan(fitted.fitted, used, progress=say) if explanation else None
