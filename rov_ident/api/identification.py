@@ -273,7 +273,9 @@ def identify(
         extended = explanation.findings.verdict in ("explained", "unexplained")
         start = explanation.extended if extended else given
         explanation = _as_a_start(explanation, extended)
-    fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
+    fitted = checked[0][1].quick if explanation is None and judge is None else None
+    if fitted is None:  # else a single dive without velocity: its check has made this very fit
+        fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
     judged: dict[str, Any] = {}
     if judge is not None:
         with _opened([judge], given, say) as held_back:
