@@ -9,19 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident.api.functions import (
-    File,
-    Files,
-    Progress,
-    _opened,
-    _several,
-    _silent,
-    check,
-    explain,
-    load,
-    plan,
-)
+from rov_ident.api.functions import check, explain, opened, plan
 from rov_ident.api.functions import fit as fit_bags
+from rov_ident.api.reading import File, Files, Progress, load, several, silent
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -250,8 +240,8 @@ def identify(
     UserError
         If a bag cannot be read, or no dive is fit for identification: why, and what to fly instead.
     """
-    say, given = progress or _silent, load(config)
-    paths = _several(dives)
+    say, given = progress or silent, load(config)
+    paths = several(dives)
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}
     for path in paths:
@@ -278,7 +268,7 @@ def identify(
         fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
     judged: dict[str, Any] = {}
     if judge is not None:
-        with _opened([judge], given, say) as held_back:
+        with opened([judge], given, say) as held_back:
             reread = held_back.as_read_by(fitted.fitted, given)
             after = open_loop(reread, fitted.fitted)
             judged = validation(held_back.bags, open_loop(held_back, given), after)

@@ -39,12 +39,6 @@ from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
-CHANNELS: dict[str, tuple[str, ...]] = {
-    **{name: (name,) for name in MOTIONS},
-    "lateral": ("sway", "yaw"),
-    "longitudinal": ("heave", "pitch"),
-}
-"""What can be fitted by itself: single axes, and those that one pair of actuators moves."""
 
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
