@@ -122,14 +122,12 @@ def fit_batch(
     states = dict.fromkeys(prior.names, State.HELD)
     unexplained, lasting = np.full((2, 6), np.nan)
     now, parts = config, []
-    if effects and config.estimate_effects:
-        archive, whole = _relinearised(archive, config, kind, settings, notes, tell)
-        values, covariance, states = whole.values, whole.covariance, whole.states
-        unexplained, lasting = whole.unexplained, whole.lasting
-        now = config.with_values(dict(zip(whole.names, values.tolist(), strict=True)))
-        parts.append(whole.more)
-    for stage in () if parts else settings.stages or (MOTIONS,):
-        found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
+    for stage in settings.stages or (MOTIONS,):
+        found: _Stage | None
+        if effects and config.estimate_effects:
+            archive, found = _relinearised(archive, config, kind, settings, notes, tell)
+        else:
+            found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
         if found is None:
             continue
         at = np.array([prior.names.index(name) for name in found.names])
@@ -138,7 +136,7 @@ def fit_batch(
         covariance[np.ix_(at, at)] = found.covariance
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
-        now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
+        now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
     judged = read.as_read_by(now, config)
