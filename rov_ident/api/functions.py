@@ -6,15 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rov_ident.api.reading import File, Files, Progress, axes, existing, load, read, several, silent
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.discrepancy.explain import Explanation
-from rov_ident.discrepancy.explain import explain as explain_streams
 from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.experiment import data_quality, design, messages_alone
 from rov_ident.experiment.data_quality import Check
@@ -33,6 +31,9 @@ from rov_ident.sampling.without_velocity import (
     refusal,
     refuse_without_velocity,
 )
+
+if TYPE_CHECKING:
+    from rov_ident.discrepancy.explain import Explanation
 
 
 @one_blas_thread()
@@ -210,7 +211,7 @@ def explain(
     validate: File | None = None,
     *,
     progress: Progress | None = None,
-) -> Explanation:
+) -> "Explanation":
     """Find what the configured simulation lacks, and what each lacking effect would gain.
 
     Parameters
@@ -234,6 +235,8 @@ def explain(
     UserError
         If a bag cannot be read or is too short, or the model cannot be simulated at all.
     """
+    from rov_ident.discrepancy.explain import explain as explain_streams  # here: no other needs it
+
     given, say = load(config), progress or silent
     read_bags = [_streams(path, given, say) for path in several(bags)]
     judge = None if validate is None else _streams(existing(validate), given, say)
