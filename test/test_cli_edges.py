@@ -161,8 +161,8 @@ def test_who_reads_the_head_has_seen_enough(arguments):
 
 def test_completion_of_fish():
     lines = run("completion", "fish").stdout.splitlines()
-    (estimator,) = [s for s in lines if "_from fit'" in s and " -l estimator " in s]
-    assert "-a 'rls ukf ls iv ml'" in estimator
+    (estimator,) = [s for s in lines if "_using fit'" in s and " -l estimator " in s]
+    assert '"rls ukf ls iv ml"' in estimator
     assert {f" -a {name} " in "\n".join(lines) for name in COMMANDS} == {True}
 
 
