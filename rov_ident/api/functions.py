@@ -198,6 +198,8 @@ def _reference(path: Path, config: Config, duration: float, say: Progress) -> di
 def opened(
     paths: Sequence[Path], config: Config, say: Progress, jobs: int = 1, dask: str = ""
 ) -> contextlib.AbstractContextManager[archive.Archive]:
+    """Bags as an archive, for a ``with``, as :func:`archive.opened`; ``say`` is told of each."""
+
     def told(name: str, done: int, total: int) -> None:
         say(f"read {name}", done / total)
 
