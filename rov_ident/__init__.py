@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from rov_ident.api.comparison import Comparison as Comparison
     from rov_ident.api.comparison import compare as compare
     from rov_ident.api.functions import check as check
-    from rov_ident.api.functions import coefficients as coefficients
     from rov_ident.api.functions import explain as explain
     from rov_ident.api.functions import fit as fit
-    from rov_ident.api.functions import load as load
     from rov_ident.api.functions import plan as plan
-    from rov_ident.api.functions import read as read
     from rov_ident.api.identification import Identification as Identification
     from rov_ident.api.identification import identify as identify
+    from rov_ident.api.reading import coefficients as coefficients
+    from rov_ident.api.reading import load as load
+    from rov_ident.api.reading import read as read
     from rov_ident.api.simulation import Simulation as Simulation
     from rov_ident.api.simulation import simulate as simulate
     from rov_ident.api.start import Draft as Draft
@@ -49,8 +49,9 @@ if TYPE_CHECKING:
 
 _PLACES = {
     "api.comparison": "Comparison compare",
-    "api.functions": "check coefficients explain fit load plan read",
+    "api.functions": "check explain fit plan",
     "api.identification": "Identification identify",
+    "api.reading": "coefficients load read",
     "api.simulation": "Simulation simulate",
     "api.start": "Draft init",
     "config": "Config",

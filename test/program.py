@@ -16,6 +16,7 @@ from bench import ROOT
 from rov_ident.cli import main
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.topics import USUAL, messages, select
 
 _QUIET = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 
@@ -59,6 +60,12 @@ def run_alone(*arguments, cwd=None):
     """The finished program, in a process of its own."""
     command = [sys.executable, "-m", "rov_ident", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=cwd)
+
+
+def messages_in(path):
+    """(role, message) of the usual topics of a bag, axes as on the wire."""
+    bag = Bag(path)
+    return messages(bag, select(bag, USUAL), USUAL)
 
 
 def lay_out_shipped(folder, seconds):

@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from program import messages_in
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_inputs import DIRECTION, GEOMETRY, POSITION, configured, estimate
 
@@ -14,7 +15,6 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, quaternion_to_matrix, to_core
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench, fault
 from rov_ident.io.ardupilot_log import import_log
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model import thruster_allocation as thrusters
 
@@ -270,13 +270,10 @@ def test_pulses_that_are_none(tmp_path, dive):
 
 
 def test_an_odometry_in_the_bag_is_an_ordinary_one(tmp_path, dive):
-    from rov_ident.io.bag_reader import Bag, read_messages, select_topics
-
     import_log(
         dataflash(tmp_path / "log.bin", rows_of(dive)), tmp_path / "b.mcap", configured(**GEOMETRY)
     )
-    bag = Bag(tmp_path / "b.mcap")
-    found = next(m for role, m in read_messages(bag, select_topics(bag)) if role == ODOMETRY)
+    found = next(m for role, m in messages_in(tmp_path / "b.mcap") if role == ODOMETRY)
     assert isinstance(found, Odometry)
     assert (found.frame_id, found.child_frame_id) == ("world_ned", "base_link_frd")
 
@@ -297,8 +294,7 @@ def test_what_no_vehicle_does_is_left_out(tmp_path, dive, kind, column, value):
     assert "left out" in report.notes[-1]
     whole = [role for _, role, _ in dive]
     assert report.odometry >= whole.count(ODOMETRY) - 3 and report.imu >= whole.count(IMU) - 1
-    bag = Bag(tmp_path / "log.mcap")
-    for role, message in read_messages(bag, select_topics(bag)):
+    for role, message in messages_in(tmp_path / "log.mcap"):
         assert not fault(message), role
 
 

@@ -11,6 +11,8 @@ import sys
 import textwrap
 import time
 import tracemalloc
+from collections import Counter
+from types import SimpleNamespace
 
 import lz4.frame
 import numpy as np
@@ -20,6 +22,7 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
+from program import messages_in
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Reader as RosbagsReader
@@ -27,10 +30,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from rov_ident.config.schema import Topics
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Imu, Odometry, Wrench
 from rov_ident.io import bag_reader, cdr, topics
-from rov_ident.io.bag_reader import Bag, _records, read_messages, select_topics
+from rov_ident.io.bag_reader import Bag, _records
 from rov_ident.io.bag_writer import BagWriter
 
 STEP = 20_000_000  # ns
@@ -107,12 +111,12 @@ def test_what_is_written_is_read(bag_path):
 
 
 def test_messages_come_decoded_with_their_role(bag_path):
-    bag = Bag(bag_path)
-    messages = list(read_messages(bag, select_topics(bag)))
+    messages = list(messages_in(bag_path))
     assert [role for role, _ in messages[:4]] == ["odom", "imu", "wrench", "odom"]
     assert messages[3][1].position[0] == 1.0
     assert [type(m) for _, m in messages[:3]] == [Odometry, Imu, Wrench]
-    without_imu = read_messages(bag, {"odom": "/odom", "imu": None, "wrench": "/thruster_wrench"})
+    chosen = {"odom": "/odom", "wrench": "/thruster_wrench"}
+    without_imu = topics.messages(Bag(bag_path), chosen, topics.USUAL)
     assert [role for role, _ in without_imu] == ["odom", "wrench"] * 3000
 
 
@@ -339,16 +343,13 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path, name):
     assert got == list(entries(1000))[: len(got)]
 
 
-def test_undecodable_messages_are_given_as_none(tmp_path):
+def test_undecodable_messages_are_counted(tmp_path):
     rows = list(entries(2))
     rows[1] = (*rows[1][:3], rows[1][3][:-20])
-    bag = Bag(write(tmp_path / "dive.mcap", rows))
-    messages = list(read_messages(bag, select_topics(bag)))
-    assert [(role, message is None) for role, message in messages[:3]] == [
-        ("odom", False),
-        ("imu", True),
-        ("wrench", False),
-    ]
+    bag, counts = Bag(write(tmp_path / "dive.mcap", rows)), Counter()
+    messages = topics.messages(bag, topics.select(bag, topics.USUAL), topics.USUAL, counts)
+    assert [role for role, _ in messages] == ["odom", "wrench", "odom", "imu", "wrench"]
+    assert counts == {"imu: bytes that are no sensor_msgs/msg/Imu": 1}
 
 
 # --- other formats ---------------------------------------------------------------------------
@@ -367,10 +368,11 @@ def write_ros1(path, rows):
 
 def test_a_bag_of_ros_1(tmp_path):
     rows = list(entries(40))
-    bag = Bag(write_ros1(tmp_path / "dive.bag", rows))
+    path = write_ros1(tmp_path / "dive.bag", rows)
+    bag = Bag(path)
     assert bag.topics == Bag(write(tmp_path / "dive.mcap", rows)).topics
     assert [raw[:3] for raw in bag.iter_raw()] == [row[:3] for row in rows]
-    read = [cdr.encode(message) for _, message in read_messages(bag, select_topics(bag))]
+    read = [cdr.encode(message) for _, message in messages_in(path)]
     assert read == [row[3] for row in rows]
     assert {m.topic for m in bag.iter_raw(["/imu/data"])} == {"/imu/data"}
 
@@ -491,6 +493,12 @@ def bag_of(tmp_path, **topics):
     return Bag(write(tmp_path / "dive.mcap", rows))
 
 
+def chosen(bag, roles=(), **names):
+    """The topics by role, where the configuration has these names."""
+    usual = SimpleNamespace(**vars(topics.USUAL) | {"topics": Topics(**names)})
+    return topics.select(bag, usual, roles)
+
+
 def test_topics_in_a_namespace_by_name_and_by_type(tmp_path):
     bag = bag_of(
         tmp_path,
@@ -498,18 +506,18 @@ def test_topics_in_a_namespace_by_name_and_by_type(tmp_path):
         imu=["/rov/imu/data", "/rov/imu/raw"],
         wrench=["/rov/tau"],
     )
-    assert select_topics(bag) == {"odom": "/rov/odom", "imu": "/rov/imu/data", "wrench": "/rov/tau"}
-    chosen = select_topics(bag, {"odom": "rov/odom/filtered", "imu": ""})
-    assert chosen["odom"] == "/rov/odom/filtered"
-    assert chosen["imu"] == "/rov/imu/data"
+    assert chosen(bag) == {"odom": "/rov/odom", "imu": "/rov/imu/data", "wrench": "/rov/tau"}
+    found = chosen(bag, odom="rov/odom/filtered")
+    assert found["odom"] == "/rov/odom/filtered"
+    assert found["imu"] == "/rov/imu/data"
 
 
 def test_imu_may_be_absent(tmp_path):
-    assert select_topics(bag_of(tmp_path, odom=["/odom"], wrench=["/w"]))["imu"] is None
+    assert "imu" not in chosen(bag_of(tmp_path, odom=["/odom"], wrench=["/w"]))
 
 
 @pytest.mark.parametrize(
-    ("topics", "overrides", "words"),
+    ("has", "names", "words"),
     [
         ({"odom": ["/odom"]}, {}, "no thruster_wrench topic.*/odom"),
         ({"wrench": ["/thruster_wrench"]}, {}, "no odom topic"),
@@ -518,13 +526,12 @@ def test_imu_may_be_absent(tmp_path):
         ({"wrench": ["/odom", "/w"]}, {}, "/odom in .* is geometry_msgs/msg/WrenchStamped"),
         ({"odom": ["/o"], "wrench": ["/w"]}, {"odom": "/x"}, "no messages on /x"),
         ({"odom": ["/o"], "wrench": ["/w"]}, {"odom": "/w"}, "/w in .* is geometry_msgs"),
-        ({"odom": ["/o"], "wrench": ["/w"]}, {"odometry": "/o"}, "odometry is not an input"),
     ],
 )
-def test_a_choice_that_cannot_be_made(tmp_path, topics, overrides, words):
-    bag = bag_of(tmp_path, **topics)
+def test_a_choice_that_cannot_be_made(tmp_path, has, names, words):
+    bag = bag_of(tmp_path, **has)
     with pytest.raises(UserError, match=words):
-        select_topics(bag, overrides)
+        chosen(bag, **names)
 
 
 def test_a_damaged_schema_or_channel_outside_chunks_is_passed_over(tmp_path):
@@ -587,9 +594,9 @@ def test_chunks_that_overlap_in_time_are_bounded(tmp_path, monkeypatch):
 def test_a_bag_of_many_topics_is_refused_in_a_sentence(tmp_path):
     rows = [(f"/topic_{k}", cdr.WRENCH_TYPE, STEP, cdr.encode(wrench(STEP))) for k in range(2_000)]
     path = write_mcap(tmp_path / "dive.mcap", rows)
-    for overrides in ({}, {"wrench": "/none"}, {"odom": "/topic_1"}):
+    for names in ({}, {"wrench": "/none"}, {"odom": "/topic_1"}):
         with pytest.raises(UserError) as refusal:
-            select_topics(Bag(path), overrides, ["wrench", "odom"])
+            chosen(Bag(path), ["wrench", "odom"], **names)
         assert len(str(refusal.value)) <= 2_000
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from program import run, run_alone
+from program import messages_in, run, run_alone
 
 from bench import HEAVY
 from rov_ident.cli.common import EXAMPLES
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import shipped
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.write_messages import write_messages
 from rov_ident.simulation import virtual_sensors as sensors
@@ -76,8 +76,7 @@ def test_without_noise_the_wrench_is_the_demand(tmp_path):
     path = tmp_path / "rest.mcap"
     done = simulate(path, "--noise", 0, source=("--manoeuvre", "rest", "--duration", 5))
     assert done.returncode == 0
-    found = Bag(path)
-    for role, message in read_messages(found, select_topics(found)):
+    for role, message in messages_in(path):
         if role == "wrench":
             assert not message.force.any() and not message.torque.any()
         elif role == "odom":
@@ -162,8 +161,8 @@ def test_who_reads_the_head_has_seen_enough(arguments):
 
 def test_completion_of_fish():
     lines = run("completion", "fish").stdout.splitlines()
-    (estimator,) = [s for s in lines if "_from fit'" in s and " -l estimator " in s]
-    assert "-a 'rls ukf ls iv ml'" in estimator
+    (estimator,) = [s for s in lines if "_using fit'" in s and " -l estimator " in s]
+    assert '"rls ukf ls iv ml"' in estimator
     assert {f" -a {name} " in "\n".join(lines) for name in COMMANDS} == {True}
 
 

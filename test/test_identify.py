@@ -17,6 +17,7 @@ from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.estimation import consistency
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import validation
+from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.table import number
 
 VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in ("", "_demo"))
@@ -54,7 +55,8 @@ def test_dives_to_a_model_that_is_judged(tmp_path, dives):
     # what is judged is what is saved
     given, saved = ri.load(WRONG), ri.load(tmp_path / "found" / "extended.yaml")
     with archive.opened([dives / "short.mcap"], given) as judge:
-        told = validation(judge, given, judge.as_read_by(saved, given), saved)
+        after = open_loop(judge.as_read_by(saved, given), saved)
+        told = validation(judge.bags, open_loop(judge, given), after)
     for name, row in result["rmse"].items():
         assert row["before"] == pytest.approx(told["rmse_before"][name])
         assert row["after"] == pytest.approx(told["rmse"][name], rel=1e-3)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from program import messages_in
 
 from bench import DATA
 from rov_ident.core import frames
 from rov_ident.core.errors import UserError
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
 from rov_ident.io.csv_log import import_csv, parse_columns
 
 BASE = ["t_s", *"uvwpqrXYZKMN"]
@@ -31,9 +31,8 @@ def save(path, columns, comment="# a log\n"):
 
 def contents(path):
     """{role: messages} on the wire."""
-    bag = Bag(path)
     found = {"odom": [], "wrench": []}
-    for role, message in read_messages(bag, select_topics(bag)):
+    for role, message in messages_in(path):
         found[role].append(message)
     return found
 

@@ -10,7 +10,8 @@ from rov_ident.core.errors import UserError
 from rov_ident.io.write_messages import write_messages
 from rov_ident.offline import maximum_likelihood as ml
 from rov_ident.offline.archive import of_records
-from rov_ident.offline.batch_fit import Settings, fit_batch, open_loop_rmse
+from rov_ident.offline.batch_fit import Settings, fit_batch
+from rov_ident.offline.prediction_error import open_loop
 from rov_ident.sampling import records
 from rov_ident.sampling.records import predicted, read_record
 from rov_ident.sampling.sample import joined
@@ -233,7 +234,7 @@ def test_a_channel_fitted_alone_holds_in_the_joint_run(heavy, off, archive_of):
     assert all(fit.identifiable)
     error = np.abs(fit.values / heavy.model.theta - 1.0)
     assert np.median(error) < 0.02 and error.max() < 0.2
-    before, after = (open_loop_rmse(joint, c) for c in (off, heavy.with_model(fit.model)))
+    before, after = (open_loop(joint, c).rmse for c in (off, heavy.with_model(fit.model)))
     assert np.all(after < 0.6 * before)
 
 

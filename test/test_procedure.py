@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from program import messages_in
 from textbook import finned
 from tiers import more
 
@@ -19,7 +20,7 @@ from rov_ident.cli import main
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import DRIVE
 from rov_ident.io import topics
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_reader import Bag
 from rov_ident.offline.coast_down import Run, _simulated, fit_coast_downs
 from rov_ident.sampling import preprocess
 
@@ -231,8 +232,7 @@ def imported(path, *options):
     """The odometry of a log imported with options, (N,) messages."""
     out = path.with_suffix(".mcap")
     assert main(["import", str(path), "--out", str(out), *options]) == 0
-    bag = Bag(out)
-    return [m for role, m in read_messages(bag, select_topics(bag)) if role == "odom"]
+    return [m for role, m in messages_in(out) if role == "odom"]
 
 
 def test_a_log_is_prepared_on_the_command_line(tmp_path, capsys):

@@ -20,6 +20,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
+from program import messages_in
 from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
@@ -32,7 +33,7 @@ from rov_ident import config
 from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_reader import Bag
 from rov_ident.io.write_messages import write_messages
 from rov_ident.nodes.common import Executor
 from rov_ident.nodes.conversions import from_diagnostics
@@ -62,8 +63,7 @@ def brief(tmp_path_factory, heavy):
 
 def offline(path, kind):
     online = OnlineEstimator(config.load(HEAVY), kind)
-    bag = Bag(path)
-    for role, message in read_messages(bag, select_topics(bag)):
+    for role, message in messages_in(path):
         online.push(role, message)
     online.flush()
     return online.report()

@@ -29,18 +29,19 @@ def here() -> dict[str, object]:
     from rov_ident import config as configuration
     from rov_ident.core import jit
     from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
-    from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+    from rov_ident.io.bag_reader import Bag
+    from rov_ident.io.topics import messages, select
 
     jit.only_run()
     config = configuration.load(ROOT / "config" / "bluerov2_heavy_demo.yaml")
     bag = Bag(ROOT / "bags" / "demo.mcap")
-    messages = [pair for pair in read_messages(bag, select_topics(bag)) if pair[1] is not None]
-    end = messages[0][1].stamp + SECONDS * 1e9
+    dive = list(messages(bag, select(bag, config), config))
+    end = dive[0][1].stamp + SECONDS * 1e9
     found = {}
     for kind in ESTIMATORS:
         jit.interpret()
         online = OnlineEstimator(config, kind)
-        for k, (role, message) in enumerate(messages):
+        for k, (role, message) in enumerate(dive):
             if k == INTERPRETED:
                 jit.stop_interpreting()
             if message.stamp < end:

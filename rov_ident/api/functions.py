@@ -1,26 +1,20 @@
-"""From files to results: reading, fitting, explaining, checking, planning."""
+"""From files to results: fitting, explaining, checking, planning."""
 
 import contextlib
 import dataclasses
 import itertools
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rov_ident import config as configuration
+from rov_ident.api.reading import File, Files, Progress, axes, existing, load, read, several, silent
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.discrepancy import velocity_sensor
-from rov_ident.discrepancy.explain import Explanation
-from rov_ident.discrepancy.explain import explain as explain_streams
+from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import Test
 from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.experiment import data_quality, design, messages_alone
@@ -28,14 +22,13 @@ from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Limits, Proposal
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
-from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
+from rov_ident.model.coefficients import MOTIONS
 from rov_ident.offline import archive, batch_fit
-from rov_ident.offline.batch_fit import CHANNELS, KINDS, Settings
+from rov_ident.offline.batch_fit import KINDS, Settings
 from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
-from rov_ident.offline.prediction_error import curves
+from rov_ident.offline.prediction_error import curves, open_loop
 from rov_ident.sampling.raw_streams import Streams, gather
-from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import (
     has_velocity,
     is_without_velocity,
@@ -43,83 +36,10 @@ from rov_ident.sampling.without_velocity import (
     refuse_without_velocity,
 )
 
+if TYPE_CHECKING:
+    from rov_ident.discrepancy.explain import Explanation
+
 _COMPARED = 100_000  # messages of a bag by which its sensors are compared: ten minutes
-
-File = str | os.PathLike[str]
-Files = File | Sequence[File]
-
-
-class Progress(Protocol):
-    """Called now and then with what is being done, and the share of it that is, where known."""
-
-    def __call__(self, what: str, share: float | None = None) -> None: ...
-
-
-def _silent(what: str, share: float | None = None) -> None:
-    pass
-
-
-def _several(files: Files) -> list[Path]:
-    one = isinstance(files, str | os.PathLike)
-    return [_existing(files)] if one else [_existing(file) for file in files]  # type: ignore[arg-type, union-attr]
-
-
-def _existing(file: File) -> Path:
-    """The path, with the name of its folder for `.`; UserError where there is nothing."""
-    path = Path(file)
-    if not path.exists():
-        raise UserError(f"{path} cannot be read (No such file or directory): check the path")
-    return path if path.name not in ("", "..") else path.resolve()
-
-
-def load(config: File | Config, node: str = "") -> Config:
-    """Read a parameter file of a vehicle, the one that nodes and commands use.
-
-    Parameters
-    ----------
-    config
-        Path of the YAML file. Vectors in it are in the axes of its key ``vehicle.frame``; those of
-        the Config are always forward-starboard-down, in SI units. A Config is returned as it is.
-    node
-        Name of a node (``rls_node``, ``ukf_node``) whose own section overrides ``/**``.
-
-    Raises
-    ------
-    UserError
-        If a key is missing, of a wrong type or unphysical: one sentence that names it.
-    """
-    return configuration.load(config, node)
-
-
-@one_blas_thread()
-def read(bag: File, config: File | Config, progress: Progress | None = None) -> Record:
-    """Read a bag into samples: all that was measured, on one clock, as the estimators see it.
-
-    Parameters
-    ----------
-    bag
-        Path of an ``.mcap`` file or a rosbag2 directory. Axes of its messages follow their frame
-        ids, or the configuration.
-    config
-        Path of a parameter file, or a Config.
-    progress
-        Called with a sentence and the share (0 to 1) that is done.
-
-    Returns
-    -------
-    Record
-        ``samples`` (k,), a structured array: ``t`` [s] since the first message, ``nu`` (k, 6) [m/s,
-        rad/s] through the water and ``wrench`` (k, 6) [N, N m] in body axes forward-starboard-down,
-        ``orientation`` (k, 4) w x y z, body to north-east-down, and what else `SAMPLE` lists;
-        ``duration`` [s]; ``notes`` on what was refused.
-
-    Raises
-    ------
-    UserError
-        If the bag cannot be read, lacks a topic or yields no sample.
-    """
-    say, path = progress or _silent, _existing(bag)
-    return read_record(path, load(config), lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
 
 
 @one_blas_thread()
@@ -209,7 +129,7 @@ def fit(
     table: dict[str, Any] = {}
     if prior_from is not None:
         given, table = with_prior(given, Path(prior_from))
-    paths, say = _several(bags), progress or _silent
+    paths, say = several(bags), progress or silent
     groups = [channels] if isinstance(channels, str) else channels or ()
     stages = tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
     settings = Settings(stages, prior, weighted, process)
@@ -226,7 +146,7 @@ def fit(
             if reference:
                 found.more["reference"] = _reference(paths[0], given, reference, say)
         else:
-            many = stack.enter_context(_opened(paths, given, say, jobs, dask))
+            many = stack.enter_context(opened(paths, given, say, jobs, dask))
             _check(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
@@ -235,12 +155,12 @@ def fit(
             found = _beside_the_table(found, given, table)
         if validate is None:
             return found
-        judge = stack.enter_context(_opened([_existing(validate)], given, say))
+        judge = stack.enter_context(opened([existing(validate)], given, say))
         say("simulating in open loop")
-        how = judge, given, judge.as_read_by(found.fitted, given), found.fitted
-        more = {"validation": batch_fit.validation(*how)}
-        judged = tuple(curves(*how))
-        return dataclasses.replace(found, more=found.more | more, judged=judged)
+        reread = judge.as_read_by(found.fitted, given)
+        runs = judge.bags, open_loop(judge, given), open_loop(reread, found.fitted)
+        more = {"validation": batch_fit.validation(*runs)}
+        return dataclasses.replace(found, more=found.more | more, judged=curves(*runs))
 
 
 def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
@@ -251,7 +171,7 @@ def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
         chosen = topics.select(bag, config)
         if has_velocity(bag, chosen, config):
             first = itertools.islice(topics.messages(bag, chosen, config), _COMPARED)
-            for test in velocity_sensor.tests_of(gather(first, config), config):
+            for test in tests_of(gather(first, config), config):
                 before = worst.get(test.name, test)
                 worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
     return list(worst.values())
@@ -297,28 +217,15 @@ def _reference(path: Path, config: Config, duration: float, say: Progress) -> di
     return compare(held, samples, lambda share: say("filterpy's filter", share))
 
 
-def _opened(
+def opened(
     paths: Sequence[Path], config: Config, say: Progress, jobs: int = 1, dask: str = ""
 ) -> contextlib.AbstractContextManager[archive.Archive]:
+    """Bags as an archive, for a ``with``, as :func:`archive.opened`; ``say`` is told of each."""
+
     def told(name: str, done: int, total: int) -> None:
         say(f"read {name}", done / total)
 
     return archive.opened(paths, config, jobs, dask, told)
-
-
-def axes(channels: str) -> NDArray[np.bool_]:
-    """Which axes (6,) the names of channels, divided by commas, mean.
-
-    Raises
-    ------
-    UserError
-        If there is no such channel.
-    """
-    wanted = channels.split(",")
-    if unknown := sorted(set(wanted) - set(CHANNELS)):
-        raise UserError(f"no channel {unknown[0]!r}: use {','.join(CHANNELS)}")
-    names = {axis for name in wanted for axis in CHANNELS[name]}
-    return np.array([name in names for name in MOTIONS])
 
 
 @one_blas_thread()
@@ -328,7 +235,7 @@ def explain(
     validate: File | None = None,
     *,
     progress: Progress | None = None,
-) -> Explanation:
+) -> "Explanation":
     """Find what the configured simulation lacks, and what each lacking effect would gain.
 
     Parameters
@@ -352,9 +259,11 @@ def explain(
     UserError
         If a bag cannot be read or is too short, or the model cannot be simulated at all.
     """
-    given, say = load(config), progress or _silent
-    read_bags = [_streams(path, given, say) for path in _several(bags)]
-    judge = None if validate is None else _streams(_existing(validate), given, say)
+    from rov_ident.discrepancy.explain import explain as explain_streams  # here: no other needs it
+
+    given, say = load(config), progress or silent
+    read_bags = [_streams(path, given, say) for path in several(bags)]
+    judge = None if validate is None else _streams(existing(validate), given, say)
     for streams, _ in read_bags:
         seen = messages_alone.samples_of(streams)
         messages_alone.refuse_reversed(messages_alone.of_dynamics(seen, given))
@@ -407,7 +316,7 @@ def check(bag: File, config: File | Config, *, progress: Progress | None = None)
     UserError
         If the bag cannot be read, or has too few messages.
     """
-    return data_quality.check(_existing(bag), load(config), progress)
+    return data_quality.check(existing(bag), load(config), progress)
 
 
 @one_blas_thread()
@@ -445,14 +354,9 @@ def plan(
     UserError
         If a bag cannot be read, or no manoeuvre is safe within these limits.
     """
-    given, say = load(config), progress or _silent
+    given, say = load(config), progress or silent
     length, width, depth = tank
     limits = Limits((length, width, depth), thrust)
-    known = contextlib.nullcontext() if bag is None else _opened(_several(bag), given, say)
+    known = contextlib.nullcontext() if bag is None else opened(several(bag), given, say)
     with known as bags:
         return design.propose(given, bags, duration, limits, say)
-
-
-def coefficients() -> tuple[Coefficient, ...]:
-    """Every coefficient a configuration may name, each with ``name``, ``unit``, ``meaning``."""
-    return (*catalogue(), *input_catalogue())

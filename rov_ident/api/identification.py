@@ -9,19 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident.api.functions import (
-    File,
-    Files,
-    Progress,
-    _opened,
-    _several,
-    _silent,
-    check,
-    explain,
-    load,
-    plan,
-)
+from rov_ident.api.functions import check, explain, opened, plan
 from rov_ident.api.functions import fit as fit_bags
+from rov_ident.api.reading import File, Files, Progress, load, several, silent
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -34,6 +24,7 @@ from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, falls
+from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, numbers
@@ -249,8 +240,8 @@ def identify(
     UserError
         If a bag cannot be read, or no dive is fit for identification: why, and what to fly instead.
     """
-    say, given = progress or _silent, load(config)
-    paths = _several(dives)
+    say, given = progress or silent, load(config)
+    paths = several(dives)
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}
     for path in paths:
@@ -272,12 +263,15 @@ def identify(
         extended = explanation.findings.verdict in ("explained", "unexplained")
         start = explanation.extended if extended else given
         explanation = _as_a_start(explanation, extended)
-    fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
+    fitted = checked[0][1].quick if explanation is None and judge is None else None
+    if fitted is None:  # else a single dive without velocity: its check has made this very fit
+        fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
     judged: dict[str, Any] = {}
     if judge is not None:
-        with _opened([judge], given, say) as held_back:
+        with opened([judge], given, say) as held_back:
             reread = held_back.as_read_by(fitted.fitted, given)
-            judged = validation(held_back, given, reread, fitted.fitted)
+            after = open_loop(reread, fitted.fitted)
+            judged = validation(held_back.bags, open_loop(held_back, given), after)
     proposal, why = None, list(fitted.notes)
     try:  # what is planned drives surge and sway
         proposal = plan(fitted.fitted, used, progress=say) if explanation else None

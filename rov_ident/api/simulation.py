@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.api.functions import File, Progress, axes, load, read
+from rov_ident.api.reading import File, Progress, axes, load, read
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident import config as configuration
-from rov_ident.api.functions import File, Progress
+from rov_ident.api.reading import File, Progress
 from rov_ident.config.writing import annotated
 from rov_ident.consumer.formats import import_model
 from rov_ident.core.errors import UserError

@@ -1,7 +1,7 @@
 """The program `rov-ident`: one file a command (or a few that belong together).
 
-Arguments in, sentences and tables out. What a command needs beyond numpy is imported when it runs,
-so that `rov-ident --help` is there at once.
+Arguments in, sentences and tables out. What a command needs beyond its arguments is imported when
+it runs, so that `rov-ident --help` is there at once.
 """
 
 from collections.abc import Sequence

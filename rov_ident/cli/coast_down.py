@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from rov_ident import config as configuration
 from rov_ident.cli import common
 from rov_ident.core.files import write_file
 
@@ -25,6 +24,7 @@ def add(commands: common.Commands) -> None:
 
 
 def _coast_down(options: argparse.Namespace) -> None:
+    from rov_ident import config as configuration
     from rov_ident.io.csv_log import parse_columns
     from rov_ident.offline import coast_down
     from rov_ident.reports.result import provenance

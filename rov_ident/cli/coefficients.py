@@ -3,7 +3,6 @@
 import argparse
 
 from rov_ident.cli.common import OUT, Commands, check_outputs, command, write_json
-from rov_ident.model.coefficients import catalogue, input_catalogue
 
 
 def add(commands: Commands) -> None:
@@ -12,6 +11,8 @@ def add(commands: Commands) -> None:
 
 
 def _coefficients(options: argparse.Namespace) -> None:
+    from rov_ident.model.coefficients import catalogue, input_catalogue
+
     check_outputs([options.json], [])
     entries = [*catalogue(), *input_catalogue()]
     for c in entries:

@@ -8,16 +8,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from rich import progress as bars
 from rich.console import Console
 from rich.text import Text
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output, write_file
-from rov_ident.reports.result import as_json
 
 if TYPE_CHECKING:
-    from rov_ident.api.functions import Progress
+    from rov_ident.api.reading import Progress
     from rov_ident.reports.result import Shown
 
 
@@ -148,6 +146,8 @@ def box(text: str) -> tuple[float, ...]:
 @contextlib.contextmanager
 def progress(options: argparse.Namespace) -> "Iterator[Progress]":
     """A line and a bar on standard error; nothing with --quiet, or where nobody looks."""
+    from rich import progress as bars
+
     shown = ERR.is_terminal and not options.quiet
     with bars.Progress(console=ERR, transient=True, disable=not shown) as shown_bars:
         bar = shown_bars.add_task("", total=None)
@@ -179,6 +179,8 @@ def check_outputs(
 def write_json(path: Path | None, result: Mapping[str, object]) -> None:
     """The machine-readable result of a command, where it is wanted."""
     if path:
+        from rov_ident.reports.result import as_json
+
         write_file(path, as_json(result))
 
 

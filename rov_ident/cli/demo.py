@@ -4,19 +4,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from rich import box
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
-
-from rov_ident import config as configuration
 from rov_ident.cli.common import ERR, LIVE, OUT, Commands, check_outputs, command, rate
-from rov_ident.config import Config
 from rov_ident.core.files import shipped, write_file
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
+    from rov_ident.config import Config
     from rov_ident.estimation.online import Report
 
 
@@ -30,6 +24,11 @@ def add(commands: Commands) -> None:
 
 def _demo(options: argparse.Namespace) -> None:
     """Replay the shipped bag over DDS into both nodes and report against the simulator's truth."""
+    import numpy as np
+    from rich.console import Console
+    from rich.live import Live
+
+    from rov_ident import config as configuration
     from rov_ident.cli import demo_page as pages
     from rov_ident.nodes.replay import replay
     from rov_ident.reports import plots
@@ -79,7 +78,11 @@ def _demo(options: argparse.Namespace) -> None:
     OUT.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")
 
 
-def _table(config: Config, truth: dict[str, float], seen: "dict[str, list[Report]]") -> Table:
+def _table(config: "Config", truth: dict[str, float], seen: "dict[str, list[Report]]") -> "Table":
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
     # Lines between the columns would need more than 80 characters.
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")

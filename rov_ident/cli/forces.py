@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-from rov_ident import config as configuration
 from rov_ident.cli import common
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -37,6 +36,7 @@ def add(commands: common.Commands) -> None:
 
 
 def _forces(options: argparse.Namespace) -> None:
+    from rov_ident import config as configuration
     from rov_ident.io.csv_log import parse_columns
     from rov_ident.model.added_mass import parse_hull
     from rov_ident.offline import captive_tests as force_tables

@@ -4,12 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rov_ident import config as configuration
 from rov_ident.cli import common
 from rov_ident.core.errors import UserError
 
 if TYPE_CHECKING:
-    from rov_ident.api.functions import Progress
+    from rov_ident.api.reading import Progress
 
 
 def add(commands: common.Commands) -> None:
@@ -84,6 +83,7 @@ def _import(options: argparse.Namespace) -> None:
 
 def _import_ardupilot(options: argparse.Namespace, tell: "Progress") -> tuple[Any, str]:
     """What was imported, and its messages in words."""
+    from rov_ident import config as configuration
     from rov_ident.io.ardupilot_log import import_log
 
     if len(options.log) > 1:

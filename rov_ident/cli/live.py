@@ -5,7 +5,6 @@ import json
 import re
 from pathlib import Path
 
-from rov_ident import config as configuration
 from rov_ident.cli.common import ERR, OUT, Commands, check_outputs, command, port, positive
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -55,6 +54,7 @@ def _watch(options: argparse.Namespace) -> None:
 
 
 def _layouts(options: argparse.Namespace) -> None:
+    from rov_ident import config as configuration
     from rov_ident.dashboard import layouts
 
     if not re.fullmatch(r"(/?[A-Za-z_]\w*)*/?", options.namespace):

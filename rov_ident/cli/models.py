@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-from rov_ident import config as configuration
 from rov_ident.cli.common import Commands, check_outputs, command, say, write_json
 from rov_ident.core.files import write_file
 
@@ -29,6 +28,7 @@ def add(commands: Commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
+    from rov_ident import config as configuration
     from rov_ident.consumer.formats import export
 
     check_outputs([options.out, options.json], [options.config])
@@ -40,6 +40,7 @@ def _export(options: argparse.Namespace) -> None:
 
 
 def _import_model(options: argparse.Namespace) -> None:
+    from rov_ident import config as configuration
     from rov_ident.consumer.formats import import_model
 
     check_outputs([options.out, options.json], [options.file, options.config])

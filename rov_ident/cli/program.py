@@ -5,9 +5,8 @@ Exit status: 0 done, 2 the user can mend it, 1 a fault of ours, 130 and 143 inte
 
 import argparse
 import os
-import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -68,35 +67,17 @@ def _parser() -> argparse.ArgumentParser:
 
 def _completion(options: argparse.Namespace) -> None:
     parser = _parser()
-    if options.shell == "fish":  # shtab does not know it
-        print("\n".join(_fish(parser)))
-        return
     try:
         import shtab
     except ImportError as error:
         raise UserError("completion needs shtab: pip install shtab") from error
+    if options.shell not in shtab.SUPPORTED_SHELLS:
+        raise UserError(f"this shtab is too old for {options.shell}: pip install --upgrade shtab")
     for each in (parser, *_commands(parser).values()):
         for action in each._actions:  # shtab, too, goes through them
             if action.type is Path:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
     print(shtab.complete(parser, options.shell))
-
-
-def _fish(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Lines that tell fish the commands, their options and what these may be."""
-    begin = f"complete -c {parser.prog} -f"
-    for name, each in _commands(parser).items():
-        yield f"{begin} -n __fish_use_subcommand -a {name} -d {shlex.quote(each.description or '')}"
-        for action in each._actions:
-            values = " ".join(map(str, action.choices or ()))
-            takes = f" -x -a {shlex.quote(values)}" if values else " -r -F" * (action.nargs != 0)
-            option = f" -l {action.option_strings[-1][2:]}" if action.option_strings else ""
-            if option or takes:
-                what = shlex.quote(action.help or "")
-                said = f" -d {what}" if option else ""
-                takes = takes if option else takes.replace(" -r", "").replace(" -x", "")
-                seen = f"'__fish_seen_subcommand_from {name}'"
-                yield f"{begin.removesuffix(' -f')} -n {seen}{option}{takes}{said}"
 
 
 def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 from rov_ident.cli import common
 from rov_ident.core.errors import UserError
-from rov_ident.reports.result import NORMAL
-from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 
 if TYPE_CHECKING:
     from rov_ident.estimation.online import Report
@@ -30,6 +28,8 @@ def _replay(options: argparse.Namespace) -> None:
     from rov_ident.core.states import State
     from rov_ident.nodes.conversions import for_json
     from rov_ident.nodes.replay import replay
+    from rov_ident.reports.result import NORMAL
+    from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 
     common.check_outputs([options.json], [options.bag, options.config], options.out)
     estimators = options.estimator or common.LIVE

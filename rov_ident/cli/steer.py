@@ -4,9 +4,6 @@ import argparse
 import math
 from pathlib import Path
 
-import numpy as np
-
-from rov_ident import config as configuration
 from rov_ident.cli import common
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -35,6 +32,9 @@ def add(commands: common.Commands) -> None:
 
 
 def _steer(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from rov_ident import config as configuration
     from rov_ident.steering import autopilot
 
     common.check_outputs([options.out, options.json], [options.config])

@@ -12,14 +12,7 @@ from rov_ident.config.reading import estimated, leaves
 from rov_ident.config.schema import PARAMETERS, VEHICLE_PARAMETERS, Config
 from rov_ident.core.files import write_file
 from rov_ident.core.yaml_file import Dumper
-from rov_ident.model.coefficients import AXES, VELOCITIES, catalogue, input_catalogue
-
-DIAGONAL = tuple(
-    name.format(a, v)
-    for name in ("{}_{}dot", "{}_{}", "{0}_{1}{1}")
-    for a, v in zip(AXES, VELOCITIES)
-)
-"""The coefficients of a hull without couplings: where an unknown vehicle begins."""
+from rov_ident.model.coefficients import DIAGONAL, catalogue, input_catalogue
 
 
 def to_parameters(config: Config) -> dict[str, Any]:
@@ -86,7 +79,7 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
             line = _line(name, None, f"UNKNOWN. {meaning}", "")
         sections.setdefault(section, {})[p.key] = line if active else f"# {line}"
     coefficients = [key for key in given if key.startswith("coefficients.")]
-    for name in DIAGONAL if not coefficients else ():
+    for name in () if coefficients else sum(DIAGONAL.values(), ()):  # where one begins
         sections["coefficients"][name] = _line(name, None, f"UNKNOWN. {meanings[name]}", "")
     for key in coefficients:
         name = key.removeprefix("coefficients.")

@@ -125,13 +125,8 @@ def _motion(found: Check, config: Config) -> str:
     run = predicted(config.dynamics, samples, HORIZON)
     keep = slice(None, None, max(1, len(samples) // _MOST))
     t, nu = samples["t"][keep], measured_motion(samples)[keep]
-    pictures = []
-    for i, name in enumerate(VELOCITIES):
-        figure = plots.curves(
-            t, {"as configured": run[keep][:, i]}, name, "time [s]", f"{name} [{UNITS[i][0]}]",
-            measured=nu[:, i],
-        )  # fmt: skip
-        pictures.append(plots.zoomable(figure, f"motion{i}"))
+    models = {"as configured": run[keep]}
+    pictures = plots.motion_panels(t, models, "{name} [{unit}]", "motion", nu)
     caption = f"Measured (grey), and simulated open loop in windows of {HORIZON:g} s."
     return report.panels(pictures, caption, wide=True)
 

@@ -34,9 +34,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import open_input
-from rov_ident.core.messages import Message
 from rov_ident.core.yaml_file import parse_file
-from rov_ident.io.cdr import DECODERS, ROLE_TYPES
 from rov_ident.io.other_bags import OtherFile, Ros1File, SqliteFile
 
 ROLE_NAMES = {
@@ -212,45 +210,15 @@ class Bag:
         yield from pending
 
 
-def select_topics(
-    bag: Bag, overrides: Mapping[str, str] | None = None, roles: Iterable[str] = tuple(ROLE_TYPES)
-) -> dict[str, str | None]:
-    """Which topic plays which role: `odom`, `imu`, `wrench`; `imu` may be None.
-
-    An override (if not empty) wins; else the topic called `odom`, `imu/data` or `thruster_wrench`
-    in whatever namespace; else the only topic of the type. Topics without messages do not count.
-
-    Raises UserError: a role is missing, ambiguous or taken by a topic of another type.
-    """
-    overrides = overrides or {}
-    if unknown := set(overrides) - set(ROLE_TYPES):
-        raise UserError(f"{min(unknown)} is not an input: use one of {', '.join(ROLE_TYPES)}.")
-    return {
-        role: select_topic(bag, role, ROLE_NAMES[role], ROLE_TYPES[role], overrides.get(role, ""))
-        for role in roles
-    }
-
-
-def read_messages(
-    bag: Bag, topics: Mapping[str, str | None]
-) -> Iterator[tuple[str, Message | None]]:
-    """(role, message) in the order of log times, axes as on the wire.
-
-    The message is None where its bytes cannot be decoded, so that the caller can count them.
-    """
-    readers = {topic: (role, DECODERS[ROLE_TYPES[role]]) for role, topic in topics.items() if topic}
-    for raw in bag.iter_raw(readers):
-        role, decode = readers[raw.topic]
-        try:
-            message = decode(raw.data)
-        except ValueError:
-            yield role, None
-        else:
-            yield role, message
-
-
 def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) -> str | None:
-    """As :func:`select_topics` for one role, which is called ``name`` and of ``type_name``."""
+    """Which topic plays a ``role``, as `odom`, that is called ``name`` and of ``type_name``.
+
+    An ``override`` (if not empty) wins; else the topic of that name in whatever namespace; else the
+    only topic of the type. Topics without messages do not count. None: there is none, and need not
+    be.
+
+    Raises UserError: the role is missing, ambiguous or taken by a topic of another type.
+    """
     filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
     holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
     if override:

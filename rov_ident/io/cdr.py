@@ -6,7 +6,6 @@ its size counted from behind that header. The three messages of the core are a `
 """
 
 import struct
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -217,13 +216,6 @@ def decode_voltage(data: bytes) -> float:
     fields = _Fields(data)
     fields.stamp(), fields.string()
     return float(fields.numbers("<f4", 1)[0])
-
-
-DECODERS: dict[str, Callable[[bytes], Message]] = {
-    ODOMETRY_TYPE: decode_odometry,
-    IMU_TYPE: decode_imu,
-    WRENCH_TYPE: decode_wrench,
-}
 
 
 def encode(message: Message) -> bytes:

@@ -28,9 +28,9 @@ from rov_ident.core.messages import (
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.csv_table import read_csv
 from rov_ident.io.write_messages import write_messages
+from rov_ident.model.coefficients import AXES, VELOCITIES
 
-_VELOCITIES = ("u", "v", "w", "p", "q", "r")
-_WRENCH = ("X", "Y", "Z", "K", "M", "N")
+_VELOCITIES, _WRENCH = tuple(VELOCITIES), tuple(AXES)
 _POSITIONS = ("x", "y", "z")
 _ANGLES = ("roll", "pitch", "yaw")
 _QUATERNION = ("qw", "qx", "qy", "qz")

@@ -12,6 +12,7 @@ from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,6 +80,12 @@ _FOREIGN = {  # what such topics and types are called, and what they could be
         "sensor_msgs/JointState (a force for each thruster) or geometry_msgs/WrenchStamped",
     ),
 }
+
+
+USUAL: Any = SimpleNamespace(
+    inputs=Inputs(), topics=schema.Topics(), frames=schema.Frames(), thrusters=schema.Thrusters()
+)
+"""What a configuration says by default of how messages are read: for whoever is given none."""
 
 
 class Source(NamedTuple):

@@ -43,6 +43,13 @@ AXES = "XYZKMN"
 VELOCITIES = "uvwpqr"
 MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
+DIAGONAL = {
+    "added_mass": tuple(f"{a}_{b}dot" for a, b in zip(AXES, VELOCITIES)),
+    "linear": tuple(f"{a}_{b}" for a, b in zip(AXES, VELOCITIES)),
+    "quadratic": tuple(f"{a}_{b}{b}" for a, b in zip(AXES, VELOCITIES)),
+}
+"""The eighteen coefficients of a hull without couplings, each kind in the order X Y Z K M N."""
+
 # Even under port-starboard or up-down mirror symmetry, hence a plain square.
 EVEN = frozenset("X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split())
 

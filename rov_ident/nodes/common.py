@@ -11,20 +11,16 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 import rclpy
-from geometry_msgs.msg import WrenchStamped
-from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import Imu
 
 from rov_ident import config as configuration
 from rov_ident.config import Inputs
 from rov_ident.core.errors import UserError
 from rov_ident.core.interrupts import INTERRUPTS, end_at_once
-from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.io.topics import sources
 
 try:  # costs half as much, and keeps the order of arrival across topics
@@ -94,12 +90,6 @@ class GuardedNode(Node):  # type: ignore[misc]
         return guarded
 
 
-INPUTS = {
-    ODOMETRY: ("odom", Odometry),
-    IMU: ("imu/data", Imu),
-    WRENCH: ("thruster_wrench", WrenchStamped),
-}
-
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -122,6 +112,9 @@ def subscribed(inputs: Inputs) -> dict[str, tuple[str, type]]:
                 "that has it, or republish its numbers as std_msgs/UInt16MultiArray"
             ) from error
     return found
+
+
+INPUTS = subscribed(Inputs())  # by default
 
 
 def live(

@@ -31,20 +31,14 @@ from rov_ident.model.coefficients import MOTIONS, Coefficient
 from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
-from rov_ident.offline.archive import Archive, Samples, total
+from rov_ident.offline.archive import Archive, Bag, Samples, total
 from rov_ident.offline.fit import IDENTIFIABLE, Fit
-from rov_ident.offline.prediction_error import by_chance, curves, open_loop_rmse
+from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
-CHANNELS: dict[str, tuple[str, ...]] = {
-    **{name: (name,) for name in MOTIONS},
-    "lateral": ("sway", "yaw"),
-    "longitudinal": ("heave", "pitch"),
-}
-"""What can be fitted by itself: single axes, and those that one pair of actuators moves."""
 
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
@@ -119,7 +113,7 @@ def fit_batch(
     tell = say or (lambda what: None)
     tell("open loop, as configured")
     read, given = archive, config
-    before = open_loop_rmse(read, given)
+    before = open_loop(read, given)
     notes = list(archive.notes)
     effects = kind == "ml" and not settings.stages
     config = config.with_nuisance if effects else config
@@ -128,14 +122,12 @@ def fit_batch(
     states = dict.fromkeys(prior.names, State.HELD)
     unexplained, lasting = np.full((2, 6), np.nan)
     now, parts = config, []
-    if effects and config.estimate_effects:
-        archive, whole = _relinearised(archive, config, kind, settings, notes, tell)
-        values, covariance, states = whole.values, whole.covariance, whole.states
-        unexplained, lasting = whole.unexplained, whole.lasting
-        now = config.with_values(dict(zip(whole.names, values.tolist(), strict=True)))
-        parts.append(whole.more)
-    for stage in () if parts else settings.stages or (MOTIONS,):
-        found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
+    for stage in settings.stages or (MOTIONS,):
+        found: _Stage | None
+        if effects and config.estimate_effects:
+            archive, found = _relinearised(archive, config, kind, settings, notes, tell)
+        else:
+            found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
         if found is None:
             continue
         at = np.array([prior.names.index(name) for name in found.names])
@@ -144,17 +136,17 @@ def fit_batch(
         covariance[np.ix_(at, at)] = found.covariance
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
-        now = now.with_model(now.model.with_values(dict(zip(found.names, found.values.tolist()))))
+        now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     tell("open loop, fitted")
     judged = read.as_read_by(now, config)
-    after = open_loop_rmse(judged, now)
+    after = open_loop(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
     sensors: dict[str, float] = {}
     for bag in judged.bags:
         sensors |= {p: max(r, sensors.get(p, 0.0)) for p, r in bag.contradictions.items()}
     consistency = consistency_of(config, prior, values, unexplained, lasting, sensors)
-    consistency = consistency.with_open_loop(before, after, chance)
+    consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
     if unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
         driven = float(np.max((forces / authority(config.dynamics))[:2]))
@@ -163,7 +155,7 @@ def fit_batch(
     motion = archive.each(_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
-        "open_loop_before": {"horizon_s": HORIZON, "rmse": numbers(before)},
+        "open_loop_before": {"horizon_s": HORIZON, "rmse": numbers(before.rmse)},
         "range": {n: [a, b] for n, a, b in zip(VELOCITIES, low.tolist(), high.tolist())},
     }
     more |= {"stages": parts} if settings.stages else parts[0]
@@ -178,12 +170,12 @@ def fit_batch(
         fitted=now,
         samples=archive.samples,
         duration=archive.duration,
-        rmse=after,
+        rmse=after.rmse,
         consistency=consistency,
         provenance=provenance(((b.path.name, b.sha256) for b in archive.bags), vehicle=config.name),
         notes=tuple(notes),
         more=more,
-        curves=tuple(curves(read, given, judged, now)),
+        curves=curves(read.bags, before, after),
     )
 
 
@@ -409,7 +401,7 @@ def _coefficients(config: Config) -> dict[str, Coefficient]:
 
 def _is_good(archive: Archive, config: Config, free: NDArray[np.bool_]) -> str:
     """Why a channel needs no fit, in words, or nothing."""
-    rmse = open_loop_rmse(archive, config, free)[free]
+    rmse = open_loop(archive, config, free).rmse[free]
     size, noise = _sizes(archive)
     share = rmse / np.maximum(size[free], 1e-9)
     if np.all((share < _GOOD) | (rmse < _NOISY * noise[free])):
@@ -486,14 +478,14 @@ def _size(samples: Samples) -> tuple[Array, Array]:
     return np.sqrt(np.mean(samples["nu"] ** 2, axis=0)), noise
 
 
-def validation(read: Archive, before: Config, reread: Archive, after: Config) -> dict[str, Any]:
-    """RMSE of the open-loop simulation on bags that no fit has seen, for the JSON of a fit; with
-    one configuration and another, and the archive as each of them reads it."""
+def validation(bags: Sequence[Bag], before: OpenLoop, after: OpenLoop) -> dict[str, Any]:
+    """RMSE of the open-loop simulation on bags that no fit has seen, with one configuration and
+    another, for the JSON of a fit."""
     return {
         "horizon_s": HORIZON,
-        "rmse_before": numbers(open_loop_rmse(read, before)),
-        "rmse": numbers(open_loop_rmse(reread, after)),
-        "bags": [{"file": bag.path.name, "sha256": bag.sha256} for bag in read.bags],
+        "rmse_before": numbers(before.rmse),
+        "rmse": numbers(after.rmse),
+        "bags": [{"file": bag.path.name, "sha256": bag.sha256} for bag in bags],
     }
 
 

@@ -19,7 +19,7 @@ from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
 from rov_ident.offline import archive
-from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_loop_rmse
+from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_loop
 from rov_ident.reports.result import Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, Record, numbers
@@ -272,8 +272,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
     read = archive.of_records(records)
     judged = read.as_read_by(found, config)
-    before = open_loop_rmse(read, config)
-    after = open_loop_rmse(judged, found)
+    before, after = open_loop(read, config), open_loop(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
     assert report.consistency is not None
     if not report.consistency.judged:  # nobody has asked what it leaves of what was learnt last
@@ -289,9 +288,9 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         fitted=found,
         samples=read.samples,
         duration=read.duration,
-        rmse=after,
+        rmse=after.rmse,
         consistency=report.consistency,
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
-        curves=tuple(curves(read, config, judged, found)),
-    ).asked(Consistency(()).with_open_loop(before, after, chance).tests)
+        curves=curves(read.bags, before, after),
+    ).asked(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)

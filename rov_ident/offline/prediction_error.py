@@ -12,12 +12,20 @@ from rov_ident.core.messages import Array
 from rov_ident.core.states import State
 from rov_ident.effects import EFFECTS, Acting, compiled
 from rov_ident.model.equations import Model
-from rov_ident.offline.archive import Archive, Samples
+from rov_ident.offline.archive import Archive, Bag, Samples
 from rov_ident.sampling.records import HORIZON, measured_motion, predicted
 
 _POINTS = 1500  # of a curve in a picture
 _DRAWS = 8  # the RMS over them is known to 25 %
 _STEP = 0.1  # standard deviations: small enough to be linear, and to stay physical
+
+
+class OpenLoop(NamedTuple):
+    """The open-loop simulation of an archive in windows of HORIZON seconds: its RMSE (6,), and of
+    each bag t (k,), the measured and the simulated velocities (k, 6), thinned for a picture."""
+
+    rmse: Array
+    drawn: tuple[tuple[Array, Array, Array], ...]
 
 
 class Curves(NamedTuple):
@@ -30,33 +38,34 @@ class Curves(NamedTuple):
     after: Array
 
 
-def curves(read: Archive, before: Config, reread: Archive, after: Config) -> list[Curves]:
-    """One for each bag: the open-loop simulation in windows of HORIZON with one configuration and
-    another, and the archive as each of them reads it."""
-    known = read.each(_curves, before.dynamics, compiled(before.effects))
-    found = reread.each(_curves, after.dynamics, compiled(after.effects))
-    return [
+def open_loop(archive: Archive, config: Config, free: NDArray[np.bool_] | None = None) -> OpenLoop:
+    """All bags of an archive, which ``config`` has read; components not ``free`` (6,) follow the
+    measurement."""
+    parts = archive.each(_simulated, config.dynamics, compiled(config.effects), free)
+    squares, counts, drawn = zip(*parts)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return OpenLoop(np.sqrt(sum(squares) / sum(counts)), drawn)
+
+
+def _simulated(
+    samples: Samples, model: Model, effects: Acting, free: NDArray[np.bool_] | None
+) -> tuple[Array, int, tuple[Array, Array, Array]]:
+    """Of a bag the sum (6,) of squared errors over so many samples, and what is drawn."""
+    motion, simulated = measured_motion(samples), predicted(model, samples, HORIZON, free, effects)
+    told, keep = samples["measured"], slice(None, None, max(1, len(samples) // _POINTS))
+    with np.errstate(invalid="ignore"):
+        squares = np.sum((simulated - motion)[told] ** 2, axis=0)
+    return squares, int(told.sum()), (samples["t"][keep], motion[keep], simulated[keep])
+
+
+def curves(bags: Sequence[Bag], before: OpenLoop, after: OpenLoop) -> tuple[Curves, ...]:
+    """One for each of the ``bags``, simulated with one configuration and another."""
+    return tuple(
         Curves(bag.path.name, t, measured, simulated, interpolated(later, fitted, t))
         for bag, (t, measured, simulated), (later, _, fitted) in zip(
-            read.bags, known, found, strict=True
+            bags, before.drawn, after.drawn, strict=True
         )
-    ]
-
-
-def _curves(samples: Samples, model: Model, effects: Acting) -> tuple[Array, Array, Array]:
-    keep = slice(None, None, max(1, len(samples) // _POINTS))
-    simulated = predicted(model, samples, HORIZON, None, effects)[keep]
-    return samples["t"][keep], measured_motion(samples)[keep], simulated
-
-
-def open_loop_rmse(
-    archive: Archive, config: Config, free: NDArray[np.bool_] | None = None
-) -> Array:
-    """RMSE (6,) of the open-loop simulation in windows of HORIZON seconds over all bags."""
-    parts = archive.each(_squares, config.dynamics, compiled(config.effects), free)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rmse: Array = np.sqrt(sum(p[0] for p in parts) / sum(p[1] for p in parts))
-    return rmse
+    )
 
 
 def by_chance(
@@ -96,15 +105,6 @@ def by_chance(
 def _is_read(name: str) -> bool:
     effect = EFFECTS.get(name.partition(".")[0])
     return effect is not None and (effect.place == "input" or effect.of_sensors)
-
-
-def _squares(
-    samples: Samples, model: Model, effects: Acting, free: NDArray[np.bool_] | None
-) -> tuple[Array, int]:
-    measured = samples["measured"]
-    with np.errstate(invalid="ignore"):
-        error = predicted(model, samples, HORIZON, free, effects) - measured_motion(samples)
-    return np.sum(error[measured] ** 2, axis=0), int(measured.sum())
 
 
 def _departures(

@@ -11,7 +11,7 @@ from rov_ident.reports import plots
 from rov_ident.reports.html import beside_table, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES
+from rov_ident.sampling.records import HORIZON, VELOCITIES
 
 _BEFORE, _AFTER = "as configured", "retuned"
 _MOST = 4  # bags that are drawn
@@ -84,12 +84,5 @@ def _motion(
     curve: Curves, pair: Sequence[Array], label: str, measured: Array | None, caption: str, key: str
 ) -> str:
     """Six panels of ``pair``, before and after (k, 6)."""
-    svgs = []
-    for i, (name, unit) in enumerate(zip(VELOCITIES, UNITS)):
-        drawn = plots.curves(
-            curve.t, {_BEFORE: pair[0][:, i], _AFTER: pair[1][:, i]}, name, "time [s]",
-            label.format(name=name, unit=unit),
-            measured=None if measured is None else measured[:, i],
-        )  # fmt: skip
-        svgs.append(plots.zoomable(drawn, f"{key}{i}"))
-    return panels(svgs, caption, wide=True)
+    models = dict(zip((_BEFORE, _AFTER), pair, strict=True))
+    return panels(plots.motion_panels(curve.t, models, label, key, measured), caption, wide=True)

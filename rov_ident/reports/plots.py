@@ -139,6 +139,21 @@ def curves(
     return figure
 
 
+def motion_panels(
+    t: Array, models: Mapping[str, Array], label: str, key: str, measured: Array | None = None
+) -> list[str]:
+    """For a page: as :func:`motions`, each velocity apart, by :func:`curves`; ``label`` of the
+    y-axis is filled in with `{name}` and `{unit}`, ``key`` begins the ids."""
+    panels = []
+    for i, name in enumerate("uvwpqr"):
+        columns = {model: y[:, i] for model, y in models.items()}
+        y_label = label.format(name=name, unit="m/s" if i < 3 else "rad/s")
+        behind = None if measured is None else measured[:, i]
+        drawn = curves(t, columns, name, "time [s]", y_label, measured=behind)
+        panels.append(zoomable(drawn, f"{key}{i}"))
+    return panels
+
+
 @styled
 def panel(
     title: str, x_label: str, y_label: str, size: tuple[float, float] = PANEL

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import FrameDefaults, quaternion_to_euler, to_core
+from rov_ident.core.frames import quaternion_to_euler, to_core
 from rov_ident.core.messages import Array, Odometry, Wrench
-from rov_ident.io.bag_reader import Bag, read_messages, select_topics
+from rov_ident.io.bag_reader import ROLE_NAMES, Bag, select_topic
+from rov_ident.io.cdr import ROLE_TYPES
 from rov_ident.io.csv_table import CsvTable, read_csv
-from rov_ident.io.topics import ODOMETRY, POSE, WRENCH, messages, select
+from rov_ident.io.topics import ODOMETRY, POSE, USUAL, WRENCH, messages, select
 
 _RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
@@ -178,15 +179,16 @@ def from_bag(path: Path, config: Config | None = None) -> Zigzag:
         raise UserError(f"{path} has several rudders, {', '.join(steered)}: keep one")
     roles = (ODOMETRY,) if steered else (ODOMETRY, WRENCH)
     if config is None:
-        frames, stream = FrameDefaults(), read_messages(bag, select_topics(bag, roles=roles))
+        config = USUAL
+        found = {r: select_topic(bag, r, ROLE_NAMES[r], ROLE_TYPES[r], "") for r in roles}
+        chosen = {role: topic for role, topic in found.items() if topic}
     else:
-        frames = config.frames
-        stream = messages(bag, select(bag, config, (*roles, POSE)), config)
+        chosen = select(bag, config, (*roles, POSE))
     rows: dict[str, list[tuple[float, float]]] = {ODOMETRY: [], WRENCH: []}
-    for role, message in stream:
+    for role, message in messages(bag, chosen, config):
         if not isinstance(message, Odometry | Wrench):
             continue
-        core = to_core(message, frames)
+        core = to_core(message, config.frames)
         if isinstance(core, Odometry):
             value = float(quaternion_to_euler(core.orientation)[2])
         else:

@@ -9,7 +9,6 @@ import yaml
 
 from rov_ident.config import Config
 from rov_ident.consumer.formats.base import (
-    DIAGONAL,
     Read,
     Written,
     diagonal,
@@ -20,6 +19,7 @@ from rov_ident.consumer.formats.base import (
 )
 from rov_ident.core.errors import UserError
 from rov_ident.core.yaml_file import parse
+from rov_ident.model.coefficients import DIAGONAL
 
 PARAMETERS = {
     "added_mass": DIAGONAL["added_mass"],

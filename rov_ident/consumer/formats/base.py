@@ -15,14 +15,7 @@ import numpy as np
 from rov_ident.config import Config, Thrusters
 from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
-from rov_ident.model.coefficients import AXES, VELOCITIES, Coefficient
-
-DIAGONAL = {
-    "added_mass": tuple(f"{a}_{b}dot" for a, b in zip(AXES, VELOCITIES, strict=True)),
-    "linear": tuple(f"{a}_{b}" for a, b in zip(AXES, VELOCITIES, strict=True)),
-    "quadratic": tuple(f"{a}_{b}{b}" for a, b in zip(AXES, VELOCITIES, strict=True)),
-}
-"""The eighteen coefficients of a diagonal model, each kind in the order X Y Z K M N."""
+from rov_ident.model.coefficients import DIAGONAL, Coefficient
 
 INERTIA = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
 """The place of each element in the tensor, in the order of ``vehicle.inertia``."""
@@ -44,7 +37,7 @@ class Read(NamedTuple):
 
 
 def diagonal(values: Mapping[str, float], kind: str) -> list[float]:
-    """Six numbers of one kind of :data:`DIAGONAL`, zero where the model has no such term."""
+    """Six numbers of one kind of DIAGONAL, zero where the model has no such term."""
     return [values.get(name, 0.0) for name in DIAGONAL[kind]]
 
 

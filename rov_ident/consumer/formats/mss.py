@@ -9,8 +9,8 @@ import re
 import numpy as np
 
 from rov_ident.config import Config
-from rov_ident.consumer.formats.base import DIAGONAL, Written, diagonal, lost_besides, lost_terms
-from rov_ident.model.coefficients import ONE
+from rov_ident.consumer.formats.base import Written, diagonal, lost_besides, lost_terms
+from rov_ident.model.coefficients import DIAGONAL, ONE
 
 
 def write(config: Config) -> Written:

@@ -1,0 +1,120 @@
+"""What the functions of this room are given: files, configurations, channels; and reading them."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident import config as configuration
+from rov_ident.config import Config
+from rov_ident.core.errors import UserError
+from rov_ident.core.threads import one_blas_thread
+from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
+from rov_ident.sampling.records import Record, read_record
+
+CHANNELS: dict[str, tuple[str, ...]] = {
+    **{name: (name,) for name in MOTIONS},
+    "lateral": ("sway", "yaw"),
+    "longitudinal": ("heave", "pitch"),
+}
+"""What can be fitted by itself: single axes, and those that one pair of actuators moves."""
+
+File = str | os.PathLike[str]
+Files = File | Sequence[File]
+
+
+class Progress(Protocol):
+    """Called now and then with what is being done, and the share of it that is, where known."""
+
+    def __call__(self, what: str, share: float | None = None) -> None: ...
+
+
+def silent(what: str, share: float | None = None) -> None:
+    """Tells nobody."""
+
+
+def several(files: Files) -> list[Path]:
+    """The paths of one file or of several, each as :func:`existing` gives it."""
+    one = isinstance(files, str | os.PathLike)
+    return [existing(files)] if one else [existing(file) for file in files]  # type: ignore[arg-type, union-attr]
+
+
+def existing(file: File) -> Path:
+    """The path, with the name of its folder for `.`; UserError where there is nothing."""
+    path = Path(file)
+    if not path.exists():
+        raise UserError(f"{path} cannot be read (No such file or directory): check the path")
+    return path if path.name not in ("", "..") else path.resolve()
+
+
+def load(config: File | Config, node: str = "") -> Config:
+    """Read a parameter file of a vehicle, the one that nodes and commands use.
+
+    Parameters
+    ----------
+    config
+        Path of the YAML file. Vectors in it are in the axes of its key ``vehicle.frame``; those of
+        the Config are always forward-starboard-down, in SI units. A Config is returned as it is.
+    node
+        Name of a node (``rls_node``, ``ukf_node``) whose own section overrides ``/**``.
+
+    Raises
+    ------
+    UserError
+        If a key is missing, of a wrong type or unphysical: one sentence that names it.
+    """
+    return configuration.load(config, node)
+
+
+@one_blas_thread()
+def read(bag: File, config: File | Config, progress: Progress | None = None) -> Record:
+    """Read a bag into samples: all that was measured, on one clock, as the estimators see it.
+
+    Parameters
+    ----------
+    bag
+        Path of an ``.mcap`` file or a rosbag2 directory. Axes of its messages follow their frame
+        ids, or the configuration.
+    config
+        Path of a parameter file, or a Config.
+    progress
+        Called with a sentence and the share (0 to 1) that is done.
+
+    Returns
+    -------
+    Record
+        ``samples`` (k,), a structured array: ``t`` [s] since the first message, ``nu`` (k, 6) [m/s,
+        rad/s] through the water and ``wrench`` (k, 6) [N, N m] in body axes forward-starboard-down,
+        ``orientation`` (k, 4) w x y z, body to north-east-down, and what else `SAMPLE` lists;
+        ``duration`` [s]; ``notes`` on what was refused.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read, lacks a topic or yields no sample.
+    """
+    say, path = progress or silent, existing(bag)
+    return read_record(path, load(config), lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
+
+
+def axes(channels: str) -> NDArray[np.bool_]:
+    """Which axes (6,) the names of channels, divided by commas, mean.
+
+    Raises
+    ------
+    UserError
+        If there is no such channel.
+    """
+    wanted = channels.split(",")
+    if unknown := sorted(set(wanted) - set(CHANNELS)):
+        raise UserError(f"no channel {unknown[0]!r}: use {','.join(CHANNELS)}")
+    names = {axis for name in wanted for axis in CHANNELS[name]}
+    return np.array([name in names for name in MOTIONS])
+
+
+def coefficients() -> tuple[Coefficient, ...]:
+    """Every coefficient a configuration may name, each with ``name``, ``unit``, ``meaning``."""
+    return (*catalogue(), *input_catalogue())
