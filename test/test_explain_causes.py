@@ -12,8 +12,10 @@ from bench.studies.explain import streams_of
 from rov_ident.config import from_parameters, to_parameters
 from rov_ident.discrepancy import extension
 from rov_ident.discrepancy.explain import explain
+from rov_ident.discrepancy.findings import as_the_arm_is_known
 from rov_ident.discrepancy.held_out import Judge, split
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
+from rov_ident.discrepancy.results import Value
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.reading_noise import resting_noise
@@ -116,6 +118,30 @@ def test_late_velocities_are_said_to_be_late(seed):
     (found,) = findings.effects
     assert found.effect == "velocity_latency"
     assert found.parameters["delay"].value == pytest.approx(0.12, abs=0.006)
+
+
+@pytest.mark.parametrize("arm", [0.02, 0.2])
+def test_a_height_is_known_no_better_than_what_it_stands_for(heavy, arm):
+    """Thrust of another size is, to the data, another righting arm, and so is a centre of buoyancy
+    of another height: dz was stated to a hundredth of a millimetre, and a hundred of its standard
+    deviations off. A file that knows both leaves it as it is."""
+    raw = to_parameters(heavy)
+    raw["vehicle"]["cob"] = [0.0, 0.0, -arm]
+    raw["vehicle"]["cob_std"], raw["wrench"] = 0.001, {"scale_std": 0.15}
+    config = from_parameters(raw)
+    raw["vehicle"]["cob_std"], raw["wrench"] = 0.0, {"scale_std": 0.0}
+    dz, scale = {"dz": Value(3e-4, 1e-6, "m")}, {"scale": Value(1.05, 1e-4, "1")}
+
+    def std(effect, parameters, scaled, of=config):
+        (value,) = as_the_arm_is_known(effect, parameters, of, scaled).values()
+        return value.std
+
+    assert std("cog_offset", dz, False) == pytest.approx(np.hypot(0.001, 0.15 * arm), rel=0.02)
+    assert std("cog_offset", dz, True) == 1e-6
+    assert std("thrust_scale", scale, True) == pytest.approx(1.05 * 0.001 / arm, rel=0.02)
+    known = from_parameters(raw)
+    assert std("cog_offset", dz, False, known) == 1e-6
+    assert std("thrust_scale", scale, True, known) == 1e-4
 
 
 def test_what_is_left_is_told():

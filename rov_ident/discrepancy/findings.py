@@ -37,6 +37,7 @@ _ACTS = 0.2  # of the wrench on the axis it acts on most, over the authority: ac
 _PARTIAL = "fitted in its stead, it explains only {:.0f} % of this"
 _COSTLY = "fitted in its stead, it needs more parameters to explain as much"
 _EQUAL = "fits this bag as well"
+_SCALE = "thrust_scale"
 _EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
 
 
@@ -107,6 +108,8 @@ def is_certain(search: Search, last: Fitted, name: str) -> bool:
 def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
     """The finding with the values that all of the data give."""
     parameters = parameters_of(last, search.keys_of(last, found.effect))
+    scaled = _SCALE in last.hypothesis.effects
+    parameters = as_the_arm_is_known(found.effect, parameters, search.config, scaled)
     onset = parameters.get("onset")
     return possibly_earlier(
         dataclasses.replace(
@@ -116,6 +119,28 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
             sentence=sentence(found.effect, parameters, found.gain),
         )
     )
+
+
+def as_the_arm_is_known(
+    effect: str, parameters: Mapping[str, Value], config: Config, scaled: bool
+) -> dict[str, Value]:
+    """Parameters with what the righting arm, and the thrust where no scale of it is in the model
+    (``scaled``), are not known to. With the righting moment, thrust and all coefficients times k
+    nothing moves otherwise (:func:`righting_arm_covariance`): what is off in height or in thrust
+    is, to the data, a height of the centre of gravity, or else that scale."""
+    body, height = config.model.body, config.vehicle_uncertainty.cob_std
+    arm, of_thrust = abs(body.restoring[3, 1]) / body.weight, config.wrench.scale_std
+    out = dict(parameters)
+    if effect == "cog_offset" and not scaled:
+        dz = out["dz"]
+        std = float(np.hypot(dz.std, np.hypot(height, arm * of_thrust)))
+        out["dz"] = dataclasses.replace(dz, std=std)
+    elif effect == _SCALE:
+        scale = out["scale"]
+        share = min(height / max(arm, 1e-9), of_thrust)
+        std = float(np.hypot(scale.std, share * scale.value))
+        out["scale"] = dataclasses.replace(scale, std=std)
+    return out
 
 
 def possibly_earlier(found: Finding) -> Finding:

@@ -48,7 +48,8 @@ class Agreed:
 def agreed(streams: Streams, config: Config) -> Agreed:
     """The streams with what surely differs set right: the rates, or the heading."""
     body = [np.broadcast_to(axis, (len(streams.t), 3)) for axis in np.eye(3)]
-    value, std = _apart(streams, body)
+    between = _between(streams, config)
+    value, std = _apart(streams, between, body)
     value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
     std = std[:3]
     if not value.any():
@@ -62,7 +63,7 @@ def agreed(streams: Streams, config: Config) -> Agreed:
         "set right"
     )
     biased = _noted(streams, _rates(streams, body, value), note)
-    drift = _drift(streams, body) if value[:3].any() else 0.0
+    drift = _drift(streams, between, body) if value[:3].any() else 0.0
     if not drift:
         return Agreed(biased, std, late)
     turned = _turned(streams, -drift)
@@ -97,12 +98,13 @@ def _chosen(biased: Streams, drifts: Streams, config: Config) -> tuple[Streams, 
     return biased, True
 
 
-def _drift(streams: Streams, body: Sequence[Array]) -> float:
+def _drift(streams: Streams, between: Array, body: Sequence[Array]) -> float:
     """The drift [rad/s] of the heading that explains all that the rates (beside being late) have
     beside the turns of the attitude; 0 if none does."""
     down = quaternion_to_matrix(streams.orientation)[:, 2]
-    drift = -float(_apart(streams, [down])[0][0])
-    return drift if drift and not _apart(_turned(streams, -drift), body)[0][:3].any() else 0.0
+    drift = -float(_apart(streams, between, [down])[0][0])
+    turned = _turned(streams, -drift)
+    return drift if drift and not _apart(turned, between, body)[0][:3].any() else 0.0
 
 
 def _turned(streams: Streams, rate: float) -> Streams:
@@ -121,15 +123,37 @@ def _noted(streams: Streams, rates: Array, note: str) -> Streams:
     return dataclasses.replace(streams, nu=nu, notes=(*streams.notes, note))
 
 
-def _apart(streams: Streams, errors: Sequence[Array]) -> tuple[Array, Array]:
+def _between(streams: Streams, config: Config) -> Array:
+    """What the trapezoids of rates at the times of the odometry leave out of each turn (N - 1, 3)
+    [rad], as the gyro sees it, which reads oftener. A bias of it is in both and hence in neither.
+
+    The turn is the integral of the rate and of half the angle so far x rate (Bortz 1971).
+    """
+    if len(streams.imu_t) < 2:
+        return np.zeros((len(streams.t) - 1, 3))
+    t = np.union1d(streams.t, streams.imu_t)
+    first, *_, last = at = np.searchsorted(t, streams.t)
+    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    gyro = interpolated(streams.imu_t, streams.gyro, t) @ mounting.T
+    angle = integral(t, gyro)
+    steps, so_far = np.diff(angle, axis=0), angle[first:last]
+    so_far = so_far - np.repeat(angle[at[:-1]], np.diff(at), axis=0)
+    steps = steps[first:last] + 0.5 * np.cross(so_far, steps[first:last])
+    turn = np.add.reduceat(steps, at[:-1] - first)
+    out: Array = turn - np.diff(integral(streams.t, gyro[at]), axis=0)
+    return out
+
+
+def _apart(streams: Streams, between: Array, errors: Sequence[Array]) -> tuple[Array, Array]:
     """How much of each of P rate ``errors`` (N, 3) [rad/s] the angular velocities have beside the
     turns of the attitude, and how late they are [s]: (P + 1,), zero where that is not sure; and the
-    standard deviations of that, with what was set to zero."""
+    standard deviations of that, with what was set to zero. What rates do ``between`` the times of
+    the odometry (N - 1, 3) is added to them."""
     t, turn = streams.t, turns(streams.orientation)
     value, std, nothing = (np.zeros(len(errors) + 1) for _ in range(3))
     if t[-1] - t[0] < _FEWEST_CLUSTERS * CLUSTER or not turn.any():
         return nothing, nothing
-    turned = np.vstack([np.zeros(3), np.cumsum(turn, axis=0)])
+    turned = np.vstack([np.zeros(3), np.cumsum(turn - between, axis=0)])
     grows = [integral(t, error) for error in errors]
     for _ in range(ROUNDS):
         rate = _rates(streams, errors, value)
@@ -148,6 +172,8 @@ def _apart(streams: Streams, errors: Sequence[Array]) -> tuple[Array, Array]:
     sure = np.where(np.abs(value) > _BIASED * std, value, 0.0)
     std = np.hypot(std, value - sure)
     sure[-1] = np.clip(sure[-1], 0.0, _LATEST)  # a late attitude is no fault of the rates
+    if len(streams.imu_t) > 1:  # nor is what trapezoids leave out between two readings of the gyro
+        sure[-1] *= sure[-1] > 0.5 * np.median(np.diff(streams.imu_t))
     return sure, std
 
 
