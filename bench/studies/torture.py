@@ -24,7 +24,7 @@ from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Message, Odometry, Wrench
 from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Report
-from rov_ident.io.cdr import decode_imu, decode_odometry, decode_wrench, encode
+from rov_ident.io.cdr import DECODERS, ROLE_TYPES, encode
 from rov_ident.sampling.sample import joined
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.simulation.manoeuvres import manoeuvre
@@ -370,16 +370,13 @@ def garbage(_: int, only: str, count: int = 1_000_000) -> Iterator[Row]:
             print(f"    {n:8d}  {name}", file=sys.stderr)
 
 
-_DECODERS = {ODOMETRY: decode_odometry, IMU: decode_imu, WRENCH: decode_wrench}
-
-
 def abused(config: Config, kind: Kind, good: Messages, count: int, seed: int) -> Abuse:
     """An estimator that was given wild messages, as bytes."""
     done = Abuse(OnlineEstimator(config, kind))  # type: ignore[arg-type]
     rng = np.random.default_rng(seed)
     for k, (_, role, data) in enumerate(wild_bytes(good, count, rng)):
         try:
-            message = _DECODERS[role](data)
+            message = DECODERS[ROLE_TYPES[role]](data)
         except ValueError:
             done.undecodable += 1
             continue

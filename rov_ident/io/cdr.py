@@ -6,7 +6,9 @@ its size counted from behind that header. The three messages of the core are a `
 """
 
 import struct
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,9 +54,9 @@ _IMU = _Layout(37, np.r_[3, 0:3, 13:16, 25:28, 16:25:4, 28:37:4], ((16, 3, 10), 
 _WRENCH = _Layout(6, np.r_[0:6])
 _IMU_ORIENTATION_COVARIANCE = 4
 _TWIST = _Layout(6, np.r_[0:6])
-TWIST_WITH_COVARIANCE = _Layout(42, np.r_[0:6, 6:42:7], ((6, 6, 6),))
+_TWIST_WITH_COVARIANCE = _Layout(42, np.r_[0:6, 6:42:7], ((6, 6, 6),))
 _POSE = _Layout(7, np.r_[0:3, 6, 3:6])
-POSE_WITH_COVARIANCE = _Layout(43, _POSE.kept)
+_POSE_WITH_COVARIANCE = _Layout(43, _POSE.kept)
 
 
 class _Fields:
@@ -216,6 +218,30 @@ def decode_voltage(data: bytes) -> float:
     fields = _Fields(data)
     fields.stamp(), fields.string()
     return float(fields.numbers("<f4", 1)[0])
+
+
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    ODOMETRY_TYPE: decode_odometry,
+    IMU_TYPE: decode_imu,
+    WRENCH_TYPE: decode_wrench,
+    "geometry_msgs/msg/Wrench": decode_bare_wrench,
+    "geometry_msgs/msg/TwistStamped": decode_twist,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": partial(
+        decode_twist, layout=_TWIST_WITH_COVARIANCE
+    ),
+    "geometry_msgs/msg/PoseStamped": decode_pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": partial(
+        decode_pose, layout=_POSE_WITH_COVARIANCE
+    ),
+    JOINTS_TYPE: decode_joint_state,
+    "std_msgs/msg/Float64MultiArray": partial(decode_multi_array, kind="<f8"),
+    "std_msgs/msg/Float32MultiArray": partial(decode_multi_array, kind="<f4"),
+    "std_msgs/msg/UInt16MultiArray": partial(decode_multi_array, kind="<u2"),
+    "std_msgs/msg/Int16MultiArray": partial(decode_multi_array, kind="<i2"),
+    "mavros_msgs/msg/RCOut": decode_channels,
+    "sensor_msgs/msg/BatteryState": decode_voltage,
+}
+"""By the name of the type; of joints their efforts."""
 
 
 def encode(message: Message) -> bytes:

@@ -10,8 +10,7 @@ along the shortest rotation.
 
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Mapping
-from functools import partial
+from collections.abc import Collection, Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -41,27 +40,6 @@ _HELD = 1000  # poses and twists that wait for each other
 _NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
 _FRAME = "base_link"  # of a wrench that comes without a frame: the axes are those of frames.body
 
-_DECODERS: dict[str, Callable[[bytes], Any]] = {
-    "nav_msgs/Odometry": cdr.decode_odometry,
-    "sensor_msgs/Imu": cdr.decode_imu,
-    "geometry_msgs/WrenchStamped": cdr.decode_wrench,
-    "geometry_msgs/Wrench": cdr.decode_bare_wrench,
-    "geometry_msgs/TwistStamped": cdr.decode_twist,
-    "geometry_msgs/TwistWithCovarianceStamped": partial(
-        cdr.decode_twist, layout=cdr.TWIST_WITH_COVARIANCE
-    ),
-    "geometry_msgs/PoseStamped": cdr.decode_pose,
-    "geometry_msgs/PoseWithCovarianceStamped": partial(
-        cdr.decode_pose, layout=cdr.POSE_WITH_COVARIANCE
-    ),
-    "sensor_msgs/JointState": cdr.decode_joint_state,
-    "std_msgs/Float64MultiArray": partial(cdr.decode_multi_array, kind="<f8"),
-    "std_msgs/Float32MultiArray": partial(cdr.decode_multi_array, kind="<f4"),
-    "std_msgs/UInt16MultiArray": partial(cdr.decode_multi_array, kind="<u2"),
-    "std_msgs/Int16MultiArray": partial(cdr.decode_multi_array, kind="<i2"),
-    "mavros_msgs/RCOut": cdr.decode_channels,
-    schema.BATTERY_TYPE: cdr.decode_voltage,
-}
 _CHOICES = {
     ODOMETRY: schema.ODOMETRY_TYPES,
     POSE: schema.POSE_TYPES,
@@ -126,7 +104,8 @@ class Reader:
         self.counts: Counter[str] = Counter()
         self._frames = config.frames
         self._is_twist = config.inputs.is_twist
-        self._types = {role: source.type_name for role, source in sources(config.inputs).items()}
+        heard = sources(config.inputs).items()
+        self._types = {role: _full(source.type_name) for role, source in heard}
         self.on_arrival = config.inputs.wrench not in _STAMPED
         self._allocator = None
         if config.inputs.is_allocated:
@@ -142,9 +121,9 @@ class Reader:
         try:
             if role == DRIVE:
                 return [(DRIVE, cdr.decode_joints(data))]
-            message = _DECODERS[type_name](data)
+            message = cdr.DECODERS[type_name](data)
         except ValueError:
-            self.counts[f"{role}: bytes that are no {_full(type_name)}"] += 1
+            self.counts[f"{role}: bytes that are no {type_name}"] += 1
             return []
         if role == BATTERY:
             if knows(message):
@@ -264,7 +243,7 @@ def _hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
 def _foreign(bag: Bag, role: str) -> str:
     """Which topic of a type that is not known may be meant, and what to do with it."""
     words, instead = _FOREIGN.get(role, ((), ""))
-    packages = {name.partition("/")[0] for name in _DECODERS}
+    packages = {name.partition("/")[0] for name in cdr.DECODERS}
     for topic, info in bag.topics.items():
         package, _, kind = info.type_name.partition("/msg/")
         named = any(word in f"{topic} {kind}".lower() for word in words)
@@ -388,7 +367,7 @@ def _seen(bag: Bag, topic: str, kind: str) -> Seen:
     for raw in bag.iter_raw([topic]):
         times.append(raw.log_time)
         if first is None:
-            first = _DECODERS[kind](raw.data)
+            first = cdr.DECODERS[_full(kind)](raw.data)
     span = max(times) - min(times)
     frames = (getattr(first, name, "") for name in ("frame_id", "child_frame_id"))
     return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)
