@@ -106,7 +106,7 @@ def test_one_that_cannot_be_used_is_said(installed, tmp_path, code, words):
     broken = shutil.copytree(installed, tmp_path / "broken")
     (broken / "propeller_reaction.py").write_text(code)
     shutil.rmtree(broken / "__pycache__", ignore_errors=True)
-    run = "from rov_ident.cli import main; raise SystemExit(main(['coefficients']))"
+    run = "from rov_ident.cli import main; raise SystemExit(main(['plan', '--config', 'none']))"
     done = python(run, cwd="/", path=(broken, ROOT))
     assert done.returncode == 2 and words in done.stderr
     assert "propeller-reaction" in done.stderr and "uninstall" in done.stderr
