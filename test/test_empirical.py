@@ -11,7 +11,7 @@ from rov_ident import config as configuration
 from rov_ident.discrepancy.explain import explain
 from rov_ident.effects.empirical import OF, ON
 
-DIVE = hidden.Conditions(duration=80.0, odometry_rate=10.0, imu_rate=50.0)
+DIVE = hidden.Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,6 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
 @pytest.mark.parametrize(
     "name",
     [
-        "thruster_saturation",
         "battery_resistance",
         "thrust_curve",
         "coriolis",
@@ -73,6 +72,7 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
             "heading_offset",
             "oblique_damping",  # in test_tank.py, too
             "thrust_advance",
+            "thruster_saturation",
             "crossflow",
         ),
     ],

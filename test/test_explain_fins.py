@@ -60,7 +60,7 @@ def test_a_fin_without_its_coefficient_is_named(tmp_path):
     for name in ("Y_uudr", "N_uudr"):
         del plain["coefficients"][name]
     path = tmp_path / "dive.mcap"
-    ri.simulate(true, manoeuvre="waypoints", duration=120.0, seed=1, sensors=LEAN).save(path)
+    ri.simulate(true, manoeuvre="waypoints", duration=70.0, seed=1, sensors=LEAN).save(path)
     found = ri.explain(path, configuration.from_parameters(plain)).findings
     names = {name for f in found.effects if f.effect == "fin_lift" for name in f.parameters}
     assert "N_uudr" in names

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from tiers import more
 
 from rov_ident.api.functions import fit
 from rov_ident.config import from_parameters, to_parameters
@@ -242,7 +243,7 @@ def test_a_value_that_a_bound_made_is_not_what_the_data_tell(fits):
     assert told["coefficients"][found.names[known]]["identifiable"] is False
 
 
-@pytest.mark.parametrize("estimator", ["rls", "ml"])
+@pytest.mark.parametrize("estimator", ["rls", *more("ml")])
 def test_a_velocity_sensor_that_pose_and_imu_contradict_is_told(folder, heavy, estimator):
     """To the dynamics it is as if the coefficients were others."""
     found = []
