@@ -1,9 +1,8 @@
 """Fixtures, and the tiers of the tests.
 
-`make full` runs everything but `study`, which the tests themselves say of some parameters
-(tiers.py). `make test` leaves out `long`, and `make quick` also `slow`, `dds` and `process`. These
-are marked here: the latter two by what a test uses, `long` and `slow` by long.txt and slow.txt,
-which `make tiers` measures anew.
+`make test` runs everything but `study`, which the tests themselves say of some parameters
+(tiers.py). `make quick` also leaves out what is marked here: `dds` and `process` by what a test
+uses, `slow` by slow.txt, which `make tiers` measures anew.
 """
 
 import contextlib
@@ -37,33 +36,24 @@ hypothesis.settings.load_profile("patient")
 # ------------------------------------------------------------------ tiers
 
 
-# Of what these leave out; s of processor that the rest may take.
-BUDGETS = {
-    "long": 720.0,  # `make test`: 8 minutes of two cores, less style, types, and the start
-    "slow": 90.0,  # `make quick`: 45 s of two cores, and as much to start and collect
-}
-
-
-def _listed(tier):
-    """The file that names what a tier leaves out."""
-    return Path(__file__).with_name(f"{tier}.txt")
+SLOW = Path(__file__).with_name("slow.txt")
+QUICK = 90.0  # s of processor for `make quick`: 45 s on two cores, and as much to start and collect
 
 
 def _function(nodeid):
-    """What a line of these files names: a test with all its parameters."""
+    """What a line of slow.txt names: a test with all its parameters."""
     return Path(nodeid.partition("[")[0]).name
 
 
 def pytest_addoption(parser):
-    parser.addoption("--find-slow", action="store_true", help="write long.txt and slow.txt anew")
+    parser.addoption("--find-slow", action="store_true", help="write slow.txt anew (all tests)")
 
 
 def pytest_collection_modifyitems(items):
-    listed = {tier: set(_listed(tier).read_text().split()) for tier in BUDGETS}
+    slow = set(SLOW.read_text().split())
     for item in items:
-        own = {_function(item.nodeid), item.path.name}
-        for tier in (tier for tier, names in listed.items() if own & names):
-            item.add_marker(tier)
+        if {_function(item.nodeid), item.path.name} & slow:
+            item.add_marker("slow")
         names = getattr(item.function, "__code__", None) and item.function.__code__.co_names
         if "domain" in item.fixturenames:
             item.add_marker("dds")
@@ -89,22 +79,18 @@ def pytest_runtest_makereport():
 
 
 def pytest_terminal_summary(config):
-    """The cheapest tests stay in a tier, up to its budget; in the quick one, of those that start
-    nothing."""
+    """Of the tests that start nothing, the quickest stay in the quick tier, up to its budget."""
     if not config.option.find_slow:
         return
-    spent = {tier: Counter() for tier in BUDGETS}
+    spent = Counter()
     stats = config.pluginmanager.get_plugin("terminalreporter").stats
     for report in itertools.chain(*stats.values()):
-        if isinstance(report, pytest.TestReport):
-            alone = not {"dds", "process"} & set(report.keywords)
-            for tier in BUDGETS if alone else ["long"]:
-                spent[tier][_function(report.nodeid)] += report.processor
-    for tier, budget in BUDGETS.items():
-        cheapest = sorted(spent[tier], key=spent[tier].__getitem__)
-        total = itertools.accumulate(spent[tier][name] for name in cheapest)
-        left_out = [name for name, so_far in zip(cheapest, total, strict=True) if so_far > budget]
-        _listed(tier).write_text("\n".join(sorted(left_out)) + "\n")
+        if isinstance(report, pytest.TestReport) and not {"dds", "process"} & set(report.keywords):
+            spent[_function(report.nodeid)] += report.processor
+    quickest = sorted(spent, key=spent.__getitem__)
+    total = itertools.accumulate(spent[name] for name in quickest)
+    slow = [name for name, so_far in zip(quickest, total, strict=True) if so_far > QUICK]
+    SLOW.write_text("\n".join(sorted(slow)) + "\n")
 
 
 # ------------------------------------------------------------------ vehicles

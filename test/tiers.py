@@ -1,4 +1,4 @@
-"""The last tier: what `make studies` runs and `make full` leaves out."""
+"""The third tier: what `make studies` runs and `make test` leaves out."""
 
 import pytest
 
