@@ -23,10 +23,12 @@ from rov_ident.discrepancy.hypothesis import (
     Hypothesis,
     Key,
     at_bound,
+    axis_of,
     bounds,
     effect_of,
     onsets,
     reach,
+    role_of,
 )
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import FIRST_NOISE, Fitted, fit, refit, with_best_onsets
@@ -228,23 +230,30 @@ class Search:
         h = now.hypothesis.having(candidate.start)
         known = self._ends.get(frozenset(h.keys))
         there = refit(h, now.linearisation, known=known)
-        if there is not None and candidate.name in HULL_DAMPING:
+        apart = any(p.axis for p in EFFECTS[candidate.name].parameters)
+        if there is not None and (apart or candidate.name in HULL_DAMPING):
             there = self._pruned(there, now)
-        if there is None or there.hypothesis.keys == now.hypothesis.keys:
+        if there is None:
+            return None
+        new = [k for k in there.hypothesis.keys if k not in now.hypothesis.values]
+        if not any(role_of(k) in ("amplitude", "limit") for k in new):
             return None
         return there if known is not None else with_best_onsets(there, candidate.start)
 
     def _pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
-        """Without the coefficients beyond ``base`` that are not worth their penalty."""
+        """Without the coefficients, and parameters of single axes, beyond ``base`` that are not
+        worth their penalty, or that a single window tells: those of an axis that is hardly driven.
+        """
         while fitted is not None:
             h, linear = fitted.hypothesis, fitted.linear
-            added = [k for k in h.keys if k not in base.hypothesis.values and k[0] == COEFFICIENTS]
-            variance = np.diag(scaled_inverse(linear.normal))
-            std = np.sqrt(np.where(variance > 0.0, variance, np.inf))  # zero: nothing is known
+            added = [k for k in h.keys if k not in base.hypothesis.values and axis_of(k)]
+            variance = fitted.inflation * np.diag(scaled_inverse(linear.normal))
+            variance = np.where(variance > 0.0, variance, np.inf)  # zero: nothing is known
+            variance = np.maximum(variance, np.diag(fitted.covariance))
             gains = [
-                (h.values[k] - bounds(k)[0]) ** 2 / std[linear.index([k])[0]] ** 2 for k in added
+                (h.values[k] - bounds(k)[0]) ** 2 / variance[linear.index([k])[0]] for k in added
             ]
-            if min(gains, default=np.inf) > PENALTY * fitted.inflation:
+            if min(gains, default=np.inf) > PENALTY:
                 return fitted
             fitted = refit(h.without([added[int(np.argmin(gains))]]), fitted.linearisation)
         return None
