@@ -242,14 +242,16 @@ class Search:
 
     def _pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
         """Without the coefficients, and parameters of single axes, beyond ``base`` that are not
-        worth their penalty, or that a single window tells: those of an axis that is hardly driven.
+        worth their penalty. Of the parameters of an effect a single window is not enough, as of an
+        axis that is hardly driven; the drag of a hull is there anyway.
         """
         while fitted is not None:
             h, linear = fitted.hypothesis, fitted.linear
             added = [k for k in h.keys if k not in base.hypothesis.values and axis_of(k)]
             variance = fitted.inflation * np.diag(scaled_inverse(linear.normal))
             variance = np.where(variance > 0.0, variance, np.inf)  # zero: nothing is known
-            variance = np.maximum(variance, np.diag(fitted.covariance))
+            by_window = np.array([k[0] != COEFFICIENTS for k in linear.keys])
+            variance = np.maximum(variance, by_window * np.diag(fitted.covariance))
             gains = [
                 (h.values[k] - bounds(k)[0]) ** 2 / variance[linear.index([k])[0]] for k in added
             ]
