@@ -267,8 +267,7 @@ def _unknown_force(kind, axis, p, t, position, r, nu, out):
         w = 2.0 * math.pi * p[1] * t
         out[axis] += p[0] * (math.sin(w + p[2]) + 0.6 * math.sin(0.37 * w + p[3]))
     elif kind == CROSS:
-        other = 5 if axis == 1 else 1
-        out[axis] -= p[0] * v * abs(nu[other])
+        out[axis] -= p[0] * v * abs(nu[1])
     elif kind == REACTION:
         out[axis] += p[0] * abs(nu[0]) * nu[0]
     elif kind == HEADING:

@@ -509,7 +509,7 @@ UNKNOWN: dict[str, Unknown] = {
     "mooring": Unknown(fossen.SPRING, "XY", ("position",), 0.3, "a spring to a line in the world"),
     "shaking": Unknown(fossen.SHAKE, "XYKMN", ("time",), 0.3, "a periodic force in body axes"),
     "drift": Unknown(fossen.DRIFT, "XYZN", ("time",), 0.2, "a force that wanders over minutes"),
-    "cross_damping": Unknown(fossen.CROSS, "YN", ("r", "v"), 0.8, "Y by v|r|, N by r|v|"),
+    "cross_damping": Unknown(fossen.CROSS, "N", ("r", "v"), 0.8, "N by r|v|"),
     "reaction": Unknown(fossen.REACTION, "KN", ("u",), 0.6, "a moment by |u|u"),
     "heading_moment": Unknown(
         fossen.HEADING, "N", ("heading",), 0.25, "a yaw moment by sin of heading"

@@ -551,6 +551,7 @@ def report(lines: Mapping[str, list[Line]], bars: Bars) -> None:
     _curve(lines.get("curve", []))
     _confusion([line for t in ("medium", "weak") for line in lines.get(t, [])])
     _parameters(lines, bars)
+    _without_a_name(lines.get("unknown", []), bars)
     _seconds(lines)
 
 
@@ -613,6 +614,24 @@ def _parameters(lines: Mapping[str, list[Line]], bars: Bars) -> None:
          "gain, of the true model's", "bags that reach 95 % of it"],
         rows,
     )  # fmt: skip
+
+
+def _without_a_name(lines: Iterable[Line], bars: Bars) -> None:
+    """How much of the gain of the true wrench is reached where no effect of the library is like it,
+    by whatever is named."""
+    shares: dict[str, list[float]] = {}
+    for line in lines:
+        if "found" in line:
+            most = max((f["gain"] for f in line["found"]), default=0.0)
+            shares.setdefault(line["name"], []).append(min(most / line["gain"][0], 1.0))
+    if not shares:
+        return
+    print("\n## Gain of what has no name, of the true wrench's (bar 80 %)")
+    rows = []
+    for name, of in {**shares, "all": sum(shares.values(), [])}.items():
+        mean = bars.check(np.mean(of) >= 0.8, f"{100 * np.mean(of):.0f} %", f"{name}: gain")
+        rows.append([name, len(of), mean, f"{100 * min(of):.0f} %"])
+    table(["hidden", "bags", "mean", "least"], rows)
 
 
 def _coverage(lines: Iterable[Line]) -> tuple[list[bool], list[float]]:

@@ -2,8 +2,9 @@
 
 For each axis of the body and of the world all variables, and pairs of them, are scored on the
 linearisation of the fit by a few polynomials; of the best few a penalised spline (Eilers and Marx
-1996) is fitted, its smoothness by cross-validation over windows. The best becomes the effect
-``empirical``: its shape then stays, and its scale is a parameter like any other.
+1996) is fitted, its smoothness by cross-validation over windows; that of a velocity may jump where
+this changes its sign. The best becomes the effect ``empirical``: its shape then stays, and its
+scale is a parameter like any other.
 """
 
 import dataclasses
@@ -65,6 +66,8 @@ class Shape:
         """(n, n) of the weights: of second differences, and a little of their size."""
         if not self.second:
             rough = _roughness(ALONE, _wraps(self.first))
+            if _may_jump(self.first):
+                rough = np.pad(rough, (0, 1))
         else:
             one, two = (_roughness(EACH, _wraps(v)) for v in (self.first, self.second))
             rough = np.kron(one, np.eye(EACH)) + np.kron(np.eye(EACH), two)
@@ -73,6 +76,10 @@ class Shape:
 
 def _wraps(variable: int) -> bool:
     return variable in (HEADING, TIME)
+
+
+def _may_jump(variable: int) -> bool:
+    return 0 < variable < ROLL
 
 
 def _roughness(count: int, wraps: bool) -> Array:
@@ -91,7 +98,8 @@ def found(problem: WindowedProblem, now: Fitted) -> Fitted | None:
     both = [[s for s in scored if bool(s.second) == pair][:_FITTED] for pair in (False, True)]
     for shape in itertools.chain(*both):
         gain = _penalised(problem, now, shape)[1]
-        sure = float(gain.sum() / max(gain.std(ddof=1) * np.sqrt(len(gain)), 1e-9))
+        most = np.sort(gain)[:-1]  # without the window that gains most, of which one is by chance
+        sure = float(most.sum() / max(most.std(ddof=1) * np.sqrt(len(most)), 1e-9))
         worth = float(gain.sum()) * (_PLAINER if shape.second else 1.0)
         if sure > _SURE and (best is None or worth > best[0]):
             best = worth, shape
@@ -193,7 +201,7 @@ def _scored(problem: WindowedProblem, now: Fitted) -> list[Shape]:
         peaks = line.frequencies(1, axis if axis < 6 else None)
         if peaks:
             there[TIME], ends[TIME] = _values(problem, now, TIME, axis), np.array([0, 1 / peaks[0]])
-        columns = {v: _polynomials(x, ends[v], _wraps(v)) for v, x in there.items()}
+        columns = {v: _polynomials(v, x, ends[v]) for v, x in there.items()}
         scores += _gains(line, axis, columns, ends, _direction(problem, axis))
     return [shape for _, shape in sorted(scores, key=lambda s: -s[0])]
 
@@ -205,14 +213,20 @@ def _ends(variable: int, x: Array) -> Array:
     return np.array([low, max(high, low + 1e-6)])
 
 
-def _polynomials(x: Array, ends: Array, wraps: bool) -> Array:
-    """(K, _DEGREE) of a variable: Chebyshev's, or sines; the first two also for pairs."""
+def _polynomials(variable: int, x: Array, ends: Array) -> Array:
+    """Columns (K, _DEGREE) of a variable: Chebyshev's, or sines; the first two also for pairs. A
+    jump is one more."""
     y = (x - ends[0]) / (ends[1] - ends[0])
-    if wraps:
+    if _wraps(variable):
         angles = 2.0 * np.pi * y[:, None] * [1, 1, 2, 2, 3]
         return np.where([True, False, True, False, True], np.sin(angles), np.cos(angles))
     angle = np.arccos(np.clip(2.0 * y - 1.0, -1.0, 1.0))
-    return np.cos(angle[:, None] * np.arange(1, _DEGREE + 1))
+    smooth = np.cos(angle[:, None] * np.arange(1, _DEGREE + 1))
+    return np.column_stack([smooth, _jumps(x, ends)]) if _may_jump(variable) else smooth
+
+
+def _jumps(x: Array, ends: Array) -> Array:
+    return np.array([effect.jump(value, *ends) for value in x])
 
 
 def _gains(
@@ -227,7 +241,8 @@ def _gains(
         forces += list(x.T)
     for v, w in itertools.combinations(columns, 2):
         both = [a * b for a in columns[v].T[:2] for b in columns[w].T[:2]]
-        of[v, w] = of[v, 0] + of[w, 0] + list(range(len(forces), len(forces) + len(both)))
+        of[v, w] = [*of[v, 0][:_DEGREE], *of[w, 0][:_DEGREE]]
+        of[v, w] += range(len(forces), len(forces) + len(both))
         forces += both
     every = np.stack(forces, axis=1)
     s = line.sensitivity_to(direction[:, :, None] * every[:, None, :])
@@ -253,7 +268,8 @@ def _basis(problem: WindowedProblem, now: Fitted, shape: Shape) -> Array:
             out[k, np.arange(i, i + 4) % count] = weights
         tables.append(out)
     if len(tables) == 1:
-        return tables[0]
+        jumps = [_jumps(x, shape.ends[0])] if _may_jump(shape.first) else []
+        return np.column_stack([*tables, *jumps])
     return np.einsum("ki,kj->kij", *tables).reshape(len(tables[0]), -1)
 
 

@@ -178,10 +178,7 @@ def explain(
     validate = None if validate is None else turned[-1]
     streams, to_fit, held = _divided(bags, validate)
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
-    rates_std = np.max([r.std for r in rates], axis=0)
-    choice = sensor_choice.chosen(
-        streams, to_fit, judged, to_judge, config, rates_std, any(headings)
-    )
+    choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config, any(headings))
     of_sensors = sensor_findings(
         streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
         choice.alternatives, choice.fixed, as_headed, choice.unsure,
@@ -386,6 +383,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     rivals = {added_effect(rest, f): f for f in search.fit_best(rest, candidates)}
     for rival, fitted in rivals.items():
         as_good = rest.squares - fitted.squares >= _AS_GOOD * (rest.squares - term.squares)
+        as_good = as_good and not judge.surely_better(term.hypothesis, fitted.hypothesis)
         as_good = as_good or judge.better(fitted.hypothesis, term.hypothesis)
         if as_good and search.is_determined(rest, fitted) and fitted.squares < best.squares:
             best, name = fitted, rival

@@ -23,7 +23,7 @@ from rov_ident.discrepancy.results import Alternative, Change, Finding, Gain, Re
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
-from rov_ident.discrepancy.sensor_choice import HEADING, NOISE, with_noise
+from rov_ident.discrepancy.sensor_choice import BIAS, HEADING, NOISE, with_noise
 from rov_ident.discrepancy.windowed_problem import Spans
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -94,6 +94,10 @@ def _alternatives(
         else:
             why = _COSTLY if share > _ALL else _PARTIAL.format(100 * share)
         found.append((share, Alternative(rival, why)))
+    ahead = search.cost(trial.rest, final) - best - VERY_STRONG
+    if 0.0 < ahead < trial.rest.squares_of_biases / final.inflation:
+        separable = False
+        found.append((1.0, Alternative(BIAS, _EQUAL)))
     told = [a for _, a in sorted(found, key=lambda x: -x[0]) if separable or a.why_not == _EQUAL]
     return tuple(told), separable
 

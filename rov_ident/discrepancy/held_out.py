@@ -161,6 +161,11 @@ class Judge:
         a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
         return bool(log_ratio(a, b).sum() < 0.0)
 
+    def surely_better(self, rival: Hypothesis, h: Hypothesis) -> bool:
+        """The same beyond chance."""
+        a, b = (self.summed(x)[:, self.free] for x in (rival, h))
+        return surely_less(a, b)
+
     def summed(self, h: Hypothesis) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
         return np.stack([np.bincount(self._chunk, x) for x in self.squares(h).T], axis=1)

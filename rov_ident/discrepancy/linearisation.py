@@ -201,6 +201,15 @@ class Linearisation:
             part -= j @ (matrix @ (j.T @ part))
         return columns if self.more is None else self.more.whitening @ columns
 
+    def of_biases(self) -> Array:
+        """Columns (6 N, 3): biases of the angular velocities, each as large as it may be, in the
+        residuals, what is taken for the initial velocities with them."""
+        biases = np.zeros((*self._weight.shape, 3))
+        biases[:, 3:] = np.diag(self.problem.streams.rates_std)
+        columns = self._whitened((biases * self._weight[:, :, None]).reshape(-1, 3))
+        self._eliminate(columns)
+        return columns
+
     def having(self, keys: Sequence[Key], columns: Array) -> LinearProblem:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
         cross, gradient = self.columns.T @ columns, self._gradient(columns)

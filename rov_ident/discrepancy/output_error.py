@@ -88,6 +88,15 @@ class Fitted:
         return self.rss - float(self.noise_squares.mean())
 
     @cached_property
+    def squares_of_biases(self) -> float:
+        """What biases of the angular velocities, each no larger than it may be, would take off the
+        squared residuals beside the parameters."""
+        base, columns = self.linearisation.columns, self.linearisation.of_biases()
+        columns -= base @ scaled_solve(self.linear.normal, base.T @ columns, 1e-9)
+        normal, slope = columns.T @ columns, columns.T @ self.linearisation.error
+        return float(slope @ np.linalg.solve(normal + self.inflation * np.eye(3), slope))
+
+    @cached_property
     def inflation(self) -> float:
         """The variance inflation over all parameters."""
         return variance_inflation(self.linear, np.arange(len(self.linear.keys)))
@@ -96,7 +105,8 @@ class Fitted:
     def covariance(self) -> Array:
         """Covariance (P, P), with correlated residuals allowed for: the mean of that of white
         residuals times their common inflation, which varies little, and the jackknife over windows,
-        which knows where each parameter comes from. Onsets are taken as known (:func:`onset_std`).
+        which knows where each parameter comes from; and with what biases of the angular velocities
+        would make of it, which all windows share. Onsets are taken as known (:func:`onset_std`).
         """
         linear, at = self.linear, self._smooth
         wide = variance_inflation(linear, at) * scaled_inverse(linear.normal[np.ix_(at, at)])
@@ -105,8 +115,10 @@ class Fitted:
         if w >= _FEWEST_CLUSTERS:
             few = (stdtrit(w - 1, 0.975) / 1.96) ** 2  # Student's: the scatter of few is uncertain
             wide = 0.5 * (wide + few * (w - 1) / w * moves.T @ moves)
+        biases = self.linearisation.columns[:, at].T @ self.linearisation.of_biases()
+        moves = scaled_solve(linear.normal[np.ix_(at, at)], biases, 1e-9)
         out = np.zeros_like(linear.normal)
-        out[np.ix_(at, at)] = wide
+        out[np.ix_(at, at)] = wide + moves @ moves.T
         return out
 
     def leave_one_out(self) -> Array:

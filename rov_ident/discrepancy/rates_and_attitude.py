@@ -35,12 +35,11 @@ _LATEST = 1.0  # s; as late as velocities may be
 
 @dataclass(frozen=True)
 class Agreed:
-    """Streams whose angular velocities are those of the attitude, but for a bias of ``std`` (3,)
-    [rad/s]; whether they were later than the odometry's rate can hide; and whether a bias was taken
-    off that may be a heading's drift."""
+    """Streams whose angular velocities are those of the attitude, but for a bias of ``rates_std``;
+    whether they were later than the odometry's rate can hide; and whether a bias was taken off that
+    may be a heading's drift."""
 
     streams: Streams
-    std: Array
     late: bool = False
     may_drift: bool = False
 
@@ -51,9 +50,10 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     between = _between(streams, config)
     value, std = _apart(streams, between, body)
     value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
-    std = std[:3]
+    if std.any():
+        streams = dataclasses.replace(streams, rates_std=std[:3])
     if not value.any():
-        return Agreed(streams, std)
+        return Agreed(streams)
     late = bool(value[3] > 0.5 * np.median(np.diff(streams.t)))
     biases = [f"{c} {bias:.2g}" for c, bias in zip("pqr", value) if bias]
     told = [f"{', '.join(biases)} rad/s too much"] if biases else []
@@ -65,7 +65,7 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     biased = _noted(streams, _rates(streams, body, value), note)
     drift = _drift(streams, between, body) if value[:3].any() else 0.0
     if not drift:
-        return Agreed(biased, std, late)
+        return Agreed(biased, late)
     turned = _turned(streams, -drift)
     note = (
         f"the heading of the odometry's attitude drifts by {drift:.2g} rad/s beside its angular "
@@ -73,7 +73,7 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     )
     drifts = _noted(turned, _rates(turned, body, value * [0.0, 0.0, 0.0, 1.0]), note)
     streams, may_drift = _chosen(biased, drifts, config)
-    return Agreed(streams, std, late, may_drift)
+    return Agreed(streams, late, may_drift)
 
 
 def _chosen(biased: Streams, drifts: Streams, config: Config) -> tuple[Streams, bool]:

@@ -97,21 +97,19 @@ def chosen(
     judged: Streams,
     held: Spans,
     config: Config,
-    rates_std: Array,
     turned: bool = False,
 ) -> Choice:
     """The effects that the streams support in the ``spans``, by what they do in the spans ``held``
-    of the streams ``judged``. The attitude knows angular rates to ``rates_std`` (3,) [rad/s].
-    ``turned``: the heading is off, by what several records say."""
+    of the streams ``judged``. ``turned``: the heading is off, by what several records say."""
     data = Data(streams, spans, judged, held, config)
     found, std = sensor_consistency.search(streams, config, spans)
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
-    return _beside_tilt(data, _without_refuted(data, choice), rates_std)
+    return _beside_tilt(data, _without_refuted(data, choice))
 
 
-def _beside_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
+def _beside_tilt(data: Data, choice: Choice) -> Choice:
     """What the attitude is needed for is known as well as the attitude: tilted by delta, it makes
     delta x f of a bias of the accelerometer and delta x omega of a gyro's, of the mean f and omega,
     and turns a velocity sensor that is compared with positions. So an effect is none if it is no
@@ -120,7 +118,7 @@ def _beside_tilt(data: Data, choice: Choice, rates_std: Array) -> Choice:
     tilt = config.odometry.attitude_std
     turning = tilt * _across(streams.nu[:, 3:].mean(axis=0))
     wider = {
-        BIAS: [*(tilt * _across(_weight(data))), *np.hypot(rates_std, turning)],
+        BIAS: [*(tilt * _across(_weight(data))), *np.hypot(streams.rates_std, turning)],
         MOUNTING: [tilt * streams.has_pose] * 2 + [0.0],
     }
     for name, values in choice.sensors.items():

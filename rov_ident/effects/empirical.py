@@ -2,8 +2,10 @@
 
 ``scale sum_ij w_ij B_i(a) B_j(b)``, with cubic B-splines B whose knots lie evenly between ``low``
 and ``high`` of each variable; beyond them the function keeps its value. The heading and the time in
-a period close upon themselves. On axes of the body, or along an axis of the world. Numbers of axes
-and variables are their places in :data:`ON` and :data:`OF`; the weights are N or N m.
+a period close upon themselves. A function of a velocity alone may also jump where that changes its
+sign, as dry friction does, which splines would need ten times as many knots for. On axes of the
+body, or along an axis of the world. Numbers of axes and variables are their places in :data:`ON`
+and :data:`OF`; the weights are N or N m.
 """
 
 import math
@@ -15,7 +17,8 @@ ON = ("X", "Y", "Z", "K", "M", "N", "north", "east", "down")
 VELOCITY, ANGLE, PLACE = ("u", "v", "w", "p", "q", "r"), ("roll", "pitch", "heading"), ON[6:8]
 OF = ("nothing", *VELOCITY, *ANGLE, *PLACE, "depth", "thrust", "time")
 ROLL, PITCH, HEADING, NORTH, THRUST, TIME = 7, 8, 9, 10, 13, 14
-ALONE, EACH = 24, 6  # weights of a function of one variable; for each of two
+ALONE, EACH = 24, 6  # splines of a function of one variable; for each of two
+_WIDTH = 0.03  # of a jump, over the largest velocity: a third of the distance between two knots
 _SHAPE = 8  # parameters before the weights
 
 
@@ -51,6 +54,12 @@ def splines(x, low, high, count, wraps):
     return i, (g * g * g / 6.0, middle[0], middle[1], f * f * f / 6.0)
 
 
+@lean
+def jump(x, low, high):
+    """A jump from -1 to 1 where x changes its sign, steep beside the range of x."""
+    return math.tanh(x / (_WIDTH * max(abs(low), abs(high), 1e-9)))
+
+
 @kernel
 def wrench(p, t, position, nu, rotation, thrust, out):
     axis, first, second = int(p[1]), int(p[2]), int(p[3])
@@ -71,6 +80,8 @@ def wrench(p, t, position, nu, rotation, thrust, out):
                 force += p[_SHAPE + EACH * row + (j + n) % EACH] * a[m] * b[n]
         else:
             force += p[_SHAPE + row] * a[m]
+    if not second and first < ROLL:
+        force += p[_SHAPE + ALONE] * jump(x, p[4], p[5])
     force *= p[0]
     if axis < 6:
         out[axis] += force

@@ -6,7 +6,7 @@ contradicts another shows only before that.
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ class Streams:
     wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; dropped ones are estimated.
     fins and shafts: ``inputs_t`` (I,), inputs (I, 4) of INPUTS, straight from each to the next.
     ``has_pose`` tells whether the positions say anything beside the velocities; ``notes`` say what
-    was left out.
+    was left out. ``rates_std`` (3,) [rad/s]: a bias of the angular velocities is none beyond that.
     """
 
     t: Array
@@ -53,6 +53,7 @@ class Streams:
     inputs_t: Array
     inputs: Array
     notes: tuple[str, ...] = ()
+    rates_std: Array = field(default_factory=lambda: np.zeros(3))
 
     @property
     def has_pose(self) -> bool:
@@ -138,8 +139,11 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     if len(bags) == 1:
         return bags[0], begins
 
-    both: dict[str, Any] = {"notes": tuple(note for bag in bags for note in bag.notes)}
-    for name in (f.name for f in fields(Streams) if f.name != "notes"):
+    both: dict[str, Any] = {
+        "notes": tuple(note for bag in bags for note in bag.notes),
+        "rates_std": np.max([bag.rates_std for bag in bags], axis=0),
+    }
+    for name in (f.name for f in fields(Streams) if f.name not in both):
         shifts = begins if name.endswith("_t") or name == "t" else [0.0] * len(bags)
         both[name] = np.concatenate([getattr(b, name) + s for b, s in zip(bags, shifts)])
     return Streams(**both), begins
