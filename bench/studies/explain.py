@@ -628,7 +628,7 @@ def _without_a_name(lines: Iterable[Line], bars: Bars) -> None:
         return
     print("\n## Gain of what has no name, of the true wrench's (bar 80 %)")
     rows = []
-    for name, of in {**shares, "all": sum(shares.values(), [])}.items():
+    for name, of in {**shares, "all": [x for part in shares.values() for x in part]}.items():
         mean = bars.check(np.mean(of) >= 0.8, f"{100 * np.mean(of):.0f} %", f"{name}: gain")
         rows.append([name, len(of), mean, f"{100 * min(of):.0f} %"])
     table(["hidden", "bags", "mean", "least"], rows)
