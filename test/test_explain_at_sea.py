@@ -31,6 +31,7 @@ from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import Streams, gather
 
 
@@ -162,6 +163,52 @@ def test_a_small_bias_shows_in_brisk_turns_where_the_gyro_reads_oftener(heavy):
     taken = (streams.nu - found.streams.nu)[:, 3:].mean(axis=0)
     np.testing.assert_allclose(taken, bias, atol=1e-4)
     assert found.streams.rates_std.max() < 1e-4 and "late" not in found.streams.notes[-1]
+
+
+BIAS = 0.004  # rad/s
+
+
+def biased(driving, seed):
+    """A dive without an IMU whose angular velocities have a bias, and a configuration."""
+    _, streams, config = streams_of("", driving, seed, 100.0, lambda *_: {})
+    bias = BIAS * np.sign(np.random.default_rng(seed).standard_normal(3))
+    empty, three = np.zeros(0), np.zeros((0, 3))
+    streams = dataclasses.replace(streams, imu_t=empty, gyro=three, specific_force=three)
+    return streams, dataclasses.replace(streams, nu=streams.nu + [0.0, 0.0, 0.0, *bias]), config
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+def test_what_a_bias_of_the_rates_explains_as_well_is_not_sure(seed, monkeypatch):
+    """Where the attitude cannot exclude such a bias; where it can, no bias explains anything."""
+    _, streams, config = biased("six-axis", seed)
+
+    def found(std):
+        known = rates_and_attitude.Agreed(dataclasses.replace(streams, rates_std=np.full(3, std)))
+        monkeypatch.setattr(rates_and_attitude, "agreed", lambda *_: known)
+        (finding,) = explain([streams], config).findings.effects
+        return finding
+
+    assert found(0.0).effect == "asymmetric_damping" and found(0.0).separable
+    unsure = found(BIAS)
+    assert not unsure.separable and "imu_bias" in [a.effect for a in unsure.alternatives]
+
+
+def test_a_bias_of_the_rates_is_in_the_residuals_as_the_covariance_has_it():
+    straight, streams, config = biased("pilot", 3)
+    streams = dataclasses.replace(streams, rates_std=np.full(3, BIAS))
+    spans, bias = split(straight.duration)[0], (streams.nu - straight.nu)[0, 3:]
+    here = Search(straight, config, spans).start()
+    h, starts, noise = here.hypothesis, here.linearisation.starts, here.noise
+    problems = [WindowedProblem(s, spans) for s in (straight, streams)]
+    without, having = (linearise(p, h, starts, noise) for p in problems)
+    expected = having.of_biases() @ (bias / BIAS)
+    # between two messages the attitude is turned by the rates, which makes 2e-4 of it
+    np.testing.assert_allclose(having.error - without.error, expected, atol=1e-3)
+    fitted = [Fitted(h, line, True) for line in (without, having)]
+    wider = np.diag(fitted[1].covariance) / np.diag(here.covariance)
+    yaw = [i for i, (_, name) in enumerate(h.keys) if name == "N_r"]
+    assert fitted[0].squares_of_biases == 0.0 < fitted[1].squares_of_biases
+    assert (wider[yaw] > 1.01).all()
 
 
 def a_configuration():
