@@ -18,8 +18,8 @@ AXES, VELOCITIES = "XYZKMN", "uvwpqr"
 GRAVITY = 9.81
 
 # Effects that the library lacks, by how their force is computed (_unknown_force).
-POWER, FRICTION, FOAM, HALOCLINE, SPRING, SHAKE, DRIFT, CROSS, REACTION, HEADING = range(1, 11)
-BUMP, SLOPE = 11, 12
+POWER, FRICTION, FOAM, HALOCLINE, SPRING, SHAKE, DRIFT, REACTION, HEADING = range(1, 10)
+BUMP, SLOPE = 10, 11
 
 
 # ------------------------------------------------------------------ matrices
@@ -266,8 +266,6 @@ def _unknown_force(kind, axis, p, t, position, r, nu, out):
     elif kind == DRIFT:
         w = 2.0 * math.pi * p[1] * t
         out[axis] += p[0] * (math.sin(w + p[2]) + 0.6 * math.sin(0.37 * w + p[3]))
-    elif kind == CROSS:
-        out[axis] -= p[0] * v * abs(nu[1])
     elif kind == REACTION:
         out[axis] += p[0] * abs(nu[0]) * nu[0]
     elif kind == HEADING:

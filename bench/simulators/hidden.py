@@ -509,7 +509,6 @@ UNKNOWN: dict[str, Unknown] = {
     "mooring": Unknown(fossen.SPRING, "XY", ("position",), 0.3, "a spring to a line in the world"),
     "shaking": Unknown(fossen.SHAKE, "XYKMN", ("time",), 0.3, "a periodic force in body axes"),
     "drift": Unknown(fossen.DRIFT, "XYZN", ("time",), 0.2, "a force that wanders over minutes"),
-    "cross_damping": Unknown(fossen.CROSS, "N", ("r", "v"), 0.8, "N by r|v|"),
     "reaction": Unknown(fossen.REACTION, "KN", ("u",), 0.6, "a moment by |u|u"),
     "heading_moment": Unknown(
         fossen.HEADING, "N", ("heading",), 0.25, "a yaw moment by sin of heading"
@@ -868,8 +867,6 @@ def _foreign(seed: int, name: str | None, strength: float, s: Setting) -> _Forei
         p[1], p[2] = rng.uniform(0.3, 1.5), rng.uniform(-math.pi, math.pi)
     elif kind.kind == fossen.DRIFT:
         p[1], p[2], p[3] = rng.uniform(0.005, 0.02), *rng.uniform(-math.pi, math.pi, 2)
-    elif kind.kind == fossen.CROSS:
-        p[0] /= speed[1] * speed[5]
     elif kind.kind == fossen.REACTION:
         p[0] *= _sign(rng) / speed[0] ** 2
     elif kind.kind == fossen.HEADING:
