@@ -392,7 +392,7 @@ def choice_of(sea, seed):
     """What is believed of the sensors of a pilot's dive."""
     _, streams, config = streams_of(str(sea), "pilot", seed, 80.0, lambda *_: sea)
     spans = split(streams.duration)
-    return sensor_choice.chosen(streams, spans[0], streams, spans[1], config)
+    return sensor_choice.chosen(sensor_choice.Data(streams, spans[0], streams, spans[1], config))
 
 
 @pytest.mark.parametrize(

@@ -167,86 +167,45 @@ def explain(
             "anything"
         )
     say("comparing the sensors", 0.05)
-    rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
-    bags, late = [r.streams for r in rates], any(r.late for r in rates)
-    if validate is not None:
-        validate = rates_and_attitude.agreed(validate, config).streams
-    with_others = [*bags, *([] if validate is None else [validate])]
-    as_headed = joined(bags)[0] if validate is None else validate
-    turned, headings = repetition.turned(with_others, config)
-    bags = turned[: len(bags)]
-    validate = None if validate is None else turned[-1]
-    streams, to_fit, held = _divided(bags, validate)
-    judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
-    choice = sensor_choice.chosen(streams, to_fit, judged, to_judge, config, any(headings))
-    of_sensors = sensor_findings(
-        streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
-        choice.alternatives, choice.fixed, as_headed, choice.unsure,
-    )  # fmt: skip
-    if len(bags) > 1:
-        of_sensors = repetition.of_sensors(bags, config, of_sensors, headings[: len(bags)])
-    sensors = {f.effect: choice.sensors[f.effect] for f in of_sensors if is_practical(f.gain)}
-    recorded = judged, streams
-    streams = sensor_consistency.corrected(streams, sensors)
-    judged = sensor_consistency.corrected(judged, sensors)
-
+    data = _set_right(bags, config, validate)
     say("refitting the coefficients", 0.1)
-    search, start = _with_reading(Search(streams, config, thinned(to_fit)), to_fit)
+    search, start = _with_reading(Search(data.streams, config, thinned(data.to_fit)), data.to_fit)
     retuned, model, residual = _searched(search, start, say)
     say("judging on held-out data", 0.9)
-    judge = Judge(WindowedProblem(judged, to_judge), sensors)
+    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors)
     _judge_effects(search, judge, retuned, model)
     _add_term(search, judge, retuned, model)
+    of_sensors = list(data.findings)
     if search.config is not config:
-        std = sensor_choice.noise_std(streams, search.config.effects[NOISE])
+        std = sensor_choice.noise_std(data.streams, search.config.effects[NOISE])
         of_sensors.append(noise_finding(judge, model.final, config, std))
     given = Hypothesis(config, {})
-    as_recorded = Judge(WindowedProblem(recorded[0], to_judge))
-    baseline = as_recorded.summed(given)
-    written = extension.kept(judge, baseline, model.final.hypothesis)
-    last, notes = _with_all_data(search, streams, model)
-    found = [f for f in of_sensors if is_practical(f.gain)]
+    as_recorded = Judge(WindowedProblem(data.recorded.judged, data.to_judge))
+    written = extension.kept(judge, as_recorded.summed(given), model.final.hypothesis)
+    last, notes = _with_all_data(search, data.streams, model)
     of_dynamics = [with_parameters(search, last, f) for f in model.found]
     if len(bags) > 1:
         say("leaving records out", 0.95)
-        records = repetition.Records(streams, bags, joined(bags)[1])
+        records = repetition.Records(data.streams, data.bags, joined(data.bags)[1])
         of_dynamics = repetition.in_each(search, records, last, of_dynamics)
-    found += of_dynamics
-    if late:  # a filter does more than delay, and what it does besides looks like any cause
-        found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
-    if any(r.may_drift for r in rates):
-        found = list(map(unsure, found))
+    best = given if written.model is None else written.model
+    compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
+    judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
+    rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
+    left = _left(data.judged, rmse[2], judge.rmse_of_noise(best))
+    found = _sure_or_not(data, [f for f in of_sensors if is_practical(f.gain)] + of_dynamics, left)
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
             found[i] = empirical_term.described(f, last.hypothesis)
             residual = residual or [empirical_term.residual(f, last.hypothesis)]
     minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
-    verdict: Verdict = "unexplained" if residual else "explained" if found else "agrees"
-    if verdict == "agrees" and is_practical(judge.gain(search.given, retuned.hypothesis)):
-        verdict = "retuned"
-    best = given if written.model is None else written.model
-    compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
-    judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
-    rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
-    left = _left(judged, rmse[2], judge.rmse_of_noise(best))
-    only_sensors = all(EFFECTS[f.effect].of_sensors for f in found)
-    if any(share > _FAR_OFF or only_sensors for share in left.values()):
-        verdict = "unexplained"
-    # what is left there may have made it
-    found = [unsure(f) if _acts_on(f, left) else f for f in found]
-    extended = config
-    if written.model is not None:
-        values = extension.without_rows(last.hypothesis, written.axes)
-        reads = any(f.effect == NOISE and is_practical(f.gain) for f in of_sensors)
-        if not reads:
-            values = sensor_choice.with_noise(values, config.effects.get(NOISE, {}))
-        lasting = {n: v for n, v in sensors.items() if not (n == HEADING and any(headings))}
-        extended = _extended(values, lasting)
-    everything = WindowedProblem(streams, blocks(streams))
-    notes = [*choice.notes, *notes, *filter(None, [written.note, _told(left)])]
-    notes += [_OWN_HEADINGS] if any(headings) else []
-    notes += [_FILTERED] if late else []
-    notes += [_NO_TORQUE] if streams.guided.any() else []
+    improves = is_practical(judge.gain(search.given, retuned.hypothesis))
+    verdict = _verdict(found, residual, left, improves)
+    everything = WindowedProblem(data.streams, blocks(data.streams))
+    notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
+    notes += [_OWN_HEADINGS] if any(data.headings) else []
+    notes += [_FILTERED] if data.late else []
+    notes += [_NO_TORQUE] if data.streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
     findings = Findings(
@@ -258,17 +217,101 @@ def explain(
         tuple(f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL),
         tuple(residual),
         verdict,
-        (*streams.notes, *notes),
+        (*data.streams.notes, *notes),
     )
     return Explanation(
         findings,
         config,
-        extended,
+        config if written.model is None else _extended(last.hypothesis, written.axes, data, found),
         everything.times,
         everything.measured,
         {label: everything.measured - everything.errors(h) for label, h in compared.items()},
-        to_judge if validate is None else [],
+        data.to_judge if validate is None else [],
     )
+
+
+@dataclass(frozen=True)
+class _Data:
+    """The bags with what their sensors contradict set right: ``streams``, all of them joined, to
+    fit in the spans ``to_fit``, and those ``judged`` in the spans ``to_judge``; the latter as
+    ``recorded``. ``headings`` that were taken off each bag; the ``choice`` of sensor effects, their
+    ``findings``, and those of practical weight, ``sensors``, which were taken off. Whether
+    velocities are ``late``, and whether the heading ``may_drift`` where a gyro was taken for
+    biased."""
+
+    bags: Sequence[Streams]
+    streams: Streams
+    to_fit: Spans
+    judged: Streams
+    to_judge: Spans
+    recorded: sensor_choice.Data
+    headings: Sequence[float]
+    choice: sensor_choice.Choice
+    findings: Sequence[Finding]
+    sensors: Sensors
+    late: bool
+    may_drift: bool
+
+
+def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None) -> _Data:
+    rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
+    bags = [r.streams for r in rates]
+    if validate is not None:
+        validate = rates_and_attitude.agreed(validate, config).streams
+    with_others = [*bags, *([] if validate is None else [validate])]
+    as_headed = joined(bags)[0] if validate is None else validate
+    turned, headings = repetition.turned(with_others, config)
+    bags = turned[: len(bags)]
+    validate = None if validate is None else turned[-1]
+    streams, to_fit, held = _divided(bags, validate)
+    judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
+    recorded = sensor_choice.Data(streams, to_fit, judged, to_judge, config)
+    choice = sensor_choice.chosen(recorded, any(headings))
+    findings = sensor_findings(
+        streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
+        choice.alternatives, choice.fixed, as_headed, choice.unsure,
+    )  # fmt: skip
+    if len(bags) > 1:
+        findings = repetition.of_sensors(bags, config, findings, headings[: len(bags)])
+    sensors = {f.effect: choice.sensors[f.effect] for f in findings if is_practical(f.gain)}
+    return _Data(
+        bags,
+        sensor_consistency.corrected(streams, sensors),
+        to_fit,
+        sensor_consistency.corrected(judged, sensors),
+        to_judge,
+        recorded,
+        headings,
+        choice,
+        findings,
+        sensors,
+        any(r.late for r in rates),
+        any(r.may_drift for r in rates),
+    )
+
+
+def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -> list[Finding]:
+    """What is found, not sure where what the sensors do beside it, or what is ``left``, may have
+    made it."""
+    if data.late:  # a filter does more than delay, and what it does besides looks like any cause
+        found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
+    if data.may_drift:
+        found = list(map(unsure, found))
+    return [unsure(f) if _acts_on(f, left) else f for f in found]
+
+
+def _verdict(
+    found: Sequence[Finding],
+    residual: Sequence[Residual],
+    left: Mapping[str, float],
+    retuning_improves: bool,
+) -> Verdict:
+    only_sensors = all(EFFECTS[f.effect].of_sensors for f in found)
+    if residual or any(share > _FAR_OFF or only_sensors for share in left.values()):
+        return "unexplained"
+    if found:
+        return "explained"
+    return "retuned" if retuning_improves else "agrees"
 
 
 def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams, Spans, Spans]:
@@ -431,12 +474,20 @@ def _with_all_data(search: Search, streams: Streams, model: _Model) -> tuple[Fit
     return last, notes
 
 
-def _extended(h: Hypothesis, sensors: Sensors) -> Config:
-    """The configuration of a hypothesis with what was found."""
+def _extended(h: Hypothesis, kept: Sequence[str], data: _Data, found: Sequence[Finding]) -> Config:
+    """The configuration of a hypothesis with what was found; the rows of the axes ``kept`` are as
+    in the file. A heading that each bag has of its own is in none."""
+    given = data.recorded.config
+    h = extension.without_rows(h, kept)
+    if all(f.effect != NOISE for f in found):
+        h = sensor_choice.with_noise(h, given.effects.get(NOISE, {}))
+    sensors = {n: dict(v) for n, v in data.sensors.items()}
+    if any(data.headings):
+        sensors.pop(HEADING, None)
     config = h.config
     document = configuration.to_parameters(config)
     document["coefficients"] = {**document["coefficients"], **h.coefficients}
-    if effects := h.effects | {name: dict(values) for name, values in sensors.items()}:
+    if effects := h.effects | sensors:
         document["effects"] = effects
     chosen = document.pop("estimate", None)
     extended = configuration.from_parameters(document)

@@ -91,18 +91,10 @@ class Data:
         return [sums[:, i] for i in range(len(of))]
 
 
-def chosen(
-    streams: Streams,
-    spans: Spans,
-    judged: Streams,
-    held: Spans,
-    config: Config,
-    turned: bool = False,
-) -> Choice:
-    """The effects that the streams support in the ``spans``, by what they do in the spans ``held``
-    of the streams ``judged``. ``turned``: the heading is off, by what several records say."""
-    data = Data(streams, spans, judged, held, config)
-    found, std = sensor_consistency.search(streams, config, spans)
+def chosen(data: Data, turned: bool = False) -> Choice:
+    """The effects that the streams support in the spans that are fitted, by what they do in those
+    that are judged. ``turned``: the heading is off, by what several records say."""
+    found, std = sensor_consistency.search(data.streams, data.config, data.spans)
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
