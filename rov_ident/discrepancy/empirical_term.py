@@ -30,7 +30,6 @@ SCALE = NAME, "scale"
 
 _SURE = 2.5  # standard deviations of the mean gain over windows: by chance in one of 160 functions
 # (normal, one-sided), of which six are fitted; held-out data then decide
-_WHITE = 1.5  # variance inflation of what a fit leaves, 1 where that is white: nothing is missing
 _PLAINER = 0.9  # of what a function of two variables gains one of a single one is preferred
 _FITTED = 3  # functions of one variable, and of two, that are fitted as splines; effort
 _LEAST_PROGRESS = 0.99  # of the squared residuals; a round that leaves more is the last
@@ -92,18 +91,23 @@ def _roughness(count: int, wraps: bool) -> Array:
 def found(problem: WindowedProblem, now: Fitted) -> Fitted | None:
     """The fit with the term that predicts windows left out best; None where none surely does."""
     best: tuple[float, Shape] | None = None
-    if now.inflation < _WHITE:
-        return None
     scored = _scored(problem, now)
     both = [[s for s in scored if bool(s.second) == pair][:_FITTED] for pair in (False, True)]
     for shape in itertools.chain(*both):
         gain = _penalised(problem, now, shape)[1]
-        most = np.sort(gain)[:-1]  # without the window that gains most, of which one is by chance
-        sure = float(most.sum() / max(most.std(ddof=1) * np.sqrt(len(most)), 1e-9))
+        sure = max(_standard_scores(gain))
         worth = float(gain.sum()) * (_PLAINER if shape.second else 1.0)
         if sure > _SURE and (best is None or worth > best[0]):
             best = worth, shape
     return None if best is None else _fitted(problem, now, best[1])
+
+
+def _standard_scores(gain: Array) -> tuple[float, float]:
+    """The mean gain of windows (W,) in its standard deviations; and without the window that gains
+    most: next to one that gains twenty times as much, the gain of all others looks like scatter."""
+    of = gain, np.sort(gain)[:-1]
+    first, second = (float(g.sum() / max(g.std(ddof=1) * np.sqrt(len(g)), 1e-9)) for g in of)
+    return first, second
 
 
 def described(of: Finding, h: Hypothesis) -> Finding:
@@ -115,11 +119,13 @@ def described(of: Finding, h: Hypothesis) -> Finding:
 
 
 def residual(of: Finding, h: Hypothesis) -> Residual:
-    """What the term stands for, as what is left is told."""
+    """What the term stands for, as what is left is told: of one along an axis of the world, on the
+    axis that gains most."""
     shape, gain = h.effects[NAME], of.gain
     period = shape["first_high"] if int(shape["first"]) == TIME else 0.0
     share = 1.0 - (gain.rmse_after / gain.rmse_before) ** 2
-    axis = AXES[VELOCITIES.index(gain.component)]
+    on = ON[int(shape["axis"])]
+    axis = on if on in AXES else AXES[VELOCITIES.index(gain.component)]
     return Residual(axis, OF[int(shape["first"])], 1.0 / period if period else None, share)
 
 
