@@ -174,23 +174,28 @@ def simulate(
         return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
     assert bag is not None
     record = read(bag, given, progress)
-    model, effects = given.dynamics, compiled(given.effects)
-    nu = predicted(model, record.samples, math.inf, free, effects)
+    samples = record.samples
+
+    def simulated(horizon: float) -> Array:
+        effects = compiled(given.effects)
+        return predicted(given.dynamics, samples, horizon, free, effects)
+
+    nu = simulated(math.inf)
     if not np.isfinite(nu).all():
         raise UserError(
             f"the simulation diverges on {bag}: check the signs and sizes of the coefficients and "
             "of the wrench"
         )
-    t = record.samples["t"]
+    t = samples["t"]
     return Simulation(
         record.path.name,
         t,
         nu,
         odometry_of(t, nu),
-        measured_motion(record.samples),
+        measured_motion(samples),
         free,
-        score(model, record.samples, math.inf, free, effects),
-        score(model, record.samples, HORIZON, free, effects),
+        score(samples, nu),
+        score(samples, simulated(HORIZON)),
         record.notes,
         record.duration,
     )

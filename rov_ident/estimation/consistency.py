@@ -17,6 +17,7 @@ from rov_ident.core.messages import Array
 from rov_ident.core.states import State
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.records import VELOCITIES
 
 CAUSE = "rov-ident explain looks for the cause"
@@ -92,10 +93,19 @@ class Consistency:
             return "model and data agree"
         return max(failed, key=lambda test: test.value / test.limit).failure
 
-    def of_states(self, states: Iterable[State]) -> tuple[State, ...]:
-        """The states of a fit: nothing has converged where model and data disagree."""
-        doubted = {} if self.consistent else {State.CONVERGED: State.CONVERGING}
-        return tuple(doubted.get(state, state) for state in states)
+    @property
+    def doubt(self) -> str:
+        """Why nothing can have converged, in a few words; empty where something can."""
+        if not self.consistent:
+            return "data and model disagree"
+        return "" if self.judged else "too little motion yet to judge the model"
+
+    def of_states(self, states: Iterable[State], asks: bool = True) -> tuple[State, ...]:
+        """The states of a fit, of which nothing has converged in :attr:`doubt`; least squares never
+        ``asks`` what the motion has beside the model, and is doubted for what it knows alone."""
+        doubted = bool(self.doubt) if asks else not self.consistent
+        lesser = {State.CONVERGED: State.CONVERGING} if doubted else {}
+        return tuple(lesser.get(state, state) for state in states)
 
     def with_open_loop(self, before: Array, after: Array, chance: Array) -> "Consistency":
         """The same, asked also whether a fit predicts worse than what it began with.
@@ -173,12 +183,13 @@ def consistency_of(
     supposed = {".".join(key) for key in config.nuisance_std}
     for i in (i for i, name in enumerate(prior.names) if name in supposed):
         name = prior.names[i]
-        off = abs(values[i] - prior.mean[i]) / prior.std[i]
+        mean, half = prior.mean[i], NORMAL * prior.std[i]
+        off = abs(values[i] - mean) / prior.std[i]
         tests.append(
             Test(
                 f"{_PRIOR}{name}", float(off), SUPPOSED,
                 f"the data ask for {name} = {_told(values[i], prior.units[i])}, which the "
-                f"configuration takes for impossible ({prior.mean[i]:.3g} ± {prior.std[i]:.2g}): "
+                f"configuration takes for impossible ({mean:.3g} ± {half:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
         )  # fmt: skip

@@ -31,6 +31,7 @@ from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.estimation.shared import INFO, noisy_axes, teachers_of, too_noisy
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.sample import believed, joined
 from rov_ident.sampling.sampler import Sampler
 
@@ -51,7 +52,6 @@ EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
 _EXCITED = 0.05  # of the prior variance that this motion alone would remove; page.js has the same
-_QUANTILE = 1.959963984540054  # of the normal distribution, 97.5 %
 
 
 ESTIMATORS: dict[Kind, ModuleType] = {"rls": rls, "ukf": ukf}
@@ -439,7 +439,7 @@ class OnlineEstimator:
             covariance = covariance + arm
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
-        upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
+        upper = np.minimum(values + NORMAL * std, self.prior.upper)
         upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
         return Report(
             self.stamp,
@@ -447,7 +447,7 @@ class OnlineEstimator:
             self.prior.units,
             values,
             std,
-            np.maximum(values - _QUANTILE * std, self.prior.lower),
+            np.maximum(values - NORMAL * std, self.prior.lower),
             upper,
             covariance,
             excitation,
@@ -502,10 +502,8 @@ class OnlineEstimator:
         known = is_known(values[i], std[i], self.prior.std[i])
         if waiting and not (known and consistency.consistent):
             return State.HELD, f"held: {waiting}"
-        if not consistency.consistent and (excited or known):
-            return State.CONVERGING, "converging: data and model disagree"
-        if known and not consistency.judged:
-            return State.CONVERGING, "converging: too little motion yet to judge the model"
+        if consistency.doubt and (known or (excited and not consistency.consistent)):
+            return State.CONVERGING, f"converging: {consistency.doubt}"
         if known:
             return State.CONVERGED, "converged" if excited else "converged: not excited now"
         if excited:

@@ -21,22 +21,14 @@ from rov_ident.core.linalg import interpolated
 from rov_ident.core.states import CONVERGED, State, of_fit
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import SUPPOSED
-from rov_ident.experiment.messages_alone import (
-    BAD,
-    DRIVEN,
-    GOOD,
-    WARNING,
-    Remark,
-    of_dynamics,
-    of_messages,
-)
+from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.offline import archive
-from rov_ident.offline.batch_fit import fit_batch
+from rov_ident.offline.batch_fit import AT_REST, fit_batch
 from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online, thrust_or_mass
 from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
@@ -278,9 +270,9 @@ def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
         text = f"from {low:.2f} to {high:.2f} {unit}" if measured else "velocity not measured"
         text += f", wrench {driven:.2g} {force} rms"
         level = GOOD
-        if driven < DRIVEN * limits[i]:
+        if driven < AT_REST * limits[i]:
             level, text = WARNING, text + ": not driven"
-        elif varied < DRIVEN * limits[i]:
+        elif varied < AT_REST * limits[i]:
             level, text = WARNING, text + ": it hardly changes, so inertia does not show"
         elif measured and min(-low, high) < _ONE_WAY * max(-low, high):
             level, text = WARNING, text + ": one direction only, what is asymmetric does not show"

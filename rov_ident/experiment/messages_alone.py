@@ -16,17 +16,17 @@ from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.model.scales import authority
+from rov_ident.offline.batch_fit import AT_REST
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams, integral
 from rov_ident.sampling.sample import SAMPLE
+from rov_ident.sampling.sampler import LONGEST_INTERVAL
 from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
-_GAP = 0.5  # s without a message, from which the sampler gives up the time between
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
-DRIVEN = 0.05  # of the axis's authority: an RMS wrench below it is that of keeping station
 _DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
 _CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes, ...
@@ -79,8 +79,8 @@ def _rates(streams: Streams) -> list[Remark]:
         rate, gap = 1.0 / float(np.median(steps)), float(steps.max())
         text = f"{rate:.1f} Hz, longest pause {gap:.2f} s"
         level = GOOD
-        if gap > _GAP and name != "wrench":
-            lost = float(steps[steps > _GAP].sum())
+        if gap > LONGEST_INTERVAL and name != "wrench":
+            lost = float(steps[steps > LONGEST_INTERVAL].sum())
             level, text = WARNING, f"{text}; {lost:.1f} s in all are lost to pauses"
         if rate < _SLOW:
             level = WARNING
@@ -196,9 +196,9 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     size = np.sqrt(np.mean(wrench**2, axis=0))
     if is_without_velocity(samples):  # forces drive what is simulated itself
         size[:3] = 0.0
-        if not np.any(size > DRIVEN * authority(config.dynamics)):
+        if not np.any(size > AT_REST * authority(config.dynamics)):
             return []
-    driven = size > DRIVEN * authority(config.dynamics)
+    driven = size > AT_REST * authority(config.dynamics)
     subject, moved = "wrench against motion", wrench - phi[:, :, -1]
     if not driven.any():
         return [Remark(subject, BAD, "no axis is driven: nothing can be identified")]
@@ -234,7 +234,7 @@ def samples_of(streams: Streams) -> NDArray[np.void]:
     )
     at = interpolated(streams.demand_t, impulse, streams.t)
     samples["t"], samples["dt"], samples["nu"] = streams.t, dt, streams.nu
-    samples["restart"] = (dt <= 0.0) | (dt > _GAP)
+    samples["restart"] = (dt <= 0.0) | (dt > LONGEST_INTERVAL)
     samples["wrench"][1:] = np.diff(at, axis=0) / np.maximum(dt[1:, None], 1e-9)
     if len(streams.inputs_t):
         samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, streams.t)

@@ -17,6 +17,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import (
     DRIVE,
     ODOMETRY,
+    SECOND,
     WRENCH,
     Array,
     Joints,
@@ -40,7 +41,6 @@ _DRIVEN = (*_FINS, "rpm")
 NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION, *_DRIVEN)
 
 _FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
-_SECOND = 1_000_000_000  # ns
 _LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
 _IN_RADIANS = (*_VELOCITIES[3:], *_ANGLES, *_FINS)
 _LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
@@ -122,7 +122,7 @@ def import_csv(
     start = min(0.0, float(time[0]))
     if start < 0.0:
         notes.append(f"times begin at {start} s: moved to begin at 1 s")
-    stamps = np.rint((time - start) * _SECOND).astype(np.int64) + _SECOND
+    stamps = np.rint((time - start) * SECOND).astype(np.int64) + SECOND
     linear, angular = log.matrix(_VELOCITIES[:3]), log.matrix(_VELOCITIES[3:])
     orientation, wrapped = _attitude(log, angular, notes)
     position = _position(log, linear, orientation, notes)

@@ -26,7 +26,17 @@ from rov_ident.core.frames import (
     quaternion_to_euler,
     quaternion_to_matrix,
 )
-from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.core.messages import (
+    DRIVE,
+    SECOND,
+    Array,
+    Commands,
+    Message,
+    Odometry,
+    Pose,
+    Twist,
+    Wrench,
+)
 from rov_ident.io import cdr
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
@@ -161,7 +171,7 @@ class Reader:
     def _joined(self, message: Twist | Pose) -> list[tuple[str, Message]]:
         if isinstance(message, Pose):
             if self._poses and message.stamp <= self._poses[-1].stamp:
-                if self._poses[-1].stamp - message.stamp < 1_000_000_000:
+                if self._poses[-1].stamp - message.stamp < SECOND:
                     self.counts["pose: duplicate or backward stamp"] += 1
                     return []
                 self._poses.clear()  # a bag that starts over

@@ -32,7 +32,7 @@ from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Bag, Samples, total
-from rov_ident.offline.fit import IDENTIFIABLE, Fit
+from rov_ident.offline.fit import ASKING, IDENTIFIABLE, Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
@@ -43,7 +43,7 @@ KINDS = ("ls", "iv", "ml")
 _MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
 _GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
-AT_REST = 0.05  # of the axis's authority, rms: the wrench of keeping station, as in `check`
+AT_REST = 0.05  # of the axis's authority, rms: a smaller wrench is that of keeping station
 DRIVEN_UNSEEN = (
     "surge or sway is driven, and no velocity is measured: how fast it goes is unknown, and so are "
     "the moments and the depth that follow from it; drive heave, roll, pitch and yaw while surge "
@@ -165,7 +165,7 @@ def fit_batch(
         units=prior.units,
         values=values,
         covariance=consistency.widened(covariance, prior.std),
-        states=consistency.of_states(states.values()),
+        states=consistency.of_states(states.values(), kind in ASKING),
         given=config,
         fitted=now,
         samples=archive.samples,

@@ -29,6 +29,8 @@ IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have rem
 
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
+ASKING = ("ml", *ESTIMATORS)
+"""Those that ask what the motion has beside the model: least squares takes it all for noise."""
 _SHOWN = 60.0  # s of motion in the picture of a fit
 
 
@@ -100,8 +102,8 @@ class Fit(Shown, Result):
         least squares, which does not ask."""
         if not self.consistency.consistent:
             return f"data and model disagree: {self.consistency.sentence}"
-        asked = self.estimator in ("ml", *ESTIMATORS)
-        return self.consistency.sentence if asked and not self.consistency.judged else ""
+        asks = self.estimator in ASKING
+        return self.consistency.sentence if asks and not self.consistency.judged else ""
 
     def asked(self, tests: Sequence[Test]) -> "Fit":
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
@@ -114,7 +116,7 @@ class Fit(Shown, Result):
             self,
             consistency=consistency,
             covariance=Consistency(tuple(tests)).widened(self.covariance, std),
-            states=consistency.of_states(self.states),
+            states=consistency.of_states(self.states, self.estimator in ASKING),
         )
 
     @property
@@ -275,8 +277,6 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     before, after = open_loop(read, config), open_loop(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
     assert report.consistency is not None
-    if not report.consistency.judged:  # nobody has asked what it leaves of what was learnt last
-        states = [State.CONVERGING if s is State.CONVERGED else s for s in states]
     return Fit(
         estimator=kind,
         names=report.names,

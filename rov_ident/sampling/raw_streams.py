@@ -16,6 +16,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, to_core
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
+from rov_ident.core.noise import second_differences
 from rov_ident.model.coefficients import INPUTS
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.driven import value_of
@@ -78,7 +79,7 @@ class Streams:
         v = np.einsum("kij,kj->ki", quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
         dt = np.diff(self.t)[:, None]
         step = np.diff(self.position[:, :2], axis=0)
-        noise = np.median(np.abs(np.diff(v, 2, axis=0)), axis=0) / np.sqrt(6.0) * np.median(dt)
+        noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(dt)
         rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
         left = [np.median(np.abs(step - dt * rule), axis=0) for rule in rules]
         return bool((np.min(left, axis=0) < _RECKONED * noise).all())

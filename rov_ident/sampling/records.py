@@ -161,18 +161,12 @@ class Score:
     r2: Array
 
 
-def score(
-    model: Model,
-    samples: NDArray[np.void],
-    horizon: float = HORIZON,
-    free: NDArray[np.bool_] | None = None,
-    effects: Acting | None = None,
-) -> Score:
-    """Score the simulation of :func:`predicted` where the velocity was measured: NaN where none
+def score(samples: NDArray[np.void], simulated: Array) -> Score:
+    """Score velocities (k, 6) of :func:`predicted` where the velocity was measured: NaN where none
     was."""
     measured = samples["measured"]
     nu = measured_motion(samples)[measured]
-    error = predicted(model, samples, horizon, free, effects)[measured] - nu
+    error = simulated[measured] - nu
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(np.mean(error**2, axis=0))
         r2 = 1.0 - np.sum(error**2, axis=0) / np.sum((nu - nu.mean(axis=0)) ** 2, axis=0)
