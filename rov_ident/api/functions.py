@@ -140,19 +140,19 @@ def fit(
                 if is_without_velocity(record.samples):
                     raise refusal(record.path.name)
             many = archive.of_records(records)
-            _check(many, given)
+            _refuse_unusable(many, given)
             say("estimating")
             found = fit_online(records, given, estimator)  # type: ignore[arg-type]
             if reference:
                 found.more["reference"] = _reference(paths[0], given, reference, say)
         else:
             many = stack.enter_context(opened(paths, given, say, jobs, dask))
-            _check(many, given)
+            _refuse_unusable(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
-        found = found.asked(_of_velocity([bag.path for bag in many.bags], given))
+        found = found.with_tests(_velocity_sensor_tests([bag.path for bag in many.bags], given))
         if table:
-            found = _beside_the_table(found, given, table)
+            found = _with_table_notes(found, given, table)
         if validate is None:
             return found
         judge = stack.enter_context(opened([existing(validate)], given, say))
@@ -163,7 +163,7 @@ def fit(
         return dataclasses.replace(found, more=found.more | more, judged=curves(*runs))
 
 
-def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
+def _velocity_sensor_tests(paths: Sequence[Path], config: Config) -> list[Test]:
     """What is asked of the velocity sensor by the first messages of each bag: the worst answers."""
     worst: dict[str, Test] = {}
     for path in paths:
@@ -177,7 +177,7 @@ def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
     return list(worst.values())
 
 
-def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:
+def _with_table_notes(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:
     """The fit, saying where its prior is from, and where table and dives exclude each other."""
     prior = prior_of(given)
     of_table = {
@@ -191,7 +191,7 @@ def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fi
     )
 
 
-def _check(many: archive.Archive, config: Config) -> None:
+def _refuse_unusable(many: archive.Archive, config: Config) -> None:
     """UserError where the data are too few, or so wrong that no fit makes sense of them.
 
     k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed.

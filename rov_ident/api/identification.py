@@ -23,7 +23,7 @@ from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.offline.batch_fit import validation
-from rov_ident.offline.fit import Fit, falls
+from rov_ident.offline.fit import Fit, rmse_change
 from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
@@ -85,7 +85,7 @@ class Identification(Shown):
         if self.explanation is not None:
             where, told = "parts of the dives that were held back", self.explanation.sentence
         return (
-            f"{self._doubt}{told} On {self.judge or where}, {falls(before, after)}; "
+            f"{self._doubt}{told} On {self.judge or where}, {rmse_change(before, after)}; "
             f"the data determine {known} of {total} parameters."
         )
 
@@ -252,7 +252,9 @@ def identify(
             left_out[path.name] = found.why
     if not checked:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-        raise UserError(f"no dive is fit for identification: {reasons}{_instead(given, say)}")
+        raise UserError(
+            f"no dive is fit for identification: {reasons}{_suggest_first_dive(given, say)}"
+        )
     judge = Path(validate) if validate else None
     if judge is None and len(checked) > 1:
         judge, _ = min(checked, key=lambda pair: pair[1].duration)
@@ -262,7 +264,7 @@ def identify(
         explanation = explain(used, config, judge, progress=say)
         extended = explanation.findings.verdict in ("explained", "unexplained")
         start = explanation.extended if extended else given
-        explanation = _as_a_start(explanation, extended)
+        explanation = _with_start_notes(explanation, extended)
     fitted = checked[0][1].quick if explanation is None and judge is None else None
     if fitted is None:  # else a single dive without velocity: its check has made this very fit
         fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
@@ -283,7 +285,7 @@ def identify(
     return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
 
 
-def _as_a_start(explanation: Explanation, used: bool) -> Explanation:
+def _with_start_notes(explanation: Explanation, used: bool) -> Explanation:
     """With notes on its configuration that say what that is here: the fit's start, if ``used``."""
     findings = explanation.findings
     notes = tuple(
@@ -294,7 +296,7 @@ def _as_a_start(explanation: Explanation, used: bool) -> Explanation:
     return replace(explanation, findings=replace(findings, notes=notes))
 
 
-def _instead(config: Any, say: Progress) -> str:
+def _suggest_first_dive(config: Any, say: Progress) -> str:
     """The manoeuvre for a vehicle of which nothing is known yet."""
     try:
         return f"; fly instead: {plan(config, progress=say).sentence}"

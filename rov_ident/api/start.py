@@ -127,11 +127,11 @@ def init(
         if progress:
             progress(f"reading {path.name}")
         if path.suffix.lower() in SUFFIXES:
-            _of_log(path, found, vehicle)
+            _add_log(path, found, vehicle)
         elif path.suffix.lower() in _MODELS:
-            _of_model(path, found, vehicle)
+            _add_model(path, found, vehicle)
         else:
-            _of_bag(path, found)
+            _add_bag(path, found)
     text = annotated(found.parameters, found.remarks, _HEAD)
     unknown = tuple(re.findall(r"^ *(\w+): *# UNKNOWN", text, re.MULTILINE))
     if not unknown:  # what is drafted can be read
@@ -139,7 +139,7 @@ def init(
     return Draft(text, unknown, tuple(found.notes), found.unfit)
 
 
-def _of_model(path: Path, found: _Found, vehicle: str) -> None:
+def _add_model(path: Path, found: _Found, vehicle: str) -> None:
     known = not vehicle and path.suffix.lower() != ".urdf"
     base = None if known else configuration.load(shipped(f"config/{vehicle or VEHICLES[0]}.yaml"))
     config, notes = import_model(path, base)
@@ -157,7 +157,7 @@ def _of_model(path: Path, found: _Found, vehicle: str) -> None:
 # ------------------------------------------------------------------ logs of autopilots
 
 
-def _of_log(path: Path, found: _Found, vehicle: str) -> None:
+def _add_log(path: Path, found: _Found, vehicle: str) -> None:
     log = read_log(path)
     frame = int(log.parameters.get("FRAME_CONFIG", -1))
     if not vehicle and frame in _OF_FRAME:
@@ -199,7 +199,7 @@ def _of_log(path: Path, found: _Found, vehicle: str) -> None:
 # ------------------------------------------------------------------ bags
 
 
-def _of_bag(path: Path, found: _Found) -> None:
+def _add_bag(path: Path, found: _Found) -> None:
     bag = Bag(path)
     seen = topics.survey(bag)
     for role, source in seen.sources.items():

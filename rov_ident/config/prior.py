@@ -129,14 +129,14 @@ def rigid_body_covariance(
     """
     known, body = config.vehicle_uncertainty, config.model.body
     masses, moments = _own_inertia(body)
-    if scaled := _scaled(names, values):
+    if scaled := _proportional_to_thrust(names, values):
         # relative to the inertia that the file gives and that does not change with the mass
         of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
     else:
         of_mass = masses
     sources = [{n: known.mass_std * v for n, v in of_mass.items()}]
     sources += [{n: known.inertia_std * moment} for n, moment in moments.items()]
-    return _considered(sources, names, gain)
+    return _consider_covariance(sources, names, gain)
 
 
 def righting_arm_covariance(
@@ -156,8 +156,10 @@ def righting_arm_covariance(
     share = min(std / max(arm, 1e-9), config.wrench.scale_std)
     masses, moments = _own_inertia(body)
     own = masses | moments
-    moved = {n: share * (v - own.get(n, 0.0)) for n, v in _scaled(names, values).items()}
-    return _considered([moved], names, gain)
+    moved = {
+        n: share * (v - own.get(n, 0.0)) for n, v in _proportional_to_thrust(names, values).items()
+    }
+    return _consider_covariance([moved], names, gain)
 
 
 def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
@@ -170,7 +172,7 @@ def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
     )
 
 
-def _scaled(names: tuple[str, ...], values: Array) -> dict[str, float]:
+def _proportional_to_thrust(names: tuple[str, ...], values: Array) -> dict[str, float]:
     """What is proportional to the thrust in the same motion, if its scale is estimated."""
     if THRUST_SCALE not in names:
         return {}
@@ -178,7 +180,7 @@ def _scaled(names: tuple[str, ...], values: Array) -> dict[str, float]:
     return {n: v for n, v in of_all if n == THRUST_SCALE or moves_with_thrust(n)}
 
 
-def _considered(
+def _consider_covariance(
     sources: list[dict[str, float]], names: tuple[str, ...], gain: Array | None
 ) -> Array:
     """The covariance (n, n) of what sources of unit variance do to the estimates."""

@@ -172,7 +172,7 @@ def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyM
     `frame_id` and the world the default one. Frame ids are kept: they name the axes on the wire.
     Variances belong to axes without direction, so no sign touches them.
     """
-    return _turned(message, defaults, _TURNS)
+    return _change_axes(message, defaults, _TURNS)
 
 
 def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> AnyMessage:
@@ -181,7 +181,7 @@ def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> Any
     The frame ids of the message decide in the same way, so that a message is never written with
     axes that its frame ids deny.
     """
-    return _turned(message, FrameDefaults(body, world), _TURNS_BACK)
+    return _change_axes(message, FrameDefaults(body, world), _TURNS_BACK)
 
 
 def body_is_frd(frame_id: str, defaults: FrameDefaults = ROS_DEFAULTS) -> bool:
@@ -194,7 +194,7 @@ def world_is_ned(frame_id: str, defaults: FrameDefaults = ROS_DEFAULTS) -> bool:
     return frame_id.endswith(_NED_SUFFIX) or defaults.world == "ned"
 
 
-def _turned(
+def _change_axes(
     message: AnyMessage, defaults: FrameDefaults, turns: dict[tuple[bool, bool], Array]
 ) -> AnyMessage:
     """The message with axes other than FRD, NED turned, or back, by the ``turns`` of attitudes."""

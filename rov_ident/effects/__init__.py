@@ -33,7 +33,7 @@ from rov_ident.effects.base import (
 from rov_ident.model.equations import RigidBody, add_current
 
 
-def _of_others(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
+def _installed_effects(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
     """Effects that installed packages bring, by the names of their entry points. UserError if one
     is invalid, or its name is taken."""
     names: dict[str, str] = dict.fromkeys(taken, "rov_ident")
@@ -59,7 +59,7 @@ def _library() -> dict[str, Effect]:
         for module in iter_modules(__path__)
         if module.name != "base"
     }
-    return {**dict(_of_others(ours)), **ours}
+    return {**dict(_installed_effects(ours)), **ours}
 
 
 EFFECTS: dict[str, Effect] = _library()  # every effect by the name users give it

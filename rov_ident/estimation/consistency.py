@@ -188,7 +188,7 @@ def consistency_of(
         tests.append(
             Test(
                 f"{_PRIOR}{name}", float(off), SUPPOSED,
-                f"the data ask for {name} = {_told(values[i], prior.units[i])}, which the "
+                f"the data ask for {name} = {_with_unit(values[i], prior.units[i])}, which the "
                 f"configuration takes for impossible ({mean:.3g} ± {half:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
@@ -201,10 +201,9 @@ def consistency_of(
             tests.append(
                 Test(
                     f"bound of {name}", float(beyond[i]), _BEYOND,
-                    f"the data ask for {name} = {_told(values[i], prior.units[i])}, which cannot "
-                    "be: check that wrench, odometry and IMU are stamped by one clock, when "
-                    "measured; "
-                    f"{CAUSE}",
+                    f"the data ask for {name} = {_with_unit(values[i], prior.units[i])}, which is "
+                    "impossible: check that wrench, odometry and IMU are stamped by one clock, at "
+                    f"the time of measurement; {CAUSE}",
                 )
             )  # fmt: skip
     for part, ratio in (sensors or {}).items():
@@ -219,6 +218,6 @@ def consistency_of(
     return Consistency(tuple(tests))
 
 
-def _told(value: float, unit: str) -> str:
+def _with_unit(value: float, unit: str) -> str:
     """A value with its unit, if it has one."""
     return f"{value:.3g} {unit}".removesuffix(" 1")

@@ -22,7 +22,7 @@ from rov_ident.sampling.sample import joined
 # twice as many samples again as come in. "Looking back" has the study.
 _TIMES = (7.5, 15.0, 30.0)
 _PASSES = 4  # two are enough where it ends at all
-_MOVED = 1.0  # standard deviations, by which an estimate may be off in any case
+_LARGEST_CHANGE = 1.0  # standard deviations, by which an estimate may be off in any case
 
 
 class IteratedUpdate:
@@ -66,7 +66,7 @@ class IteratedUpdate:
         this would take minutes.
         """
         about, std = rls.solution_of(task, state)
-        if interpreting() or not self._samples or not _moved(about, self._about, std):
+        if interpreting() or not self._samples or not _differ(about, self._about, std):
             return state
         samples = joined(self._samples)
         for _ in range(_PASSES):
@@ -74,12 +74,12 @@ class IteratedUpdate:
             if again is None:
                 break
             solution, std = rls.solution_of(task, again)
-            if not _moved(solution, about, std):
+            if not _differ(solution, about, std):
                 self._about = about
                 return again
             about = solution
         return state
 
 
-def _moved(a: Array, b: Array, std: Array) -> bool:
-    return bool((np.abs(a - b) > _MOVED * std).any())
+def _differ(a: Array, b: Array, std: Array) -> bool:
+    return bool((np.abs(a - b) > _LARGEST_CHANGE * std).any())

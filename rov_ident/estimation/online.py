@@ -30,9 +30,9 @@ from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
-from rov_ident.estimation.shared import INFO, noisy_axes, teachers_of, too_noisy
+from rov_ident.estimation.shared import INFO, informative_axes, noisy_axes, too_noisy
 from rov_ident.reports.result import NORMAL
-from rov_ident.sampling.sample import believed, joined
+from rov_ident.sampling.sample import after_reset, joined
 from rov_ident.sampling.sampler import Sampler
 
 Kind = Literal["rls", "ukf"]
@@ -186,7 +186,7 @@ class OnlineEstimator:
         self._task = self._module.problem(config)
         self._begin_window()
         self.sampler.configure(config)
-        self._centre(self._present)
+        self._centre(self._effect_values)
 
     def attach(self, monitor: Monitor) -> None:
         """Let a monitor see from now on what the estimator sees."""
@@ -255,7 +255,7 @@ class OnlineEstimator:
         if len(samples) == 0 or not self._enabled:
             return np.zeros(0, dtype=INFO)
         if samples["anew"].any():
-            samples = believed(samples)
+            samples = after_reset(samples)
             self._begin_with(self._origin)
             if self.monitor is not None:
                 self.monitor.reset()
@@ -308,10 +308,10 @@ class OnlineEstimator:
         """Another record follows: inputs begin anew, what is learnt stays."""
         self.sampler, self._settled = Sampler(self.config), math.nan
         self._begin_window()
-        self._centre(self._present)
+        self._centre(self._effect_values)
 
     @property
-    def _present(self) -> dict[str, float]:
+    def _effect_values(self) -> dict[str, float]:
         """The parameters of effects as samples have them."""
         return dict(zip(self.config.effect_names, self._about.tolist(), strict=True))
 
@@ -410,7 +410,7 @@ class OnlineEstimator:
         """The present coefficients, made physical, with their state in words."""
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         consistency = consistency_of(
-            self.config, self.prior, raw.values, self._unexplained(), self._lasting(),
+            self.config, self.prior, raw.values, self._unexplained(), self._whiteness(),
             self.sampler.kinematic_filter.contradictions, raw.std,
         )  # fmt: skip
         gain = gain_of(raw.covariance, self.prior.std)
@@ -464,7 +464,7 @@ class OnlineEstimator:
         coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))
         mass = self.config.dynamics.with_values(coefficients).mass_matrix
         noisy = noisy_axes(mass, self._reading_noise, self._state.monitor)
-        held = enumerate(teachers_of(self.config) & noisy)
+        held = enumerate(informative_axes(self.config) & noisy)
         return {i: too_noisy(axes) for i, axes in held if axes.any()}
 
     def _unexplained(self) -> Array:
@@ -473,7 +473,7 @@ class OnlineEstimator:
         share = FIRST_FORCE * np.sqrt(monitor["density"] / first)
         return np.where(monitor["seen"] > innovation_monitor.TIME, share, np.nan)
 
-    def _lasting(self) -> Array:
+    def _whiteness(self) -> Array:
         """(6,): power of innovations added up over a second, NaN where that is not known."""
         monitor = self._state.monitor
         return np.where(monitor["judged"] > JUDGED_TIME, monitor["power"], np.nan)

@@ -110,7 +110,7 @@ def factors_of(config: Config) -> NDArray[np.bool_]:
     return factors
 
 
-def teachers_of(config: Config) -> NDArray[np.bool_]:
+def informative_axes(config: Config) -> NDArray[np.bool_]:
     """(n, 6): the axes from which each estimated coefficient or factor of the thrust is learnt, and
     from no other than all of these; none of other parameters of effects."""
     structure = config.dynamics.structure
@@ -132,14 +132,14 @@ def too_noisy(axes: NDArray[np.bool_]) -> str:
 
 def noisy_axes(mass: Array, reading_noise: Array, monitor: NDArray[np.void]) -> NDArray[np.bool_]:
     """(6,) on which axes noise of the wrench's reading is known to be too large to learn from, as
-    :func:`learnt` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
+    :func:`mark_learnable` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
     noise = np.diag(np.linalg.inv(mass)) ** 2 * reading_noise
     follows = (monitor["seen"] > TIME) & (monitor["density"] <= FOLLOWED * noise)
     return (noise > 0.0) & (noise < np.inf) & ~follows
 
 
 @lean
-def learnt(task, moving, sample, monitor, inverse, noisy, moves):
+def mark_learnable(task, moving, sample, monitor, inverse, noisy, moves):
     """moves (m,): which of theta a motion teaches. Work space: noisy (6,).
 
     A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor,

@@ -181,8 +181,8 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     notes = [Remark("messages", WARNING, note) for note in record.notes]
     frames = inputs.first_frames(bag, topics, config)
-    remarks = [*of_messages(streams, config), *notes, *_excitation(streams, config)]
-    remarks += _mountings(inputs.mounting(bag, frames), config)
+    remarks = [*of_messages(streams, config), *notes, *_excitation_remarks(streams, config)]
+    remarks += _mounting_remarks(inputs.mounting(bag, frames), config)
     failed = (test for test in tests_of(streams, config) if not test.passed)
     remarks += [Remark("velocity sensor", BAD, test.failure) for test in failed]
     motion, quick = of_dynamics(record.samples, config), None
@@ -193,7 +193,7 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
             fit_batch(alone, config, "ml") if unmeasured else fit_online([record], config, "rls")
         )
         motion = of_dynamics(record.samples, config.with_model(quick.fitted.model))
-        remarks += [*_model(quick), *_coefficients(quick)]
+        remarks += [*_model_remarks(quick), *_coefficient_remarks(quick)]
     remarks += motion
     return Check(path.name, streams.duration, config, tuple(remarks), quick, record, streams)
 
@@ -209,13 +209,13 @@ def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
     )
 
 
-def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
+def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
     """Whether `/tf_static` says of the sensors what the configuration says."""
     for key, vector in told.items():
         section, name = key.split(".")
         configured = np.array(getattr(getattr(config, section), name))
         turned = name == "rotation"
-        apart = _angle(vector, configured) if turned else np.abs(vector - configured).max()
+        apart = _angle_between(vector, configured) if turned else np.abs(vector - configured).max()
         if apart > _MOUNTED:
             bag, file = ([round(float(x), 3) + 0.0 for x in v] for v in (vector, configured))
             yield Remark(
@@ -225,7 +225,7 @@ def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
             )  # fmt: skip
 
 
-def _angle(a: Array, b: Array) -> float:
+def _angle_between(a: Array, b: Array) -> float:
     """Of the rotation [rad] that leads from roll, pitch, yaw (3,) to others. The angles themselves
     may differ where it is nothing: pi and -pi, or roll and yaw of a sensor that looks up."""
     p, q = quaternion_from_euler(*a), quaternion_from_euler(*b)
@@ -236,7 +236,7 @@ def _angle(a: Array, b: Array) -> float:
 _MODEL = "model and data"
 
 
-def _model(quick: Fit) -> Iterator[Remark]:
+def _model_remarks(quick: Fit) -> Iterator[Remark]:
     """Whether a model explains the data, and what it has that the configuration has not."""
     agree = quick.consistency.consistent
     yield Remark(_MODEL, GOOD if agree else BAD, quick.consistency.sentence)
@@ -256,7 +256,7 @@ def _model(quick: Fit) -> Iterator[Remark]:
         yield Remark(effect.replace("_", " "), WARNING, text)
 
 
-def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
+def _excitation_remarks(streams: Streams, config: Config) -> Iterator[Remark]:
     limits, steered = authority(config.dynamics), np.zeros((1, 6))
     if len(streams.inputs_t):  # fins and propeller drive, too
         now = interpolated(streams.inputs_t, streams.inputs, streams.t)
@@ -279,7 +279,7 @@ def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
         yield Remark(f"excitation of {axis}", level, text)
 
 
-def _coefficients(quick: Fit) -> Iterator[Remark]:
+def _coefficient_remarks(quick: Fit) -> Iterator[Remark]:
     if not quick.consistency.consistent:
         return
     states = [pair for pair in zip(quick.names, quick.states, strict=True) if "." not in pair[0]]

@@ -165,7 +165,7 @@ def propose(
             left_out.append(f"{one.name}: without a velocity sensor surge and sway have to rest")
             continue
         tell(one.name)
-        found = _safe(vehicles, one, duration, limits)
+        found = _largest_safe(vehicles, one, duration, limits)
         if found is None:
             left_out.append(f"{one.name}: not safe within the limits, however small")
             continue
@@ -208,7 +208,7 @@ def _vehicles(config: Config, information: Array) -> list[Config]:
     return found
 
 
-def _safe(
+def _largest_safe(
     vehicles: list[Config], one: AlternatingTargets, duration: float, limits: Limits
 ) -> tuple[AlternatingTargets, Flight] | None:
     """The manoeuvre as large as is safe with every vehicle."""

@@ -55,7 +55,7 @@ class Remark:
 
 def of_messages(streams: Streams, config: Config) -> list[Remark]:
     """On the rates, pauses, axes, signs and delays of the sensors."""
-    return [*_rates(streams), *_frames(streams, config)]
+    return [*_rate_remarks(streams), *_axes_remarks(streams, config)]
 
 
 def refuse_reversed(remarks: Iterable[Remark]) -> None:
@@ -65,7 +65,7 @@ def refuse_reversed(remarks: Iterable[Remark]) -> None:
             raise UserError(f"{remark.text} (rov-ident check says more)")
 
 
-def _rates(streams: Streams) -> list[Remark]:
+def _rate_remarks(streams: Streams) -> list[Remark]:
     remarks = []
     topics = {"odometry": streams.t, "imu": streams.imu_t, "wrench": streams.demand_t}
     if len(streams.inputs_t):
@@ -89,7 +89,7 @@ def _rates(streams: Streams) -> list[Remark]:
     return remarks
 
 
-def _frames(streams: Streams, config: Config) -> list[Remark]:
+def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
     remarks = []
     body = config.model.body
     # What rights the hull for each radian of roll or pitch, the axis z down.
@@ -114,18 +114,20 @@ def _frames(streams: Streams, config: Config) -> list[Remark]:
         remarks.append(Remark("imu axes", level, text))
         gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
         rate = streams.nu[:, 3:]
-        remarks.append(_signs("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
+        remarks.append(
+            _sign_remark("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST)
+        )
     step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
     remarks += _rates_and_turns(streams, step)
     if streams.has_pose and streams.nu[:, :3].any():
         moved = streams.position[step:] - streams.position[:-step]
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
         told, axes = way[step:] - way[:-step], ("north", "east", "down")
-        remarks.append(_signs("pose against velocity", told, moved, axes, _LINEAR_LEAST))
+        remarks.append(_sign_remark("pose against velocity", told, moved, axes, _LINEAR_LEAST))
     if len(streams.imu_t) > _FEWEST_TIMED:
         known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
         lag = _lag(streams.t[known], gyro[known], rate[known])
-        remarks.append(_late("odometry behind the IMU", *lag))
+        remarks.append(_delay_remark("odometry behind the IMU", *lag))
     return remarks
 
 
@@ -147,20 +149,20 @@ def _rates_and_turns(streams: Streams, step: int) -> list[Remark]:
     return [Remark(subject, BAD, f"{text}: check units (rad/s), signs and frame ids")]
 
 
-def _signs(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
+def _sign_remark(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
     """Whether two measurements of the same agree in sign."""
     power, common = np.mean(a**2, axis=0), np.mean(a * b, axis=0)
     size = np.sqrt(power * np.mean(b**2, axis=0))
     c = np.where(size < _STILL, 1.0, common / np.maximum(size, 1e-300))
     moves = np.sqrt(power) > _MOVES
-    return _correlated(
+    return _correlation_remark(
         subject, dict(zip(names, c.tolist(), strict=True)), np.where(moves, least, _REVERSED),
         "the sign of {} is reversed: check frame ids and mounting",
         "hardly correlated in {}: check frames, or the sensor's noise", "signs and axes agree",
     )  # fmt: skip
 
 
-def _correlated(
+def _correlation_remark(
     subject: str, by_name: dict[str, float], least: Array, bad: str, weak: str, good: str,
     reversed_below: float = _REVERSED,
 ) -> Remark:  # fmt: skip
@@ -205,8 +207,8 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
         text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
         return [Remark(subject, BAD, text, hopeless=True)]
-    by_name = {MOTIONS[i]: _together(wrench[:, i], moved[:, i]) for i in np.flatnonzero(driven)}
-    push = _correlated(
+    by_name = {MOTIONS[i]: _correlation(wrench[:, i], moved[:, i]) for i in np.flatnonzero(driven)}
+    push = _correlation_remark(
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
         "frames.body); or a controller works there against what the model lacks",
@@ -214,10 +216,10 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         "the vehicle goes where it is pushed",
         -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
-    return [push, _late("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
+    return [push, _delay_remark("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
 
 
-def _together(a: Array, b: Array) -> float:
+def _correlation(a: Array, b: Array) -> float:
     """The correlation of two signals (k,) about their means or about zero, whichever is larger. A
     wrong sign turns both; a controller that pushes harder as a vehicle slows turns only the first.
     """
@@ -243,7 +245,7 @@ def samples_of(streams: Streams) -> NDArray[np.void]:
     return samples
 
 
-def _late(subject: str, lag: float, std: float) -> Remark:
+def _delay_remark(subject: str, lag: float, std: float) -> Remark:
     text = f"{1e3 * lag:.1f} ± {1e3 * NORMAL * std:.1f} ms (95 %)"
     if not np.isfinite(lag):
         return Remark(subject, WARNING, "cannot be told: nothing moves")

@@ -224,10 +224,10 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
     if missing := [name for name in ("roll", "pitch") if name not in log.data]:
         notes.append(f"no {' and '.join(missing)} given: taken as 0")
     quaternion = frames.quaternion_from_euler(roll, pitch, yaw)
-    return quaternion, _wrapped(quaternion)
+    return quaternion, _jumps_back(quaternion)
 
 
-def _wrapped(quaternion: Array) -> NDArray[np.bool_]:
+def _jumps_back(quaternion: Array) -> NDArray[np.bool_]:
     """Rows whose attitude jumps away and back at once.
 
     A log that averages Euler angles over a bin turns +179 and -179 degrees into 0.

@@ -115,7 +115,7 @@ class Reader:
         self._frames = config.frames
         self._is_twist = config.inputs.is_twist
         heard = sources(config.inputs).items()
-        self._types = {role: _full(source.type_name) for role, source in heard}
+        self._types = {role: _full_type_name(source.type_name) for role, source in heard}
         self.on_arrival = config.inputs.wrench not in _STAMPED
         self._allocator = None
         if config.inputs.is_allocated:
@@ -226,31 +226,33 @@ def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, s
         if roles and role not in roles:
             continue
         try:
-            topic = select_topic(bag, role, name, _full(type_name), wanted[role])
+            topic = select_topic(bag, role, name, _full_type_name(type_name), wanted[role])
         except UserError as error:
-            raise UserError(f"{error}{_hint(bag, role, type_name, wanted[role])}") from error
+            raise UserError(
+                f"{error}{_other_type_hint(bag, role, type_name, wanted[role])}"
+            ) from error
         if topic:
             chosen[role] = topic
     return chosen
 
 
-def _hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
+def _other_type_hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
     """Which other type the role could have in this bag."""
     named = "/" + wanted.lstrip("/")
     others = [
         (topic, other)
         for other in _CHOICES.get(role, ())
         for topic, info in bag.topics.items()
-        if other != type_name and info.type_name == _full(other) and info.message_count
+        if other != type_name and info.type_name == _full_type_name(other) and info.message_count
         if not wanted or topic == named
     ]
     if not others:
-        return _foreign(bag, role)
+        return _unknown_type_hint(bag, role)
     topic, other = others[0]
     return f" Or is it {topic}? Then set inputs.{role} to {other}."
 
 
-def _foreign(bag: Bag, role: str) -> str:
+def _unknown_type_hint(bag: Bag, role: str) -> str:
     """Which topic of a type that is not known may be meant, and what to do with it."""
     words, instead = _FOREIGN.get(role, ((), ""))
     packages = {name.partition("/")[0] for name in cdr.DECODERS}
@@ -312,7 +314,7 @@ def total(bag: Bag, topics: Mapping[str, str]) -> int:
     return sum(bag.topics[topic].message_count for topic in topics.values())
 
 
-def _full(type_name: str) -> str:
+def _full_type_name(type_name: str) -> str:
     package, _, name = type_name.partition("/")
     return f"{package}/msg/{name}"
 
@@ -347,19 +349,19 @@ def survey(bag: Bag) -> Survey:
     def look(role: str, kinds: Collection[str], name: str = "") -> None:
         for kind in kinds:
             typed: dict[str, Any] = {role: kind}
-            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full(kind)]
+            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full_type_name(kind)]
             if kind.startswith("std_msgs"):  # arrays of numbers are of everything
                 of_kind = [t for t in of_kind if "thrust" in t or "pwm" in t or "rc" in t]
             if not of_kind or not any(bag.topics[t].message_count for t in of_kind):
                 continue
             try:
                 called = name or sources(Inputs(**typed))[role].topic
-                topic = select_topic(bag, role, called, _full(kind), "")
+                topic = select_topic(bag, role, called, _full_type_name(kind), "")
             except UserError as error:
                 topic = max(of_kind, key=lambda t: bag.topics[t].message_count)
                 notes.append(f"{role}: {topic} is taken, the one with most messages. {error}")
             if topic:
-                found[role] = _seen(bag, topic, kind)
+                found[role] = _source_of(bag, topic, kind)
                 return
 
     look(ODOMETRY, schema.ODOMETRY_TYPES)
@@ -372,12 +374,12 @@ def survey(bag: Bag) -> Survey:
     return Survey(found, tuple(notes))
 
 
-def _seen(bag: Bag, topic: str, kind: str) -> Seen:
+def _source_of(bag: Bag, topic: str, kind: str) -> Seen:
     times, first = [], None
     for raw in bag.iter_raw([topic]):
         times.append(raw.log_time)
         if first is None:
-            first = cdr.DECODERS[_full(kind)](raw.data)
+            first = cdr.DECODERS[_full_type_name(kind)](raw.data)
     span = max(times) - min(times)
     frames = (getattr(first, name, "") for name in ("frame_id", "child_frame_id"))
     return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)

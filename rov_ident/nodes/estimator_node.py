@@ -83,7 +83,7 @@ class EstimatorNode(GuardedNode):
         self._compiling = compiling
         compiling.begin(config, self.get_logger(), wait=self._lockstep)
         self._online = OnlineEstimator(config, kind)
-        self._keeper = None if self._lockstep else self._recalled(settings["checkpoint_path"])
+        self._keeper = None if self._lockstep else self._restored(settings["checkpoint_path"])
 
         self._reader = Reader(config)
         self._inputs = Inputs(subscribed(config.inputs))
@@ -119,7 +119,7 @@ class EstimatorNode(GuardedNode):
         self.create_timer(_SILENCE_PERIOD, self._check_inputs)
         self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose)
         if self._keeper is not None:
-            self.create_timer(_CHECKPOINT_PERIOD, self._keep)
+            self.create_timer(_CHECKPOINT_PERIOD, self._write_checkpoint)
         parameters.follow(
             self, partial(parameters.changed, self, _OWN_NAMES), self._take_parameters
         )
@@ -182,7 +182,7 @@ class EstimatorNode(GuardedNode):
                 self._show(info)
                 # A queue of waiting messages is learnt from faster than they came in.
                 if self._keeper and self._online.stamp - self._kept > _CHECKPOINT_PERIOD * 1e9:
-                    self._keep()
+                    self._write_checkpoint()
 
     def _show(self, info: NDArray[np.void]) -> None:
         """Publish the residuals of samples, and the coefficients when due by their time."""
@@ -240,7 +240,7 @@ class EstimatorNode(GuardedNode):
         node = self.get_fully_qualified_name().replace("/", "_")
         return configuration.as_file_name(config.name) + node
 
-    def _recalled(self, given: str) -> checkpoint.Keeper | None:
+    def _restored(self, given: str) -> checkpoint.Keeper | None:
         """The keeper of checkpoints, if a path is given; the last checkpoint is restored."""
         if not given:
             return None
@@ -258,7 +258,7 @@ class EstimatorNode(GuardedNode):
             self.get_logger().error(f"{error}; beginning with the prior")
         return keeper
 
-    def _keep(self) -> None:
+    def _write_checkpoint(self) -> None:
         assert self._keeper is not None
         if self._online.stamp != self._kept or self._keeper.failure:
             self._kept = self._online.stamp
@@ -351,7 +351,7 @@ class EstimatorNode(GuardedNode):
     def take_leave(self) -> None:
         self._monitor.stop()
         if self._keeper is not None:
-            self._keep()
+            self._write_checkpoint()
             self._keeper.close()
         self._compiling.stop()
         unused = f", {len(self._waiting)} messages left unused" if self._waiting else ""
@@ -369,14 +369,14 @@ def main(kind: Kind) -> int:
     compiling = CompileState(kind)
     return live(
         f"{kind}_node",
-        lambda: _ready(kind, compiling),
+        lambda: _kernels_loaded(kind, compiling),
         _OWN_NAMES,
         begin=EstimatorNode.begin_monitoring,
         leave=EstimatorNode.take_leave,
     )
 
 
-def _ready(kind: Kind, compiling: CompileState) -> EstimatorNode:
+def _kernels_loaded(kind: Kind, compiling: CompileState) -> EstimatorNode:
     node = EstimatorNode(kind, compiling)
     settle()
     sys.setswitchinterval(_SWITCHING)

@@ -152,7 +152,7 @@ def fit_batch(
         driven = float(np.max((forces / authority(config.dynamics))[:2]))
         rest = Test("surge and sway at rest", driven, AT_REST, DRIVEN_UNSEEN)
         consistency = replace(consistency, tests=(*consistency.tests, rest))
-    motion = archive.each(_range)
+    motion = archive.each(_velocity_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
         "open_loop_before": {"horizon_s": HORIZON, "rmse": numbers(before.rmse)},
@@ -348,16 +348,16 @@ def _stage(
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
-    if free[0] and not any(archive.each(_pushes_ahead)):
-        notes += _said_of_scale(config, names, covariance)
+    if free[0] and not any(archive.each(_has_surge_thrust)):
+        notes += _scale_notes(config, names, covariance)
     return _Stage(names, values, covariance + arm, states, more, unexplained, lasting, noise)
 
 
-def _pushes_ahead(samples: Samples) -> bool:
+def _has_surge_thrust(samples: Samples) -> bool:
     return bool(samples["wrench"][:, 0].any())
 
 
-def _said_of_scale(config: Config, names: Sequence[str], covariance: Array) -> list[str]:
+def _scale_notes(config: Config, names: Sequence[str], covariance: Array) -> list[str]:
     """What speeds alone cannot tell of a propeller, whose thrust is measured nowhere: multiply
     m - X_udot, thrust and drag by one number, and the motion is the same."""
     there = _coefficients(config)
@@ -458,7 +458,7 @@ def _mean_square_wrench(samples: Samples) -> Array:
     return np.mean(samples["wrench"] ** 2, axis=0)
 
 
-def _range(samples: Samples) -> tuple[Array, Array]:
+def _velocity_range(samples: Samples) -> tuple[Array, Array]:
     """Where the motion is for all but a thousandth of the time, either side."""
     low, high = np.quantile(samples["nu"], [0.001, 0.999], axis=0)
     return low, high

@@ -148,7 +148,7 @@ def read_table(
             f"{path}: every row is the same condition: vary speed, drift, turning or fin angles"
         )
     if drift == "auto" and reader.has_flow:
-        nu = _as_a_hull_resists(nu, forces, notes)
+        nu = _with_resisting_signs(nu, forces, notes)
     unused = tuple(heading for heading in table.cells if heading not in reader.used)
     if unused:
         notes.insert(
@@ -215,7 +215,7 @@ class _Reader:
         for heading in self.table.cells:
             if heading in self.used or self._is_constant(heading):
                 continue
-            name = _likely(heading)
+            name = _guessed_name(heading)
             if (
                 name
                 and not {self.columns.get(n, n) for n in (name, *_SAME.get(name, ()))} & self.used
@@ -261,7 +261,7 @@ _WORDS = {
 }
 
 
-def _likely(heading: str) -> str:
+def _guessed_name(heading: str) -> str:
     """What a heading such as `beta(deg)` or `Speed [m/s]` may be in our names, if anything."""
     bare, _, unit = re.sub(r"[(\[\]),/ _-]+", " ", heading.lower()).strip().partition(" ")
     words = f"{bare} {unit}".split()
@@ -386,7 +386,7 @@ def _fins(reader: _Reader) -> dict[str, Array]:
     return fins
 
 
-def _as_a_hull_resists(nu: Array, forces: Mapping[str, Array], notes: list[str]) -> Array:
+def _with_resisting_signs(nu: Array, forces: Mapping[str, Array], notes: list[str]) -> Array:
     """Turns v and w round where the force would otherwise drive the hull along them."""
     out = nu.copy()
     sides = (("Y", 1, "v", "beta", "starboard"), ("Z", 2, "w", "alpha", "below"))
@@ -468,7 +468,7 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     errors = {s: _left_out(scaled[:, s], force) for s in _grow(scaled, force, most)}
     rms = {s: _rms(error) for s, error in errors.items()}
     words = {s: tuple(names[i] for i in s) for s in errors}
-    chosen, why = _smallest(errors, rms, words)
+    chosen, why = _most_parsimonious(errors, rms, words)
     terms, x, scale = words[chosen], scaled[:, chosen], size[list(chosen)]
     values = np.asarray(np.linalg.lstsq(x, force, rcond=None)[0], dtype=np.float64)
     covariance = sandwich(scaled_inverse(x.T @ x), (x.T * errors[chosen] ** 2) @ x)  # HC3
@@ -570,7 +570,7 @@ def _left_out(x: Array, y: Array) -> Array:
     return (y - q @ (q.T @ y)) / (1.0 - h)
 
 
-def _smallest(
+def _most_parsimonious(
     errors: Mapping[tuple[int, ...], Array],
     rms: Mapping[tuple[int, ...], float],
     words: Mapping[tuple[int, ...], Sequence[str]],

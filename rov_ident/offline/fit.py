@@ -91,9 +91,9 @@ class Fit(Shown, Result):
             return f"{told} {doubt[0].upper()}{doubt[1:]}."
         if judged := self.more.get("validation"):
             where, before = judged["bags"][0]["file"], judged["rmse_before"]
-            return f"{told} On {where}, {falls(before, judged['rmse'])}."
+            return f"{told} On {where}, {rmse_change(before, judged['rmse'])}."
         if before := self.more.get("open_loop_before"):
-            return f"{told} On what was fitted, {falls(before['rmse'], numbers(self.rmse))}."
+            return f"{told} On what was fitted, {rmse_change(before['rmse'], numbers(self.rmse))}."
         return told
 
     @property
@@ -105,7 +105,7 @@ class Fit(Shown, Result):
         asks = self.estimator in ASKING
         return self.consistency.sentence if asks and not self.consistency.judged else ""
 
-    def asked(self, tests: Sequence[Test]) -> "Fit":
+    def with_tests(self, tests: Sequence[Test]) -> "Fit":
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
         nothing has converged."""
         prior = prior_of(self.given, effects=True)
@@ -234,7 +234,7 @@ class Fit(Shown, Result):
         return as_json(result)
 
 
-def falls(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
+def rmse_change(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
     """How the RMSE of open-loop prediction changes, by velocity, in half a sentence."""
     ratios = [a / b for b, a in zip(before.values(), after.values()) if a is not None and b]
     share = 100.0 * (1.0 - float(np.median(ratios))) if ratios else 0.0
@@ -293,4 +293,4 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=curves(read.bags, before, after),
-    ).asked(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)
+    ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)

@@ -148,21 +148,21 @@ def solve(
 
 def moments_of(samples: Samples, batch: Batch) -> Moments:
     """The sums of one bag's samples (k,) of SAMPLE."""
-    phi, z = _both(samples, batch)
+    phi, z = _rows_and_instruments(samples, batch)
     return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(len(phi))))
 
 
 def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
     """Covariance (n, n) of one bag's accumulated ``sum w Z' e``, correlation in time included."""
-    phi, z = _both(samples, batch)
+    phi, z = _rows_and_instruments(samples, batch)
     error = phi[:, :, -1] - phi[:, :, :-1] @ x
     score = np.einsum("ka,kai->ki", error * weight, z[:, :, :-1])
     total, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
-    _scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
+    _accumulate_scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
     return total
 
 
-def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array]:
     samples, _ = parts(samples)
     z = phi = filtered_rows(batch.task, samples, PERIOD)
     if batch.instruments is not None:  # along the motion that the model says, through the water
@@ -179,7 +179,7 @@ def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
 
 
 @kernel
-def _scatter(score, fade, total, lagged):
+def _accumulate_scatter(score, fade, total, lagged):
     for k in range(len(score)):
         add_scatter(score[k], fade, total, lagged)
 

@@ -62,9 +62,9 @@ from rov_ident.estimation.shared import (
     FOLLOWED,
     add_scatter,
     drive_sides,
+    informative_axes,
     measure,
     steps_of,
-    teachers_of,
     wrench_of,
 )
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
@@ -388,7 +388,7 @@ def maximise(
     looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
     of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
-    taught = teachers_of(config)
+    taught = informative_axes(config)
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
         say(f"step {next(looks)}")
@@ -424,11 +424,11 @@ def maximise(
     seconds, power = np.sum(each(whiteness, at_values(theta), noise, free, gate, theta[~own]), 0)
     known = seconds > JUDGED_TIME
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
-    bound, covariance = _considered(at.information, at.scatter, precision, held)
+    bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
     return Likelihood(theta, covariance, bound, noise, at, lasting, held, noisy, steps, converged)
 
 
-def _considered(
+def _with_consider_parameters(
     information: Array, scatter: Array, precision: Array, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Bound and covariance (n, n) of an estimate in which what is ``held`` (n,) keeps its prior:
@@ -575,7 +575,7 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
     for step in range(steps):
         late = step * dt - 0.5 * sample.dt
         if len(x) > 6:
-            _sink(sample, 0.5 * dt, x, p, sensitivity, work)
+            _add_depth_before(sample, 0.5 * dt, x, p, sensitivity, work)
         linearised_step(eq.structure, eq.theta, eq.one_theta, x, late, dt, s)
         if n > 0:
             momentum_columns(eq.structure, s.middle_nu_dot, work.of_rate)
@@ -591,11 +591,11 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
                 s.noise[i, j] = total / (dt * dt)
         advance_covariance(s.transition, s.noise, dt, p, s.product)
         if len(x) > 6:
-            _sunk(sample, 0.5 * dt, x, p, sensitivity, work)
+            _add_depth_after(sample, 0.5 * dt, x, p, sensitivity, work)
 
 
 @inlined
-def _sink(sample, half, x, p, sensitivity, work):
+def _add_depth_before(sample, half, x, p, sensitivity, work):
     """The depth's part of a step in the velocities before it: z += half k . v, by trapezoids.
 
     ``work.along`` (7,): covariance with k . v; ``work.deep`` (7,): with the depth after this.
@@ -615,7 +615,7 @@ def _sink(sample, half, x, p, sensitivity, work):
 
 
 @inlined
-def _sunk(sample, half, x, p, sensitivity, work):
+def _add_depth_after(sample, half, x, p, sensitivity, work):
     """The depth's part in the velocities after the step."""
     phi, cross = work.scratch[0].transition, work.scratch[0].cross
     for j in range(6):

@@ -106,17 +106,17 @@ class Queues:
         t = imu_t if has_imu else odometry_t
         if not (final or self._complete(t)):
             return None
-        if has_imu and len(self.imu) <= _SUCCESSORS and not (final or self._overdue(t)):
+        if has_imu and len(self.imu) <= _SUCCESSORS and not (final or self._is_too_far_ahead(t)):
             return None
         return Instant(t, has_imu, merged or not has_imu)
 
-    def _overdue(self, t: float) -> bool:
+    def _is_too_far_ahead(self, t: float) -> bool:
         """Whether the newest stamp is so far ahead of t [s] that nothing more is waited for."""
         return self._latest - t > max(self.grace, self._lateness)
 
     def _complete(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t [s], or it is not worth waiting."""
-        if self._overdue(t):
+        if self._is_too_far_ahead(t):
             return True
         grace = max(self.grace, self._lateness)
         for reach in self._reach.values():

@@ -107,9 +107,9 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
 
     Raises UserError if odometry or wrench are missing.
     """
-    taken, counts = _taken(messages, config)
+    taken, counts = _accepted(messages, config)
     imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
-    odometry = _driven(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
+    odometry = _while_commanded(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
     for name, found in (("odometry", odometry), ("wrench", wrench)):
         if len(found) < 2:
             raise UserError(f"the bag holds no usable {name} messages")
@@ -146,7 +146,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     return Streams(**both), begins
 
 
-def _driven(
+def _while_commanded(
     odometry: list[tuple[float, Any]], commanded: list[float], hold: float, counts: Counter[str]
 ) -> list[tuple[float, Any]]:
     """The messages at times when a command acts: one that has been held for longer than ``hold``
@@ -180,7 +180,7 @@ def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, A
     return t, x
 
 
-def _taken(
+def _accepted(
     messages: Iterable[tuple[str, Message]], config: Config
 ) -> tuple[dict[str, list[tuple[float, Any]]], Counter[str]]:
     """Time [s] and message in core axes of all that the estimators would take, and what is refused.

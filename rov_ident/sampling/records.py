@@ -16,7 +16,7 @@ from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import INPUTS
 from rov_ident.model.equations import Model
-from rov_ident.sampling.sample import believed, joined, stretches
+from rov_ident.sampling.sample import after_reset, joined, stretches
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import describe
 from rov_ident.sampling.without_velocity import IMPOSSIBLE, has_velocity, is_without_velocity
@@ -77,12 +77,12 @@ def read_record(
     parts.append(sampler.flush())
     if progress is not None:
         progress(total, total)
-    samples = believed(joined(parts))
+    samples = after_reset(joined(parts))
     counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
     notes += [] if measured else [f"{bag.path.name}: {IMPOSSIBLE}"]
-    notes += _said_of_inputs(config, samples)
+    notes += _input_notes(config, samples)
     if len(samples) < 2:
         raise UserError(
             f"{path}: its messages make no samples"
@@ -92,7 +92,7 @@ def read_record(
     return Record(Path(path), samples, counts, tuple(notes), bag.sha256, contradictions)
 
 
-def _said_of_inputs(config: Config, samples: NDArray[np.void]) -> list[str]:
+def _input_notes(config: Config, samples: NDArray[np.void]) -> list[str]:
     """Which inputs are not heard, or never change: their coefficients cannot be told."""
     said = [
         f"{', '.join(names)}: held, as {name} counts as zero: name its joint in inputs.{name}.joint"

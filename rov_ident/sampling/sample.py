@@ -56,7 +56,7 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
     return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=parts[0].dtype)
 
 
-def believed(samples: NDArray[np.void]) -> NDArray[np.void]:
+def after_reset(samples: NDArray[np.void]) -> NDArray[np.void]:
     """Samples (k,) of SAMPLE from the last one on that gives up all before it (``anew``)."""
     anew = np.flatnonzero(samples["anew"])
     return samples[anew[-1] :] if len(anew) else samples

@@ -89,7 +89,7 @@ class Validation:
             self._votes[role] += 1
             return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
-            return f"frame {_shown(frames[-1:])} is a world frame, body axes are needed"
+            return f"frame {_printable(frames[-1:])} is a world frame, body axes are needed"
         # Boyer and Moore's vote: what most of the messages say is held, whichever came first. Two
         # in a row must agree: a frame that is another each time takes nothing over.
         suspect, self._other_frames[role] = self._other_frames.get(role), frames
@@ -97,7 +97,7 @@ class Validation:
             self._frame_ids[role], self._votes[role] = frames, 1
             return "" if held is None else NEW_FRAME
         self._votes[role] = max(self._votes[role] - 1, 0)
-        return f"frame changed from {_shown(held)} to {_shown(frames)}"
+        return f"frame changed from {_printable(held)} to {_printable(frames)}"
 
     def _stamp_fault(self, role: str, stamp: int) -> str:
         """What is wrong with the stamp [ns] after the last one of its topic, or an empty string."""
@@ -138,7 +138,7 @@ class Validation:
         return message
 
 
-def _shown(frames: tuple[str, ...]) -> str:
+def _printable(frames: tuple[str, ...]) -> str:
     """Frame ids as they may stand in a log, whatever is in them."""
     return ", ".join(repr(frame if len(frame) <= 40 else f"{frame[:37]}...") for frame in frames)
 
