@@ -164,7 +164,7 @@ def fit(
 
 
 def _velocity_sensor_tests(paths: Sequence[Path], config: Config) -> list[Test]:
-    """What is asked of the velocity sensor by the first messages of each bag: the worst answers."""
+    """Tests of the velocity sensor on the first messages of each bag: the worst result of each."""
     worst: dict[str, Test] = {}
     for path in paths:
         bag = Bag(path)

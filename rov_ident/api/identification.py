@@ -286,7 +286,8 @@ def identify(
 
 
 def _with_start_notes(explanation: Explanation, used: bool) -> Explanation:
-    """With notes on its configuration that say what that is here: the fit's start, if ``used``."""
+    """The explanation with notes that call its extended configuration what it is here: the start of
+    the fit if it is ``used``, else nothing."""
     findings = explanation.findings
     notes = tuple(
         note.replace(EXTENDED, "the configuration that the fit starts from")
@@ -297,7 +298,7 @@ def _with_start_notes(explanation: Explanation, used: bool) -> Explanation:
 
 
 def _suggest_first_dive(config: Any, say: Progress) -> str:
-    """The manoeuvre for a vehicle of which nothing is known yet."""
+    """The end of a message: the manoeuvre to begin with, where there is a safe one."""
     try:
         return f"; fly instead: {plan(config, progress=say).sentence}"
     except UserError:

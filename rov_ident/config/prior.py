@@ -146,9 +146,8 @@ def righting_arm_covariance(
     of the thrust is known.
 
     The equations of motion stay the same with the righting moment, thrust, drag and all inertia,
-    added and own, times k. So it is the arm of that moment which tells the scale, and a height that
-    is off moves all of these. No driving mends it: whether a coefficient has converged is asked
-    without it.
+    added and own, times k. So only the arm of that moment determines the scale, and a wrong height
+    scales all of these. No manoeuvre reduces this error, so convergence is judged without it.
     """
     body, std = config.model.body, config.vehicle_uncertainty.cob_std
     arm = abs(body.restoring[3, 1]) / body.weight

@@ -252,13 +252,14 @@ def steering_memory() -> Array:
 
 @kernel
 def steer(acting, state, dt, inputs):
-    """inputs (2, 4) read, their means over dt and their values at its end, become what acts."""
+    """Turn inputs (2, 4) as read, means over dt and values at its end, into those that act."""
     _ALL_STEERS(0, acting.steers, (acting.steer_parameters, state, dt, inputs))
 
 
 @kernel
 def steered(acting, dt, means, ends):
-    """Means (N, 4) of what acts over steps of dt (N,), of means (N, 4) and ends (N, 4) read."""
+    """Means (N, 4) of the inputs that act over steps of dt (N,), from ``means`` and values at the
+    ``ends`` (N, 4) as read."""
     out, state = means.copy(), np.zeros((len(acting.steers), STEER_MEMORY))
     inputs = np.empty((2, means.shape[1]))
     for k in range(len(dt)):

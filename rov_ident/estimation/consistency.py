@@ -61,12 +61,12 @@ class Consistency:
 
     @property
     def possible(self) -> bool:
-        """Whether what no vehicle's file knows is within what the configuration supposes of it."""
+        """Whether every nuisance parameter is within the range that its prior allows for."""
         return all(test.passed for test in self.tests if test.name.startswith(_PRIOR))
 
     @property
     def judged(self) -> bool:
-        """Whether it was asked of any motion what it has beside the model."""
+        """Whether any axis moved enough to test what the model leaves unexplained on it."""
         return any(test.name.startswith(_LEFT) for test in self.tests)
 
     def widened(self, covariance: Array, prior: Array) -> Array:
@@ -86,8 +86,8 @@ class Consistency:
         if not failed and not self.judged:
             return (
                 "nothing contradicts the model, but there was too little motion, throughout or "
-                "since all was learnt anew about another lag or delay, to ask what it leaves "
-                "unexplained"
+                "since estimation began anew with another lag or delay, to test what the model "
+                "leaves unexplained"
             )
         if not failed:
             return "model and data agree"
@@ -101,8 +101,8 @@ class Consistency:
         return "" if self.judged else "too little motion yet to judge the model"
 
     def of_states(self, states: Iterable[State], asks: bool = True) -> tuple[State, ...]:
-        """The states of a fit, of which nothing has converged in :attr:`doubt`; least squares never
-        ``asks`` what the motion has beside the model, and is doubted for what it knows alone."""
+        """The states of a fit: in :attr:`doubt` nothing has converged. A method that never ``asks``
+        what the model leaves unexplained (least squares) is only doubted where a test failed."""
         doubted = bool(self.doubt) if asks else not self.consistent
         lesser = {State.CONVERGED: State.CONVERGING} if doubted else {}
         return tuple(lesser.get(state, state) for state in states)

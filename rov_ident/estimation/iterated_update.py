@@ -1,11 +1,11 @@
-"""Rows of RLS that were taken about poor estimates, taken again about better ones.
+"""Rows of RLS that were linearised about poor estimates, linearised again about better ones.
 
-A row is right to first order in the distance of the coefficients it was taken about. While little
-is known, rows claim combinations of coefficients that the motion does not tell, and no later row
-takes that back ("Looking back" in docs/accuracy.md). So the samples of a window are kept with the
-state from before them, and folded again from it, about the present estimate, once that has moved:
-the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a Gauss-Newton
-step.
+A row is right to first order in the error of the coefficients that it is linearised about. While
+little is known, rows claim combinations of coefficients that the motion does not determine, and no
+later row corrects that ("Looking back" in docs/accuracy.md). So the samples of a window are kept
+with the state from before them, and folded again from it, about the present estimate, once that has
+moved: the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a
+Gauss-Newton step.
 """
 
 import numpy as np
@@ -51,14 +51,14 @@ class IteratedUpdate:
         self._samples.append(samples)
         if samples["t"][-1] < self._began + _TIMES[self._looks]:
             return state
-        state = self.look_back(task, state)
+        state = self.iterate(task, state)
         self._looks += 1
         if self._looks == len(_TIMES):
             self.begin(state)
         return state
 
     @one_blas_thread()
-    def look_back(self, task: Problem, state: rls.State) -> rls.State:
+    def iterate(self, task: Problem, state: rls.State) -> rls.State:
         """The state with the window's samples folded about its estimate, if that has moved.
 
         Repeated until rows and the estimate that follows from them agree; where they never do, too

@@ -240,14 +240,14 @@ class OnlineEstimator:
         self.flush()
 
     def _is_due(self, samples: NDArray[np.void]) -> bool:
-        """Whether it is time to see what samples (k,) have taught."""
+        """Whether parameters of effects are to be looked at after samples (k,)."""
         return not abs(float(samples["t"][-1]) - self._centred) < CENTRING_TIME
 
     def flush(self) -> NDArray[np.void]:
         """The input has ended or stopped: use what still waits for a late topic."""
         info = self.take(self.sampler.flush())
         if self._update and self._enabled:
-            self._state = self._update.look_back(self._task, self._state)
+            self._state = self._update.iterate(self._task, self._state)
         return info
 
     def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
@@ -286,7 +286,7 @@ class OnlineEstimator:
         return info
 
     def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
-        """Samples (k,) into the state, which RLS looks back on as often as their times say."""
+        """Fold samples (k,) into the state; RLS iterates its update at the times it has set."""
         fold, task, update = self._module.fold, self._task, self._update
         if not update:
             self._state, info = fold(task, self._state, samples)
@@ -458,7 +458,7 @@ class OnlineEstimator:
         )
 
     def _waiting(self, values: Array) -> dict[int, str]:
-        """Why some, by their place, are not learnt now, at coefficients of these values."""
+        """Why some coefficients, by their index, are not updated at present; ``values`` (n,)."""
         if not self._reading_noise.any():
             return {}
         coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))

@@ -694,7 +694,7 @@ def _absorb(task, state, work, n, effects):
 
 @inlined
 def _learn(task, state, work, info):
-    """The observer takes over what the rows since the last time have taught."""
+    """Give the observer the coefficients that follow from all rows so far."""
     s, c, n = task.settings[0], state.scalars[0], len(state.order)
     invert(work.root, work.inverse)
     info.condition = one_norm(work.root, n, work.line) * one_norm(work.inverse, n, work.line)

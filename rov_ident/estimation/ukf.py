@@ -498,7 +498,7 @@ def _given_held(task, p, free, side, i, spread, least):
 
 @inlined
 def _predicted_measurement(task, x, p, side, i):
-    """A velocity as measured, with what parameters of effects add to it, and its variance."""
+    """The predicted measurement of velocity i, effects on it included, and its variance."""
     predicted, spread, k = x[i], p[i, i], side.shape[1]
     first, scale = len(x) - k, len(task.scale) - k
     for j in range(k):

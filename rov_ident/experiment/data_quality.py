@@ -199,7 +199,7 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
 
 
 def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
-    """What information (n, n) about the coefficients to estimate makes of the prior."""
+    """How well each coefficient would be known from this information (n, n) and the prior."""
     prior = prior_of(config)
     std = np.sqrt(np.diag(inverse_of(information + np.diag(prior.std**-2.0)))).tolist()
     rows = zip(prior.names, prior.mean.tolist(), prior.units, std, prior.std.tolist(), strict=True)

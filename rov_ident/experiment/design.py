@@ -40,7 +40,7 @@ _DRAWS = 3  # vehicles within the present uncertainty, for which a manoeuvre mus
 # four safe of four exclude, at 95 %, that more than half of such vehicles leave the tank
 _SHRINK = 0.75  # of a manoeuvre that is not safe; seven times until it is the smallest
 _SMALLEST = 0.15  # of the size in the library: smaller ones move a vehicle hardly more than noise
-_SHORTEST = 10.0  # s
+_SHORTEST = 10.0  # s; as long as the predictions by which models are judged (HORIZON)
 _SHOWN = 0.99  # of the present uncertainty: more than that left is as good as nothing learnt
 _OTHERS = 0.05  # weight of the mean over all coefficients, which decides where the worst is alike
 

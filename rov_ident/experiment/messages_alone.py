@@ -180,10 +180,10 @@ def _correlation_remark(
 
 
 def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
-    """What wrench and motion, samples (k,) of SAMPLE, filtered alike, say of each other.
+    """Whether wrench and motion of samples (k,) of SAMPLE, filtered alike, agree in sign and time.
 
-    A controller that holds a place in waves pushes against the motion, too, but hardly on most of
-    the axes that are driven: that is a wrong sign, and hopeless.
+    A controller that holds a position in waves pushes against the motion as well, but hardly on
+    most of the driven axes: there it is a wrong sign, and no fit makes sense.
     """
     if samples["inputs"].any():
         return []  # fins and propellers drive it, too: the wrench alone does not say where it goes

@@ -56,11 +56,11 @@ _END = LAST_STAMP // 1000 - _START  # us; a stamp holds no more
 _WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
 _LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
 _LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
-_OUTPUTS = 16
+_OUTPUTS = 16  # of SERVO_OUTPUT_RAW and RCOU
 _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
 _MOTOR_1 = 33  # of SERVOn_FUNCTION
 _SAFETY_ARMED = 128  # of base_mode in HEARTBEAT
-_GROUND_STATION = 255
+_GROUND_STATION = 255  # its system in MAVLink, by convention
 _EVENTS = {10: True, 11: False}  # of EV: armed, disarmed
 _ALIGNED = 0.7  # cosine; thrusters of one frame differ by 45 degrees and more from each other
 

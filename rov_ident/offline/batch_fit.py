@@ -40,10 +40,10 @@ from rov_ident.sampling.without_velocity import is_impossible, is_without_veloci
 
 KINDS = ("ls", "iv", "ml")
 
-_MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
-_GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
+_MOVES = 2.0  # times the noise of its measurement, rms: then three quarters of the power are motion
+_GOOD = 0.03  # a choice: open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
-AT_REST = 0.05  # of the axis's authority, rms: a smaller wrench is that of keeping station
+AT_REST = 0.05  # of the axis's working wrench, rms: a smaller wrench is that of keeping station
 DRIVEN_UNSEEN = (
     "surge or sway is driven, and no velocity is measured: how fast it goes is unknown, and so are "
     "the moments and the depth that follow from it; drive heave, roll, pitch and yaw while surge "
@@ -358,8 +358,8 @@ def _has_surge_thrust(samples: Samples) -> bool:
 
 
 def _scale_notes(config: Config, names: Sequence[str], covariance: Array) -> list[str]:
-    """What speeds alone cannot tell of a propeller, whose thrust is measured nowhere: multiply
-    m - X_udot, thrust and drag by one number, and the motion is the same."""
+    """A note where only speeds are measured, and not the thrust: with m - X_udot, thrust and drag
+    times any number the motion is the same."""
     there = _coefficients(config)
     own = [n for n, c in there.items() if c.row == 0 and "n" in c.inputs]
     if not own or "X_udot" not in names:

@@ -39,15 +39,17 @@ _FIN_COLUMNS = {
     "s": ("stern", "stern_plane", "delta_s", "ds", "deltas", "elevator", "delta_e", "de"),
     "a": ("aileron", "delta_a", "da", "deltaa"),
 }
-_SLOWEST, _FASTEST = 1e-6, 2.0 * math.pi  # m/s, rad/s
-_MOST_ROWS = 100_000
-_ALIKE = 0.995  # cosine between two columns from which a table cannot tell them apart
-_CONDITION = 100.0  # of a structure's scaled columns, beyond which its values mean nothing apart
-_FEWEST = 6  # conditions
-_ROWS_PER_TERM = 3
-_PATIENCE = 3  # sizes without a better cross-validation until structures grow no further
-_SHOWN = 20  # candidates, beside the chosen
-_WORTH = 2.0  # standard errors
+_SLOWEST = 1e-6  # m/s; below it is a zero that was rounded
+_FASTEST = 2.0 * math.pi  # rad/s; a turn a second: beyond it are degrees
+_MOST_ROWS = 100_000  # a guard: a hundred candidate columns take 80 MB
+_ALIKE = 0.995  # cosine between two columns, which then inflate each other's variance a hundredfold
+_CONDITION = 100.0  # of a structure's scaled columns: beyond it collinearity ruins a fit (Belsley,
+# Kuh and Welsch 1980, sec. 3.2)
+_ROWS_PER_TERM = 3  # conditions, so that two of three are left to judge by
+_FEWEST = 2 * _ROWS_PER_TERM  # conditions: with one term there is nothing to choose from
+_PATIENCE = 3  # a choice: sizes without a better cross-validation until structures grow no further
+_SHOWN = 20  # candidates, beside the chosen: a screenful
+_WORTH = 2.0  # standard errors, which chance exceeds one time in forty
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 
 

@@ -30,7 +30,7 @@ IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have rem
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
 ASKING = ("ml", *ESTIMATORS)
-"""Those that ask what the motion has beside the model: least squares takes it all for noise."""
+"""Methods that test what the model leaves unexplained: least squares takes it for noise."""
 _SHOWN = 60.0  # s of motion in the picture of a fit
 
 
@@ -98,8 +98,8 @@ class Fit(Shown, Result):
 
     @property
     def doubt(self) -> str:
-        """In what data and model disagree, or that it is not known; empty where they agree, and of
-        least squares, which does not ask."""
+        """How data and model disagree, or that it is unknown; empty where they agree, and of least
+        squares, which does not test that."""
         if not self.consistency.consistent:
             return f"data and model disagree: {self.consistency.sentence}"
         asks = self.estimator in ASKING

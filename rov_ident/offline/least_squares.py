@@ -35,9 +35,9 @@ from rov_ident.offline.filtered_regression import Regression, filtered_rows, reg
 from rov_ident.sampling.records import HORIZON, predicted
 from rov_ident.sampling.sample import parts
 
-PERIOD = 0.1  # s between rows
+PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
 _LAG = 2.0  # s; window over the correlation of the residuals
-_ROUNDS = 4  # of instruments, each simulated with the coefficients of the one before
+_ROUNDS = 4  # a guard: of instruments, each simulated with the coefficients of the one before
 _KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
 # quarters of the prior variance are gone
 

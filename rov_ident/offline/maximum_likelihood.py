@@ -76,18 +76,18 @@ from rov_ident.sampling.sample import NO_SIDES, parts
 T = TypeVar("T")
 
 _LAG = 1.0  # s; window over the correlation of the score in time
-_GATE = 6.0  # standard deviations; an innovation further off is an outlier
-_NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
-_ITERATIONS = 25
-_DOUBTFUL = 0.03  # of the axis's authority, lasting a second: what may be unexplained at first
+_GATE = 6.0  # standard deviations; one of 500 million normal innovations is further off
+_NOISE_SAMPLES = 12_000  # of a bag: they tell a noise level to 1 %
+_ITERATIONS = 25  # a guard: Gauss-Newton steps converge in a few, or never
+_DOUBTFUL = 0.03  # of the axis's working wrench, lasting a second: what may be unexplained at first
 _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first level to the least
 _NEAR = 0.05  # squared standard deviations of noise levels from the most likely ones
 _SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better than a hundredth
-_SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
+_SMALLEST = 1e-4  # floor of the process noise over the axis's working wrench: as good as none
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
 _NONE = np.zeros(0)
 _NO_ROWS = np.zeros((3, 0, 6))
-LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
+LIKELY = 3e-3  # a choice: the same before a fit of the noise, stated in docs/offline.md
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Noise:
 def assumed(config: Config, least: float = _SMALLEST) -> Noise:
     """The noise that a configuration states.
 
-    ``least``: that of the wrench where there is none, relative to the axis's authority.
+    ``least``: that of the wrench where there is none, relative to the axis's working wrench.
     """
     w = config.wrench
     smallest = least * authority(config.dynamics)
@@ -244,8 +244,8 @@ def whiteness(
 # ------------------------------------------------------------------ noise
 
 
-_STEP_NOISE = 0.02  # of the logarithm of a noise level, for its sensitivities
-_KNOWN = np.log(30.0)  # prior standard deviation of such a logarithm
+_STEP_NOISE = 0.02  # of the logarithm of a noise level: its slope is then right to 1 %
+_KNOWN = np.log(30.0)  # prior standard deviation of such a logarithm: hardly anything is known
 
 
 def _levels(noise: Noise) -> Array:
@@ -431,8 +431,8 @@ def maximise(
 def _with_consider_parameters(
     information: Array, scatter: Array, precision: Array, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Bound and covariance (n, n) of an estimate in which what is ``held`` (n,) keeps its prior:
-    an error of that moves all others (Schmidt 1966)."""
+    """Bound and covariance (n, n) of an estimate, of which the ``held`` parameters (n,) keep their
+    prior: their errors move all others (consider parameters, Schmidt 1966)."""
     ours = np.ix_(~held, ~held)
     error = np.eye(len(held))  # by the score of what is estimated, and by errors of what is held
     error[ours] = inverse_of((information + np.diag(precision))[ours])

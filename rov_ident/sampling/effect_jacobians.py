@@ -177,7 +177,7 @@ class EffectJacobians:
             self._velocity[:, i] = change / self._width[i]
 
     def extend(self, sample: NDArray[np.void], sides: Array, acceleration: Array) -> None:
-        """Fill sides (13, k) of the sample (1,) with J, V and p0; what has acted is used up.
+        """Fill sides (13, k) of the sample (1,) with J, V and p0, and begin the next interval.
 
         ``acceleration`` (3,) [m/s2] is that over ground, in body axes, by the IMU; it is not read
         where the sample has no gyro.

@@ -31,7 +31,7 @@ STATE = record(
     [
         ("known", "?"),  # an odometry message has been seen since the last restart
         ("inertial", "?"),  # an IMU message has
-        ("chances", "i8"),  # so often may the first odometry of all still be given up
+        ("chances", "i8"),  # how often the first odometry of all may still be discarded
         ("q", "f8", (4,)),
         ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2

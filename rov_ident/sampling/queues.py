@@ -12,9 +12,9 @@ from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message
 
 MERGE = 0.05  # s; an odometry message is carried to the IMU message that follows this closely: one
 # interval of the slowest odometry beside which an IMU is of use, 20 Hz
-_LONGEST_WAIT = 1.0  # s; a topic that is later than this is not waited for
-_MARGIN = 1.25  # times as late as a topic was is how long it is waited for from then on
-_LONGEST_QUEUE = 10.0  # s; of commands that are kept while nothing else comes
+_LONGEST_WAIT = 1.0  # s; a choice: a topic that is later than this is not waited for
+_MARGIN = 1.25  # a choice: a topic is waited for as long as it was late, times this
+_LONGEST_QUEUE = 10.0  # s; a guard: of commands that are kept while nothing else comes
 _SUCCESSORS = 2  # further messages of the IMU tell whether one is an outlier
 
 

@@ -23,7 +23,7 @@ from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
-_USUAL = 2.0  # times what 99 % of the messages keep to
+_USUAL = 2.0  # a choice: times what 99 % of the messages keep to
 # of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
 # a tenth as noisy; without noise the sum of true velocities is a fifth of it off
 _RECKONED = 0.1
@@ -74,8 +74,8 @@ class Streams:
 
     @property
     def is_reckoned(self) -> bool:
-        """Whether the position is the sum of the velocities along the attitude, their noise
-        included: it then agrees with them whatever is wrong. Depth may be measured all the same."""
+        """Whether the position is dead reckoning, the sum of the velocities along the attitude with
+        their noise: it agrees with them whatever is wrong. Depth may still be measured."""
         v = np.einsum("kij,kj->ki", quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
         dt = np.diff(self.t)[:, None]
         step = np.diff(self.position[:, :2], axis=0)

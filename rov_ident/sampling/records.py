@@ -93,7 +93,7 @@ def read_record(
 
 
 def _input_notes(config: Config, samples: NDArray[np.void]) -> list[str]:
-    """Which inputs are not heard, or never change: their coefficients cannot be told."""
+    """Notes on inputs that are missing or never change: their coefficients cannot be estimated."""
     said = [
         f"{', '.join(names)}: held, as {name} counts as zero: name its joint in inputs.{name}.joint"
         for name, names in config.unheard.items()

@@ -57,7 +57,7 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
 
 
 def after_reset(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """Samples (k,) of SAMPLE from the last one on that gives up all before it (``anew``)."""
+    """Samples (k,) of SAMPLE from the last one on that makes all before it invalid (``anew``)."""
     anew = np.flatnonzero(samples["anew"])
     return samples[anew[-1] :] if len(anew) else samples
 
