@@ -252,9 +252,7 @@ def identify(
             left_out[path.name] = found.why
     if not checked:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-        raise UserError(
-            f"no dive is fit for identification: {reasons}{_suggest_first_dive(given, say)}"
-        )
+        raise UserError(f"no dive is fit for identification: {reasons}{_first_dive(given, say)}")
     judge = Path(validate) if validate else None
     if judge is None and len(checked) > 1:
         judge, _ = min(checked, key=lambda pair: pair[1].duration)
@@ -297,7 +295,7 @@ def _with_start_notes(explanation: Explanation, used: bool) -> Explanation:
     return replace(explanation, findings=replace(findings, notes=notes))
 
 
-def _suggest_first_dive(config: Any, say: Progress) -> str:
+def _first_dive(config: Any, say: Progress) -> str:
     """The end of a message: the manoeuvre to begin with, where there is a safe one."""
     try:
         return f"; fly instead: {plan(config, progress=say).sentence}"

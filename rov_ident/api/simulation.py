@@ -174,13 +174,8 @@ def simulate(
         return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
     assert bag is not None
     record = read(bag, given, progress)
-    samples = record.samples
-
-    def simulated(horizon: float) -> Array:
-        effects = compiled(given.effects)
-        return predicted(given.dynamics, samples, horizon, free, effects)
-
-    nu = simulated(math.inf)
+    samples, model, effects = record.samples, given.dynamics, compiled(given.effects)
+    nu, restarted = (predicted(model, samples, h, free, effects) for h in (math.inf, HORIZON))
     if not np.isfinite(nu).all():
         raise UserError(
             f"the simulation diverges on {bag}: check the signs and sizes of the coefficients and "
@@ -195,7 +190,7 @@ def simulate(
         measured_motion(samples),
         free,
         score(samples, nu),
-        score(samples, simulated(HORIZON)),
+        score(samples, restarted),
         record.notes,
         record.duration,
     )

@@ -129,7 +129,7 @@ def rigid_body_covariance(
     """
     known, body = config.vehicle_uncertainty, config.model.body
     masses, moments = _own_inertia(body)
-    if scaled := _proportional_to_thrust(names, values):
+    if scaled := _with_thrust(names, values):
         # relative to the inertia that the file gives and that does not change with the mass
         of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
     else:
@@ -155,9 +155,7 @@ def righting_arm_covariance(
     share = min(std / max(arm, 1e-9), config.wrench.scale_std)
     masses, moments = _own_inertia(body)
     own = masses | moments
-    moved = {
-        n: share * (v - own.get(n, 0.0)) for n, v in _proportional_to_thrust(names, values).items()
-    }
+    moved = {n: share * (v - own.get(n, 0.0)) for n, v in _with_thrust(names, values).items()}
     return _consider_covariance([moved], names, gain)
 
 
@@ -171,7 +169,7 @@ def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
     )
 
 
-def _proportional_to_thrust(names: tuple[str, ...], values: Array) -> dict[str, float]:
+def _with_thrust(names: tuple[str, ...], values: Array) -> dict[str, float]:
     """What is proportional to the thrust in the same motion, if its scale is estimated."""
     if THRUST_SCALE not in names:
         return {}

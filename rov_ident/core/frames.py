@@ -137,6 +137,11 @@ def turns(q: Array) -> Array:
     return out
 
 
+def quaternion_angle(p: Array, q: Array) -> Array:
+    """The angle (...) [rad], from 0 to pi, between attitudes p and q (..., 4)."""
+    return 2.0 * np.arccos(np.minimum(np.abs(np.sum(p * q, axis=-1)), 1.0))
+
+
 def quaternion_between(p: Array, q: Array, share: float) -> Array:
     """The unit quaternion (4,) a share of the way from p to q, along the shortest rotation."""
     cosine = float(p @ q)

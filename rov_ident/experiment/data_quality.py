@@ -16,7 +16,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.config.prior import THRUST_SCALE, prior_of
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
+from rov_ident.core.frames import quaternion_angle, quaternion_from_euler
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.states import CONVERGED, State, of_fit
 from rov_ident.discrepancy.velocity_sensor import tests_of
@@ -215,7 +215,11 @@ def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Rem
         section, name = key.split(".")
         configured = np.array(getattr(getattr(config, section), name))
         turned = name == "rotation"
-        apart = _angle_between(vector, configured) if turned else np.abs(vector - configured).max()
+        if turned:  # the angles themselves may differ where nothing turns: pi and -pi
+            vectors = vector, configured
+            apart = quaternion_angle(*(quaternion_from_euler(*angles) for angles in vectors))
+        else:
+            apart = np.abs(vector - configured).max()
         if apart > _MOUNTED:
             bag, file = ([round(float(x), 3) + 0.0 for x in v] for v in (vector, configured))
             yield Remark(
@@ -223,14 +227,6 @@ def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Rem
                 f"{bag} by /tf_static of the bag, {file} in the configuration (forward, starboard, "
                 "down): correct the wrong one",
             )  # fmt: skip
-
-
-def _angle_between(a: Array, b: Array) -> float:
-    """Of the rotation [rad] that leads from roll, pitch, yaw (3,) to others. The angles themselves
-    may differ where it is nothing: pi and -pi, or roll and yaw of a sensor that looks up."""
-    p, q = quaternion_from_euler(*a), quaternion_from_euler(*b)
-    between = quaternion_multiply(p * [1.0, -1.0, -1.0, -1.0], q)
-    return float(2.0 * np.arctan2(np.linalg.norm(between[1:]), abs(between[0])))
 
 
 _MODEL = "model and data"

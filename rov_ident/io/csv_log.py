@@ -232,16 +232,12 @@ def _jumps_back(quaternion: Array) -> NDArray[np.bool_]:
 
     A log that averages Euler angles over a bin turns +179 and -179 degrees into 0.
     """
-    step = _angle_between(quaternion[1:], quaternion[:-1])
-    bridge = _angle_between(quaternion[2:], quaternion[:-2])
+    step = frames.quaternion_angle(quaternion[1:], quaternion[:-1])
+    bridge = frames.quaternion_angle(quaternion[2:], quaternion[:-2])
     jump = np.minimum(step[1:], step[:-1])
     wrapped = np.zeros(len(quaternion), dtype=bool)
     wrapped[1:-1] = (jump > _WRAP_JUMP) & (bridge < 0.5 * jump)
     return wrapped
-
-
-def _angle_between(p: Array, q: Array) -> Array:
-    return 2.0 * np.arccos(np.minimum(np.abs(np.sum(p * q, axis=-1)), 1.0))
 
 
 def _position(log: "_Log", linear: Array, orientation: Array, notes: list[str]) -> Array:

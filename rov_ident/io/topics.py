@@ -26,17 +26,7 @@ from rov_ident.core.frames import (
     quaternion_to_euler,
     quaternion_to_matrix,
 )
-from rov_ident.core.messages import (
-    DRIVE,
-    SECOND,
-    Array,
-    Commands,
-    Message,
-    Odometry,
-    Pose,
-    Twist,
-    Wrench,
-)
+from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
 from rov_ident.io import cdr
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
@@ -115,7 +105,7 @@ class Reader:
         self._frames = config.frames
         self._is_twist = config.inputs.is_twist
         heard = sources(config.inputs).items()
-        self._types = {role: _full_type_name(source.type_name) for role, source in heard}
+        self._types = {role: _full_name(source.type_name) for role, source in heard}
         self.on_arrival = config.inputs.wrench not in _STAMPED
         self._allocator = None
         if config.inputs.is_allocated:
@@ -171,7 +161,7 @@ class Reader:
     def _joined(self, message: Twist | Pose) -> list[tuple[str, Message]]:
         if isinstance(message, Pose):
             if self._poses and message.stamp <= self._poses[-1].stamp:
-                if self._poses[-1].stamp - message.stamp < SECOND:
+                if self._poses[-1].stamp - message.stamp < 1_000_000_000:
                     self.counts["pose: duplicate or backward stamp"] += 1
                     return []
                 self._poses.clear()  # a bag that starts over
@@ -226,33 +216,31 @@ def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, s
         if roles and role not in roles:
             continue
         try:
-            topic = select_topic(bag, role, name, _full_type_name(type_name), wanted[role])
+            topic = select_topic(bag, role, name, _full_name(type_name), wanted[role])
         except UserError as error:
-            raise UserError(
-                f"{error}{_other_type_hint(bag, role, type_name, wanted[role])}"
-            ) from error
+            raise UserError(f"{error}{_other_type(bag, role, type_name, wanted[role])}") from error
         if topic:
             chosen[role] = topic
     return chosen
 
 
-def _other_type_hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
+def _other_type(bag: Bag, role: str, type_name: str, wanted: str) -> str:
     """Which other type the role could have in this bag."""
     named = "/" + wanted.lstrip("/")
     others = [
         (topic, other)
         for other in _CHOICES.get(role, ())
         for topic, info in bag.topics.items()
-        if other != type_name and info.type_name == _full_type_name(other) and info.message_count
+        if other != type_name and info.type_name == _full_name(other) and info.message_count
         if not wanted or topic == named
     ]
     if not others:
-        return _unknown_type_hint(bag, role)
+        return _unknown_type(bag, role)
     topic, other = others[0]
     return f" Or is it {topic}? Then set inputs.{role} to {other}."
 
 
-def _unknown_type_hint(bag: Bag, role: str) -> str:
+def _unknown_type(bag: Bag, role: str) -> str:
     """Which topic of a type that is not known may be meant, and what to do with it."""
     words, instead = _FOREIGN.get(role, ((), ""))
     packages = {name.partition("/")[0] for name in cdr.DECODERS}
@@ -314,7 +302,7 @@ def total(bag: Bag, topics: Mapping[str, str]) -> int:
     return sum(bag.topics[topic].message_count for topic in topics.values())
 
 
-def _full_type_name(type_name: str) -> str:
+def _full_name(type_name: str) -> str:
     package, _, name = type_name.partition("/")
     return f"{package}/msg/{name}"
 
@@ -349,14 +337,14 @@ def survey(bag: Bag) -> Survey:
     def look(role: str, kinds: Collection[str], name: str = "") -> None:
         for kind in kinds:
             typed: dict[str, Any] = {role: kind}
-            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full_type_name(kind)]
+            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full_name(kind)]
             if kind.startswith("std_msgs"):  # arrays of numbers are of everything
                 of_kind = [t for t in of_kind if "thrust" in t or "pwm" in t or "rc" in t]
             if not of_kind or not any(bag.topics[t].message_count for t in of_kind):
                 continue
             try:
                 called = name or sources(Inputs(**typed))[role].topic
-                topic = select_topic(bag, role, called, _full_type_name(kind), "")
+                topic = select_topic(bag, role, called, _full_name(kind), "")
             except UserError as error:
                 topic = max(of_kind, key=lambda t: bag.topics[t].message_count)
                 notes.append(f"{role}: {topic} is taken, the one with most messages. {error}")
@@ -379,7 +367,7 @@ def _source_of(bag: Bag, topic: str, kind: str) -> Seen:
     for raw in bag.iter_raw([topic]):
         times.append(raw.log_time)
         if first is None:
-            first = cdr.DECODERS[_full_type_name(kind)](raw.data)
+            first = cdr.DECODERS[_full_name(kind)](raw.data)
     span = max(times) - min(times)
     frames = (getattr(first, name, "") for name in ("frame_id", "child_frame_id"))
     return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)

@@ -162,13 +162,13 @@ class ControllerBridge(GuardedNode):
             self._pending = self._compare()
             due = time.monotonic() - self._tried >= self._settings["period"]
             if not self._pending:
-                self._log_and_keep(Level.OK, "the controller has what is converged")
+                self._report(Level.OK, "the controller has what is converged")
             elif self._settings["approval"]:
-                self._log_and_keep(Level.OK, "waiting for ~/approve")
+                self._report(Level.OK, "waiting for ~/approve")
             elif due:
                 self._send(self._pending)
             else:
-                self._log_and_keep(Level.OK, "waiting for the period to pass")
+                self._report(Level.OK, "waiting for the period to pass")
 
     def _compare(self) -> Sequence[Change]:
         """What should be sent; raises UserError where nothing can be."""
@@ -193,7 +193,7 @@ class ControllerBridge(GuardedNode):
         self._exchange(before, bridge.write(self._targets, before, new))
         self._sent += 1
         self._pending = ()
-        self._log_and_keep(Level.OK, f"sent {'; '.join(change.words for change in pending)}")
+        self._report(Level.OK, f"sent {'; '.join(change.words for change in pending)}")
 
     def _exchange(self, before: Values, new: Values) -> None:
         """All of ``new`` is in the controller afterwards; or, with a UserError, nothing of it."""
@@ -318,7 +318,7 @@ class ControllerBridge(GuardedNode):
                 raise UserError("the controller was never changed")
             self._wait_for_answer()
             self._exchange(self._read(), self._original)
-            self._log_and_keep(
+            self._report(
                 Level.OK, "the controller has what it had at first; disabled until ~/enable"
             )
         return response
@@ -330,7 +330,7 @@ class ControllerBridge(GuardedNode):
         self.get_logger().info(response.message)
         return response
 
-    def _log_and_keep(self, level: Level, words: str) -> None:
+    def _report(self, level: Level, words: str) -> None:
         self._level, self._words = level, words
         if words == self._logged:
             return
@@ -349,7 +349,7 @@ class ControllerBridge(GuardedNode):
             yield
         except UserError as error:
             half_changed = isinstance(error, _HalfChangedError)
-            self._log_and_keep(Level.ERROR if half_changed else Level.WARN, str(error))
+            self._report(Level.ERROR if half_changed else Level.WARN, str(error))
         self._publish_pending()
         if response is not None:
             response.success, response.message = self._level == Level.OK, self._words

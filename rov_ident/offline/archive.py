@@ -84,8 +84,8 @@ def total(parts: Sequence[Sums]) -> Sums:
 def of_records(records: Sequence[Record]) -> Archive:
     """Records that have been read already, in this process."""
     paths = [record.path for record in records]
-    reread = _reader(lambda *how: (_read_or_reason(path, *how) for path in paths), _in_this_process)
-    return _archive([_bag_and_samples(record) for record in records], _in_this_process, reread)
+    reread = _reader(lambda *how: (_outcome(path, *how) for path in paths), _locally)
+    return _archive([_bag_and_samples(record) for record in records], _locally, reread)
 
 
 @contextlib.contextmanager
@@ -101,7 +101,7 @@ def opened(
     Raises UserError if no bag can be read, or the cluster cannot be reached.
     """
 
-    def reporting(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
+    def reported(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True)):
             yield outcome
             if progress is not None:
@@ -110,7 +110,7 @@ def opened(
     if dask:
         with children.environment(), _cluster(dask, jobs) as client:
             on_dask = partial(_by_dask, client)
-            yield _reader(lambda *how: reporting(_on_dask(client, paths, *how)), on_dask)(
+            yield _reader(lambda *how: reported(_on_dask(client, paths, *how)), on_dask)(
                 config, False
             )
     elif jobs > 1 and len(paths) > 1:
@@ -125,13 +125,13 @@ def opened(
             def in_processes(config: Config, columns: bool) -> Iterator[Outcome]:
                 k = next(readings)
                 files = [Path(folder) / f"{k}-{i}.npy" for i in range(len(paths))]
-                return reporting(pool.map(_stored, paths, repeat(config), repeat(columns), files))
+                return reported(pool.map(_stored, paths, repeat(config), repeat(columns), files))
 
             yield _reader(in_processes, partial(_by_processes, pool))(config, False)
     else:
-        yield _reader(
-            lambda *how: reporting(_read_or_reason(path, *how) for path in paths), _in_this_process
-        )(config, False)
+        yield _reader(lambda *how: reported(_outcome(path, *how) for path in paths), _locally)(
+            config, False
+        )
 
 
 def default_jobs() -> int:
@@ -184,7 +184,7 @@ def _bag_and_samples(record: Record) -> tuple[Bag, Samples]:
     return bag, samples
 
 
-def _read_or_reason(path: Path, config: Config, columns: bool = False) -> Outcome:
+def _outcome(path: Path, config: Config, columns: bool = False) -> Outcome:
     try:
         return _bag_and_samples(read_record(path, config, columns=columns))
     except UserError as error:
@@ -192,7 +192,7 @@ def _read_or_reason(path: Path, config: Config, columns: bool = False) -> Outcom
         return f"left out: {text if path.name in text else f'{path.name}: {text}'}"
 
 
-def _in_this_process(
+def _locally(
     samples: Sequence[Samples], function: Callable[..., Any], *arguments: Any
 ) -> list[Any]:
     return [function(part, *arguments) for part in samples]
@@ -202,7 +202,7 @@ def _in_this_process(
 
 
 def _stored(path: Path, config: Config, columns: bool, file: Path) -> Outcome:
-    outcome = _read_or_reason(path, config, columns)
+    outcome = _outcome(path, config, columns)
     if isinstance(outcome, str):
         return outcome
     np.save(file, outcome[1])
@@ -262,7 +262,7 @@ def _on_dask(
 ) -> Iterator[Outcome]:
     """Every bag with the future of its samples, which stay on the cluster."""
     n = len(paths)
-    read = client.map(_read_or_reason, list(paths), [config] * n, [columns] * n, pure=False)
+    read = client.map(_outcome, list(paths), [config] * n, [columns] * n, pure=False)
     for whole, alone in zip(read, client.map(_bag_alone, read, pure=False), strict=True):
         bag = alone.result()
         yield (

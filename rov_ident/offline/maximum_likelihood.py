@@ -226,9 +226,9 @@ def whiteness(
     samples: Samples,
     model: Model,
     noise: Noise,
-    free: NDArray[np.bool_] | None = None,
-    gate: float = np.inf,
-    effects: Array = _NONE,
+    free: NDArray[np.bool_],
+    gate: float,
+    effects: Array,
 ) -> Array:
     """(2, 6): seconds in which the vehicle moved, and the integral over them of the power of
     innovations added up over a second (:mod:`rov_ident.core.whiteness`).
