@@ -4,15 +4,16 @@ import contextlib
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rov_ident.api.reading import File, Files, Progress, axes, existing, load, read, several, silent
+from rov_ident.api.reading import File, Files, axes, existing, load, read, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import Test
@@ -146,7 +147,7 @@ def fit(
             if reference:
                 found.more["reference"] = _reference(paths[0], given, reference, say)
         else:
-            many = stack.enter_context(opened(paths, given, say, jobs, dask))
+            many = stack.enter_context(archive.opened(paths, given, jobs, dask, say))
             _refuse_unusable(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
@@ -155,7 +156,7 @@ def fit(
             found = _with_table_notes(found, given, table)
         if validate is None:
             return found
-        judge = stack.enter_context(opened([existing(validate)], given, say))
+        judge = stack.enter_context(archive.opened([existing(validate)], given, say=say))
         say("simulating in open loop")
         reread = judge.as_read_by(found.fitted, given)
         runs = judge.bags, open_loop(judge, given), open_loop(reread, found.fitted)
@@ -214,18 +215,7 @@ def _reference(path: Path, config: Config, duration: float, say: Progress) -> di
     held = config.with_effects_held
     samples = read(path, held, say).samples
     samples = samples[samples["t"] < samples["t"][0] + duration]
-    return compare(held, samples, lambda share: say("filterpy's filter", share))
-
-
-def opened(
-    paths: Sequence[Path], config: Config, say: Progress, jobs: int = 1, dask: str = ""
-) -> contextlib.AbstractContextManager[archive.Archive]:
-    """Bags as an archive, for a ``with``, as :func:`archive.opened`; ``say`` is told of each."""
-
-    def told(name: str, done: int, total: int) -> None:
-        say(f"read {name}", done / total)
-
-    return archive.opened(paths, config, jobs, dask, told)
+    return compare(held, samples, say)
 
 
 @one_blas_thread()
@@ -281,16 +271,9 @@ def _streams(path: Path, config: Config, say: Progress) -> tuple[Streams, dict[s
     """A bag's messages in arrays, and its name and sha256."""
     bag = Bag(path)
     chosen = topics.select(bag, config)
-    total = topics.total(bag, chosen)
     refuse_without_velocity(bag, chosen, config)
 
-    def counted() -> Iterator[Any]:
-        for done, message in enumerate(topics.messages(bag, chosen, config)):
-            if done % 2000 == 0:
-                say(f"reading {path.name}", done / total)
-            yield message
-
-    streams = gather(counted(), config)
+    streams = gather(topics.messages(bag, chosen, config, say=say), config)
     if bag.damage:
         streams = dataclasses.replace(streams, notes=(*streams.notes, bag.damage))
     return streams, {"name": bag.path.name, "sha256": bag.sha256}
@@ -316,7 +299,7 @@ def check(bag: File, config: File | Config, *, progress: Progress | None = None)
     UserError
         If the bag cannot be read, or has too few messages.
     """
-    return data_quality.check(existing(bag), load(config), progress)
+    return data_quality.check(existing(bag), load(config), progress or silent)
 
 
 @one_blas_thread()
@@ -327,7 +310,7 @@ def plan(
     duration: float = 60.0,
     tank: Sequence[float] = (6.0, 6.0, 2.0),
     thrust: float = 1.0,
-    progress: Callable[..., None] | None = None,
+    progress: Progress | None = None,
 ) -> Proposal:
     """Propose the manoeuvre to run next: safe, and best for the coefficient that is known worst.
 
@@ -357,6 +340,8 @@ def plan(
     given, say = load(config), progress or silent
     length, width, depth = tank
     limits = Limits((length, width, depth), thrust)
-    known = contextlib.nullcontext() if bag is None else opened(several(bag), given, say)
+    known = (
+        contextlib.nullcontext() if bag is None else archive.opened(several(bag), given, say=say)
+    )
     with known as bags:
         return design.propose(given, bags, duration, limits, say)

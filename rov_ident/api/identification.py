@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident.api.functions import check, explain, opened, plan
+from rov_ident.api.functions import check, explain, plan
 from rov_ident.api.functions import fit as fit_bags
-from rov_ident.api.reading import File, Files, Progress, load, several, silent
+from rov_ident.api.reading import File, Files, load, several
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import EXTENDED
@@ -22,6 +23,7 @@ from rov_ident.estimation.consistency import CAUSE
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
+from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, rmse_change
 from rov_ident.offline.prediction_error import open_loop
@@ -268,7 +270,7 @@ def identify(
         fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
     judged: dict[str, Any] = {}
     if judge is not None:
-        with opened([judge], given, say) as held_back:
+        with archive.opened([judge], given, say=say) as held_back:
             reread = held_back.as_read_by(fitted.fitted, given)
             after = open_loop(reread, fitted.fitted)
             judged = validation(held_back.bags, open_loop(held_back, given), after)

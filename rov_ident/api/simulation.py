@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.api.reading import File, Progress, axes, load, read
+from rov_ident.api.reading import File, axes, load, read
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
+from rov_ident.core.progress import Progress
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.effects import compiled
 from rov_ident.io.write_messages import write_messages

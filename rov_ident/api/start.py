@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from rov_ident import config as configuration
-from rov_ident.api.reading import File, Progress
+from rov_ident.api.reading import File
 from rov_ident.config.writing import annotated
 from rov_ident.consumer.formats import import_model
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import VEHICLES, shipped, write_file
 from rov_ident.core.frames import FLIP_BODY
+from rov_ident.core.progress import Progress
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io import topics
 from rov_ident.io.ardupilot_log import FRAMES, SUFFIXES, read_log

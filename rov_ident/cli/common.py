@@ -15,7 +15,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output, write_file
 
 if TYPE_CHECKING:
-    from rov_ident.api.reading import Progress
+    from rov_ident.core.progress import Progress
     from rov_ident.reports.result import Shown
 
 

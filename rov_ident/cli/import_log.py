@@ -8,7 +8,7 @@ from rov_ident.cli import common
 from rov_ident.core.errors import UserError
 
 if TYPE_CHECKING:
-    from rov_ident.api.reading import Progress
+    from rov_ident.core.progress import Progress
 
 
 def add(commands: common.Commands) -> None:

@@ -6,7 +6,6 @@ measurements are outliers, which coefficients the motion does not show, how much
 is. Both must then give the same numbers; ours is some three hundred times as fast.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.messages import Array
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.runge_kutta import NODES, WEIGHTS
 from rov_ident.estimation import ukf
 from rov_ident.estimation.shared import RELEARNING_TIME, Problem, mark_learnable, steps_of
@@ -156,13 +156,11 @@ def raised(mass: Array, least: Array) -> Array:
     return added
 
 
-def compare(
-    config: Config, samples: NDArray[np.void], tell: Callable[[float], None] = lambda share: None
-) -> dict[str, Any]:
+def compare(config: Config, samples: NDArray[np.void], say: Progress = silent) -> dict[str, Any]:
     """Both filters over samples (k,) of SAMPLE, as JSON has it; effects' parameters are held.
 
-    Standard deviations are those of the filters, without what coloured residuals add. ``tell`` is
-    given the share that is done. A sample takes filterpy some milliseconds.
+    Standard deviations are those of the filters, without what coloured residuals add. A
+    sample takes filterpy some milliseconds.
     """
     config = config.with_effects_held
     task = ukf.problem(config)
@@ -173,7 +171,7 @@ def compare(
         state, info = ukf.step(task, before, samples[k : k + 1])
         reference.step(samples[k], before, state, info[0])
         if k % 20 == 0:
-            tell(k / len(samples))
+            say("filterpy's filter", k / len(samples))
     columns = {
         "value": task.scale * state.x[6:],
         "std": task.scale * np.sqrt(np.diag(state.p)[6:]),

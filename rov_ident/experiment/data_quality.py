@@ -6,7 +6,7 @@ coefficients, a recursive least squares fit with all that is estimated by defaul
 model can explain the motion, what the configuration lacks, and how well each coefficient is known.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -18,6 +18,7 @@ from rov_ident.config.prior import THRUST_SCALE, prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_angle, quaternion_from_euler
 from rov_ident.core.linalg import interpolated
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONVERGED, State, of_fit
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import SUPPOSED
@@ -36,8 +37,6 @@ from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import blanked, is_without_velocity
-
-Tell = Callable[..., None]
 
 UNITS = (("m/s", "N"),) * 3 + (("rad/s", "N m"),) * 3  # of velocity and wrench on each axis
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
@@ -167,11 +166,10 @@ class Check(Shown):
         return as_json(document)
 
 
-def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
-    """Look at a bag; ``tell`` is called with what is being done, and what share of it is. UserError
+def check(path: Path, config: Config, say: Progress = silent) -> Check:
+    """Look at a bag; UserError
     if it cannot be read, or lacks the messages that are needed."""
-    say = tell or (lambda what, share=None: None)
-    record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
+    record = read_record(path, config, say)
     say("looking at its messages")
     bag, unmeasured = Bag(path), is_without_velocity(record.samples)
     topics = inputs.select(bag, config)

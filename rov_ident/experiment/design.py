@@ -15,6 +15,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of, typical
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.estimation.physical import is_passive
 from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Flight, Limits
@@ -140,12 +141,11 @@ def propose(
     bags: Archive | None = None,
     duration: float = 60.0,
     limits: Limits | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Progress = silent,
 ) -> Proposal:
     """The manoeuvre to run next, after ``bags`` or, without, from the prior alone. UserError if no
     manoeuvre is safe within the limits."""
     limits = limits or Limits()
-    tell = say or (lambda what: None)
     if duration < _SHORTEST:
         raise UserError(
             f"a manoeuvre of {duration:g} s shows nothing: {_SHORTEST:g} s are the least"
@@ -164,7 +164,7 @@ def propose(
         if not velocity and any(one.amplitude[:2]):
             left_out.append(f"{one.name}: without a velocity sensor surge and sway have to rest")
             continue
-        tell(one.name)
+        say(one.name)
         found = _largest_safe(vehicles, one, duration, limits)
         if found is None:
             left_out.append(f"{one.name}: not safe within the limits, however small")

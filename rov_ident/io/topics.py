@@ -27,6 +27,7 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
 )
 from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.core.progress import Progress, silent
 from rov_ident.io import cdr
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
@@ -256,13 +257,17 @@ def _unknown_type(bag: Bag, role: str) -> str:
 
 
 def messages(
-    bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None = None
+    bag: Bag,
+    topics: Mapping[str, str],
+    config: Config,
+    counts: Counter[str] | None = None,
+    say: Progress = silent,
 ) -> Iterator[tuple[str, Message]]:
     """(role, message) in the order of log times, axes as on the wire; ``topics`` of :func:`select`.
 
     What cannot be used is added to ``counts`` at the end.
     """
-    for role, message, _ in _read(bag, topics, config, counts):
+    for role, message, _ in _read(bag, topics, config, counts, say):
         yield role, message
 
 
@@ -278,28 +283,31 @@ def as_played(
         for raw in bag.iter_raw(roles):
             yield roles[raw.topic], raw
         return
-    for role, message, raw in _read(bag, topics, config, None):
+    for role, message, raw in _read(bag, topics, config):
         if role != DRIVE:
             raw = raw._replace(type_name=cdr.ROLE_TYPES[role], data=cdr.encode(message))
         yield role, raw
 
 
 def _read(
-    bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None
+    bag: Bag,
+    topics: Mapping[str, str],
+    config: Config,
+    counts: Counter[str] | None = None,
+    say: Progress = silent,
 ) -> Iterator[tuple[str, Message, RawMessage]]:
-    reader = Reader(config)
+    reader, what = Reader(config), f"reading {bag.path.name}"
     roles = {topic: role for role, topic in topics.items()}
-    for raw in bag.iter_raw(roles):
+    total = sum(bag.topics[topic].message_count for topic in roles)
+    for done, raw in enumerate(bag.iter_raw(roles)):
+        if done % 2000 == 0:
+            say(what, done / max(total, 1))
         for role, message in reader.read(roles[raw.topic], raw.data, raw.log_time):
             yield role, message, raw
     reader.flush()
+    say(what, 1.0)
     if counts is not None:
         counts.update(reader.counts)
-
-
-def total(bag: Bag, topics: Mapping[str, str]) -> int:
-    """How many messages there are on the topics."""
-    return sum(bag.topics[topic].message_count for topic in topics.values())
 
 
 def _full_name(type_name: str) -> str:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core import children
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import limit_process
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.smoothing import smoothed
@@ -32,8 +33,6 @@ Samples = NDArray[np.void]
 Mapper = Callable[..., list[Any]]
 """``mapper(function, *arguments)``: [function(samples, *arguments)] of every bag, in order."""
 Sums = TypeVar("Sums", bound=tuple[Any, ...])
-Progress = Callable[[str, int, int], None]
-"""Called with the name of the bag just read, how many are done, and how many there are."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +89,7 @@ def of_records(records: Sequence[Record]) -> Archive:
 
 @contextlib.contextmanager
 def opened(
-    paths: Sequence[Path],
-    config: Config,
-    jobs: int = 1,
-    dask: str = "",
-    progress: Progress | None = None,
+    paths: Sequence[Path], config: Config, jobs: int = 1, dask: str = "", say: Progress = silent
 ) -> Iterator[Archive]:
     """Read bags, in ``jobs`` processes or on a Dask cluster at the address ``dask`` ("local").
 
@@ -104,8 +99,7 @@ def opened(
     def reported(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True)):
             yield outcome
-            if progress is not None:
-                progress(path.name, i + 1, len(paths))
+            say(f"read {path.name}", (i + 1) / len(paths))
 
     if dask:
         with children.environment(), _cluster(dask, jobs) as client:

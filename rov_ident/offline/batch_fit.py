@@ -5,7 +5,7 @@ measured, a channel whose open-loop simulation is good already is left alone, an
 motion does not show is refused, with the reason (Zhao et al. 2018).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from rov_ident.config.prior import (
 )
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
@@ -50,8 +51,6 @@ DRIVEN_UNSEEN = (
     "and sway rest (or record a DVL)"
 )
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def fit_batch(
     config: Config,
     kind: str,
     settings: Settings | None = None,
-    say: Say | None = None,
+    say: Progress = silent,
 ) -> Fit:
     """Fit an archive.
 
@@ -110,8 +109,7 @@ def fit_batch(
         odometry = replace(config.odometry, latency_std=0.0)
         config = replace(config, current_std=0.0, odometry=odometry)
         settings = replace(settings, readings=2 * settings.readings)
-    tell = say or (lambda what: None)
-    tell("open loop, as configured")
+    say("open loop, as configured")
     read, given = archive, config
     before = open_loop(read, given)
     notes = list(archive.notes)
@@ -125,9 +123,9 @@ def fit_batch(
     for stage in settings.stages or (MOTIONS,):
         found: _Stage | None
         if effects and config.estimate_effects:
-            archive, found = _relinearised(archive, config, kind, settings, notes, tell)
+            archive, found = _relinearised(archive, config, kind, settings, notes, say)
         else:
-            found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
+            found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, say)
         if found is None:
             continue
         at = np.array([prior.names.index(name) for name in found.names])
@@ -138,7 +136,7 @@ def fit_batch(
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
         now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
-    tell("open loop, fitted")
+    say("open loop, fitted")
     judged = read.as_read_by(now, config)
     after = open_loop(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
@@ -180,7 +178,7 @@ def fit_batch(
 
 
 def _relinearised(
-    archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Say
+    archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Progress
 ) -> tuple[Archive, _Stage]:
     """A fit with parameters of effects, and the archive as they have it.
 
@@ -220,7 +218,7 @@ def _stage(
     channels: Sequence[str],
     settings: Settings,
     notes: list[str],
-    say: Say,
+    say: Progress,
     before: _Stage | None = None,
     body: RigidBody | None = None,
 ) -> _Stage | None:
@@ -256,8 +254,8 @@ def _stage(
     coefficients = prior_of(config)
     precision = 1.0 if settings.prior else _NO_PRIOR
 
-    def progress(what: str) -> None:
-        say(f"{name}: {what}" if settings.stages else what)
+    def of_stage(what: str, share: float | None = None) -> None:
+        say(f"{name}: {what}" if settings.stages else what, share)
 
     unmeasured = any(archive.each(is_without_velocity))
     if unmeasured:  # as far as it is simulated, the motion tells least squares nothing
@@ -272,7 +270,7 @@ def _stage(
             instrumental=kind == "iv",
             weighted=settings.weighted,
             precision=precision,
-            progress=progress,
+            say=of_stage,
         )
         found, covariance, information = solution.values, solution.covariance, solution.information
     base = least_squares.base_parameters(names, information, coefficients.std)
@@ -302,7 +300,7 @@ def _stage(
             free,
             precision / prior.std**2,
             settings.process,
-            progress,
+            of_stage,
             start[len(names) :],
             noise,
         )

@@ -15,7 +15,7 @@ masses', not the second, that of quadratic damping. Maximum likelihood has neith
 Sums over the samples of several bags are sums over bags: an archive is one fit.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from scipy.linalg import qr
 from rov_ident.config import Config
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting, compiled
 from rov_ident.estimation.shared import add_scatter
 from rov_ident.model.equations import Array, Model
@@ -83,7 +84,7 @@ def solve(
     instrumental: bool = False,
     weighted: bool = True,
     precision: float = 1.0,
-    progress: Callable[[str], None] | None = None,
+    say: Progress = silent,
 ) -> Solution:
     """Least squares over every bag, the estimated coefficients those of the configuration.
 
@@ -91,7 +92,6 @@ def solve(
     axis's own forces). ``precision`` multiplies the prior's: 1 takes the configuration as it is.
     """
     free = np.ones(6, dtype=bool) if free is None else free
-    say = progress or (lambda what: None)
     task = regression(config)
     batch = Batch(task, compiled(config.effects))
     prior: Array = np.eye(len(task.scale)) * precision

@@ -45,6 +45,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.observer import (
@@ -339,7 +340,7 @@ def maximise(
     free: NDArray[np.bool_] | None = None,
     precision: Array | None = None,
     process: bool = True,
-    progress: Callable[[str], None] | None = None,
+    say: Progress = silent,
     effects: Array | None = None,
     first_noise: Noise | None = None,
 ) -> Likelihood:
@@ -367,7 +368,6 @@ def maximise(
         starts = [replace(likely, floor=np.zeros(6), relative=0.0, restoring=exact)]
     if first_noise is not None:
         starts = [first_noise]
-    say = progress or (lambda what: None)
 
     def at_values(theta: Array) -> Model:
         moved = model.theta.copy()

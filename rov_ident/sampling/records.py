@@ -1,7 +1,7 @@
 """A bag as the estimators see it: its samples, and what had to be refused."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
+from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -26,9 +27,6 @@ from rov_ident.simulation.virtual_sensors import Dive
 HORIZON = 10.0  # s; of the open-loop windows by which models are judged
 VELOCITIES = tuple("uvwpqr")
 UNITS = ("m/s",) * 3 + ("rad/s",) * 3
-
-Progress = Callable[[int, int], None]
-"""Called now and then with the messages read so far and in all."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Record:
 
 
 def read_record(
-    path: str | Path, config: Config, progress: Progress | None = None, columns: bool = False
+    path: str | Path, config: Config, say: Progress = silent, columns: bool = False
 ) -> Record:
     """Read a bag into samples; with ``columns`` they say how they change with the estimated
     parameters of effects (:func:`~rov_ident.sampling.sample.sample_type`).
@@ -63,20 +61,15 @@ def read_record(
     """
     bag = Bag(Path(path))
     topics = inputs.select(bag, config)
-    total = inputs.total(bag, topics)
     measured = has_velocity(bag, topics, config)
     sampler = Sampler(config if columns else config.with_effects_held, measured)
     parts: list[NDArray[np.void]] = []
     unusable: Counter[str] = Counter()
-    for done, (role, message) in enumerate(inputs.messages(bag, topics, config, unusable)):
+    for role, message in inputs.messages(bag, topics, config, unusable, say):
         part = sampler.push(role, message)
         if len(part):
             parts.append(part)
-        if progress is not None and done % 2000 == 0:
-            progress(done, total)
     parts.append(sampler.flush())
-    if progress is not None:
-        progress(total, total)
     samples = after_reset(joined(parts))
     counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
