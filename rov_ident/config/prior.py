@@ -99,16 +99,15 @@ def drift_of(config: Config, names: tuple[str, ...]) -> Array:
     says that it is known (``current_std: 0`` ...).
     """
     supposed = {".".join(key): std for key, std in config.nuisance_std.items()}
-    body, tilt = config.model.body, config.odometry.attitude_std
-    weight = body.mass * config.gravity
-    arm = {"dx": body.restoring[4, 0] / weight, "dy": body.restoring[3, 1] / weight}  # m
+    # m: so far off, a centre of gravity looks like the error of the attitude
+    offset = config.model.body.righting_arm * config.odometry.attitude_std
 
     def rate(name: str) -> float:
         effect, _, own = name.partition(".")
         if name in supposed and effect == "ocean_current":
             return 1.0 / _CURRENT_TIME
-        if name in supposed and effect == "cog_offset" and own in arm:
-            return 2.0 * float((arm[own] * tilt / supposed[name]) ** 2) / _ATTITUDE_TIME
+        if name in supposed and effect == "cog_offset" and own in ("dx", "dy"):
+            return 2.0 * float((offset / supposed[name]) ** 2) / _ATTITUDE_TIME
         return 0.0
 
     return np.array([rate(name) for name in names])
@@ -150,7 +149,7 @@ def righting_arm_covariance(
     scales all of these. No manoeuvre reduces this error, so convergence is judged without it.
     """
     body, std = config.model.body, config.vehicle_uncertainty.cob_std
-    arm = abs(body.restoring[3, 1]) / body.weight
+    arm = abs(body.righting_arm)
     # no more than is supposed of the scale: a body without an arm tells nothing of it
     share = min(std / max(arm, 1e-9), config.wrench.scale_std)
     masses, moments = _own_inertia(body)

@@ -256,7 +256,7 @@ def _steps(task, state, work, samples, sides, infos):
             for i in range(len(state.x)):
                 work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
             _update(task, state, work, sample, side, info)
-            _look_back(task, state, work, sample.dt)
+            _end_period(task, state, work, sample.dt)
         _residual(task, state, work, sample, side, info)
 
 
@@ -590,12 +590,12 @@ def _absorb_beside_noise(task, x, work, side, first):
                 p[b, a] = p[a, b]
 
 
-# ---------------------------------------------------------------- looking back
+# ---------------------------------------------------------------- once a period
 
 
 @inlined
-def _look_back(task, state, work, dt):
-    """Every _PERIOD: what the innovations did to the coefficients, and the random walk of these."""
+def _end_period(task, state, work, dt):
+    """Every _PERIOD: sum up what innovations did to the coefficients, and let these walk."""
     c = state.scalars[0]
     c.since += dt
     if c.since < _PERIOD:

@@ -92,10 +92,9 @@ def _rate_remarks(streams: Streams) -> list[Remark]:
 def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
     remarks = []
     body = config.model.body
-    # What rights the hull for each radian of roll or pitch, the axis z down.
-    righting = body.weight * body.cog[2] - body.buoyancy * body.cob[2]
-    if righting < 0.0:
-        text = f"by its cob and cog the configured hull would capsize ({righting:.2g} N m/rad): "
+    if body.righting_arm < 0.0:
+        moment = body.righting_arm * body.weight
+        text = f"by its cob and cog the configured hull would capsize ({moment:.2g} N m/rad): "
         text += "check vehicle.frame (frd: z down, flu: z up), vehicle.cob and vehicle.cog"
         remarks.append(Remark("vehicle.frame", BAD, text))
     r = quaternion_to_matrix(streams.orientation)

@@ -71,6 +71,7 @@ from rov_ident.estimation.shared import (
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
+from rov_ident.sampling.kinematic_filter import SUREST
 from rov_ident.sampling.reading_noise import SHARE
 from rov_ident.sampling.sample import NO_SIDES, parts
 
@@ -83,7 +84,6 @@ _ITERATIONS = 25  # a guard: Gauss-Newton steps converge in a few, or never
 _DOUBTFUL = 0.03  # of the axis's working wrench, lasting a second: what may be unexplained at first
 _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first level to the least
 _NEAR = 0.05  # squared standard deviations of noise levels from the most likely ones
-_SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better than a hundredth
 _SMALLEST = 1e-4  # floor of the process noise over the axis's working wrench: as good as none
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
 _NONE = np.zeros(0)
@@ -462,7 +462,7 @@ def _noise_levels(
 ) -> Noise:
     """The most likely levels, begun from those of ``noise``."""
     start = _levels(noise) if process else np.zeros(13)
-    least = np.full(13, np.log(_SUREST))
+    least = np.full(13, np.log(SUREST))
     least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
     least[12] = np.log(1e-10)
 
