@@ -5,7 +5,7 @@ badly. "Does the model explain the data?" in docs/live.md has the study that lim
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,9 +51,13 @@ class Test:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The tests, and by how much wider they make every interval."""
+    """The tests, and by how much wider they make every interval.
+
+    ``asks``: whether the method tests what the model leaves unexplained. Least squares does not.
+    """
 
     tests: tuple[Test, ...]
+    asks: bool = True
 
     @property
     def consistent(self) -> bool:
@@ -81,8 +85,10 @@ class Consistency:
 
     @property
     def sentence(self) -> str:
-        """What the worst test says, and what to do; nothing where all are passed."""
+        """What the worst test says, and what to do; or what it means that none fails."""
         failed = [test for test in self.tests if not test.passed]
+        if not failed and not self.asks:
+            return "no test fails, but least squares does not ask what the model leaves unexplained"
         if not failed and not self.judged:
             return (
                 "nothing contradicts the model, but there was too little motion, throughout or "
@@ -98,14 +104,12 @@ class Consistency:
         """Why nothing can have converged, in a few words; empty where something can."""
         if not self.consistent:
             return "data and model disagree"
-        return "" if self.judged else "too little motion yet to judge the model"
+        return "too little motion yet to judge the model" if self.asks and not self.judged else ""
 
-    def of_states(self, states: Iterable[State], asks: bool = True) -> tuple[State, ...]:
-        """The states of a fit: in :attr:`doubt` nothing has converged. A method that never ``asks``
-        what the model leaves unexplained (least squares) is only doubted where a test failed."""
-        doubted = bool(self.doubt) if asks else not self.consistent
-        lesser = {State.CONVERGED: State.CONVERGING} if doubted else {}
-        return tuple(lesser.get(state, state) for state in states)
+    def of_states(self, states: Iterable[State]) -> tuple[State, ...]:
+        """The states of a fit: in :attr:`doubt` nothing has converged."""
+        doubted = {State.CONVERGED: State.CONVERGING} if self.doubt else {}
+        return tuple(doubted.get(state, state) for state in states)
 
     def with_open_loop(self, before: Array, after: Array, chance: Array) -> "Consistency":
         """The same, asked also whether a fit predicts worse than what it began with.
@@ -128,7 +132,7 @@ class Consistency:
                         f"{new:.3g} instead of {old:.3g}): {CAUSE}",
                     )
                 )  # fmt: skip
-        return Consistency(tuple(tests))
+        return replace(self, tests=tuple(tests))
 
     def to_dict(self) -> dict[str, Any]:
         """As in the JSON of a fit."""

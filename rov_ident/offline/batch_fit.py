@@ -33,7 +33,7 @@ from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Bag, Samples, total
-from rov_ident.offline.fit import ASKING, IDENTIFIABLE, Fit
+from rov_ident.offline.fit import IDENTIFIABLE, Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
@@ -144,6 +144,7 @@ def fit_batch(
     for bag in judged.bags:
         sensors |= {p: max(r, sensors.get(p, 0.0)) for p, r in bag.contradictions.items()}
     consistency = consistency_of(config, prior, values, unexplained, lasting, sensors)
+    consistency = replace(consistency, asks=kind == "ml")
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
     if unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
@@ -163,7 +164,7 @@ def fit_batch(
         units=prior.units,
         values=values,
         covariance=consistency.widened(covariance, prior.std),
-        states=consistency.of_states(states.values(), kind in ASKING),
+        states=consistency.of_states(states.values()),
         given=config,
         fitted=now,
         samples=archive.samples,

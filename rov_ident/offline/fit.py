@@ -29,8 +29,6 @@ IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have rem
 
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
-ASKING = ("ml", *ESTIMATORS)
-"""Methods that test what the model leaves unexplained: least squares takes it for noise."""
 _SHOWN = 60.0  # s of motion in the picture of a fit
 
 
@@ -102,8 +100,7 @@ class Fit(Shown, Result):
         squares, which does not test that."""
         if not self.consistency.consistent:
             return f"data and model disagree: {self.consistency.sentence}"
-        asks = self.estimator in ASKING
-        return self.consistency.sentence if asks and not self.consistency.judged else ""
+        return self.consistency.sentence if self.consistency.doubt else ""
 
     def with_tests(self, tests: Sequence[Test]) -> "Fit":
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
@@ -111,12 +108,12 @@ class Fit(Shown, Result):
         prior = prior_of(self.given, effects=True)
         known = dict(zip(prior.names, prior.std.tolist(), strict=True))
         std = np.array([known[name] for name in self.names])
-        consistency = Consistency((*self.consistency.tests, *tests))
+        consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
         return replace(
             self,
             consistency=consistency,
             covariance=Consistency(tuple(tests)).widened(self.covariance, std),
-            states=consistency.of_states(self.states, self.estimator in ASKING),
+            states=consistency.of_states(self.states),
         )
 
     @property
