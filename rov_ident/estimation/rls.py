@@ -347,7 +347,7 @@ def _work(task, state):
         np.zeros((6, columns)),
         np.zeros((6, columns)),  # what a column adds to the measured velocity alone
         np.zeros((n + 2, columns)),  # [R | z]
-        np.zeros((n + 2, columns)),  # R^-1 as of the last time that the observer was told
+        np.zeros((n + 2, columns)),  # R^-1 when the observer last took over the coefficients
         np.zeros((n + 2, columns)),
         np.zeros((n + 2, columns)),
         np.zeros((12, columns)),  # what comes in, and what is forgotten

@@ -139,7 +139,7 @@ def over_ground(samples: NDArray[np.void]) -> Array:
 
 
 def measured_motion(samples: NDArray[np.void]) -> Array:
-    """:func:`over_ground`, NaN where no linear velocity was measured, but simulated."""
+    """:func:`over_ground`, NaN where linear velocities were simulated, as none was measured."""
     nu = over_ground(samples)
     if is_without_velocity(samples):
         nu[:, :3] = np.nan

@@ -107,8 +107,8 @@ class Validation:
         step = (stamp - last) * 1e-9
         if 0.0 < step <= _LARGEST_JUMP:
             return ""
-        # A single wild stamp is an error; two in a row that agree are another clock, as are two a
-        # step behind of which the second goes on from the first: reordered ones are single.
+        # A single wild stamp is an error. Two in a row that agree are of another clock, and so are
+        # two that are both late, the second shortly after the first; reordering makes single ones.
         suspect = self._suspect.get(role)
         self._suspect[role] = stamp
         since = math.inf if suspect is None else (stamp - suspect) * 1e-9

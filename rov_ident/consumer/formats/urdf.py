@@ -31,8 +31,8 @@ class _Place(NamedTuple):
     origin: Array
     axes: Array
 
-    def inside(self, other: "_Place") -> "_Place":
-        """What is given in ``other``, in what ``other`` is given in."""
+    def in_parent_of(self, other: "_Place") -> "_Place":
+        """The same pose, relative to ``other``, in the frame that ``other`` is relative to."""
         return _Place(other.origin + other.axes @ self.origin, other.axes @ self.axes)
 
 
@@ -132,11 +132,11 @@ def _link_poses(links: list[str], joints: list[_Joint]) -> dict[str, _Place]:
         if not ready:
             raise UserError(f"the joint {waiting[0].name} hangs on no link of the tree")
         for joint in ready:
-            places[joint.child] = joint.place.inside(places[joint.parent])
+            places[joint.child] = joint.place.in_parent_of(places[joint.parent])
         waiting = [joint for joint in waiting if joint not in ready]
     body = places.get("base_link", places[roots[0]])
     back = _Place(-body.axes.T @ body.origin, body.axes.T)
-    return {name: place.inside(back) for name, place in places.items()}
+    return {name: place.in_parent_of(back) for name, place in places.items()}
 
 
 def _rigid_body(
@@ -149,7 +149,7 @@ def _rigid_body(
         if inertial is None or inertial.find("mass") is None:
             continue
         (mass,) = _numbers(inertial.find("mass"), "value", [0.0])
-        own = _pose_of(inertial).inside(places[name])
+        own = _pose_of(inertial).in_parent_of(places[name])
         tensor = np.zeros((3, 3))
         for key, (i, j) in INERTIA.items():
             tensor[i, j] = tensor[j, i] = _numbers(inertial.find("inertia"), key, [0.0])[0]
