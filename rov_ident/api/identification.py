@@ -213,7 +213,11 @@ class Identification(Shown):
 
 @one_blas_thread()
 def identify(
-    dives: Files, config: File, *, validate: File | None = None, progress: Progress | None = None
+    dives: Files,
+    config: File | Config,
+    *,
+    validate: File | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """Identify a vehicle from its dives, by the whole path: check, explain, fit, judge, plan.
 
@@ -297,7 +301,7 @@ def _with_start_notes(explanation: Explanation, used: bool) -> Explanation:
     return replace(explanation, findings=replace(findings, notes=notes))
 
 
-def _first_dive(config: Any, say: Progress) -> str:
+def _first_dive(config: Config, say: Progress) -> str:
     """The end of a message: the manoeuvre to begin with, where there is a safe one."""
     try:
         return f"; fly instead: {plan(config, progress=say).sentence}"

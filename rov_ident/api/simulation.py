@@ -142,8 +142,7 @@ def simulate(
     duration
         Of a manoeuvre, s.
     sensors
-        Of a manoeuvre: rates [Hz] and noise of the simulated sensors, a
-        ``rov_ident.simulation.virtual_sensors.Suite``.
+        Of a manoeuvre: rates [Hz] and noise of the simulated sensors, a ``rov_ident.Suite``.
     seed
         Of a manoeuvre: of its course and of the noise.
     config, progress
