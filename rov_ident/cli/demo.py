@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rov_ident.cli.common import ERR, LIVE, OUT, Commands, check_outputs, command, rate
+from rov_ident.cli.common import ERR, LIVE, OUT, Commands, command, rate
 from rov_ident.core.files import shipped, write_file
 
 if TYPE_CHECKING:
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    demo = command(commands, "demo", "the main job on the shipped bag, live over DDS", _demo)
+    text, files = "the main job on the shipped bag, live over DDS", "report.html convergence.png"
+    demo = command(commands, "demo", text, _demo, "", f"{files} coefficients.mcap")
     demo.add_argument("--rate", type=rate, default=4.0, help="speed of the replay (default 4)")
     demo.add_argument(
         "--out", type=Path, default=Path("out/demo"), help="folder of the report (out/demo)"
@@ -40,7 +41,6 @@ def _demo(options: argparse.Namespace) -> None:
     coefficients, path, picture = (
         options.out / name for name in ("coefficients.mcap", "report.html", "convergence.png")
     )
-    check_outputs([path, picture], [], coefficients)
     bag, start = shipped("bags/demo.mcap"), shipped("config/bluerov2_heavy_demo.yaml")
     config = configuration.load(start)
     model = configuration.load(shipped("config/bluerov2_heavy.yaml")).model

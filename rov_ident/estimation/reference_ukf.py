@@ -17,7 +17,7 @@ from rov_ident.core.messages import Array
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.runge_kutta import NODES, WEIGHTS
 from rov_ident.estimation import ukf
-from rov_ident.estimation.shared import RELEARNING_TIME, Problem, mark_learnable, steps_of
+from rov_ident.estimation.shared import RELEARNING_TIME, Problem, excited, steps_of
 from rov_ident.model.equations import force_of_one
 
 
@@ -121,7 +121,7 @@ class ReferenceUkf:
         self.filter.update(z[measured], R=np.diag(r[measured]), hx=lambda x: x[measured])
         # What does not show in the motion is only considered (Schmidt 1966).
         moves, noisy = np.ones(len(self.task.theta), dtype=bool), np.zeros(6, dtype=bool)
-        mark_learnable(self.task, row["moving"], row, monitor, self._inverse_mass(), noisy, moves)
+        excited(self.task, row["moving"], row, monitor, self._inverse_mass(), noisy, moves)
         held = 6 + np.flatnonzero(~moves[self.task.estimated])
         self.filter.x[held] = x[held]
         self.filter.P[np.ix_(held, held)] = p[np.ix_(held, held)]

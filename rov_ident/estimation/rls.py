@@ -79,8 +79,8 @@ from rov_ident.estimation.shared import (
     add_scatter,
     begin,
     drive_sides,
+    excited,
     folded,
-    mark_learnable,
     measure,
     problem_of,
     steps_of,
@@ -566,7 +566,7 @@ def _judge_motion(task, state, work, sample):
         c.peak[i] = max(c.peak[i] * decay, surely)
         work.moving[i] = 1 if c.peak[i] > _MOVING * r else 0
     inverse = work.scratch[0].inverse
-    mark_learnable(task, work.moving, sample, state.monitor, inverse, work.noisy, work.moves)
+    excited(task, work.moving, sample, state.monitor, inverse, work.noisy, work.moves)
     free, sorted_already = 0, True
     for a in range(len(work.estimated)):
         if work.moves[work.estimated[a]]:

@@ -132,14 +132,14 @@ def too_noisy(axes: NDArray[np.bool_]) -> str:
 
 def noisy_axes(mass: Array, reading_noise: Array, monitor: NDArray[np.void]) -> NDArray[np.bool_]:
     """(6,) on which axes noise of the wrench's reading is known to be too large to learn from, as
-    :func:`mark_learnable` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
+    :func:`excited` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
     noise = np.diag(np.linalg.inv(mass)) ** 2 * reading_noise
     follows = (monitor["seen"] > TIME) & (monitor["density"] <= FOLLOWED * noise)
     return (noise > 0.0) & (noise < np.inf) & ~follows
 
 
 @lean
-def mark_learnable(task, moving, sample, monitor, inverse, noisy, moves):
+def excited(task, moving, sample, monitor, inverse, noisy, moves):
     """Set moves (m,): which entries of theta the motion excites. Work space: noisy (6,).
 
     A coefficient is excited by axes that are ``moving`` (6,), well above the noise of their sensor,

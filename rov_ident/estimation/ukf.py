@@ -56,8 +56,8 @@ from rov_ident.estimation.shared import (
     Problem,
     add_scatter,
     begin,
+    excited,
     folded,
-    mark_learnable,
     measure,
     problem_of,
     steps_of,
@@ -250,9 +250,7 @@ def _steps(task, state, work, samples, sides, infos):
                 c.started = False
                 continue
             inverse = work.scratch[0].centre_inverse
-            mark_learnable(
-                task, sample.moving, sample, state.monitor, inverse, work.noisy, work.moves
-            )
+            excited(task, sample.moving, sample, state.monitor, inverse, work.noisy, work.moves)
             for i in range(len(state.x)):
                 work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
             _update(task, state, work, sample, side, info)

@@ -20,9 +20,9 @@ from rov_ident.offline.batch_fit import AT_REST
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams, integral
 from rov_ident.sampling.sample import SAMPLE
-from rov_ident.sampling.sampler import LONGEST_INTERVAL
 from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
@@ -113,16 +113,14 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         remarks.append(Remark("imu axes", level, text))
         gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
         rate = streams.nu[:, 3:]
-        remarks.append(
-            _sign_remark("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST)
-        )
+        remarks.append(_agreement("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
     step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
     remarks += _rates_and_turns(streams, step)
     if streams.has_pose and streams.nu[:, :3].any():
         moved = streams.position[step:] - streams.position[:-step]
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
         told, axes = way[step:] - way[:-step], ("north", "east", "down")
-        remarks.append(_sign_remark("pose against velocity", told, moved, axes, _LINEAR_LEAST))
+        remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
     if len(streams.imu_t) > _FEWEST_TIMED:
         known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
         lag = _lag(streams.t[known], gyro[known], rate[known])
@@ -148,7 +146,7 @@ def _rates_and_turns(streams: Streams, step: int) -> list[Remark]:
     return [Remark(subject, BAD, f"{text}: check units (rad/s), signs and frame ids")]
 
 
-def _sign_remark(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
+def _agreement(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
     """Whether two measurements of the same agree in sign."""
     power, common = np.mean(a**2, axis=0), np.mean(a * b, axis=0)
     size = np.sqrt(power * np.mean(b**2, axis=0))

@@ -267,8 +267,11 @@ def messages(
 
     What cannot be used is added to ``counts`` at the end.
     """
-    for role, message, _ in _read(bag, topics, config, counts, say):
+    reader = Reader(config)
+    for role, message, _ in _read(bag, topics, reader, say):
         yield role, message
+    if counts is not None:
+        counts.update(reader.counts)
 
 
 def as_played(
@@ -283,21 +286,16 @@ def as_played(
         for raw in bag.iter_raw(roles):
             yield roles[raw.topic], raw
         return
-    for role, message, raw in _read(bag, topics, config):
+    for role, message, raw in _read(bag, topics, Reader(config)):
         if role != DRIVE:
             raw = raw._replace(type_name=cdr.ROLE_TYPES[role], data=cdr.encode(message))
         yield role, raw
 
 
 def _read(
-    bag: Bag,
-    topics: Mapping[str, str],
-    config: Config,
-    counts: Counter[str] | None = None,
-    say: Progress = silent,
+    bag: Bag, topics: Mapping[str, str], reader: Reader, say: Progress = silent
 ) -> Iterator[tuple[str, Message, RawMessage]]:
-    reader, what = Reader(config), f"reading {bag.path.name}"
-    roles = {topic: role for role, topic in topics.items()}
+    roles, what = {topic: role for role, topic in topics.items()}, f"reading {bag.path.name}"
     total = sum(bag.topics[topic].message_count for topic in roles)
     for done, raw in enumerate(bag.iter_raw(roles)):
         if done % 2000 == 0:
@@ -306,8 +304,6 @@ def _read(
             yield role, message, raw
     reader.flush()
     say(what, 1.0)
-    if counts is not None:
-        counts.update(reader.counts)
 
 
 def _full_name(type_name: str) -> str:

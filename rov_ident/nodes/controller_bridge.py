@@ -27,11 +27,10 @@ from rov_ident.consumer.parameter_bridge import Change, Values
 from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, GuardedNode, live
+from rov_ident.nodes.common import DIAGNOSTICS_PERIOD, LATCHED, GuardedNode, live
 from rov_ident.nodes.conversions import from_diagnostics, to_status
 
 _LOOK_PERIOD = 0.5  # s; between two comparisons of controller and estimator: a second at most late
-_DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _THREADS = 3  # the one that waits for the controller, the one that hears its answer, and services
 
 _OWN = (
@@ -122,7 +121,7 @@ class ControllerBridge(GuardedNode):
         self.create_service(Trigger, "~/revert", self._revert, callback_group=looks)
         self.create_service(SetBool, "~/enable", self._enable, callback_group=looks)
         self.create_timer(_LOOK_PERIOD, self._compare_and_send, looks)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._diagnose, answers)
         parameters.follow(self, partial(parameters.own, self, _OWN), self._take_parameters)
 
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:

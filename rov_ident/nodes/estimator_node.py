@@ -32,7 +32,14 @@ from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Repor
 from rov_ident.io.cdr import encode
 from rov_ident.io.topics import Reader
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, STREAM, GuardedNode, live, subscribed
+from rov_ident.nodes.common import (
+    DIAGNOSTICS_PERIOD,
+    LATCHED,
+    STREAM,
+    GuardedNode,
+    live,
+    subscribed,
+)
 from rov_ident.nodes.compile_state import CompileState, settle
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix
 from rov_ident.nodes.diagnostics import Diagnostics, Inputs
@@ -48,7 +55,6 @@ _OWN = (
 )  # fmt: skip
 _OWN_NAMES = [parameter.key for parameter in _OWN]
 _SILENCE_PERIOD = 0.1  # s; between looks at the inputs: a tenth of the default timeout
-_DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
 _INPUT_SHARE = 4.0  # s left to the inputs for each of publishing, whatever publish_rate says
 _TURN = 0.02  # s; of using messages that wait before anything else is done: one input at 50 Hz
@@ -117,7 +123,7 @@ class EstimatorNode(GuardedNode):
 
         self._publish_timer = self.create_timer(1.0 / config.publish_rate, self._publish_in_time)
         self.create_timer(_SILENCE_PERIOD, self._check_inputs)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._diagnose)
         if self._keeper is not None:
             self.create_timer(_CHECKPOINT_PERIOD, self._write_checkpoint)
         parameters.follow(

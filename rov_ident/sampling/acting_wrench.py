@@ -90,7 +90,7 @@ class ActingWrench:
         """
         pieces: list[tuple[float, float, Array, Array]] = []
         now = start
-        while (command := self._next_command(end, queue, despiker)) is not None:
+        while (command := self._next(end, queue, despiker)) is not None:
             if self._command is None:
                 start = now = max(command.t, start)
             elif command.t > now:
@@ -119,9 +119,7 @@ class ActingWrench:
             _add_piece(share, moment, wrench, doubt, *total)
         return total
 
-    def _next_command(
-        self, end: float, queue: deque[Waiting], despiker: Despiker
-    ) -> _Command | None:
+    def _next(self, end: float, queue: deque[Waiting], despiker: Despiker) -> _Command | None:
         """The next command before ``end`` [s]; if it was dropped, an estimate of it."""
         if not queue:
             return None

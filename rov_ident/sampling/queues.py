@@ -12,6 +12,7 @@ from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message
 
 MERGE = 0.05  # s; an odometry message is carried to the IMU message that follows this closely: one
 # interval of the slowest odometry beside which an IMU is of use, 20 Hz
+LONGEST_INTERVAL = 0.5  # s without a measurement: nothing is interpolated across, all restarts
 _LONGEST_WAIT = 1.0  # s; a choice: a topic that is later than this is not waited for
 _MARGIN = 1.25  # a choice: a topic is waited for as long as it was late, times this
 _LONGEST_QUEUE = 10.0  # s; a guard: of commands that are kept while nothing else comes

@@ -18,10 +18,7 @@ SAMPLE = record(
         ("t", "f8"),  # s since the first message
         ("dt", "f8"),  # s since the previous sample
         ("restart", "?"),  # the interval before this sample is not known: filters restart
-        (
-            "anew",
-            "?",
-        ),  # the samples before were wrong, too: what was estimated from them is discarded
+        ("anew", "?"),  # the samples before were wrong, too: they are discarded
         ("measured", "?"),  # an odometry message belongs to this sample
         ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
         ("nu", "f8", (6,)),  # m/s, rad/s: through the water
