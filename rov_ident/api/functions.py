@@ -123,7 +123,9 @@ def fit(
         "reference (--reference)": estimator != "ukf" and bool(reference),
     }
     if prior_from is not None and not prior:
-        raise UserError("--prior-from and --no-prior exclude each other: leave one out")
+        raise UserError(
+            "prior_from (--prior-from), prior=False (--no-prior) exclude each other: leave one out"
+        )
     if wrong := [name for name, is_ignored in ignored.items() if is_ignored]:
         raise UserError(f"{wrong[0]} has no meaning with the estimator {estimator}")
     given = load(config, f"{estimator}_node" if live else "")

@@ -24,7 +24,6 @@ from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.offline import archive
-from rov_ident.offline.batch_fit import validation
 from rov_ident.offline.fit import Fit, rmse_change
 from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.result import Figure, Shown, as_json
@@ -272,12 +271,10 @@ def identify(
     fitted = checked[0][1].quick if explanation is None and judge is None else None
     if fitted is None:  # else a single dive without velocity: its check has made this very fit
         fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
-    judged: dict[str, Any] = {}
-    if judge is not None:
+    judged = dict(fitted.more.get("validation", {}))  # against what the fit began with
+    if judge is not None and start is not given:
         with archive.opened([judge], given, say=say) as held_back:
-            reread = held_back.as_read_by(fitted.fitted, given)
-            after = open_loop(reread, fitted.fitted)
-            judged = validation(held_back.bags, open_loop(held_back, given), after)
+            judged["rmse_before"] = numbers(open_loop(held_back, given).rmse)
     proposal, why = None, list(fitted.notes)
     try:  # what is planned drives surge and sway
         proposal = plan(fitted.fitted, used, progress=say) if explanation else None
