@@ -17,7 +17,6 @@ from rov_ident.core.noise import robust_std, second_differences
 
 _BLOCK = 50  # commands in which noise is measured, to a fifth
 _ROUNDING = 1e-6  # of the largest command: 32 bits round by less
-OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
