@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from rov_ident.model.equations import Model as Model
     from rov_ident.offline.fit import Fit as Fit
     from rov_ident.sampling.records import Record as Record
+    from rov_ident.simulation.virtual_sensors import Suite as Suite
 
     __version__: str
 
@@ -66,6 +67,7 @@ _PLACES = {
     "model.equations": "Model",
     "offline.fit": "Fit",
     "sampling.records": "Record",
+    "simulation.virtual_sensors": "Suite",
 }
 _PUBLIC = {name: place for place, names in _PLACES.items() for name in names.split()}
 _MODULES = ("config", "consumer")

@@ -70,11 +70,11 @@ def test_information_adds(paths, off, alone):
 def test_several_processes_give_the_same(paths, off, alone):
     seen = []
     with archive.opened(
-        paths, off, jobs=2, progress=lambda name, done, total: seen.append((name, done, total))
+        paths, off, jobs=2, say=lambda what, share: seen.append((what, share))
     ) as bags:
         for kind, fit in alone.items():
             same(fit_batch(bags, off, kind), fit)
-    assert seen == [(p.name, i + 1, 4) for i, p in enumerate(paths)]
+    assert seen == [(f"read {p.name}", (i + 1) / 4) for i, p in enumerate(paths)]
 
 
 def test_dask_gives_the_same(paths, off, alone):

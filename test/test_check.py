@@ -19,7 +19,7 @@ from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
 from rov_ident.experiment.data_quality import check
 from rov_ident.experiment.design import propose
-from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _together
+from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _correlation
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import of_records
@@ -154,9 +154,9 @@ def test_a_controller_that_pushes_as_the_vehicle_slows_is_no_wrong_sign():
     rng = np.random.default_rng(1)
     speed = 1.0 + 0.1 * rng.standard_normal(400)
     wrench = 30.0 * (2.0 - speed)
-    assert np.corrcoef(wrench, speed)[0, 1] < -0.99 and _together(wrench, speed) > 0.9
+    assert np.corrcoef(wrench, speed)[0, 1] < -0.99 and _correlation(wrench, speed) > 0.9
     pushed = 30.0 * speed
-    assert _together(pushed, speed) > 0.9 and _together(-pushed, speed) < -0.9
+    assert _correlation(pushed, speed) > 0.9 and _correlation(-pushed, speed) < -0.9
 
 
 def test_a_late_wrench_is_noticed(checked):

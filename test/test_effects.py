@@ -24,7 +24,7 @@ from rov_ident.estimation import rls, ukf
 from rov_ident.model.coefficients import INPUTS, parse
 from rov_ident.model.equations import RigidBody, build
 from rov_ident.sampling import records
-from rov_ident.sampling.records import score
+from rov_ident.sampling.records import predicted, score
 from rov_ident.sampling.sample import joined
 from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.open_loop import simulate
@@ -259,7 +259,7 @@ def test_with_the_effect_samples_show_the_truth_and_without_they_do_not(effect, 
     for told in (values | known, known):
         config = dataclasses.replace(vehicle, effects=told)
         rows = samples_of(config, dive)
-        result = score(config.dynamics, rows, 5.0, effects=compiled(told))
+        result = score(rows, predicted(config.dynamics, rows, 5.0, effects=compiled(told)))
         errors.append(result.rmse)
     informed, ignorant = np.array(errors)
     # What is left with the effect known: sensors in single precision, wrench between two samples.
@@ -313,7 +313,8 @@ def test_all_effects_at_once(mounted):
     values = {e.name: typical(e, np.random.default_rng(3)) for e in EXACT}
     config = dataclasses.replace(finned(mounted), effects=values)
     dive = simulated(config, values)
-    result = score(config.dynamics, samples_of(config, dive), 5.0, effects=compiled(values))
+    rows = samples_of(config, dive)
+    result = score(rows, predicted(config.dynamics, rows, 5.0, effects=compiled(values)))
     assert np.all(result.rmse < [3e-3, 3e-3, 3e-3, 2e-2, 2e-2, 5e-3])
 
 

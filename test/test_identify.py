@@ -112,7 +112,7 @@ def test_one_configuration_is_called_extended(used):
     """That of the fit, which is written; explain's own is at most where the fit starts."""
     notes = ("another", Kept((), None).note, Kept(("Y",), Hypothesis(None, {})).note)
     found = Explanation(Findings(notes), None, None, None, None, {}, ())
-    said = identification._as_a_start(found, used).findings.notes
+    said = identification._with_start_notes(found, used).findings.notes
     assert said[0] == "another" and "extended" not in " ".join(said)
     assert len(said) == (3 if used else 1)
     assert all("the configuration that the fit starts from" in note for note in said[1:])

@@ -10,7 +10,7 @@ from rov_ident.estimation import iterated_update, rls
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
-from rov_ident.sampling.sample import believed
+from rov_ident.sampling.sample import after_reset
 
 SCALE = "thrust_scale.scale"
 
@@ -44,7 +44,7 @@ def dived(request, tmp_path_factory):
     ):
         estimator.push(role, message)
     estimator.flush()
-    return estimator, believed(np.concatenate(samples)), dive.vehicle.theta
+    return estimator, after_reset(np.concatenate(samples)), dive.vehicle.theta
 
 
 def true_solution(estimator, theta):

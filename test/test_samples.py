@@ -14,7 +14,7 @@ from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
 from rov_ident.sampling.raw_streams import gather
-from rov_ident.sampling.sample import SAMPLE, believed, joined
+from rov_ident.sampling.sample import SAMPLE, after_reset, joined
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import NEW_FRAME, describe
 from rov_ident.simulation import virtual_sensors as sensors
@@ -746,7 +746,7 @@ def test_odometry_that_begins_with_outliers(heavy, field, wrong):
         messages.append((role, m))
     samples, sampler = taken(heavy, messages)
     assert sampler.counts[BEGUN_ANEW] == samples["anew"].sum() > 0
-    rest = believed(samples)
+    rest = after_reset(samples)
     assert not rest["anew"][1:].any() and rest["restart"][0] and rest["measured"][0]
     assert rest["t"][0] < samples["t"][0] + 0.2
     error = rest["nu"] - dive.truth.nu[instants(dive, sampler, rest)]

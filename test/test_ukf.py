@@ -131,7 +131,7 @@ def test_the_reference_follows_outliers_and_what_does_not_move(heavy):
     rows["odometry"][40, 0] += 1.0
     rows["odometry"][[70, 71], 1] -= 1.0
     told = []
-    found = reference_ukf.compare(config, rows, told.append)
+    found = reference_ukf.compare(config, rows, lambda what, share: told.append(share))
     assert tuple(found["coefficients"]) == config.model.names and found["samples"] == len(rows)
     of_both = found["coefficients"].values()
     assert max(abs(row["apart_in_std"]) for row in of_both) < 1e-6

@@ -343,7 +343,7 @@ def _lift(rng: np.random.Generator, s: Setting) -> list[Knob]:
 
 
 def _cog(rng: np.random.Generator, s: Setting) -> list[Knob]:
-    """A moment of about half the roll authority; upward by no more than leaves it upright."""
+    """A moment of about half the working roll moment; upward by no more than leaves it upright."""
     size = rng.uniform(0.4, 0.9) * s.vehicle.limits[4] / (s.vehicle.mass * GRAVITY)
     heading, rise = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(-0.8, 0.3)
     height = s.vehicle.cog[2] - s.vehicle.cob[2]

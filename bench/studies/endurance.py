@@ -24,10 +24,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.signals import SignalHandlerOptions
 
 from bench import HEAVY
-from bench.harness import Bars, Row, announce, show
-from bench.simulators.live import compile_all, end_node, start_connected
+from bench.harness import Row
+from bench.simulators.live import end_node, start_connected
 from bench.studies.torture import SECOND, accounted
-from bench.studies.torture_live import _cpu, _memory, _repeated
+from bench.studies.torture_live import _cpu, _memory, _repeated, run
 from rov_ident import config as configuration
 from rov_ident.estimation import checkpoint
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
@@ -223,15 +223,7 @@ def main() -> int:
         "--estimators", nargs="+", choices=ESTIMATORS, default=[*ESTIMATORS], help="of the day"
     )
     parser.add_argument("--seconds", type=float, default=600.0, help="of the fleet")
-    options = parser.parse_args()
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", "98")
-    compile_all()
-    announce()
-    bars = Bars()
-    for name in options.studies or STUDIES:
-        show(STUDIES[name](options), bars)
-    return bars.status()
+    return run(STUDIES, parser.parse_args(), "98")
 
 
 if __name__ == "__main__":

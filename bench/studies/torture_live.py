@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -274,6 +274,22 @@ def _cpu(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def run(
+    studies: Mapping[str, Callable[[argparse.Namespace], Iterator[Row]]],
+    options: argparse.Namespace,
+    domain: str,
+) -> int:
+    """The studies asked for, all by default, with live nodes in a DDS domain of their own."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", domain)
+    compile_all()
+    announce()
+    bars = Bars()
+    for name in options.studies or studies:
+        show(studies[name](options), bars)
+    return bars.status()
+
+
 STUDIES = {"kills": kills, "writers": writers, "load": load, "rate": rate}
 
 
@@ -284,15 +300,7 @@ def main() -> int:
     parser.add_argument("studies", nargs="*", choices=[*STUDIES, []], metavar="STUDY")
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--hours", type=float, default=1.0)
-    options = parser.parse_args()
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", "97")
-    compile_all()
-    announce()
-    bars = Bars()
-    for name in options.studies or STUDIES:
-        show(STUDIES[name](options), bars)
-    return bars.status()
+    return run(STUDIES, parser.parse_args(), "97")
 
 
 if __name__ == "__main__":

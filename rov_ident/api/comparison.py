@@ -120,8 +120,8 @@ class Comparison(Shown):
             [name, *first, *second, unit, percent, off, "changed" if name in self.changed else ""]
             for name, first, second, unit, percent, off in zip(
                 self.names,
-                map(_written, self.a, self.a_std),
-                map(_written, self.b, self.b_std),
+                map(_value_and_interval, self.a, self.a_std),
+                map(_value_and_interval, self.b, self.b_std),
                 self.units,
                 percents,
                 offs,
@@ -161,7 +161,7 @@ class Comparison(Shown):
         return as_json(document)
 
 
-def _written(value: float, std: float) -> tuple[str, str]:
+def _value_and_interval(value: float, std: float) -> tuple[str, str]:
     return (f"{value:.5g}", "") if std == 0.0 else estimate(value, NORMAL * std)
 
 
@@ -214,30 +214,30 @@ def compare(
 
 def _estimates(source: Any) -> Estimates:
     if isinstance(source, Config):
-        return _of_config(source, source.name)
+        return _numbers_of_config(source, source.name)
     if isinstance(source, Shown):
         label = source.estimator if isinstance(source, Result) else type(source).__name__.lower()
-        return _of_document(json.loads(source.to_json()), label)
+        return _numbers_of_json(json.loads(source.to_json()), label)
     path, label = Path(source), Path(source).name
     if path.is_dir():  # of identify
         path /= "result.json"
     if path.suffix in (".yaml", ".yml"):
-        return _of_config(configuration.load(path), path.name)
+        return _numbers_of_config(configuration.load(path), path.name)
     try:
-        return _of_document(json.loads(read_input(path, _LARGEST_FILE), parse_int=float), label)
+        return _numbers_of_json(json.loads(read_input(path, _LARGEST_FILE), parse_int=float), label)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is no JSON of a result: {error}") from error
 
 
-def _of_config(config: Config, label: str) -> Estimates:
+def _numbers_of_config(config: Config, label: str) -> Estimates:
     model = config.model
     units = tuple(c.unit for c in model.coefficients)
     return Estimates(label, model.names, units, model.theta, 0.0 * model.theta, frozenset())
 
 
-def _of_document(document: Any, label: str) -> Estimates:
+def _numbers_of_json(document: Any, label: str) -> Estimates:
     """The numbers in the JSON of a result.
 
     Raises UserError if there are none.

@@ -4,15 +4,16 @@ import contextlib
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rov_ident.api.reading import File, Files, Progress, axes, existing, load, read, several, silent
+from rov_ident.api.reading import File, Files, axes, existing, load, read, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import Test
@@ -122,7 +123,9 @@ def fit(
         "reference (--reference)": estimator != "ukf" and bool(reference),
     }
     if prior_from is not None and not prior:
-        raise UserError("--prior-from and --no-prior exclude each other: leave one out")
+        raise UserError(
+            "prior_from (--prior-from), prior=False (--no-prior) exclude each other: leave one out"
+        )
     if wrong := [name for name, is_ignored in ignored.items() if is_ignored]:
         raise UserError(f"{wrong[0]} has no meaning with the estimator {estimator}")
     given = load(config, f"{estimator}_node" if live else "")
@@ -140,22 +143,22 @@ def fit(
                 if is_without_velocity(record.samples):
                     raise refusal(record.path.name)
             many = archive.of_records(records)
-            _check(many, given)
+            _refuse_unusable(many, given)
             say("estimating")
             found = fit_online(records, given, estimator)  # type: ignore[arg-type]
             if reference:
                 found.more["reference"] = _reference(paths[0], given, reference, say)
         else:
-            many = stack.enter_context(opened(paths, given, say, jobs, dask))
-            _check(many, given)
+            many = stack.enter_context(archive.opened(paths, given, jobs, dask, say))
+            _refuse_unusable(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
-        found = found.asked(_of_velocity([bag.path for bag in many.bags], given))
+        found = found.with_tests(_velocity_sensor_tests([bag.path for bag in many.bags], given))
         if table:
-            found = _beside_the_table(found, given, table)
+            found = _with_table_notes(found, given, table)
         if validate is None:
             return found
-        judge = stack.enter_context(opened([existing(validate)], given, say))
+        judge = stack.enter_context(archive.opened([existing(validate)], given, say=say))
         say("simulating in open loop")
         reread = judge.as_read_by(found.fitted, given)
         runs = judge.bags, open_loop(judge, given), open_loop(reread, found.fitted)
@@ -163,8 +166,8 @@ def fit(
         return dataclasses.replace(found, more=found.more | more, judged=curves(*runs))
 
 
-def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
-    """What is asked of the velocity sensor by the first messages of each bag: the worst answers."""
+def _velocity_sensor_tests(paths: Sequence[Path], config: Config) -> list[Test]:
+    """Tests of the velocity sensor on the first messages of each bag: the worst result of each."""
     worst: dict[str, Test] = {}
     for path in paths:
         bag = Bag(path)
@@ -177,7 +180,7 @@ def _of_velocity(paths: Sequence[Path], config: Config) -> list[Test]:
     return list(worst.values())
 
 
-def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:
+def _with_table_notes(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:
     """The fit, saying where its prior is from, and where table and dives exclude each other."""
     prior = prior_of(given)
     of_table = {
@@ -191,7 +194,7 @@ def _beside_the_table(found: Fit, given: Config, table: Mapping[str, Any]) -> Fi
     )
 
 
-def _check(many: archive.Archive, config: Config) -> None:
+def _refuse_unusable(many: archive.Archive, config: Config) -> None:
     """UserError where the data are too few, or so wrong that no fit makes sense of them.
 
     k samples show k - 1 changes of velocity on each axis: more than its unknowns are needed.
@@ -214,18 +217,7 @@ def _reference(path: Path, config: Config, duration: float, say: Progress) -> di
     held = config.with_effects_held
     samples = read(path, held, say).samples
     samples = samples[samples["t"] < samples["t"][0] + duration]
-    return compare(held, samples, lambda share: say("filterpy's filter", share))
-
-
-def opened(
-    paths: Sequence[Path], config: Config, say: Progress, jobs: int = 1, dask: str = ""
-) -> contextlib.AbstractContextManager[archive.Archive]:
-    """Bags as an archive, for a ``with``, as :func:`archive.opened`; ``say`` is told of each."""
-
-    def told(name: str, done: int, total: int) -> None:
-        say(f"read {name}", done / total)
-
-    return archive.opened(paths, config, jobs, dask, told)
+    return compare(held, samples, say)
 
 
 @one_blas_thread()
@@ -281,16 +273,9 @@ def _streams(path: Path, config: Config, say: Progress) -> tuple[Streams, dict[s
     """A bag's messages in arrays, and its name and sha256."""
     bag = Bag(path)
     chosen = topics.select(bag, config)
-    total = topics.total(bag, chosen)
     refuse_without_velocity(bag, chosen, config)
 
-    def counted() -> Iterator[Any]:
-        for done, message in enumerate(topics.messages(bag, chosen, config)):
-            if done % 2000 == 0:
-                say(f"reading {path.name}", done / total)
-            yield message
-
-    streams = gather(counted(), config)
+    streams = gather(topics.messages(bag, chosen, config, say=say), config)
     if bag.damage:
         streams = dataclasses.replace(streams, notes=(*streams.notes, bag.damage))
     return streams, {"name": bag.path.name, "sha256": bag.sha256}
@@ -316,7 +301,7 @@ def check(bag: File, config: File | Config, *, progress: Progress | None = None)
     UserError
         If the bag cannot be read, or has too few messages.
     """
-    return data_quality.check(existing(bag), load(config), progress)
+    return data_quality.check(existing(bag), load(config), progress or silent)
 
 
 @one_blas_thread()
@@ -327,7 +312,7 @@ def plan(
     duration: float = 60.0,
     tank: Sequence[float] = (6.0, 6.0, 2.0),
     thrust: float = 1.0,
-    progress: Callable[..., None] | None = None,
+    progress: Progress | None = None,
 ) -> Proposal:
     """Propose the manoeuvre to run next: safe, and best for the coefficient that is known worst.
 
@@ -357,6 +342,8 @@ def plan(
     given, say = load(config), progress or silent
     length, width, depth = tank
     limits = Limits((length, width, depth), thrust)
-    known = contextlib.nullcontext() if bag is None else opened(several(bag), given, say)
+    known = (
+        contextlib.nullcontext() if bag is None else archive.opened(several(bag), given, say=say)
+    )
     with known as bags:
         return design.propose(given, bags, duration, limits, say)

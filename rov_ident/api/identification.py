@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rov_ident.api.functions import check, explain, opened, plan
+from rov_ident.api.functions import check, explain, plan
 from rov_ident.api.functions import fit as fit_bags
-from rov_ident.api.reading import File, Files, Progress, load, several, silent
+from rov_ident.api.reading import File, Files, load, several
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import EXTENDED
@@ -22,8 +23,8 @@ from rov_ident.estimation.consistency import CAUSE
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
-from rov_ident.offline.batch_fit import validation
-from rov_ident.offline.fit import Fit, falls
+from rov_ident.offline import archive
+from rov_ident.offline.fit import Fit, rmse_change
 from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
@@ -85,7 +86,7 @@ class Identification(Shown):
         if self.explanation is not None:
             where, told = "parts of the dives that were held back", self.explanation.sentence
         return (
-            f"{self._doubt}{told} On {self.judge or where}, {falls(before, after)}; "
+            f"{self._doubt}{told} On {self.judge or where}, {rmse_change(before, after)}; "
             f"the data determine {known} of {total} parameters."
         )
 
@@ -211,7 +212,11 @@ class Identification(Shown):
 
 @one_blas_thread()
 def identify(
-    dives: Files, config: File, *, validate: File | None = None, progress: Progress | None = None
+    dives: Files,
+    config: File | Config,
+    *,
+    validate: File | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """Identify a vehicle from its dives, by the whole path: check, explain, fit, judge, plan.
 
@@ -252,7 +257,7 @@ def identify(
             left_out[path.name] = found.why
     if not checked:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-        raise UserError(f"no dive is fit for identification: {reasons}{_instead(given, say)}")
+        raise UserError(f"no dive is fit for identification: {reasons}{_first_dive(given, say)}")
     judge = Path(validate) if validate else None
     if judge is None and len(checked) > 1:
         judge, _ = min(checked, key=lambda pair: pair[1].duration)
@@ -262,16 +267,14 @@ def identify(
         explanation = explain(used, config, judge, progress=say)
         extended = explanation.findings.verdict in ("explained", "unexplained")
         start = explanation.extended if extended else given
-        explanation = _as_a_start(explanation, extended)
+        explanation = _with_start_notes(explanation, extended)
     fitted = checked[0][1].quick if explanation is None and judge is None else None
     if fitted is None:  # else a single dive without velocity: its check has made this very fit
         fitted = fit_bags(used, start, "ml", validate=judge, progress=say)
-    judged: dict[str, Any] = {}
-    if judge is not None:
-        with opened([judge], given, say) as held_back:
-            reread = held_back.as_read_by(fitted.fitted, given)
-            after = open_loop(reread, fitted.fitted)
-            judged = validation(held_back.bags, open_loop(held_back, given), after)
+    judged = dict(fitted.more.get("validation", {}))  # against what the fit began with
+    if judge is not None and start is not given:
+        with archive.opened([judge], given, say=say) as held_back:
+            judged["rmse_before"] = numbers(open_loop(held_back, given).rmse)
     proposal, why = None, list(fitted.notes)
     try:  # what is planned drives surge and sway
         proposal = plan(fitted.fitted, used, progress=say) if explanation else None
@@ -283,8 +286,9 @@ def identify(
     return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
 
 
-def _as_a_start(explanation: Explanation, used: bool) -> Explanation:
-    """With notes on its configuration that say what that is here: the fit's start, if ``used``."""
+def _with_start_notes(explanation: Explanation, used: bool) -> Explanation:
+    """The explanation with notes that call its extended configuration what it is here: the start of
+    the fit if it is ``used``, else nothing."""
     findings = explanation.findings
     notes = tuple(
         note.replace(EXTENDED, "the configuration that the fit starts from")
@@ -294,8 +298,8 @@ def _as_a_start(explanation: Explanation, used: bool) -> Explanation:
     return replace(explanation, findings=replace(findings, notes=notes))
 
 
-def _instead(config: Any, say: Progress) -> str:
-    """The manoeuvre for a vehicle of which nothing is known yet."""
+def _first_dive(config: Config, say: Progress) -> str:
+    """The end of a message: the manoeuvre to begin with, where there is a safe one."""
     try:
         return f"; fly instead: {plan(config, progress=say).sentence}"
     except UserError:

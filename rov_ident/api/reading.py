@@ -3,7 +3,6 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
 from rov_ident.sampling.records import Record, read_record
@@ -24,16 +24,6 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 
 File = str | os.PathLike[str]
 Files = File | Sequence[File]
-
-
-class Progress(Protocol):
-    """Called now and then with what is being done, and the share of it that is, where known."""
-
-    def __call__(self, what: str, share: float | None = None) -> None: ...
-
-
-def silent(what: str, share: float | None = None) -> None:
-    """Tells nobody."""
 
 
 def several(files: Files) -> list[Path]:
@@ -96,8 +86,7 @@ def read(bag: File, config: File | Config, progress: Progress | None = None) -> 
     UserError
         If the bag cannot be read, lacks a topic or yields no sample.
     """
-    say, path = progress or silent, existing(bag)
-    return read_record(path, load(config), lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
+    return read_record(existing(bag), load(config), progress or silent)
 
 
 def axes(channels: str) -> NDArray[np.bool_]:

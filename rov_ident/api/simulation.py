@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.api.reading import File, Progress, axes, load, read
+from rov_ident.api.reading import File, axes, load, read
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
+from rov_ident.core.progress import Progress
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.effects import compiled
 from rov_ident.io.write_messages import write_messages
@@ -141,8 +142,7 @@ def simulate(
     duration
         Of a manoeuvre, s.
     sensors
-        Of a manoeuvre: rates [Hz] and noise of the simulated sensors, a
-        ``rov_ident.simulation.virtual_sensors.Suite``.
+        Of a manoeuvre: rates [Hz] and noise of the simulated sensors, a ``rov_ident.Suite``.
     seed
         Of a manoeuvre: of its course and of the noise.
     config, progress
@@ -174,23 +174,23 @@ def simulate(
         return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
     assert bag is not None
     record = read(bag, given, progress)
-    model, effects = given.dynamics, compiled(given.effects)
-    nu = predicted(model, record.samples, math.inf, free, effects)
+    samples, model, effects = record.samples, given.dynamics, compiled(given.effects)
+    nu, restarted = (predicted(model, samples, h, free, effects) for h in (math.inf, HORIZON))
     if not np.isfinite(nu).all():
         raise UserError(
             f"the simulation diverges on {bag}: check the signs and sizes of the coefficients and "
             "of the wrench"
         )
-    t = record.samples["t"]
+    t = samples["t"]
     return Simulation(
         record.path.name,
         t,
         nu,
         odometry_of(t, nu),
-        measured_motion(record.samples),
+        measured_motion(samples),
         free,
-        score(model, record.samples, math.inf, free, effects),
-        score(model, record.samples, HORIZON, free, effects),
+        score(samples, nu),
+        score(samples, restarted),
         record.notes,
         record.duration,
     )

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from rov_ident import config as configuration
-from rov_ident.api.reading import File, Progress
+from rov_ident.api.reading import File
 from rov_ident.config.writing import annotated
 from rov_ident.consumer.formats import import_model
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import VEHICLES, shipped, write_file
 from rov_ident.core.frames import FLIP_BODY
+from rov_ident.core.progress import Progress
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io import topics
 from rov_ident.io.ardupilot_log import FRAMES, SUFFIXES, read_log
@@ -127,11 +128,11 @@ def init(
         if progress:
             progress(f"reading {path.name}")
         if path.suffix.lower() in SUFFIXES:
-            _of_log(path, found, vehicle)
+            _add_log(path, found, vehicle)
         elif path.suffix.lower() in _MODELS:
-            _of_model(path, found, vehicle)
+            _add_model(path, found, vehicle)
         else:
-            _of_bag(path, found)
+            _add_bag(path, found)
     text = annotated(found.parameters, found.remarks, _HEAD)
     unknown = tuple(re.findall(r"^ *(\w+): *# UNKNOWN", text, re.MULTILINE))
     if not unknown:  # what is drafted can be read
@@ -139,7 +140,7 @@ def init(
     return Draft(text, unknown, tuple(found.notes), found.unfit)
 
 
-def _of_model(path: Path, found: _Found, vehicle: str) -> None:
+def _add_model(path: Path, found: _Found, vehicle: str) -> None:
     known = not vehicle and path.suffix.lower() != ".urdf"
     base = None if known else configuration.load(shipped(f"config/{vehicle or VEHICLES[0]}.yaml"))
     config, notes = import_model(path, base)
@@ -157,7 +158,7 @@ def _of_model(path: Path, found: _Found, vehicle: str) -> None:
 # ------------------------------------------------------------------ logs of autopilots
 
 
-def _of_log(path: Path, found: _Found, vehicle: str) -> None:
+def _add_log(path: Path, found: _Found, vehicle: str) -> None:
     log = read_log(path)
     frame = int(log.parameters.get("FRAME_CONFIG", -1))
     if not vehicle and frame in _OF_FRAME:
@@ -199,7 +200,7 @@ def _of_log(path: Path, found: _Found, vehicle: str) -> None:
 # ------------------------------------------------------------------ bags
 
 
-def _of_bag(path: Path, found: _Found) -> None:
+def _add_bag(path: Path, found: _Found) -> None:
     bag = Bag(path)
     seen = topics.survey(bag)
     for role, source in seen.sources.items():

@@ -2,7 +2,7 @@
 
 import argparse
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, show, write_result
+from rov_ident.cli.common import OUT, Commands, command, progress, show, write_result
 
 
 def add(commands: Commands) -> None:
@@ -13,7 +13,6 @@ def add(commands: Commands) -> None:
 def _check(options: argparse.Namespace) -> None:
     from rov_ident.api.functions import check
 
-    check_outputs([options.json, options.report], [options.bag, options.config])
     with progress(options) as tell:
         found = check(options.bag, options.config, progress=tell)
         write_result(found, options, tell)

@@ -29,7 +29,6 @@ def _coast_down(options: argparse.Namespace) -> None:
     from rov_ident.offline import coast_down
     from rov_ident.reports.result import provenance
 
-    common.check_outputs([options.json, options.save], [*options.runs, options.config])
     config = configuration.load(options.config)
     model = config.model
     columns = parse_columns(options.map)

@@ -2,7 +2,7 @@
 
 import argparse
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, write_json
+from rov_ident.cli.common import OUT, Commands, command, write_json
 
 
 def add(commands: Commands) -> None:
@@ -13,7 +13,6 @@ def add(commands: Commands) -> None:
 def _coefficients(options: argparse.Namespace) -> None:
     from rov_ident.model.coefficients import catalogue, input_catalogue
 
-    check_outputs([options.json], [])
     entries = [*catalogue(), *input_catalogue()]
     for c in entries:
         OUT.print(f"{c.name:<10} {c.unit:<18} {c.meaning}")

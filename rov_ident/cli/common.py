@@ -15,7 +15,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output, write_file
 
 if TYPE_CHECKING:
-    from rov_ident.api.reading import Progress
+    from rov_ident.core.progress import Progress
     from rov_ident.reports.result import Shown
 
 
@@ -77,6 +77,9 @@ _PATHS: Mapping[str, Mapping[str, Any]] = {
 }
 """Paths that several commands take, each with one meaning."""
 
+OUTPUTS = ("json", "save", "report", "out")
+"""The options that name what a command writes; all other paths are read."""
+
 
 def command(
     commands: Commands,
@@ -84,15 +87,17 @@ def command(
     text: str,
     run: Callable[[argparse.Namespace], None],
     paths: str = "",
+    out: str = "file",
 ) -> argparse.ArgumentParser:
-    """A new command and what runs it, with the common ``paths`` of these names."""
+    """A new command and what runs it, with the common ``paths`` of these names. ``out`` is what
+    --out names: a "file", a "bag", or a folder for files of these names."""
     example = f"example: rov-ident {name} {EXAMPLES[name]}".rstrip()
     # Raw: an example that is broken into lines cannot be copied.
     raw = argparse.RawDescriptionHelpFormatter
     parser = commands.add_parser(
         name, help=text, description=text, epilog=example, formatter_class=raw
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, out_kind=out)
     for path in paths.split():
         parser.add_argument(path, type=Path, **_PATHS[path])
     return parser
@@ -162,18 +167,22 @@ def progress(options: argparse.Namespace) -> "Iterator[Progress]":
         yield tell
 
 
-def check_outputs(
-    outputs: Sequence[Path | None], inputs: Sequence[Path | None], bag: Path | None = None
-) -> None:
-    """Refuse, before any work, what could not be written or would replace what is read, or another
-    result; ``bag`` is an output that is a bag."""
-    taken = [path for path in inputs if path]
+def check_paths(options: argparse.Namespace) -> None:
+    """Refuse, before any work, what could not be written, or would replace what is read or another
+    result."""
+    lists = {k: v if isinstance(v, list) else [v] for k, v in vars(options).items()}
+    paths = {k: [path for path in v if isinstance(path, Path)] for k, v in lists.items()}
+    outputs = [(name, path) for name in OUTPUTS for path in paths.pop(name, ())]
+    taken = [path for read in paths.values() for path in read]
     for path in taken:
         if "\0" in str(path):
             raise UserError(f"{path!r} cannot be read: no file can have that name")
-    for out in filter(None, (*outputs, bag)):
-        check_output(out, taken, out is bag)
-        taken.append(out)
+    for name, path in outputs:
+        kind = options.out_kind if name == "out" else "file"
+        files = [] if kind in ("file", "bag") else [path / file for file in kind.split()]
+        for place in files or [path]:
+            check_output(place, taken, kind == "bag" or (bool(files) and place.suffix == ".mcap"))
+            taken.append(place)
 
 
 def write_json(path: Path | None, result: Mapping[str, object]) -> None:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, show, write_result
+from rov_ident.cli.common import OUT, Commands, command, show, write_result
 
 
 def add(commands: Commands) -> None:
@@ -20,7 +20,6 @@ def add(commands: Commands) -> None:
 def _compare(options: argparse.Namespace) -> None:
     from rov_ident.api.comparison import compare
 
-    check_outputs([options.json, options.report], [options.a, options.b])
     found = compare(options.a, options.b)
     write_result(found, options)
     show(found, found.notes)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rov_ident.cli.common import ERR, LIVE, OUT, Commands, check_outputs, command, rate
+from rov_ident.cli.common import ERR, LIVE, OUT, Commands, command, rate
 from rov_ident.core.files import shipped, write_file
 
 if TYPE_CHECKING:
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 def add(commands: Commands) -> None:
-    demo = command(commands, "demo", "the main job on the shipped bag, live over DDS", _demo)
+    text, files = "the main job on the shipped bag, live over DDS", "report.html convergence.png"
+    demo = command(commands, "demo", text, _demo, "", f"{files} coefficients.mcap")
     demo.add_argument("--rate", type=rate, default=4.0, help="speed of the replay (default 4)")
     demo.add_argument(
         "--out", type=Path, default=Path("out/demo"), help="folder of the report (out/demo)"
@@ -32,6 +33,7 @@ def _demo(options: argparse.Namespace) -> None:
     from rov_ident.cli import demo_page as pages
     from rov_ident.nodes.replay import replay
     from rov_ident.reports import plots
+    from rov_ident.reports.result import NORMAL
     from rov_ident.sampling.records import read_record
 
     # Its own pictures are the progress: with --quiet there are none.
@@ -39,7 +41,6 @@ def _demo(options: argparse.Namespace) -> None:
     coefficients, path, picture = (
         options.out / name for name in ("coefficients.mcap", "report.html", "convergence.png")
     )
-    check_outputs([path, picture], [], coefficients)
     bag, start = shipped("bags/demo.mcap"), shipped("config/bluerov2_heavy_demo.yaml")
     config = configuration.load(start)
     model = configuration.load(shipped("config/bluerov2_heavy.yaml")).model
@@ -72,7 +73,7 @@ def _demo(options: argparse.Namespace) -> None:
         OUT.print(
             f"{name}: the median error of a coefficient fell from {100 * np.median(begun):.0f} % "
             f"to {100 * np.median(error):.2f} %, largest {100 * error.max():.1f} % "
-            f"({history.names[int(np.argmax(error))]}); {np.sum(z < 1.96)} of {len(z)} true "
+            f"({history.names[int(np.argmax(error))]}); {np.sum(z < NORMAL)} of {len(z)} true "
             "values inside their 95 % interval"
         )
     OUT.print(f"{result.messages} messages in {result.seconds:.1f} s; report: {path}")
@@ -82,6 +83,8 @@ def _table(config: "Config", truth: dict[str, float], seen: "dict[str, list[Repo
     from rich import box
     from rich.table import Table
     from rich.text import Text
+
+    from rov_ident.reports.result import NORMAL
 
     # Lines between the columns would need more than 80 characters.
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -97,7 +100,7 @@ def _table(config: "Config", truth: dict[str, float], seen: "dict[str, list[Repo
                 cells.append(Text())
                 continue
             colour = ("green", "yellow", "red", "dim")[state.levels[i]]
-            cells.append(Text(f"{state.values[i]:.4g} ± {1.96 * state.std[i]:.2g}", colour))
+            cells.append(Text(f"{state.values[i]:.4g} ± {NORMAL * state.std[i]:.2g}", colour))
         start = config.value(name)
         unit = config.model.coefficients[config.model.names.index(name)].unit
         table.add_row(name, f"{truth[name]:.4g}", f"{start:.4g}", *cells, unit)

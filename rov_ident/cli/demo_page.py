@@ -10,6 +10,7 @@ from rov_ident.config import Config
 from rov_ident.estimation.online import Report
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, Record, predicted, score
 
 
@@ -37,8 +38,10 @@ def page(
     stretch = samples["t"] < 60.0
     t, measured = samples["t"][stretch], samples["nu"][stretch]
     runs = {name: predicted(model, samples, math.inf)[stretch] for name, model in models.items()}
-    scores = {name: score(model, samples).rmse for name, model in models.items()}
-    rows = [[name, *(f"{value:.4f}" for value in rmse)] for name, rmse in scores.items()]
+    rows = []
+    for name, model in models.items():
+        rmse = score(samples, predicted(model, samples, HORIZON)).rmse
+        rows.append([name, *(f"{value:.4f}" for value in rmse)])
     labels = [f"{name} [{unit}]" for name, unit in zip(VELOCITIES, UNITS)]
     motions = [
         plots.motion(t, measured[:, i], {name: run[:, i] for name, run in runs.items()}, label)
@@ -47,7 +50,7 @@ def page(
     coefficients = [
         [name, f"{truth[name]:.5g}"]
         + [
-            f"{history.values[-1, i]:.5g} ± {1.96 * history.std[-1, i]:.2g}"
+            f"{history.values[-1, i]:.5g} ± {NORMAL * history.std[-1, i]:.2g}"
             for history in histories.values()
         ]
         + [history.units[i]]

@@ -4,12 +4,13 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, say, show
+from rov_ident.cli.common import OUT, Commands, command, progress, say, show
 
 
 def add(commands: Commands) -> None:
     text = "what the simulation gets wrong, why, and what mending it gains"
-    explain = command(commands, "explain", text, _explain, "bags --config")
+    files = "findings.json report.html extended.yaml"
+    explain = command(commands, "explain", text, _explain, "bags --config", files)
     explain.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
         help="folder for findings.json, report.html and extended.yaml",
@@ -20,8 +21,6 @@ def add(commands: Commands) -> None:
 
 
 def _explain(options: argparse.Namespace) -> None:
-    outputs = [options.out / name for name in ("findings.json", "report.html", "extended.yaml")]
-    check_outputs(outputs, [*options.bags, options.config, options.validate])
     new = not options.out.exists()
     try:
         _explained(options)

@@ -50,10 +50,6 @@ def _fit(options: argparse.Namespace) -> None:
     from rov_ident.api.functions import fit
     from rov_ident.offline.archive import default_jobs
 
-    outputs = [options.json, options.save, options.report]
-    common.check_outputs(
-        outputs, [*options.bags, options.config, options.validate, options.prior_from]
-    )
     live = options.estimator in common.LIVE
     with common.progress(options) as tell:
         found = fit(

@@ -41,9 +41,6 @@ def _forces(options: argparse.Namespace) -> None:
     from rov_ident.model.added_mass import parse_hull
     from rov_ident.offline import captive_tests as force_tables
 
-    common.check_outputs(
-        [options.json, options.out, options.report], [options.table, options.config]
-    )
     if not options.config and (options.out or options.hull):
         raise UserError("--out and --hull need --config: the vehicle's mass, inertia and buoyancy")
     config = configuration.load(options.config) if options.config else None

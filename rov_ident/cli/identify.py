@@ -3,12 +3,13 @@
 import argparse
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, show
+from rov_ident.cli.common import OUT, Commands, command, progress, show
 
 
 def add(commands: Commands) -> None:
     text = "from dives to a judged model: check, explain, fit, one report, what to fly next"
-    identify = command(commands, "identify", text, _identify, "bags --config")
+    files = "report.html extended.yaml result.json"
+    identify = command(commands, "identify", text, _identify, "bags --config", files)
     identify.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
         help="folder for report.html, extended.yaml and result.json",
@@ -22,8 +23,6 @@ def add(commands: Commands) -> None:
 def _identify(options: argparse.Namespace) -> None:
     from rov_ident.api.identification import identify
 
-    outputs = [options.out / name for name in ("report.html", "extended.yaml", "result.json")]
-    check_outputs(outputs, [*options.bags, options.config, options.validate])
     with progress(options) as tell:
         found = identify(options.bags, options.config, validate=options.validate, progress=tell)
         tell("drawing")

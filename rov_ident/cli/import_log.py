@@ -8,12 +8,12 @@ from rov_ident.cli import common
 from rov_ident.core.errors import UserError
 
 if TYPE_CHECKING:
-    from rov_ident.api.reading import Progress
+    from rov_ident.core.progress import Progress
 
 
 def add(commands: common.Commands) -> None:
     text = "turn plain CSV or logs of ArduSub or PX4 into a bag"
-    import_ = common.command(commands, "import", text, _import, "--json")
+    import_ = common.command(commands, "import", text, _import, "--json", "bag")
     import_.add_argument(
         "log",
         nargs="+",
@@ -73,7 +73,6 @@ def add(commands: common.Commands) -> None:
 def _import(options: argparse.Namespace) -> None:
     from rov_ident.io import ardupilot_log as ardupilot
 
-    common.check_outputs([options.json], [*options.log, options.config], options.out)
     of_ardupilot = any(path.suffix.lower() in ardupilot.SUFFIXES for path in options.log)
     with common.progress(options) as tell:
         report, messages = (_import_ardupilot if of_ardupilot else _import_csv)(options, tell)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, progress, say
+from rov_ident.cli.common import OUT, Commands, command, progress, say
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import VEHICLES
 
@@ -25,7 +25,6 @@ def add(commands: Commands) -> None:
 def _init(options: argparse.Namespace) -> None:
     from rov_ident.api.start import init
 
-    check_outputs([options.out], [options.record])
     if options.out and options.out.exists() and not options.force:
         raise UserError(
             f"{options.out} is there already, perhaps edited by hand: choose another name, or give "

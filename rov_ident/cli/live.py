@@ -5,7 +5,7 @@ import json
 import re
 from pathlib import Path
 
-from rov_ident.cli.common import ERR, OUT, Commands, check_outputs, command, port, positive
+from rov_ident.cli.common import ERR, OUT, Commands, command, port, positive
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
 
@@ -27,7 +27,9 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
 
     text = "layouts of this vehicle's topics for Foxglove and PlotJuggler"
-    layouts = command(commands, "layouts", text, _layouts, "--config")
+    layouts = command(
+        commands, "layouts", text, _layouts, "--config", "foxglove.json plotjuggler.xml"
+    )
     layouts.add_argument("--namespace", default="", help="of the nodes (none)")
     layouts.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
@@ -63,7 +65,6 @@ def _layouts(options: argparse.Namespace) -> None:
         options.out / "foxglove.json": layouts.foxglove,
         options.out / "plotjuggler.xml": layouts.plotjuggler,
     }
-    check_outputs([*writers], [options.config])
     config = configuration.load(options.config)
     for path, write in writers.items():
         write_file(path, write(config, options.namespace))

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rov_ident.cli.common import Commands, check_outputs, command, say, write_json
+from rov_ident.cli.common import Commands, command, say, write_json
 from rov_ident.core.files import write_file
 
 
@@ -31,7 +31,6 @@ def _export(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
     from rov_ident.consumer.formats import export
 
-    check_outputs([options.out, options.json], [options.config])
     written = export(configuration.load(options.config), options.format)
     write_file(options.out, written.content)
     lost = (f"lost in {options.format}: {what}" for what in written.lost)
@@ -43,7 +42,6 @@ def _import_model(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
     from rov_ident.consumer.formats import import_model
 
-    check_outputs([options.out, options.json], [options.file, options.config])
     base = configuration.load(options.config) if options.config else None
     config, notes = import_model(options.file, base)
     configuration.dump(config, options.out, comment=f"From {options.file.name}.")

@@ -4,7 +4,7 @@ import argparse
 import math
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, check_outputs, command, positive, progress, say
+from rov_ident.cli.common import OUT, Commands, command, positive, progress, say
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
 
@@ -43,9 +43,6 @@ def _nomoto(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
     from rov_ident.steering import nomoto, nomoto_model, zigzag
 
-    check_outputs(
-        [options.json, options.report], [*options.files, options.validate, options.config]
-    )
     config = configuration.load(options.config) if options.config else None
     runs = [zigzag.read(path, config) for path in options.files]
     judge = zigzag.read(options.validate, config) if options.validate else None

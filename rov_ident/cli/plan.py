@@ -8,7 +8,7 @@ from rov_ident.cli import common
 
 def add(commands: common.Commands) -> None:
     text = "the manoeuvre to run next: safe, and best for the worst known coefficient"
-    plan = common.command(commands, "plan", text, _plan, "--config --json --report")
+    plan = common.command(commands, "plan", text, _plan, "--config --json --report", "bag")
     plan.add_argument(
         "--bag", type=Path, nargs="+", default=[], help="what has been recorded already"
     )
@@ -28,8 +28,6 @@ def _plan(options: argparse.Namespace) -> None:
     from rov_ident.api.functions import plan
     from rov_ident.io.write_messages import write_messages
 
-    outputs = [options.json, options.report]
-    common.check_outputs(outputs, [*options.bag, options.config], options.out)
     limits = {name: getattr(options, name) for name in ("duration", "tank", "thrust")}
     with common.progress(options) as tell:
         found = plan(options.config, options.bag or None, **limits, progress=tell)

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
-from rov_ident.cli.common import command, say
+from rov_ident.cli.common import OUTPUTS, check_paths, command, say
 from rov_ident.core.errors import UserError
 from rov_ident.core.interrupts import raise_interrupts
 
@@ -30,9 +30,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name += f" {options.command}"
         if arguments is None:
             raise_interrupts()
+        check_paths(options)
         options.run(options)
         sys.stdout.flush()
-        written = (getattr(options, name, None) for name in ("json", "save", "report", "out"))
+        written = (getattr(options, name, None) for name in OUTPUTS)
         if paths := [str(path) for path in written if isinstance(path, Path) and path.exists()]:
             say(f"written: {', '.join(paths)}")
     except UserError as error:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def add(commands: common.Commands) -> None:
     text = "play a bag into live nodes over DDS and record what they publish"
-    replay = common.command(commands, "replay", text, _replay, "bag --config --json")
+    replay = common.command(commands, "replay", text, _replay, "bag --config --json", "bag")
     replay.add_argument("--estimator", choices=common.LIVE, action="append", help="default: both")
     replay.add_argument(
         "--rate",
@@ -31,7 +31,6 @@ def _replay(options: argparse.Namespace) -> None:
     from rov_ident.reports.result import NORMAL
     from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 
-    common.check_outputs([options.json], [options.bag, options.config], options.out)
     estimators = options.estimator or common.LIVE
     with common.progress(options) as tell:
         tell("starting the nodes")

@@ -9,7 +9,7 @@ from rov_ident.cli import common
 
 def add(commands: common.Commands) -> None:
     text = "simulate open loop: a manoeuvre measured by simulated sensors, or a bag's wrench"
-    simulate = common.command(commands, "simulate", text, _simulate, "--config --json")
+    simulate = common.command(commands, "simulate", text, _simulate, "--config --json", "bag")
     source = simulate.add_mutually_exclusive_group(required=True)
     source.add_argument("--bag", type=Path, help="drive by the wrench of this bag and compare")
     source.add_argument(
@@ -43,7 +43,6 @@ def _simulate(options: argparse.Namespace) -> None:
     from rov_ident.io.write_messages import write_messages
     from rov_ident.simulation.virtual_sensors import Suite
 
-    common.check_outputs([options.json], [options.bag, options.config], options.out)
     given = ("odometry_rate", "imu_rate", "wrench_rate", "delay", "jitter", "drop")
     suite = Suite().scaled(options.noise)
     suite = dataclasses.replace(suite, **{name: getattr(options, name) for name in given})

@@ -37,7 +37,6 @@ def _steer(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
     from rov_ident.steering import autopilot
 
-    common.check_outputs([options.out, options.json], [options.config])
     if not abs(options.angle) <= 180.0:
         raise UserError(f"--angle {options.angle:g}: give degrees from -180 to 180")
     run = autopilot.manoeuvre(

@@ -99,16 +99,15 @@ def drift_of(config: Config, names: tuple[str, ...]) -> Array:
     says that it is known (``current_std: 0`` ...).
     """
     supposed = {".".join(key): std for key, std in config.nuisance_std.items()}
-    body, tilt = config.model.body, config.odometry.attitude_std
-    weight = body.mass * config.gravity
-    arm = {"dx": body.restoring[4, 0] / weight, "dy": body.restoring[3, 1] / weight}  # m
+    # m: so far off, a centre of gravity looks like the error of the attitude
+    offset = config.model.body.righting_arm * config.odometry.attitude_std
 
     def rate(name: str) -> float:
         effect, _, own = name.partition(".")
         if name in supposed and effect == "ocean_current":
             return 1.0 / _CURRENT_TIME
-        if name in supposed and effect == "cog_offset" and own in arm:
-            return 2.0 * float((arm[own] * tilt / supposed[name]) ** 2) / _ATTITUDE_TIME
+        if name in supposed and effect == "cog_offset" and own in ("dx", "dy"):
+            return 2.0 * float((offset / supposed[name]) ** 2) / _ATTITUDE_TIME
         return 0.0
 
     return np.array([rate(name) for name in names])
@@ -129,14 +128,14 @@ def rigid_body_covariance(
     """
     known, body = config.vehicle_uncertainty, config.model.body
     masses, moments = _own_inertia(body)
-    if scaled := _scaled(names, values):
+    if scaled := _with_thrust(names, values):
         # relative to the inertia that the file gives and that does not change with the mass
         of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
     else:
         of_mass = masses
     sources = [{n: known.mass_std * v for n, v in of_mass.items()}]
     sources += [{n: known.inertia_std * moment} for n, moment in moments.items()]
-    return _considered(sources, names, gain)
+    return _consider_covariance(sources, names, gain)
 
 
 def righting_arm_covariance(
@@ -146,18 +145,17 @@ def righting_arm_covariance(
     of the thrust is known.
 
     The equations of motion stay the same with the righting moment, thrust, drag and all inertia,
-    added and own, times k. So it is the arm of that moment which tells the scale, and a height that
-    is off moves all of these. No driving mends it: whether a coefficient has converged is asked
-    without it.
+    added and own, times k. So only the arm of that moment determines the scale, and a wrong height
+    scales all of these. No manoeuvre reduces this error, so convergence is judged without it.
     """
     body, std = config.model.body, config.vehicle_uncertainty.cob_std
-    arm = abs(body.restoring[3, 1]) / body.weight
+    arm = abs(body.righting_arm)
     # no more than is supposed of the scale: a body without an arm tells nothing of it
     share = min(std / max(arm, 1e-9), config.wrench.scale_std)
     masses, moments = _own_inertia(body)
     own = masses | moments
-    moved = {n: share * (v - own.get(n, 0.0)) for n, v in _scaled(names, values).items()}
-    return _considered([moved], names, gain)
+    moved = {n: share * (v - own.get(n, 0.0)) for n, v in _with_thrust(names, values).items()}
+    return _consider_covariance([moved], names, gain)
 
 
 def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
@@ -170,7 +168,7 @@ def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
     )
 
 
-def _scaled(names: tuple[str, ...], values: Array) -> dict[str, float]:
+def _with_thrust(names: tuple[str, ...], values: Array) -> dict[str, float]:
     """What is proportional to the thrust in the same motion, if its scale is estimated."""
     if THRUST_SCALE not in names:
         return {}
@@ -178,7 +176,7 @@ def _scaled(names: tuple[str, ...], values: Array) -> dict[str, float]:
     return {n: v for n, v in of_all if n == THRUST_SCALE or moves_with_thrust(n)}
 
 
-def _considered(
+def _consider_covariance(
     sources: list[dict[str, float]], names: tuple[str, ...], gain: Array | None
 ) -> Array:
     """The covariance (n, n) of what sources of unit variance do to the estimates."""

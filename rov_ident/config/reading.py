@@ -92,7 +92,7 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
     )
     signs = _signs(vehicle.frame)
     for section in _VECTORS.keys() & settings.keys():
-        settings[section] = _turned(settings[section], _VECTORS[section], signs)
+        settings[section] = _in_core_axes(settings[section], _VECTORS[section], signs)
     inputs, chosen = settings.get("inputs", Inputs()), settings.get("thrusters", Thrusters())
     signal = thruster_signal(inputs, chosen) if inputs.is_allocated else thrusters.FORCE
     if inputs.is_allocated:
@@ -104,7 +104,7 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
         )
     if "prior" in settings:
         prior = settings["prior"]
-        std = {_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}
+        std = {_name_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}
         settings["prior"] = dataclasses.replace(prior, std=std)
     known = {f.name: getattr(vehicle, f.name) for f in dataclasses.fields(VehicleUncertainty)}
     settings["vehicle_uncertainty"] = VehicleUncertainty(**known)
@@ -302,7 +302,7 @@ def estimated(
             raise UserError(f"estimate: {name} is not in effects: {suggestion(name, possible)}")
         if parameter not in estimable(effect):
             raise UserError(f"estimate: {name} cannot be estimated live: leave it out")
-    chosen = {_in_model(model, n, f"estimate: {n}") for n in names if "." not in n}
+    chosen = {_name_in_model(model, n, f"estimate: {n}") for n in names if "." not in n}
     waiting = {c.name: m for c in model.coefficients if (m := missing_inputs(c, inputs))}
     for name in sorted(chosen & waiting.keys()):
         missing = waiting[name][0]
@@ -329,7 +329,7 @@ def thruster_signal(inputs: Inputs, chosen: Thrusters) -> str:
     return thrusters.PWM if inputs.wrench in PULSE_TYPES else thrusters.FORCE
 
 
-def _turned(given: Any, names: Names, signs: Array) -> Any:
+def _in_core_axes(given: Any, names: Names, signs: Array) -> Any:
     """A section with these vectors, in threes, brought into forward-starboard-down."""
     turned: dict[str, Any] = {}
     for name in names:
@@ -339,7 +339,7 @@ def _turned(given: Any, names: Names, signs: Array) -> Any:
     return dataclasses.replace(given, **turned)
 
 
-def _in_model(model: Model, name: str, key: str) -> str:
+def _name_in_model(model: Model, name: str, key: str) -> str:
     """The model's own name of a coefficient (N_vdot may be its Y_rdot)."""
     with contextlib.suppress(UserError, KeyError):
         return {c.place: c.name for c in model.coefficients}[parse(name).place]

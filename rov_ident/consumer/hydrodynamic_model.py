@@ -14,11 +14,10 @@ from rov_ident.config import LARGEST, Config, load
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import gravity_direction, quaternion_normalise
+from rov_ident.core.messages import SECOND
 from rov_ident.core.states import Level
 from rov_ident.estimation.physical import is_passive
 from rov_ident.model.equations import Array, Model, build
-
-_SECOND = 1_000_000_000  # ns
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,9 @@ class HydrodynamicModel:
         A stamp before the last one is refused while the stream is fresh. Once it is not, its
         source has begun anew (a bag that loops, a simulation reset) and any stamp is accepted.
         """
-        stamp = message.header.stamp.sec * _SECOND + message.header.stamp.nanosec
+        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
         if self._stamp is not None and stamp < self._stamp and self.fresh(now):
-            late = (self._stamp - stamp) / _SECOND
+            late = (self._stamp - stamp) / SECOND
             return Taken(reason=f"its stamp is {late:.3f} s before the last one")
         values: dict[str, float] = {}
         refused: dict[str, str] = {}

@@ -51,7 +51,7 @@ def check_output(path: Place, inputs: Iterable[Place | None] = (), bag: bool = F
     except ValueError:  # a NUL character, or half of one in UTF-16
         refusal = "no file can have that name"
     if refusal:
-        raise UserError(f"{_shown(path)} cannot be written: {refusal}")
+        raise UserError(f"{_shortened(path)} cannot be written: {refusal}")
 
 
 def open_input(path: Place) -> IO[bytes]:
@@ -170,7 +170,7 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
         if place == source or (kind and source.exists() and place.samefile(source)):
             return "the result would replace what it is made from, so choose another name"
         if source.is_dir() and place.is_relative_to(source):
-            return f"it lies within the bag {_shown(given)}, so choose another folder"
+            return f"it lies within the bag {_shortened(given)}, so choose another folder"
     if kind and bag and place.suffix != ".mcap":
         return "it exists already, so remove it or choose another name"
     if stat.S_ISDIR(kind):
@@ -178,9 +178,9 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
     if kind and not stat.S_ISREG(kind):
         return "there is a device, a pipe or a socket, so give the name of a file"
     try:
-        if kind and not bag and _begins(place, _BAG):
+        if kind and not bag and _begins_with(place, _BAG):
             return "there is a bag, so choose another name"
-        if _begins(place.parent / "metadata.yaml", _ROSBAG2):
+        if _begins_with(place.parent / "metadata.yaml", _ROSBAG2):
             return "it lies within a bag, so choose another folder"
     except OSError as error:
         return error.strerror or str(error)
@@ -198,14 +198,14 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
         return f"{folder} takes no files ({error.strerror})"
 
 
-def _begins(path: Path, how: bytes) -> bool:
+def _begins_with(path: Path, how: bytes) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as stream:
         return stream.read(len(how)) == how
 
 
-def _shown(path: Place) -> str:
+def _shortened(path: Place) -> str:
     """A path within a sentence."""
     text = str(path).replace("\0", "\\0")
     return text if len(text) <= 200 else f"{text[:197]}..."

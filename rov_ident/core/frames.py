@@ -137,6 +137,11 @@ def turns(q: Array) -> Array:
     return out
 
 
+def quaternion_angle(p: Array, q: Array) -> Array:
+    """The angle (...) [rad], from 0 to pi, between attitudes p and q (..., 4)."""
+    return 2.0 * np.arccos(np.minimum(np.abs(np.sum(p * q, axis=-1)), 1.0))
+
+
 def quaternion_between(p: Array, q: Array, share: float) -> Array:
     """The unit quaternion (4,) a share of the way from p to q, along the shortest rotation."""
     cosine = float(p @ q)
@@ -172,7 +177,7 @@ def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyM
     `frame_id` and the world the default one. Frame ids are kept: they name the axes on the wire.
     Variances belong to axes without direction, so no sign touches them.
     """
-    return _turned(message, defaults, _TURNS)
+    return _change_axes(message, defaults, _TURNS)
 
 
 def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> AnyMessage:
@@ -181,7 +186,7 @@ def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> Any
     The frame ids of the message decide in the same way, so that a message is never written with
     axes that its frame ids deny.
     """
-    return _turned(message, FrameDefaults(body, world), _TURNS_BACK)
+    return _change_axes(message, FrameDefaults(body, world), _TURNS_BACK)
 
 
 def body_is_frd(frame_id: str, defaults: FrameDefaults = ROS_DEFAULTS) -> bool:
@@ -194,7 +199,7 @@ def world_is_ned(frame_id: str, defaults: FrameDefaults = ROS_DEFAULTS) -> bool:
     return frame_id.endswith(_NED_SUFFIX) or defaults.world == "ned"
 
 
-def _turned(
+def _change_axes(
     message: AnyMessage, defaults: FrameDefaults, turns: dict[tuple[bool, bool], Array]
 ) -> AnyMessage:
     """The message with axes other than FRD, NED turned, or back, by the ``turns`` of attitudes."""

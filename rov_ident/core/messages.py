@@ -85,7 +85,8 @@ class Commands(NamedTuple):
 
 Message = Odometry | Imu | Wrench | Joints
 
-LAST_STAMP = (2**31 - 1) * 10**9  # ns; the end of ROS time, 32 bits of seconds
+SECOND = 1_000_000_000  # ns
+LAST_STAMP = (2**31 - 1) * SECOND  # ns; the end of ROS time, 32 bits of seconds
 
 
 def fault(message: Message) -> str:

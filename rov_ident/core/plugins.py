@@ -24,7 +24,7 @@ GROUP = "rov_ident.effects"
 def installed() -> tuple[tuple[str, EntryPoint], ...]:
     """The entry points and the packages (of the folder that comes first) that bring them."""
     found: dict[str, list[tuple[str, EntryPoint]]] = {}
-    for package in distributions(path=_elsewhere()):
+    for package in distributions(path=_safe_search_path()):
         if GROUP not in (package.read_text("entry_points.txt") or ""):
             continue
         name = package.metadata["Name"]
@@ -36,7 +36,7 @@ def installed() -> tuple[tuple[str, EntryPoint], ...]:
 def loaded(package: str, point: EntryPoint) -> Any:
     """What an entry point names. UserError if it cannot be imported."""
     try:
-        with _not_from_here():
+        with _without_current_folder():
             return point.load()
     except Exception as error:  # it is code of others
         raise UserError(
@@ -48,7 +48,7 @@ def loaded(package: str, point: EntryPoint) -> Any:
 def sources() -> Iterator[bytes]:
     """All Python files of the packages that bring something: compiled kernels depend on them."""
     for module in sorted({point.module.partition(".")[0] for _, point in installed()}):
-        with _not_from_here():
+        with _without_current_folder():
             spec = find_spec(module)
         if spec is None:
             continue
@@ -58,7 +58,7 @@ def sources() -> Iterator[bytes]:
             yield path.read_bytes()
 
 
-def _elsewhere() -> list[str]:
+def _safe_search_path() -> list[str]:
     """Where Python looks for modules, but for the current folder."""
     try:
         here = os.getcwd()
@@ -68,9 +68,9 @@ def _elsewhere() -> list[str]:
 
 
 @contextmanager
-def _not_from_here() -> Iterator[None]:
+def _without_current_folder() -> Iterator[None]:
     before = sys.path[:]
-    sys.path[:] = _elsewhere()
+    sys.path[:] = _safe_search_path()
     try:
         yield
     finally:

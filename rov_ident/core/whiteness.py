@@ -1,7 +1,7 @@
 """Whether innovations are white: the power of their sums, which is then 1 in the mean.
 
-What a model lacks, or one sensor says against another, lasts longer than noise does: in a sum over
-a second it stands out from what would be lost in each innovation alone.
+An error of the model, or a disagreement of two sensors, lasts longer than noise: it shows in sums
+over a second, and is lost in a single innovation.
 """
 
 from rov_ident.core.jit import inlined

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rov_ident.core.linalg import scaled_solve, unit_diagonal
+from rov_ident.core.noise import robust_std
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key
 from rov_ident.discrepancy.multiple_shooting import Motion, adjoint, tangent
 from rov_ident.discrepancy.windowed_problem import MAX_STEP, WindowedProblem
@@ -72,7 +73,7 @@ class Linearisation:
         self.problem, self.hypothesis, self.starts = problem, h, starts
         self.noise, self.motion, self.more = noise, motion, more
         error = (problem.measured - motion.nu[problem.nodes]) / noise
-        spread = 1.4826 * np.median(np.abs(error), axis=0)  # the standard deviation if normal
+        spread = robust_std(error)
         self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
         self._weight[:, problem.guided] = 0.0
         error = (error * (self._weight > 0.0)).reshape(-1, 1)

@@ -30,6 +30,7 @@ from rov_ident.core.frames import (
 )
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
+from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import turned
 from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
@@ -296,7 +297,7 @@ def whitened(
         else:
             a = np.zeros((y.size, 0))
         left = e.ravel() - a @ np.linalg.lstsq(a, e.ravel(), rcond=None)[0]
-        spread = 1.4826 * float(np.median(np.abs(left)))
+        spread = float(robust_std(left))
         if spread < least:
             least, best = spread, gain
     e = _innovations(y, best, gap)

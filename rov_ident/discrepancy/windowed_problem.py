@@ -22,6 +22,7 @@ from rov_ident.core.frames import (
     turns,
 )
 from rov_ident.core.linalg import interpolated
+from rov_ident.core.noise import robust_std
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
 from rov_ident.discrepancy.multiple_shooting import (
     Motion,
@@ -39,7 +40,7 @@ from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
-from rov_ident.sampling.reading_noise import OF_MEDIAN, resting_noise
+from rov_ident.sampling.reading_noise import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
 MAX_STEP = 0.05  # s; of integration, where odometry is slower
@@ -384,8 +385,7 @@ class WindowedProblem:
         good = np.isfinite(self.streams.nu).all(axis=1)
         q, nu = self.streams.orientation[good], self.streams.nu[good]
         second = np.hstack([np.diff(turns(q), axis=0), np.diff(nu, 2, axis=0)]) / np.sqrt(6.0)
-        out: Array = OF_MEDIAN * np.median(np.abs(second), axis=0)
-        return out
+        return robust_std(second)
 
     def measured_starts(self) -> Array:
         """The measured velocity (W, 6) at the beginning of each window."""

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from rov_ident.effects.base import (
 from rov_ident.model.equations import RigidBody, add_current
 
 
-def _of_others(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
+def _installed_effects(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
     """Effects that installed packages bring, by the names of their entry points. UserError if one
     is invalid, or its name is taken."""
     names: dict[str, str] = dict.fromkeys(taken, "rov_ident")
@@ -59,7 +59,7 @@ def _library() -> dict[str, Effect]:
         for module in iter_modules(__path__)
         if module.name != "base"
     }
-    return {**dict(_of_others(ours)), **ours}
+    return {**dict(_installed_effects(ours)), **ours}
 
 
 EFFECTS: dict[str, Effect] = _library()  # every effect by the name users give it
@@ -70,55 +70,39 @@ _WRENCH = [e for e in EFFECTS.values() if e.wrench]
 _SENSE = sorted((e for e in EFFECTS.values() if e.sense), key=lambda e: (e.order, e.name))
 
 
-def _acts(effects: list[Effect]) -> Any:
-    """A function for kernels that lets all input effects that are there act in turn, from i = 0 on.
+def _in_turn(calls: list[Any]) -> Any:
+    """A function for kernels that makes every call whose effect is there, in turn, from i = 0 on.
 
     Not a loop over a tuple of functions: numba may take that for one of pointers, which do not
     survive in its cache.
     """
-    if not effects:
-        return inlined(lambda i, there, parameters, state, t, dt, wrench: None)
-    first, others = cast(Any, effects[0].act), _acts(effects[1:])
+    if not calls:
+        return inlined(lambda i, there, arguments: None)
+    first, others = calls[0], _in_turn(calls[1:])
 
-    def calls(i, there, parameters, state, t, dt, wrench):  # type: ignore[no-untyped-def]
+    def make(i, there, arguments):  # type: ignore[no-untyped-def]
         if there[i]:
-            first(parameters[i], state[i], t, dt, wrench)
-        others(i + 1, there, parameters, state, t, dt, wrench)
+            first(i, arguments)
+        others(i + 1, there, arguments)
 
-    return inlined(calls)
-
-
-def _wrenches(effects: list[Effect]) -> Any:
-    """The same of all wrench effects."""
-    if not effects:
-        return inlined(lambda i, there, parameters, t, position, nu, rotation, thrust, out: None)
-    first, others = cast(Any, effects[0].wrench), _wrenches(effects[1:])
-
-    def calls(i, there, parameters, t, position, nu, rotation, thrust, out):  # type: ignore
-        if there[i]:
-            first(parameters[i], t, position, nu, rotation, thrust, out)
-        others(i + 1, there, parameters, t, position, nu, rotation, thrust, out)
-
-    return inlined(calls)
+    return inlined(make)
 
 
-def _steers(effects: list[Effect]) -> Any:
-    """The same of all effects on fins."""
-    if not effects:
-        return inlined(lambda i, there, parameters, state, dt, inputs: None)
-    first, others = cast(Any, effects[0].steer), _steers(effects[1:])
-
-    def calls(i, there, parameters, state, dt, inputs):  # type: ignore[no-untyped-def]
-        if there[i]:
-            first(parameters[i], state[i], dt, inputs)
-        others(i + 1, there, parameters, state, dt, inputs)
-
-    return inlined(calls)
+def _act(act: Any) -> Any:  # of (parameters, state, t, dt, wrench)
+    return inlined(lambda i, a: act(a[0][i], a[1][i], a[2], a[3], a[4]))
 
 
-_ALL_ACTS = _acts(_INPUT)
-_ALL_STEERS = _steers(_STEER)
-_ALL_WRENCHES = _wrenches(_WRENCH)
+def _wrench(wrench: Any) -> Any:  # of (parameters, t, position, nu, rotation, thrust, out)
+    return inlined(lambda i, a: wrench(a[0][i], a[1], a[2], a[3], a[4], a[5], a[6]))
+
+
+def _steer(steer: Any) -> Any:  # of (parameters, state, dt, inputs)
+    return inlined(lambda i, a: steer(a[0][i], a[1][i], a[2], a[3]))
+
+
+_ALL_ACTS = _in_turn([_act(effect.act) for effect in _INPUT])
+_ALL_STEERS = _in_turn([_steer(effect.steer) for effect in _STEER])
+_ALL_WRENCHES = _in_turn([_wrench(effect.wrench) for effect in _WRENCH])
 
 
 Values = Mapping[str, Mapping[str, float]]
@@ -248,7 +232,7 @@ def memory() -> Array:
 @lean
 def act(acting, state, t, dt, wrench):
     """wrench (6,), commanded from t to t + dt, becomes the mean of what acts in that time."""
-    _ALL_ACTS(0, acting.inputs, acting.input_parameters, state, t, dt, wrench)
+    _ALL_ACTS(0, acting.inputs, (acting.input_parameters, state, t, dt, wrench))
 
 
 @kernel
@@ -268,13 +252,14 @@ def steering_memory() -> Array:
 
 @kernel
 def steer(acting, state, dt, inputs):
-    """inputs (2, 4) read, their means over dt and their values at its end, become what acts."""
-    _ALL_STEERS(0, acting.steers, acting.steer_parameters, state, dt, inputs)
+    """Turn inputs (2, 4) as read, means over dt and values at its end, into those that act."""
+    _ALL_STEERS(0, acting.steers, (acting.steer_parameters, state, dt, inputs))
 
 
 @kernel
 def steered(acting, dt, means, ends):
-    """Means (N, 4) of what acts over steps of dt (N,), of means (N, 4) and ends (N, 4) read."""
+    """Means (N, 4) of the inputs that act over steps of dt (N,), from ``means`` and values at the
+    ``ends`` (N, 4) as read."""
     out, state = means.copy(), np.zeros((len(acting.steers), STEER_MEMORY))
     inputs = np.empty((2, means.shape[1]))
     for k in range(len(dt)):
@@ -294,8 +279,8 @@ def surrounds(acting):
 def add_wrenches(acting, t, position, nu, rotation, thrust, out):
     """Add to out (6,) what the wrench effects do at time t, at ``position`` (3,) in the world and
     nu (6,) relative to the water, while the thrusters give ``thrust`` (6,)."""
-    there, parameters = acting.wrenches, acting.wrench_parameters
-    _ALL_WRENCHES(0, there, parameters, t, position, nu, rotation, thrust, out)
+    arguments = (acting.wrench_parameters, t, position, nu, rotation, thrust, out)
+    _ALL_WRENCHES(0, acting.wrenches, arguments)
 
 
 @inlined

@@ -58,6 +58,8 @@ Axes = tuple[str, str, str]
 
 MEMORY = 1024  # numbers that an input effect may keep from one call to the next
 STEER_MEMORY = 8  # the same of an effect on fins
+FORCE, MOMENT = 50.0, 10.0
+"""N, N m; at which effects that grow with thrust are stated: the most of a T200, at 0.2 m."""
 
 
 class Reading(NamedTuple):

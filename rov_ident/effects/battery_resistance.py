@@ -9,16 +9,14 @@ How the thrusters share the wrench is not known here: load counts axes as if eac
 """
 
 from rov_ident.core.jit import kernel
-from rov_ident.effects.base import Effect, EffectParameter
-
-_FORCE, _MOMENT = 50.0, 10.0  # N, N m; at which the loss is stated: a T200's most, at 0.2 m
+from rov_ident.effects.base import FORCE, MOMENT, Effect, EffectParameter
 
 
 @kernel
 def act(p, state, t, dt, wrench):
     load = 0.0
     for i in range(3):
-        load += (abs(wrench[i]) / _FORCE) ** 1.5 + (abs(wrench[3 + i]) / _MOMENT) ** 1.5
+        load += (abs(wrench[i]) / FORCE) ** 1.5 + (abs(wrench[3 + i]) / MOMENT) ** 1.5
     gain = max(1.0 - p[0] * load, 0.0)
     for i in range(6):
         wrench[i] *= gain

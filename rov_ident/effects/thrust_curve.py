@@ -6,15 +6,13 @@ rising for any size of either.
 """
 
 from rov_ident.core.jit import kernel
-from rov_ident.effects.base import Effect, per_axis
-
-_FORCE, _MOMENT = 50.0, 10.0  # N, N m; at which the curvature is stated: a T200's most, at 0.2 m
+from rov_ident.effects.base import FORCE, MOMENT, Effect, per_axis
 
 
 @kernel
 def act(p, state, t, dt, wrench):
     for i in range(6):
-        x = p[i] * abs(wrench[i]) / (_FORCE if i < 3 else _MOMENT)
+        x = p[i] * abs(wrench[i]) / (FORCE if i < 3 else MOMENT)
         if x > 0.0:
             wrench[i] /= 1.0 + x
         else:

@@ -42,7 +42,7 @@ def identity(online: OnlineEstimator) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "estimator": online.kind,
-        "configuration": _digest(_lasting(online.config)),
+        "configuration": _digest(_fixed_settings(online.config)),
         "structure": _digest([type(memory.state)._fields, shapes]),
     }
 
@@ -201,7 +201,7 @@ def _bytes(part: NDArray[Any]) -> bytes:
     return clean.tobytes()
 
 
-def _lasting(config: Config) -> dict[str, Any]:
+def _fixed_settings(config: Config) -> dict[str, Any]:
     """The configuration without what may change while a node runs, and how messages come in."""
     values = to_parameters(config)
     values.pop("topics", None)

@@ -5,7 +5,7 @@ badly. "Does the model explain the data?" in docs/live.md has the study that lim
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from rov_ident.core.messages import Array
 from rov_ident.core.states import State
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.records import VELOCITIES
 
 CAUSE = "rov-ident explain looks for the cause"
@@ -50,9 +51,13 @@ class Test:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The tests, and by how much wider they make every interval."""
+    """The tests, and by how much wider they make every interval.
+
+    ``asks``: whether the method tests what the model leaves unexplained. Least squares does not.
+    """
 
     tests: tuple[Test, ...]
+    asks: bool = True
 
     @property
     def consistent(self) -> bool:
@@ -60,12 +65,12 @@ class Consistency:
 
     @property
     def possible(self) -> bool:
-        """Whether what no vehicle's file knows is within what the configuration supposes of it."""
+        """Whether every nuisance parameter is within the range that its prior allows for."""
         return all(test.passed for test in self.tests if test.name.startswith(_PRIOR))
 
     @property
     def judged(self) -> bool:
-        """Whether it was asked of any motion what it has beside the model."""
+        """Whether any axis moved enough to test what the model leaves unexplained on it."""
         return any(test.name.startswith(_LEFT) for test in self.tests)
 
     def widened(self, covariance: Array, prior: Array) -> Array:
@@ -80,21 +85,30 @@ class Consistency:
 
     @property
     def sentence(self) -> str:
-        """What the worst test says, and what to do; nothing where all are passed."""
+        """What the worst test says, and what to do; or what it means that none fails."""
         failed = [test for test in self.tests if not test.passed]
+        if not failed and not self.asks:
+            return "no test fails, but least squares does not ask what the model leaves unexplained"
         if not failed and not self.judged:
             return (
                 "nothing contradicts the model, but there was too little motion, throughout or "
-                "since all was learnt anew about another lag or delay, to ask what it leaves "
-                "unexplained"
+                "since estimation began anew with another lag or delay, to test what the model "
+                "leaves unexplained"
             )
         if not failed:
             return "model and data agree"
         return max(failed, key=lambda test: test.value / test.limit).failure
 
+    @property
+    def doubt(self) -> str:
+        """Why nothing can have converged, in a few words; empty where something can."""
+        if not self.consistent:
+            return "data and model disagree"
+        return "too little motion yet to judge the model" if self.asks and not self.judged else ""
+
     def of_states(self, states: Iterable[State]) -> tuple[State, ...]:
-        """The states of a fit: nothing has converged where model and data disagree."""
-        doubted = {} if self.consistent else {State.CONVERGED: State.CONVERGING}
+        """The states of a fit: in :attr:`doubt` nothing has converged."""
+        doubted = {State.CONVERGED: State.CONVERGING} if self.doubt else {}
         return tuple(doubted.get(state, state) for state in states)
 
     def with_open_loop(self, before: Array, after: Array, chance: Array) -> "Consistency":
@@ -118,7 +132,7 @@ class Consistency:
                         f"{new:.3g} instead of {old:.3g}): {CAUSE}",
                     )
                 )  # fmt: skip
-        return Consistency(tuple(tests))
+        return replace(self, tests=tuple(tests))
 
     def to_dict(self) -> dict[str, Any]:
         """As in the JSON of a fit."""
@@ -173,12 +187,13 @@ def consistency_of(
     supposed = {".".join(key) for key in config.nuisance_std}
     for i in (i for i, name in enumerate(prior.names) if name in supposed):
         name = prior.names[i]
-        off = abs(values[i] - prior.mean[i]) / prior.std[i]
+        mean, half = prior.mean[i], NORMAL * prior.std[i]
+        off = abs(values[i] - mean) / prior.std[i]
         tests.append(
             Test(
                 f"{_PRIOR}{name}", float(off), SUPPOSED,
-                f"the data ask for {name} = {_told(values[i], prior.units[i])}, which the "
-                f"configuration takes for impossible ({prior.mean[i]:.3g} ± {prior.std[i]:.2g}): "
+                f"the data ask for {name} = {_with_unit(values[i], prior.units[i])}, which the "
+                f"configuration takes for impossible ({mean:.3g} ± {half:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
         )  # fmt: skip
@@ -190,10 +205,9 @@ def consistency_of(
             tests.append(
                 Test(
                     f"bound of {name}", float(beyond[i]), _BEYOND,
-                    f"the data ask for {name} = {_told(values[i], prior.units[i])}, which cannot "
-                    "be: check that wrench, odometry and IMU are stamped by one clock, when "
-                    "measured; "
-                    f"{CAUSE}",
+                    f"the data ask for {name} = {_with_unit(values[i], prior.units[i])}, which is "
+                    "impossible: check that wrench, odometry and IMU are stamped by one clock, at "
+                    f"the time of measurement; {CAUSE}",
                 )
             )  # fmt: skip
     for part, ratio in (sensors or {}).items():
@@ -208,6 +222,6 @@ def consistency_of(
     return Consistency(tuple(tests))
 
 
-def _told(value: float, unit: str) -> str:
+def _with_unit(value: float, unit: str) -> str:
     """A value with its unit, if it has one."""
     return f"{value:.3g} {unit}".removesuffix(" 1")

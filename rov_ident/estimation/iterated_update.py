@@ -1,11 +1,11 @@
-"""Rows of RLS that were taken about poor estimates, taken again about better ones.
+"""Rows of RLS that were linearised about poor estimates, linearised again about better ones.
 
-A row is right to first order in the distance of the coefficients it was taken about. While little
-is known, rows claim combinations of coefficients that the motion does not tell, and no later row
-takes that back ("Looking back" in docs/accuracy.md). So the samples of a window are kept with the
-state from before them, and folded again from it, about the present estimate, once that has moved:
-the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a Gauss-Newton
-step.
+A row is right to first order in the error of the coefficients that it is linearised about. While
+little is known, rows claim combinations of coefficients that the motion does not determine, and no
+later row corrects that ("Looking back" in docs/accuracy.md). So the samples of a window are kept
+with the state from before them, and folded again from it, about the present estimate, once that has
+moved: the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a
+Gauss-Newton step.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from rov_ident.sampling.sample import joined
 # twice as many samples again as come in. "Looking back" has the study.
 _TIMES = (7.5, 15.0, 30.0)
 _PASSES = 4  # two are enough where it ends at all
-_MOVED = 1.0  # standard deviations, by which an estimate may be off in any case
+_LARGEST_CHANGE = 1.0  # standard deviations, by which an estimate may be off in any case
 
 
 class IteratedUpdate:
@@ -51,14 +51,14 @@ class IteratedUpdate:
         self._samples.append(samples)
         if samples["t"][-1] < self._began + _TIMES[self._looks]:
             return state
-        state = self.look_back(task, state)
+        state = self.iterate(task, state)
         self._looks += 1
         if self._looks == len(_TIMES):
             self.begin(state)
         return state
 
     @one_blas_thread()
-    def look_back(self, task: Problem, state: rls.State) -> rls.State:
+    def iterate(self, task: Problem, state: rls.State) -> rls.State:
         """The state with the window's samples folded about its estimate, if that has moved.
 
         Repeated until rows and the estimate that follows from them agree; where they never do, too
@@ -66,7 +66,7 @@ class IteratedUpdate:
         this would take minutes.
         """
         about, std = rls.solution_of(task, state)
-        if interpreting() or not self._samples or not _moved(about, self._about, std):
+        if interpreting() or not self._samples or not _differ(about, self._about, std):
             return state
         samples = joined(self._samples)
         for _ in range(_PASSES):
@@ -74,12 +74,12 @@ class IteratedUpdate:
             if again is None:
                 break
             solution, std = rls.solution_of(task, again)
-            if not _moved(solution, about, std):
+            if not _differ(solution, about, std):
                 self._about = about
                 return again
             about = solution
         return state
 
 
-def _moved(a: Array, b: Array, std: Array) -> bool:
-    return bool((np.abs(a - b) > _MOVED * std).any())
+def _differ(a: Array, b: Array, std: Array) -> bool:
+    return bool((np.abs(a - b) > _LARGEST_CHANGE * std).any())

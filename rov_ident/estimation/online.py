@@ -30,8 +30,9 @@ from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
-from rov_ident.estimation.shared import INFO, noisy_axes, teachers_of, too_noisy
-from rov_ident.sampling.sample import believed, joined
+from rov_ident.estimation.shared import INFO, informative_axes, noisy_axes, too_noisy
+from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.sample import after_reset, joined
 from rov_ident.sampling.sampler import Sampler
 
 Kind = Literal["rls", "ukf"]
@@ -51,7 +52,6 @@ EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
 _EXCITED = 0.05  # of the prior variance that this motion alone would remove; page.js has the same
-_QUANTILE = 1.959963984540054  # of the normal distribution, 97.5 %
 
 
 ESTIMATORS: dict[Kind, ModuleType] = {"rls": rls, "ukf": ukf}
@@ -186,7 +186,7 @@ class OnlineEstimator:
         self._task = self._module.problem(config)
         self._begin_window()
         self.sampler.configure(config)
-        self._centre(self._present)
+        self._centre(self._effect_values)
 
     def attach(self, monitor: Monitor) -> None:
         """Let a monitor see from now on what the estimator sees."""
@@ -240,14 +240,14 @@ class OnlineEstimator:
         self.flush()
 
     def _is_due(self, samples: NDArray[np.void]) -> bool:
-        """Whether it is time to see what samples (k,) have taught."""
+        """Whether parameters of effects are to be looked at after samples (k,)."""
         return not abs(float(samples["t"][-1]) - self._centred) < CENTRING_TIME
 
     def flush(self) -> NDArray[np.void]:
         """The input has ended or stopped: use what still waits for a late topic."""
         info = self.take(self.sampler.flush())
         if self._update and self._enabled:
-            self._state = self._update.look_back(self._task, self._state)
+            self._state = self._update.iterate(self._task, self._state)
         return info
 
     def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
@@ -255,7 +255,7 @@ class OnlineEstimator:
         if len(samples) == 0 or not self._enabled:
             return np.zeros(0, dtype=INFO)
         if samples["anew"].any():
-            samples = believed(samples)
+            samples = after_reset(samples)
             self._begin_with(self._origin)
             if self.monitor is not None:
                 self.monitor.reset()
@@ -286,7 +286,7 @@ class OnlineEstimator:
         return info
 
     def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
-        """Samples (k,) into the state, which RLS looks back on as often as their times say."""
+        """Fold samples (k,) into the state; RLS iterates its update at the times it has set."""
         fold, task, update = self._module.fold, self._task, self._update
         if not update:
             self._state, info = fold(task, self._state, samples)
@@ -308,10 +308,10 @@ class OnlineEstimator:
         """Another record follows: inputs begin anew, what is learnt stays."""
         self.sampler, self._settled = Sampler(self.config), math.nan
         self._begin_window()
-        self._centre(self._present)
+        self._centre(self._effect_values)
 
     @property
-    def _present(self) -> dict[str, float]:
+    def _effect_values(self) -> dict[str, float]:
         """The parameters of effects as samples have them."""
         return dict(zip(self.config.effect_names, self._about.tolist(), strict=True))
 
@@ -410,7 +410,7 @@ class OnlineEstimator:
         """The present coefficients, made physical, with their state in words."""
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         consistency = consistency_of(
-            self.config, self.prior, raw.values, self._unexplained(), self._lasting(),
+            self.config, self.prior, raw.values, self._unexplained(), self._whiteness(),
             self.sampler.kinematic_filter.contradictions, raw.std,
         )  # fmt: skip
         gain = gain_of(raw.covariance, self.prior.std)
@@ -439,7 +439,7 @@ class OnlineEstimator:
             covariance = covariance + arm
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
-        upper = np.minimum(values + _QUANTILE * std, self.prior.upper)
+        upper = np.minimum(values + NORMAL * std, self.prior.upper)
         upper = np.where(self.prior.negative, np.minimum(upper, 0.0), upper)
         return Report(
             self.stamp,
@@ -447,7 +447,7 @@ class OnlineEstimator:
             self.prior.units,
             values,
             std,
-            np.maximum(values - _QUANTILE * std, self.prior.lower),
+            np.maximum(values - NORMAL * std, self.prior.lower),
             upper,
             covariance,
             excitation,
@@ -458,13 +458,13 @@ class OnlineEstimator:
         )
 
     def _waiting(self, values: Array) -> dict[int, str]:
-        """Why some, by their place, are not learnt now, at coefficients of these values."""
+        """Why some coefficients, by their index, are not updated at present; ``values`` (n,)."""
         if not self._reading_noise.any():
             return {}
         coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))
         mass = self.config.dynamics.with_values(coefficients).mass_matrix
         noisy = noisy_axes(mass, self._reading_noise, self._state.monitor)
-        held = enumerate(teachers_of(self.config) & noisy)
+        held = enumerate(informative_axes(self.config) & noisy)
         return {i: too_noisy(axes) for i, axes in held if axes.any()}
 
     def _unexplained(self) -> Array:
@@ -473,7 +473,7 @@ class OnlineEstimator:
         share = FIRST_FORCE * np.sqrt(monitor["density"] / first)
         return np.where(monitor["seen"] > innovation_monitor.TIME, share, np.nan)
 
-    def _lasting(self) -> Array:
+    def _whiteness(self) -> Array:
         """(6,): power of innovations added up over a second, NaN where that is not known."""
         monitor = self._state.monitor
         return np.where(monitor["judged"] > JUDGED_TIME, monitor["power"], np.nan)
@@ -502,10 +502,8 @@ class OnlineEstimator:
         known = is_known(values[i], std[i], self.prior.std[i])
         if waiting and not (known and consistency.consistent):
             return State.HELD, f"held: {waiting}"
-        if not consistency.consistent and (excited or known):
-            return State.CONVERGING, "converging: data and model disagree"
-        if known and not consistency.judged:
-            return State.CONVERGING, "converging: too little motion yet to judge the model"
+        if consistency.doubt and (known or (excited and not consistency.consistent)):
+            return State.CONVERGING, f"converging: {consistency.doubt}"
         if known:
             return State.CONVERGED, "converged" if excited else "converged: not excited now"
         if excited:

@@ -51,10 +51,10 @@ def wrench_noise(constants, sample, out):
     """out (6,): variance density [N2 s, (N m)2 s] of the wrench; an error lasts as long as it.
 
     A tilt by the small angles a turns down d by ``d x a``, and changes the wrench ``R d`` of weight
-    by ``(R_i x d) a``. Without that, a vehicle at rest would be one that a righting moment does not
-    move, and thrust and coefficients be learnt from it: too large, and too surely.
+    by ``(R_i x d) a``. Without this term a vehicle at rest would contradict its righting moment,
+    and thrust and coefficients would come out too large and too certain.
 
-    Whether some of the wrench is in doubt, so that nothing about noise can be learnt.
+    Returns whether some of the wrench is in doubt: then the noise levels are not updated.
     """
     lasting, doubtful = max(constants.lasting, sample.hold), False
     for i in range(6):

@@ -6,7 +6,6 @@ measurements are outliers, which coefficients the motion does not show, how much
 is. Both must then give the same numbers; ours is some three hundred times as fast.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,10 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.messages import Array
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.runge_kutta import NODES, WEIGHTS
 from rov_ident.estimation import ukf
-from rov_ident.estimation.shared import RELEARNING_TIME, Problem, learnt, steps_of
+from rov_ident.estimation.shared import RELEARNING_TIME, Problem, excited, steps_of
 from rov_ident.model.equations import force_of_one
 
 
@@ -121,7 +121,7 @@ class ReferenceUkf:
         self.filter.update(z[measured], R=np.diag(r[measured]), hx=lambda x: x[measured])
         # What does not show in the motion is only considered (Schmidt 1966).
         moves, noisy = np.ones(len(self.task.theta), dtype=bool), np.zeros(6, dtype=bool)
-        learnt(self.task, row["moving"], row, monitor, self._inverse_mass(), noisy, moves)
+        excited(self.task, row["moving"], row, monitor, self._inverse_mass(), noisy, moves)
         held = 6 + np.flatnonzero(~moves[self.task.estimated])
         self.filter.x[held] = x[held]
         self.filter.P[np.ix_(held, held)] = p[np.ix_(held, held)]
@@ -156,13 +156,11 @@ def raised(mass: Array, least: Array) -> Array:
     return added
 
 
-def compare(
-    config: Config, samples: NDArray[np.void], tell: Callable[[float], None] = lambda share: None
-) -> dict[str, Any]:
+def compare(config: Config, samples: NDArray[np.void], say: Progress = silent) -> dict[str, Any]:
     """Both filters over samples (k,) of SAMPLE, as JSON has it; effects' parameters are held.
 
-    Standard deviations are those of the filters, without what coloured residuals add. ``tell`` is
-    given the share that is done. A sample takes filterpy some milliseconds.
+    Standard deviations are those of the filters, without what coloured residuals add. A
+    sample takes filterpy some milliseconds.
     """
     config = config.with_effects_held
     task = ukf.problem(config)
@@ -173,7 +171,7 @@ def compare(
         state, info = ukf.step(task, before, samples[k : k + 1])
         reference.step(samples[k], before, state, info[0])
         if k % 20 == 0:
-            tell(k / len(samples))
+            say("filterpy's filter", k / len(samples))
     columns = {
         "value": task.scale * state.x[6:],
         "std": task.scale * np.sqrt(np.diag(state.p)[6:]),

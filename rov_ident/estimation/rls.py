@@ -79,8 +79,8 @@ from rov_ident.estimation.shared import (
     add_scatter,
     begin,
     drive_sides,
+    excited,
     folded,
-    learnt,
     measure,
     problem_of,
     steps_of,
@@ -347,7 +347,7 @@ def _work(task, state):
         np.zeros((6, columns)),
         np.zeros((6, columns)),  # what a column adds to the measured velocity alone
         np.zeros((n + 2, columns)),  # [R | z]
-        np.zeros((n + 2, columns)),  # R^-1 as of the last time that the observer was told
+        np.zeros((n + 2, columns)),  # R^-1 when the observer last took over the coefficients
         np.zeros((n + 2, columns)),
         np.zeros((n + 2, columns)),
         np.zeros((12, columns)),  # what comes in, and what is forgotten
@@ -566,7 +566,7 @@ def _judge_motion(task, state, work, sample):
         c.peak[i] = max(c.peak[i] * decay, surely)
         work.moving[i] = 1 if c.peak[i] > _MOVING * r else 0
     inverse = work.scratch[0].inverse
-    learnt(task, work.moving, sample, state.monitor, inverse, work.noisy, work.moves)
+    excited(task, work.moving, sample, state.monitor, inverse, work.noisy, work.moves)
     free, sorted_already = 0, True
     for a in range(len(work.estimated)):
         if work.moves[work.estimated[a]]:
@@ -694,7 +694,7 @@ def _absorb(task, state, work, n, effects):
 
 @inlined
 def _learn(task, state, work, info):
-    """The observer takes over what the rows since the last time have taught."""
+    """Give the observer the coefficients that follow from all rows so far."""
     s, c, n = task.settings[0], state.scalars[0], len(state.order)
     invert(work.root, work.inverse)
     info.condition = one_norm(work.root, n, work.line) * one_norm(work.inverse, n, work.line)

@@ -110,7 +110,7 @@ def factors_of(config: Config) -> NDArray[np.bool_]:
     return factors
 
 
-def teachers_of(config: Config) -> NDArray[np.bool_]:
+def informative_axes(config: Config) -> NDArray[np.bool_]:
     """(n, 6): the axes from which each estimated coefficient or factor of the thrust is learnt, and
     from no other than all of these; none of other parameters of effects."""
     structure = config.dynamics.structure
@@ -132,19 +132,19 @@ def too_noisy(axes: NDArray[np.bool_]) -> str:
 
 def noisy_axes(mass: Array, reading_noise: Array, monitor: NDArray[np.void]) -> NDArray[np.bool_]:
     """(6,) on which axes noise of the wrench's reading is known to be too large to learn from, as
-    :func:`learnt` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
+    :func:`excited` decides it; ``mass`` (6, 6), ``monitor`` (6,) of MONITOR."""
     noise = np.diag(np.linalg.inv(mass)) ** 2 * reading_noise
     follows = (monitor["seen"] > TIME) & (monitor["density"] <= FOLLOWED * noise)
     return (noise > 0.0) & (noise < np.inf) & ~follows
 
 
 @lean
-def learnt(task, moving, sample, monitor, inverse, noisy, moves):
-    """moves (m,): which of theta a motion teaches. Work space: noisy (6,).
+def excited(task, moving, sample, monitor, inverse, noisy, moves):
+    """Set moves (m,): which entries of theta the motion excites. Work space: noisy (6,).
 
-    A coefficient is taught by axes that are ``moving`` (6,), well above the noise of their sensor,
+    A coefficient is excited by axes that are ``moving`` (6,), well above the noise of their sensor,
     and on which the wrench is surely far above the noise of its reading; a factor of the thrust if
-    that is so on all axes that it is for. What looks like noise may be a command that trembles,
+    that is so on all axes that it scales. What looks like noise may be a command that trembles, and
     which the vehicle follows: then the unexplained acceleration, once ``monitor`` (6,) of MONITOR
     knows it, is far below it. ``inverse`` (6, 6) is that of the mass matrix.
     """
@@ -187,9 +187,9 @@ def folded(
 
 @inner
 def begin(info, sample):
-    """Nothing has happened yet to the sample: whether nothing in it would spoil a state.
+    """Reset the info of a sample; whether all that an estimator reads of it is finite.
 
-    NaN where not measured is no harm.
+    NaN for what was not measured is allowed.
     """
     info.t = sample.t
     info.forgetting = 1.0

@@ -56,8 +56,8 @@ from rov_ident.estimation.shared import (
     Problem,
     add_scatter,
     begin,
+    excited,
     folded,
-    learnt,
     measure,
     problem_of,
     steps_of,
@@ -244,17 +244,17 @@ def _steps(task, state, work, samples, sides, infos):
             info.reason = RESTARTED
         else:
             _take_root(task, work, info)
-            _move(task, state.x, work, sample, side)
+            _predict(task, state.x, work, sample, side)
             if not _collect(task, state, work, sample):
                 info.reason = UNPREDICTABLE
                 c.started = False
                 continue
             inverse = work.scratch[0].centre_inverse
-            learnt(task, sample.moving, sample, state.monitor, inverse, work.noisy, work.moves)
+            excited(task, sample.moving, sample, state.monitor, inverse, work.noisy, work.moves)
             for i in range(len(state.x)):
                 work.free[i] = 1.0 if i < 6 or work.moves[task.estimated[i - 6]] else 0.0
             _update(task, state, work, sample, side, info)
-            _look_back(task, state, work, sample.dt)
+            _end_period(task, state, work, sample.dt)
         _residual(task, state, work, sample, side, info)
 
 
@@ -295,7 +295,7 @@ def _take_root(task, work, out):
 
 
 @inlined
-def _move(task, x, work, sample, side):
+def _predict(task, x, work, sample, side):
     """Move the sigma points to the sample's time: work.moved, and the centre's inverse mass."""
     s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
     force_of(sample, sample.wrench, task.restoring, s.force, s.slope)
@@ -305,7 +305,7 @@ def _move(task, x, work, sample, side):
     for sign in range(2):
         for first in range(0, columns, LANES):
             _spread(task, x, work, first, spread if sign == 0 else -spread)
-            _push(task, work, side)
+            _add_effect_wrench(task, work, side)
             for k in range(steps):
                 _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt)
             for i in range(6):
@@ -345,7 +345,7 @@ def _spread(task, x, work, first, spread):
 
 
 @inlined
-def _push(task, work, side):
+def _add_effect_wrench(task, work, side):
     """What the parameters of effects add to the wrench on the sigma points."""
     s, first = work.scratch[0], len(task.theta) - side.shape[1]
     for i in range(6):
@@ -456,7 +456,7 @@ def _update(task, state, work, sample, side, out):
             continue
         outlier = False
         for i in range(first, first + 3):
-            predicted, spread = _seen(task, x, p, side, i)
+            predicted, spread = _predicted_measurement(task, x, p, side, i)
             spread += r[i]
             innovation = (z[i] - predicted) / np.sqrt(spread)
             considered = 0.0
@@ -495,8 +495,8 @@ def _given_held(task, p, free, side, i, spread, least):
 
 
 @inlined
-def _seen(task, x, p, side, i):
-    """A velocity as measured, with what parameters of effects add to it, and its variance."""
+def _predicted_measurement(task, x, p, side, i):
+    """The predicted measurement of velocity i, effects on it included, and its variance."""
     predicted, spread, k = x[i], p[i, i], side.shape[1]
     first, scale = len(x) - k, len(task.scale) - k
     for j in range(k):
@@ -567,7 +567,7 @@ def _absorb_beside_noise(task, x, work, side, first):
     last, scale = size - side.shape[1], 6 + task.thrust
     given = task.thrust >= 0 and free[scale] == 0.0
     for i in range(first, first + 3):
-        predicted, v = _seen(task, x, p, side, i)
+        predicted, v = _predicted_measurement(task, x, p, side, i)
         v += s.r[i]
         for a in range(size):
             w[a] = p[i, a]
@@ -588,12 +588,12 @@ def _absorb_beside_noise(task, x, work, side, first):
                 p[b, a] = p[a, b]
 
 
-# ---------------------------------------------------------------- looking back
+# ---------------------------------------------------------------- once a period
 
 
 @inlined
-def _look_back(task, state, work, dt):
-    """Every _PERIOD: what the innovations did to the coefficients, and the random walk of these."""
+def _end_period(task, state, work, dt):
+    """Every _PERIOD: sum up what innovations did to the coefficients, and let these walk."""
     c = state.scalars[0]
     c.since += dt
     if c.since < _PERIOD:

@@ -50,7 +50,7 @@ class Limits:
 class AlternatingTargets:
     """A manoeuvre between targets that alternate: ``amplitude`` (4,), half the distance between
     them, north, east, down [m] and heading [rad]; ``period`` (4,) s from one to the next;
-    ``torque`` (2,): multisine on roll and pitch, relative to the authority. It starts in the
+    ``torque`` (2,): multisine on roll and pitch, relative to the working wrench. It starts in the
     middle, heading north."""
 
     name: str

@@ -6,7 +6,7 @@ coefficients, a recursive least squares fit with all that is estimated by defaul
 model can explain the motion, what the configuration lacks, and how well each coefficient is known.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -16,27 +16,20 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.config.prior import THRUST_SCALE, prior_of
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
+from rov_ident.core.frames import quaternion_angle, quaternion_from_euler
 from rov_ident.core.linalg import interpolated
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONVERGED, State, of_fit
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import SUPPOSED
-from rov_ident.experiment.messages_alone import (
-    BAD,
-    DRIVEN,
-    GOOD,
-    WARNING,
-    Remark,
-    of_dynamics,
-    of_messages,
-)
+from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.offline import archive
-from rov_ident.offline.batch_fit import fit_batch
+from rov_ident.offline.batch_fit import AT_REST, fit_batch
 from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online, thrust_or_mass
 from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
@@ -44,8 +37,6 @@ from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import blanked, is_without_velocity
-
-Tell = Callable[..., None]
 
 UNITS = (("m/s", "N"),) * 3 + (("rad/s", "N m"),) * 3  # of velocity and wrench on each axis
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
@@ -175,11 +166,10 @@ class Check(Shown):
         return as_json(document)
 
 
-def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
-    """Look at a bag; ``tell`` is called with what is being done, and what share of it is. UserError
+def check(path: Path, config: Config, say: Progress = silent) -> Check:
+    """Look at a bag; UserError
     if it cannot be read, or lacks the messages that are needed."""
-    say = tell or (lambda what, share=None: None)
-    record = read_record(path, config, lambda k, n: say(f"reading {path.name}", k / max(n, 1)))
+    record = read_record(path, config, say)
     say("looking at its messages")
     bag, unmeasured = Bag(path), is_without_velocity(record.samples)
     topics = inputs.select(bag, config)
@@ -189,8 +179,8 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     notes = [Remark("messages", WARNING, note) for note in record.notes]
     frames = inputs.first_frames(bag, topics, config)
-    remarks = [*of_messages(streams, config), *notes, *_excitation(streams, config)]
-    remarks += _mountings(inputs.mounting(bag, frames), config)
+    remarks = [*of_messages(streams, config), *notes, *_excitation_remarks(streams, config)]
+    remarks += _mounting_remarks(inputs.mounting(bag, frames), config)
     failed = (test for test in tests_of(streams, config) if not test.passed)
     remarks += [Remark("velocity sensor", BAD, test.failure) for test in failed]
     motion, quick = of_dynamics(record.samples, config), None
@@ -201,13 +191,13 @@ def check(path: Path, config: Config, tell: Tell | None = None) -> Check:
             fit_batch(alone, config, "ml") if unmeasured else fit_online([record], config, "rls")
         )
         motion = of_dynamics(record.samples, config.with_model(quick.fitted.model))
-        remarks += [*_model(quick), *_coefficients(quick)]
+        remarks += [*_model_remarks(quick), *_coefficient_remarks(quick)]
     remarks += motion
     return Check(path.name, streams.duration, config, tuple(remarks), quick, record, streams)
 
 
 def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
-    """What information (n, n) about the coefficients to estimate makes of the prior."""
+    """How well each coefficient would be known from this information (n, n) and the prior."""
     prior = prior_of(config)
     std = np.sqrt(np.diag(inverse_of(information + np.diag(prior.std**-2.0)))).tolist()
     rows = zip(prior.names, prior.mean.tolist(), prior.units, std, prior.std.tolist(), strict=True)
@@ -217,13 +207,17 @@ def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
     )
 
 
-def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
+def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
     """Whether `/tf_static` says of the sensors what the configuration says."""
     for key, vector in told.items():
         section, name = key.split(".")
         configured = np.array(getattr(getattr(config, section), name))
         turned = name == "rotation"
-        apart = _angle(vector, configured) if turned else np.abs(vector - configured).max()
+        if turned:  # the angles themselves may differ where nothing turns: pi and -pi
+            vectors = vector, configured
+            apart = quaternion_angle(*(quaternion_from_euler(*angles) for angles in vectors))
+        else:
+            apart = np.abs(vector - configured).max()
         if apart > _MOUNTED:
             bag, file = ([round(float(x), 3) + 0.0 for x in v] for v in (vector, configured))
             yield Remark(
@@ -233,18 +227,10 @@ def _mountings(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
             )  # fmt: skip
 
 
-def _angle(a: Array, b: Array) -> float:
-    """Of the rotation [rad] that leads from roll, pitch, yaw (3,) to others. The angles themselves
-    may differ where it is nothing: pi and -pi, or roll and yaw of a sensor that looks up."""
-    p, q = quaternion_from_euler(*a), quaternion_from_euler(*b)
-    between = quaternion_multiply(p * [1.0, -1.0, -1.0, -1.0], q)
-    return float(2.0 * np.arctan2(np.linalg.norm(between[1:]), abs(between[0])))
-
-
 _MODEL = "model and data"
 
 
-def _model(quick: Fit) -> Iterator[Remark]:
+def _model_remarks(quick: Fit) -> Iterator[Remark]:
     """Whether a model explains the data, and what it has that the configuration has not."""
     agree = quick.consistency.consistent
     yield Remark(_MODEL, GOOD if agree else BAD, quick.consistency.sentence)
@@ -264,7 +250,7 @@ def _model(quick: Fit) -> Iterator[Remark]:
         yield Remark(effect.replace("_", " "), WARNING, text)
 
 
-def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
+def _excitation_remarks(streams: Streams, config: Config) -> Iterator[Remark]:
     limits, steered = authority(config.dynamics), np.zeros((1, 6))
     if len(streams.inputs_t):  # fins and propeller drive, too
         now = interpolated(streams.inputs_t, streams.inputs, streams.t)
@@ -278,16 +264,16 @@ def _excitation(streams: Streams, config: Config) -> Iterator[Remark]:
         text = f"from {low:.2f} to {high:.2f} {unit}" if measured else "velocity not measured"
         text += f", wrench {driven:.2g} {force} rms"
         level = GOOD
-        if driven < DRIVEN * limits[i]:
+        if driven < AT_REST * limits[i]:
             level, text = WARNING, text + ": not driven"
-        elif varied < DRIVEN * limits[i]:
+        elif varied < AT_REST * limits[i]:
             level, text = WARNING, text + ": it hardly changes, so inertia does not show"
         elif measured and min(-low, high) < _ONE_WAY * max(-low, high):
             level, text = WARNING, text + ": one direction only, what is asymmetric does not show"
         yield Remark(f"excitation of {axis}", level, text)
 
 
-def _coefficients(quick: Fit) -> Iterator[Remark]:
+def _coefficient_remarks(quick: Fit) -> Iterator[Remark]:
     if not quick.consistency.consistent:
         return
     states = [pair for pair in zip(quick.names, quick.states, strict=True) if "." not in pair[0]]

@@ -15,6 +15,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of, typical
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.estimation.physical import is_passive
 from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Flight, Limits
@@ -40,7 +41,7 @@ _DRAWS = 3  # vehicles within the present uncertainty, for which a manoeuvre mus
 # four safe of four exclude, at 95 %, that more than half of such vehicles leave the tank
 _SHRINK = 0.75  # of a manoeuvre that is not safe; seven times until it is the smallest
 _SMALLEST = 0.15  # of the size in the library: smaller ones move a vehicle hardly more than noise
-_SHORTEST = 10.0  # s
+_SHORTEST = 10.0  # s; as long as the predictions by which models are judged (HORIZON)
 _SHOWN = 0.99  # of the present uncertainty: more than that left is as good as nothing learnt
 _OTHERS = 0.05  # weight of the mean over all coefficients, which decides where the worst is alike
 
@@ -140,12 +141,11 @@ def propose(
     bags: Archive | None = None,
     duration: float = 60.0,
     limits: Limits | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Progress = silent,
 ) -> Proposal:
     """The manoeuvre to run next, after ``bags`` or, without, from the prior alone. UserError if no
     manoeuvre is safe within the limits."""
     limits = limits or Limits()
-    tell = say or (lambda what: None)
     if duration < _SHORTEST:
         raise UserError(
             f"a manoeuvre of {duration:g} s shows nothing: {_SHORTEST:g} s are the least"
@@ -164,8 +164,8 @@ def propose(
         if not velocity and any(one.amplitude[:2]):
             left_out.append(f"{one.name}: without a velocity sensor surge and sway have to rest")
             continue
-        tell(one.name)
-        found = _safe(vehicles, one, duration, limits)
+        say(one.name)
+        found = _largest_safe(vehicles, one, duration, limits)
         if found is None:
             left_out.append(f"{one.name}: not safe within the limits, however small")
             continue
@@ -208,7 +208,7 @@ def _vehicles(config: Config, information: Array) -> list[Config]:
     return found
 
 
-def _safe(
+def _largest_safe(
     vehicles: list[Config], one: AlternatingTargets, duration: float, limits: Limits
 ) -> tuple[AlternatingTargets, Flight] | None:
     """The manoeuvre as large as is safe with every vehicle."""

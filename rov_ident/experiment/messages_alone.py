@@ -16,17 +16,17 @@ from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.model.scales import authority
+from rov_ident.offline.batch_fit import AT_REST
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams, integral
 from rov_ident.sampling.sample import SAMPLE
 from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
-_GAP = 0.5  # s without a message, from which the sampler gives up the time between
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
-DRIVEN = 0.05  # of the axis's authority: an RMS wrench below it is that of keeping station
 _DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
 _CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes, ...
@@ -55,7 +55,7 @@ class Remark:
 
 def of_messages(streams: Streams, config: Config) -> list[Remark]:
     """On the rates, pauses, axes, signs and delays of the sensors."""
-    return [*_rates(streams), *_frames(streams, config)]
+    return [*_rate_remarks(streams), *_axes_remarks(streams, config)]
 
 
 def refuse_reversed(remarks: Iterable[Remark]) -> None:
@@ -65,7 +65,7 @@ def refuse_reversed(remarks: Iterable[Remark]) -> None:
             raise UserError(f"{remark.text} (rov-ident check says more)")
 
 
-def _rates(streams: Streams) -> list[Remark]:
+def _rate_remarks(streams: Streams) -> list[Remark]:
     remarks = []
     topics = {"odometry": streams.t, "imu": streams.imu_t, "wrench": streams.demand_t}
     if len(streams.inputs_t):
@@ -79,8 +79,8 @@ def _rates(streams: Streams) -> list[Remark]:
         rate, gap = 1.0 / float(np.median(steps)), float(steps.max())
         text = f"{rate:.1f} Hz, longest pause {gap:.2f} s"
         level = GOOD
-        if gap > _GAP and name != "wrench":
-            lost = float(steps[steps > _GAP].sum())
+        if gap > LONGEST_INTERVAL and name != "wrench":
+            lost = float(steps[steps > LONGEST_INTERVAL].sum())
             level, text = WARNING, f"{text}; {lost:.1f} s in all are lost to pauses"
         if rate < _SLOW:
             level = WARNING
@@ -89,13 +89,12 @@ def _rates(streams: Streams) -> list[Remark]:
     return remarks
 
 
-def _frames(streams: Streams, config: Config) -> list[Remark]:
+def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
     remarks = []
     body = config.model.body
-    # What rights the hull for each radian of roll or pitch, the axis z down.
-    righting = body.weight * body.cog[2] - body.buoyancy * body.cob[2]
-    if righting < 0.0:
-        text = f"by its cob and cog the configured hull would capsize ({righting:.2g} N m/rad): "
+    if body.righting_arm < 0.0:
+        moment = body.righting_arm * body.weight
+        text = f"by its cob and cog the configured hull would capsize ({moment:.2g} N m/rad): "
         text += "check vehicle.frame (frd: z down, flu: z up), vehicle.cob and vehicle.cog"
         remarks.append(Remark("vehicle.frame", BAD, text))
     r = quaternion_to_matrix(streams.orientation)
@@ -114,18 +113,18 @@ def _frames(streams: Streams, config: Config) -> list[Remark]:
         remarks.append(Remark("imu axes", level, text))
         gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
         rate = streams.nu[:, 3:]
-        remarks.append(_signs("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
+        remarks.append(_agreement("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
     step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
     remarks += _rates_and_turns(streams, step)
     if streams.has_pose and streams.nu[:, :3].any():
         moved = streams.position[step:] - streams.position[:-step]
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
         told, axes = way[step:] - way[:-step], ("north", "east", "down")
-        remarks.append(_signs("pose against velocity", told, moved, axes, _LINEAR_LEAST))
+        remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
     if len(streams.imu_t) > _FEWEST_TIMED:
         known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
         lag = _lag(streams.t[known], gyro[known], rate[known])
-        remarks.append(_late("odometry behind the IMU", *lag))
+        remarks.append(_delay_remark("odometry behind the IMU", *lag))
     return remarks
 
 
@@ -147,20 +146,20 @@ def _rates_and_turns(streams: Streams, step: int) -> list[Remark]:
     return [Remark(subject, BAD, f"{text}: check units (rad/s), signs and frame ids")]
 
 
-def _signs(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
+def _agreement(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
     """Whether two measurements of the same agree in sign."""
     power, common = np.mean(a**2, axis=0), np.mean(a * b, axis=0)
     size = np.sqrt(power * np.mean(b**2, axis=0))
     c = np.where(size < _STILL, 1.0, common / np.maximum(size, 1e-300))
     moves = np.sqrt(power) > _MOVES
-    return _correlated(
+    return _correlation_remark(
         subject, dict(zip(names, c.tolist(), strict=True)), np.where(moves, least, _REVERSED),
         "the sign of {} is reversed: check frame ids and mounting",
         "hardly correlated in {}: check frames, or the sensor's noise", "signs and axes agree",
     )  # fmt: skip
 
 
-def _correlated(
+def _correlation_remark(
     subject: str, by_name: dict[str, float], least: Array, bad: str, weak: str, good: str,
     reversed_below: float = _REVERSED,
 ) -> Remark:  # fmt: skip
@@ -178,10 +177,10 @@ def _correlated(
 
 
 def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
-    """What wrench and motion, samples (k,) of SAMPLE, filtered alike, say of each other.
+    """Whether wrench and motion of samples (k,) of SAMPLE, filtered alike, agree in sign and time.
 
-    A controller that holds a place in waves pushes against the motion, too, but hardly on most of
-    the axes that are driven: that is a wrong sign, and hopeless.
+    A controller that holds a position in waves pushes against the motion as well, but hardly on
+    most of the driven axes: there it is a wrong sign, and no fit makes sense.
     """
     if samples["inputs"].any():
         return []  # fins and propellers drive it, too: the wrench alone does not say where it goes
@@ -196,17 +195,17 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     size = np.sqrt(np.mean(wrench**2, axis=0))
     if is_without_velocity(samples):  # forces drive what is simulated itself
         size[:3] = 0.0
-        if not np.any(size > DRIVEN * authority(config.dynamics)):
+        if not np.any(size > AT_REST * authority(config.dynamics)):
             return []
-    driven = size > DRIVEN * authority(config.dynamics)
+    driven = size > AT_REST * authority(config.dynamics)
     subject, moved = "wrench against motion", wrench - phi[:, :, -1]
     if not driven.any():
         return [Remark(subject, BAD, "no axis is driven: nothing can be identified")]
     if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
         text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
         return [Remark(subject, BAD, text, hopeless=True)]
-    by_name = {MOTIONS[i]: _together(wrench[:, i], moved[:, i]) for i in np.flatnonzero(driven)}
-    push = _correlated(
+    by_name = {MOTIONS[i]: _correlation(wrench[:, i], moved[:, i]) for i in np.flatnonzero(driven)}
+    push = _correlation_remark(
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
         "frames.body); or a controller works there against what the model lacks",
@@ -214,10 +213,10 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         "the vehicle goes where it is pushed",
         -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
-    return [push, _late("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
+    return [push, _delay_remark("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
 
 
-def _together(a: Array, b: Array) -> float:
+def _correlation(a: Array, b: Array) -> float:
     """The correlation of two signals (k,) about their means or about zero, whichever is larger. A
     wrong sign turns both; a controller that pushes harder as a vehicle slows turns only the first.
     """
@@ -234,7 +233,7 @@ def samples_of(streams: Streams) -> NDArray[np.void]:
     )
     at = interpolated(streams.demand_t, impulse, streams.t)
     samples["t"], samples["dt"], samples["nu"] = streams.t, dt, streams.nu
-    samples["restart"] = (dt <= 0.0) | (dt > _GAP)
+    samples["restart"] = (dt <= 0.0) | (dt > LONGEST_INTERVAL)
     samples["wrench"][1:] = np.diff(at, axis=0) / np.maximum(dt[1:, None], 1e-9)
     if len(streams.inputs_t):
         samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, streams.t)
@@ -243,7 +242,7 @@ def samples_of(streams: Streams) -> NDArray[np.void]:
     return samples
 
 
-def _late(subject: str, lag: float, std: float) -> Remark:
+def _delay_remark(subject: str, lag: float, std: float) -> Remark:
     text = f"{1e3 * lag:.1f} ± {1e3 * NORMAL * std:.1f} ms (95 %)"
     if not np.isfinite(lag):
         return Remark(subject, WARNING, "cannot be told: nothing moves")

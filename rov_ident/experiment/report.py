@@ -56,7 +56,7 @@ def of_plan(found: Proposal) -> str:
         report.beside([_precision(plan_picture(found))], [found.table().html()]),
         report.heading("The manoeuvre"),
         _demand(best.flight.t, best.flight.demand),
-        _way(dive.truth.position, best.limits.tank),
+        _path_panel(dive.truth.position, best.limits.tank),
         report.heading("Manoeuvres compared"),
         report.paragraph(
             "By the standard deviation of the coefficient known worst afterwards, relative to its "
@@ -150,7 +150,7 @@ def _demand(t: Array, demand: Array) -> str:
     return report.panels(pictures, "The wrench that is asked for.", wide=True)
 
 
-def _way(position: Array, tank: Sequence[float]) -> str:
+def _path_panel(position: Array, tank: Sequence[float]) -> str:
     length, width, depth = tank
     moved = position - position[0]
     keep = slice(None, None, max(1, len(moved) // _MOST))

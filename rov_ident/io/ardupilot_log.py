@@ -56,11 +56,11 @@ _END = LAST_STAMP // 1000 - _START  # us; a stamp holds no more
 _WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
 _LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
 _LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
-_OUTPUTS = 16
+_OUTPUTS = 16  # of SERVO_OUTPUT_RAW and RCOU
 _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
 _MOTOR_1 = 33  # of SERVOn_FUNCTION
 _SAFETY_ARMED = 128  # of base_mode in HEARTBEAT
-_GROUND_STATION = 255
+_GROUND_STATION = 255  # its system in MAVLink, by convention
 _EVENTS = {10: True, 11: False}  # of EV: armed, disarmed
 _ALIGNED = 0.7  # cosine; thrusters of one frame differ by 45 degrees and more from each other
 
@@ -173,7 +173,7 @@ def import_log(
     check(config.thrusters, PWM)
     log = read_log(path, progress or (lambda share: None))
     notes: list[str] = []
-    thrusters = _as_flown(config.thrusters, log, notes)
+    thrusters = _as_autopilot_has_them(config.thrusters, log, notes)
     allocator = Allocator(thrusters, log.signal)
     for name, track in (
         ("velocity of an EKF (XKF1 or LOCAL_POSITION_NED)", log.motion),
@@ -220,7 +220,7 @@ def import_log(
     return LogReport(counts[ODOMETRY], counts[IMU], counts[WRENCH], duration, tuple(notes))
 
 
-def _as_flown(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
+def _as_autopilot_has_them(given: Thrusters, log: Log, notes: list[str]) -> Thrusters:
     """The thrusters with the outputs and the signs that the autopilot has for them."""
     said = log.motors
     if not said:
@@ -355,7 +355,7 @@ def read_log(path: Path, progress: Callable[[float], None] = lambda share: None)
                     _telemetry(reader, log, progress)
             else:
                 read = DFReader.DFReader_text if kind == ".log" else DFReader.DFReader_binary
-                with _silent():
+                with _silenced_stderr():
                     reader = read(str(path))
                 _dataflash(reader, log, progress)
     except OSError as error:
@@ -366,7 +366,7 @@ def read_log(path: Path, progress: Callable[[float], None] = lambda share: None)
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def _silenced_stderr() -> Iterator[None]:
     """Nothing reaches standard error, not even from C: the indexer names each damaged byte."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -379,7 +379,7 @@ def _silent() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _received(reader: Any, kinds: list[str], progress: Callable[[float], None]) -> Iterator[Any]:
+def _messages_of(reader: Any, kinds: list[str], progress: Callable[[float], None]) -> Iterator[Any]:
     """The messages of these kinds."""
     for count in itertools.count(1):
         message = reader.recv_match(type=kinds)
@@ -393,7 +393,7 @@ def _received(reader: Any, kinds: list[str], progress: Callable[[float], None]) 
 def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
     kinds = ["XKF1", "NKF1", "XKQ", "XKQ1", "NKQ", "NKQ1", "ATT", "IMU", "RCOU", "BAT", "CURR"]
     kinds += ["PARM", "ARM", "EV"]
-    for m in _received(reader, kinds, progress):
+    for m in _messages_of(reader, kinds, progress):
         kind, t = m.get_type(), int(m.TimeUS)
         if kind == "PARM":
             log.parameters[m.Name] = float(m.Value)
@@ -428,7 +428,7 @@ def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None
     kinds += ["PARAM_VALUE", "HEARTBEAT"]
     vehicle: int | None = None
     now: int | None = None  # us, of the autopilot; until it is known nothing is taken
-    for m in _received(reader, kinds, progress):
+    for m in _messages_of(reader, kinds, progress):
         if m.get_srcSystem() == _GROUND_STATION:
             continue
         vehicle = m.get_srcSystem() if vehicle is None else vehicle

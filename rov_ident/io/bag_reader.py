@@ -285,7 +285,7 @@ def _files_of_directory(path: Path) -> list[Path]:
                 f"{metadata_path} is not the metadata of a rosbag2 bag: restore it with "
                 "`ros2 bag reindex`, or remove it to have all .mcap files read."
             ) from error
-        files = [_inside(path, name) for name in names]
+        files = [_file_of_bag(path, name) for name in names]
         if compression in ("file", "message"):
             raise UserError(
                 f"{path} is compressed by rosbag2 ({compression} mode): convert it with "
@@ -300,7 +300,7 @@ def _files_of_directory(path: Path) -> list[Path]:
     return files
 
 
-def _inside(folder: Path, name: str) -> Path:
+def _file_of_bag(folder: Path, name: str) -> Path:
     """A file of the bag; what points out of its folder is another's file."""
     file = folder / name
     if not file.resolve().is_relative_to(folder.resolve()):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.messages import (
+    SECOND,
     Array,
     Commands,
     Imu,
@@ -34,7 +35,6 @@ ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian, no options
 _STAMP = struct.Struct("<iI")
 _LENGTH = struct.Struct("<I")
-_SECOND = 1_000_000_000  # ns
 
 
 class _Layout(NamedTuple):
@@ -79,9 +79,9 @@ class _Fields:
     def stamp(self) -> int:
         """In ns."""
         seconds, nanoseconds = _STAMP.unpack_from(self._data, self._pass(4, 2, "the stamp"))
-        if nanoseconds >= _SECOND:
+        if nanoseconds >= SECOND:
             raise ValueError(f"{nanoseconds} nanoseconds are no part of a second")
-        return int(seconds * _SECOND + nanoseconds)
+        return int(seconds * SECOND + nanoseconds)
 
     def length(self) -> int:
         return int(_LENGTH.unpack_from(self._data, self._pass(4, 1, "a length"))[0])
@@ -285,7 +285,7 @@ def _encode_joints(message: Joints) -> bytes:
 
 def _stamped(stamp: int) -> bytearray:
     try:
-        return bytearray(_STAMP.pack(*divmod(stamp, _SECOND)))
+        return bytearray(_STAMP.pack(*divmod(stamp, SECOND)))
     except struct.error as error:
         raise ValueError(f"the stamp {stamp} ns does not fit a ROS time") from error
 

@@ -17,6 +17,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import (
     DRIVE,
     ODOMETRY,
+    SECOND,
     WRENCH,
     Array,
     Joints,
@@ -40,7 +41,6 @@ _DRIVEN = (*_FINS, "rpm")
 NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION, *_DRIVEN)
 
 _FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
-_SECOND = 1_000_000_000  # ns
 _LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
 _IN_RADIANS = (*_VELOCITIES[3:], *_ANGLES, *_FINS)
 _LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
@@ -122,7 +122,7 @@ def import_csv(
     start = min(0.0, float(time[0]))
     if start < 0.0:
         notes.append(f"times begin at {start} s: moved to begin at 1 s")
-    stamps = np.rint((time - start) * _SECOND).astype(np.int64) + _SECOND
+    stamps = np.rint((time - start) * SECOND).astype(np.int64) + SECOND
     linear, angular = log.matrix(_VELOCITIES[:3]), log.matrix(_VELOCITIES[3:])
     orientation, wrapped = _attitude(log, angular, notes)
     position = _position(log, linear, orientation, notes)
@@ -224,24 +224,20 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
     if missing := [name for name in ("roll", "pitch") if name not in log.data]:
         notes.append(f"no {' and '.join(missing)} given: taken as 0")
     quaternion = frames.quaternion_from_euler(roll, pitch, yaw)
-    return quaternion, _wrapped(quaternion)
+    return quaternion, _jumps_back(quaternion)
 
 
-def _wrapped(quaternion: Array) -> NDArray[np.bool_]:
+def _jumps_back(quaternion: Array) -> NDArray[np.bool_]:
     """Rows whose attitude jumps away and back at once.
 
     A log that averages Euler angles over a bin turns +179 and -179 degrees into 0.
     """
-    step = _angle_between(quaternion[1:], quaternion[:-1])
-    bridge = _angle_between(quaternion[2:], quaternion[:-2])
+    step = frames.quaternion_angle(quaternion[1:], quaternion[:-1])
+    bridge = frames.quaternion_angle(quaternion[2:], quaternion[:-2])
     jump = np.minimum(step[1:], step[:-1])
     wrapped = np.zeros(len(quaternion), dtype=bool)
     wrapped[1:-1] = (jump > _WRAP_JUMP) & (bridge < 0.5 * jump)
     return wrapped
-
-
-def _angle_between(p: Array, q: Array) -> Array:
-    return 2.0 * np.arccos(np.minimum(np.abs(np.sum(p * q, axis=-1)), 1.0))
 
 
 def _position(log: "_Log", linear: Array, orientation: Array, notes: list[str]) -> Array:

@@ -27,6 +27,7 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
 )
 from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
+from rov_ident.core.progress import Progress, silent
 from rov_ident.io import cdr
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
@@ -105,7 +106,7 @@ class Reader:
         self._frames = config.frames
         self._is_twist = config.inputs.is_twist
         heard = sources(config.inputs).items()
-        self._types = {role: _full(source.type_name) for role, source in heard}
+        self._types = {role: _full_name(source.type_name) for role, source in heard}
         self.on_arrival = config.inputs.wrench not in _STAMPED
         self._allocator = None
         if config.inputs.is_allocated:
@@ -216,31 +217,31 @@ def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, s
         if roles and role not in roles:
             continue
         try:
-            topic = select_topic(bag, role, name, _full(type_name), wanted[role])
+            topic = select_topic(bag, role, name, _full_name(type_name), wanted[role])
         except UserError as error:
-            raise UserError(f"{error}{_hint(bag, role, type_name, wanted[role])}") from error
+            raise UserError(f"{error}{_other_type(bag, role, type_name, wanted[role])}") from error
         if topic:
             chosen[role] = topic
     return chosen
 
 
-def _hint(bag: Bag, role: str, type_name: str, wanted: str) -> str:
+def _other_type(bag: Bag, role: str, type_name: str, wanted: str) -> str:
     """Which other type the role could have in this bag."""
     named = "/" + wanted.lstrip("/")
     others = [
         (topic, other)
         for other in _CHOICES.get(role, ())
         for topic, info in bag.topics.items()
-        if other != type_name and info.type_name == _full(other) and info.message_count
+        if other != type_name and info.type_name == _full_name(other) and info.message_count
         if not wanted or topic == named
     ]
     if not others:
-        return _foreign(bag, role)
+        return _unknown_type(bag, role)
     topic, other = others[0]
     return f" Or is it {topic}? Then set inputs.{role} to {other}."
 
 
-def _foreign(bag: Bag, role: str) -> str:
+def _unknown_type(bag: Bag, role: str) -> str:
     """Which topic of a type that is not known may be meant, and what to do with it."""
     words, instead = _FOREIGN.get(role, ((), ""))
     packages = {name.partition("/")[0] for name in cdr.DECODERS}
@@ -256,14 +257,21 @@ def _foreign(bag: Bag, role: str) -> str:
 
 
 def messages(
-    bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None = None
+    bag: Bag,
+    topics: Mapping[str, str],
+    config: Config,
+    counts: Counter[str] | None = None,
+    say: Progress = silent,
 ) -> Iterator[tuple[str, Message]]:
     """(role, message) in the order of log times, axes as on the wire; ``topics`` of :func:`select`.
 
     What cannot be used is added to ``counts`` at the end.
     """
-    for role, message, _ in _read(bag, topics, config, counts):
+    reader = Reader(config)
+    for role, message, _ in _read(bag, topics, reader, say):
         yield role, message
+    if counts is not None:
+        counts.update(reader.counts)
 
 
 def as_played(
@@ -278,31 +286,27 @@ def as_played(
         for raw in bag.iter_raw(roles):
             yield roles[raw.topic], raw
         return
-    for role, message, raw in _read(bag, topics, config, None):
+    for role, message, raw in _read(bag, topics, Reader(config)):
         if role != DRIVE:
             raw = raw._replace(type_name=cdr.ROLE_TYPES[role], data=cdr.encode(message))
         yield role, raw
 
 
 def _read(
-    bag: Bag, topics: Mapping[str, str], config: Config, counts: Counter[str] | None
+    bag: Bag, topics: Mapping[str, str], reader: Reader, say: Progress = silent
 ) -> Iterator[tuple[str, Message, RawMessage]]:
-    reader = Reader(config)
-    roles = {topic: role for role, topic in topics.items()}
-    for raw in bag.iter_raw(roles):
+    roles, what = {topic: role for role, topic in topics.items()}, f"reading {bag.path.name}"
+    total = sum(bag.topics[topic].message_count for topic in roles)
+    for done, raw in enumerate(bag.iter_raw(roles)):
+        if done % 2000 == 0:
+            say(what, done / max(total, 1))
         for role, message in reader.read(roles[raw.topic], raw.data, raw.log_time):
             yield role, message, raw
     reader.flush()
-    if counts is not None:
-        counts.update(reader.counts)
+    say(what, 1.0)
 
 
-def total(bag: Bag, topics: Mapping[str, str]) -> int:
-    """How many messages there are on the topics."""
-    return sum(bag.topics[topic].message_count for topic in topics.values())
-
-
-def _full(type_name: str) -> str:
+def _full_name(type_name: str) -> str:
     package, _, name = type_name.partition("/")
     return f"{package}/msg/{name}"
 
@@ -337,19 +341,19 @@ def survey(bag: Bag) -> Survey:
     def look(role: str, kinds: Collection[str], name: str = "") -> None:
         for kind in kinds:
             typed: dict[str, Any] = {role: kind}
-            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full(kind)]
+            of_kind = [t for t, i in bag.topics.items() if i.type_name == _full_name(kind)]
             if kind.startswith("std_msgs"):  # arrays of numbers are of everything
                 of_kind = [t for t in of_kind if "thrust" in t or "pwm" in t or "rc" in t]
             if not of_kind or not any(bag.topics[t].message_count for t in of_kind):
                 continue
             try:
                 called = name or sources(Inputs(**typed))[role].topic
-                topic = select_topic(bag, role, called, _full(kind), "")
+                topic = select_topic(bag, role, called, _full_name(kind), "")
             except UserError as error:
                 topic = max(of_kind, key=lambda t: bag.topics[t].message_count)
                 notes.append(f"{role}: {topic} is taken, the one with most messages. {error}")
             if topic:
-                found[role] = _seen(bag, topic, kind)
+                found[role] = _source_of(bag, topic, kind)
                 return
 
     look(ODOMETRY, schema.ODOMETRY_TYPES)
@@ -362,12 +366,12 @@ def survey(bag: Bag) -> Survey:
     return Survey(found, tuple(notes))
 
 
-def _seen(bag: Bag, topic: str, kind: str) -> Seen:
+def _source_of(bag: Bag, topic: str, kind: str) -> Seen:
     times, first = [], None
     for raw in bag.iter_raw([topic]):
         times.append(raw.log_time)
         if first is None:
-            first = cdr.DECODERS[_full(kind)](raw.data)
+            first = cdr.DECODERS[_full_name(kind)](raw.data)
     span = max(times) - min(times)
     frames = (getattr(first, name, "") for name in ("frame_id", "child_frame_id"))
     return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)

@@ -90,6 +90,12 @@ class RigidBody:
         lever = self.weight * self.cog - self.buoyancy * self.cob
         return np.vstack([(self.weight - self.buoyancy) * np.eye(3), skew(lever)])
 
+    @property
+    def righting_arm(self) -> float:
+        """What rights the hull for each radian of roll or pitch, over the weight [m]; negative: it
+        would capsize."""
+        return float(self.restoring[4, 0]) / self.weight
+
 
 @dataclass(frozen=True, eq=False)
 class Model:

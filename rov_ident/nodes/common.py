@@ -30,6 +30,8 @@ except ImportError:
 
 __all__ = ["INPUTS", "LATCHED", "STREAM", "Executor", "GuardedNode", "live", "subscribed"]
 
+DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
+
 AnyNode = TypeVar("AnyNode", bound=Node)
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 

@@ -27,11 +27,10 @@ from rov_ident.consumer.parameter_bridge import Change, Values
 from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, GuardedNode, live
+from rov_ident.nodes.common import DIAGNOSTICS_PERIOD, LATCHED, GuardedNode, live
 from rov_ident.nodes.conversions import from_diagnostics, to_status
 
 _LOOK_PERIOD = 0.5  # s; between two comparisons of controller and estimator: a second at most late
-_DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _THREADS = 3  # the one that waits for the controller, the one that hears its answer, and services
 
 _OWN = (
@@ -121,8 +120,8 @@ class ControllerBridge(GuardedNode):
         self.create_service(Trigger, "~/approve", self._approve, callback_group=looks)
         self.create_service(Trigger, "~/revert", self._revert, callback_group=looks)
         self.create_service(SetBool, "~/enable", self._enable, callback_group=looks)
-        self.create_timer(_LOOK_PERIOD, self._look, looks)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose, answers)
+        self.create_timer(_LOOK_PERIOD, self._compare_and_send, looks)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._diagnose, answers)
         parameters.follow(self, partial(parameters.own, self, _OWN), self._take_parameters)
 
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:
@@ -154,21 +153,21 @@ class ControllerBridge(GuardedNode):
                 return {}, {}, "the coefficients are stale"
             return dict(self._wanted), dict(self._std), self._refusal
 
-    def _look(self) -> None:
+    def _compare_and_send(self) -> None:
         """Compare, and send what is due."""
         self._pending = ()
-        with self._telling():
-            self._settle()
+        with self._reporting():
+            self._confirm()
             self._pending = self._compare()
             due = time.monotonic() - self._tried >= self._settings["period"]
             if not self._pending:
-                self._say(Level.OK, "the controller has what is converged")
+                self._report(Level.OK, "the controller has what is converged")
             elif self._settings["approval"]:
-                self._say(Level.OK, "waiting for ~/approve")
+                self._report(Level.OK, "waiting for ~/approve")
             elif due:
                 self._send(self._pending)
             else:
-                self._say(Level.OK, "waiting for the period to pass")
+                self._report(Level.OK, "waiting for the period to pass")
 
     def _compare(self) -> Sequence[Change]:
         """What should be sent; raises UserError where nothing can be."""
@@ -193,7 +192,7 @@ class ControllerBridge(GuardedNode):
         self._exchange(before, bridge.write(self._targets, before, new))
         self._sent += 1
         self._pending = ()
-        self._say(Level.OK, f"sent {'; '.join(change.words for change in pending)}")
+        self._report(Level.OK, f"sent {'; '.join(change.words for change in pending)}")
 
     def _exchange(self, before: Values, new: Values) -> None:
         """All of ``new`` is in the controller afterwards; or, with a UserError, nothing of it."""
@@ -202,9 +201,9 @@ class ControllerBridge(GuardedNode):
             reason = self._write(new)
         except UserError as error:  # it may or may not have accepted it
             reason = str(error)
-        self._settle(reason)
+        self._confirm(reason)
 
-    def _settle(self, reason: str = "") -> None:
+    def _confirm(self, reason: str = "") -> None:
         """Check whether the last set was accepted, and undo it if it was accepted only in part.
 
         Raises UserError unless it was accepted; if the controller does not answer, call it again.
@@ -303,7 +302,7 @@ class ControllerBridge(GuardedNode):
 
     def _approve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Send what `~/pending` shows."""
-        with self._telling(response):
+        with self._reporting(response):
             if not self._pending:
                 raise UserError(f"nothing is pending: {self._words}")
             if refusal := self._usable()[2]:
@@ -313,12 +312,14 @@ class ControllerBridge(GuardedNode):
 
     def _revert(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._enabled, self._pending = False, ()
-        with self._telling(response):
+        with self._reporting(response):
             if self._original is None:
                 raise UserError("the controller was never changed")
             self._wait_for_answer()
             self._exchange(self._read(), self._original)
-            self._say(Level.OK, "the controller has what it had at first; disabled until ~/enable")
+            self._report(
+                Level.OK, "the controller has what it had at first; disabled until ~/enable"
+            )
         return response
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -328,7 +329,7 @@ class ControllerBridge(GuardedNode):
         self.get_logger().info(response.message)
         return response
 
-    def _say(self, level: Level, words: str) -> None:
+    def _report(self, level: Level, words: str) -> None:
         self._level, self._words = level, words
         if words == self._logged:
             return
@@ -341,13 +342,13 @@ class ControllerBridge(GuardedNode):
         self._diagnose()
 
     @contextlib.contextmanager
-    def _telling(self, response: Trigger.Response | None = None) -> Iterator[None]:
+    def _reporting(self, response: Trigger.Response | None = None) -> Iterator[None]:
         """Say what goes wrong within the block; then publish what is pending, and answer."""
         try:
             yield
         except UserError as error:
             half_changed = isinstance(error, _HalfChangedError)
-            self._say(Level.ERROR if half_changed else Level.WARN, str(error))
+            self._report(Level.ERROR if half_changed else Level.WARN, str(error))
         self._publish_pending()
         if response is not None:
             response.success, response.message = self._level == Level.OK, self._words

@@ -10,21 +10,19 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
-from rov_ident.core.messages import Array
+from rov_ident.core.messages import SECOND, Array
 from rov_ident.core.states import Level, State
 from rov_ident.estimation.online import Report
-
-_SECOND = 1_000_000_000  # ns
 
 
 def to_time(stamp: int) -> Time:
     """A stamp in ns, not negative."""
-    sec, nanosec = divmod(stamp, _SECOND)
+    sec, nanosec = divmod(stamp, SECOND)
     return Time(sec=sec, nanosec=nanosec)
 
 
 def from_time(time: Time) -> int:
-    return int(time.sec) * _SECOND + int(time.nanosec)
+    return int(time.sec) * SECOND + int(time.nanosec)
 
 
 def to_status(

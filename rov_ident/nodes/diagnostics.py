@@ -84,7 +84,7 @@ class Diagnostics:
         """``stopped``: why there are no samples; ``waiting`` messages are not used yet."""
         now = time.monotonic()
         period, self._published = now - self._published, now
-        complaints = self._complaints()
+        complaints = self._input_faults()
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [
@@ -109,7 +109,7 @@ class Diagnostics:
         name = f"{full.lstrip('/')}: {kind}"
         return to_status(name, self._online.config.name, level, words, values)
 
-    def _complaints(self) -> list[str]:
+    def _input_faults(self) -> list[str]:
         """What keeps the inputs from being used, in words."""
         complaints = []
         for role, (name, _) in self._inputs.sources.items():

@@ -32,7 +32,14 @@ from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Repor
 from rov_ident.io.cdr import encode
 from rov_ident.io.topics import Reader
 from rov_ident.nodes import parameters
-from rov_ident.nodes.common import LATCHED, STREAM, GuardedNode, live, subscribed
+from rov_ident.nodes.common import (
+    DIAGNOSTICS_PERIOD,
+    LATCHED,
+    STREAM,
+    GuardedNode,
+    live,
+    subscribed,
+)
 from rov_ident.nodes.compile_state import CompileState, settle
 from rov_ident.nodes.conversions import to_diagnostics, to_matrix
 from rov_ident.nodes.diagnostics import Diagnostics, Inputs
@@ -48,7 +55,6 @@ _OWN = (
 )  # fmt: skip
 _OWN_NAMES = [parameter.key for parameter in _OWN]
 _SILENCE_PERIOD = 0.1  # s; between looks at the inputs: a tenth of the default timeout
-_DIAGNOSTICS_PERIOD = 1.0  # s; as diagnostic_updater has it
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
 _INPUT_SHARE = 4.0  # s left to the inputs for each of publishing, whatever publish_rate says
 _TURN = 0.02  # s; of using messages that wait before anything else is done: one input at 50 Hz
@@ -83,7 +89,7 @@ class EstimatorNode(GuardedNode):
         self._compiling = compiling
         compiling.begin(config, self.get_logger(), wait=self._lockstep)
         self._online = OnlineEstimator(config, kind)
-        self._keeper = None if self._lockstep else self._recalled(settings["checkpoint_path"])
+        self._keeper = None if self._lockstep else self._restored(settings["checkpoint_path"])
 
         self._reader = Reader(config)
         self._inputs = Inputs(subscribed(config.inputs))
@@ -117,9 +123,9 @@ class EstimatorNode(GuardedNode):
 
         self._publish_timer = self.create_timer(1.0 / config.publish_rate, self._publish_in_time)
         self.create_timer(_SILENCE_PERIOD, self._check_inputs)
-        self.create_timer(_DIAGNOSTICS_PERIOD, self._diagnose)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._diagnose)
         if self._keeper is not None:
-            self.create_timer(_CHECKPOINT_PERIOD, self._keep)
+            self.create_timer(_CHECKPOINT_PERIOD, self._write_checkpoint)
         parameters.follow(
             self, partial(parameters.changed, self, _OWN_NAMES), self._take_parameters
         )
@@ -182,7 +188,7 @@ class EstimatorNode(GuardedNode):
                 self._show(info)
                 # A queue of waiting messages is learnt from faster than they came in.
                 if self._keeper and self._online.stamp - self._kept > _CHECKPOINT_PERIOD * 1e9:
-                    self._keep()
+                    self._write_checkpoint()
 
     def _show(self, info: NDArray[np.void]) -> None:
         """Publish the residuals of samples, and the coefficients when due by their time."""
@@ -240,7 +246,7 @@ class EstimatorNode(GuardedNode):
         node = self.get_fully_qualified_name().replace("/", "_")
         return configuration.as_file_name(config.name) + node
 
-    def _recalled(self, given: str) -> checkpoint.Keeper | None:
+    def _restored(self, given: str) -> checkpoint.Keeper | None:
         """The keeper of checkpoints, if a path is given; the last checkpoint is restored."""
         if not given:
             return None
@@ -258,7 +264,7 @@ class EstimatorNode(GuardedNode):
             self.get_logger().error(f"{error}; beginning with the prior")
         return keeper
 
-    def _keep(self) -> None:
+    def _write_checkpoint(self) -> None:
         assert self._keeper is not None
         if self._online.stamp != self._kept or self._keeper.failure:
             self._kept = self._online.stamp
@@ -351,7 +357,7 @@ class EstimatorNode(GuardedNode):
     def take_leave(self) -> None:
         self._monitor.stop()
         if self._keeper is not None:
-            self._keep()
+            self._write_checkpoint()
             self._keeper.close()
         self._compiling.stop()
         unused = f", {len(self._waiting)} messages left unused" if self._waiting else ""
@@ -369,14 +375,14 @@ def main(kind: Kind) -> int:
     compiling = CompileState(kind)
     return live(
         f"{kind}_node",
-        lambda: _ready(kind, compiling),
+        lambda: _kernels_loaded(kind, compiling),
         _OWN_NAMES,
         begin=EstimatorNode.begin_monitoring,
         leave=EstimatorNode.take_leave,
     )
 
 
-def _ready(kind: Kind, compiling: CompileState) -> EstimatorNode:
+def _kernels_loaded(kind: Kind, compiling: CompileState) -> EstimatorNode:
     node = EstimatorNode(kind, compiling)
     settle()
     sys.setswitchinterval(_SWITCHING)

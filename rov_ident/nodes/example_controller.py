@@ -65,7 +65,7 @@ class ExampleController(GuardedNode):
         self._state, self._refused = "", ""
         self._output = self.create_publisher(WrenchStamped, "thruster_wrench", 10)
         self.create_subscription(DiagnosticArray, "coefficients", self._take, LATCHED)
-        self.create_subscription(Twist, "cmd_vel", self._obey, _LATEST)
+        self.create_subscription(Twist, "cmd_vel", self._set_reference, _LATEST)
         self.create_subscription(Odometry, "odom", self._measure, _LATEST, raw=True)
         self.create_timer(1.0 / _RATE, self._control)
 
@@ -88,7 +88,7 @@ class ExampleController(GuardedNode):
             self.get_logger().warning(f"coefficients refused: {taken.reason}")
         self._refused = taken.reason
 
-    def _obey(self, message: Twist) -> None:
+    def _set_reference(self, message: Twist) -> None:
         linear, angular = (np.array([v.x, v.y, v.z]) for v in (message.linear, message.angular))
         # A twist has the axes of a wrench.
         turned = to_core(Wrench(0, "", linear, angular), self._config.frames)

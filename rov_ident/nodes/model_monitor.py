@@ -49,10 +49,10 @@ class ModelMonitor:
 
     def _submit(self, function: Callable[..., object], *arguments: object) -> "Future[Any]":
         job = self._thread.submit(function, *arguments)
-        job.add_done_callback(self._complain)
+        job.add_done_callback(self._log_failure)
         return job
 
-    def _complain(self, job: "Future[Any]") -> None:
+    def _log_failure(self, job: "Future[Any]") -> None:
         if not job.cancelled() and (error := job.exception()):
             self._log.error(f"the search for what the model lacks failed: {error!r}")
 

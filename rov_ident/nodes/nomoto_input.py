@@ -52,24 +52,24 @@ class NomotoInput:
             core: Any = to_core(message, self._config.frames)
             self._headings.append((core.stamp, float(quaternion_to_euler(core.orientation)[2])))
             self._heard = max(self._heard, core.stamp)
-            self._use()
+            self._advance()
 
     def _joints(self, message: JointState) -> None:
         names = list(message.name)
         if self._config.rudder_joint in names:  # other joints may have messages of their own
             angle = float(message.position[names.index(self._config.rudder_joint)])
             stamp = from_time(message.header.stamp)
-            self._turned(stamp or self._node.get_clock().now().nanoseconds, angle)
+            self._take_heading(stamp or self._node.get_clock().now().nanoseconds, angle)
 
     def _angle(self, message: Float64) -> None:
-        self._turned(self._node.get_clock().now().nanoseconds, float(message.data))
+        self._take_heading(self._node.get_clock().now().nanoseconds, float(message.data))
 
-    def _turned(self, stamp: int, angle: float) -> None:
+    def _take_heading(self, stamp: int, angle: float) -> None:
         if not self._rudder or stamp > self._rudder[-1][0]:
             self._rudder.append((stamp, angle))
-            self._use()
+            self._advance()
 
-    def _use(self) -> None:
+    def _advance(self) -> None:
         """The headings up to the last rudder angle."""
         while self._headings and self._rudder and self._headings[0][0] <= self._rudder[-1][0]:
             at, heading = self._headings.popleft()

@@ -35,7 +35,7 @@ _COLOURS = {Level.OK: "green", Level.WARN: "yellow", Level.ERROR: "bold red", Le
 
 def watch(as_json: bool, out: Console, err: Console) -> None:
     """Until interrupted: a live table on ``err``, which stays there, or JSON lines on ``out``."""
-    with _hearing() as (store, spin, interrupts), ExitStack() as stack:
+    with _listening() as (store, spin, interrupts), ExitStack() as stack:
         live = None
         if not as_json:
             live = Live(console=err, auto_refresh=False, vertical_overflow="crop")
@@ -59,7 +59,7 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
 
     Raises UserError if none is heard within ``patience`` [s].
     """
-    with _hearing() as (store, spin, interrupts):
+    with _listening() as (store, spin, interrupts):
         end, known, since = time.monotonic() + patience, store.known, time.monotonic()
         while time.monotonic() < end and not interrupts:
             spin(0.1)
@@ -81,7 +81,7 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
 
 
 @contextmanager
-def _hearing() -> Iterator[tuple[Store, Callable[[float], None], list[int]]]:
+def _listening() -> Iterator[tuple[Store, Callable[[float], None], list[int]]]:
     """The store, a function that listens for some seconds, and the interrupts there were."""
     store = Store(time.monotonic)
     with noted_interrupts() as interrupts, watching(store, "rov_ident_watch") as (_, executor):

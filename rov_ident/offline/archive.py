@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core import children
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import limit_process
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.smoothing import smoothed
@@ -32,8 +33,6 @@ Samples = NDArray[np.void]
 Mapper = Callable[..., list[Any]]
 """``mapper(function, *arguments)``: [function(samples, *arguments)] of every bag, in order."""
 Sums = TypeVar("Sums", bound=tuple[Any, ...])
-Progress = Callable[[str, int, int], None]
-"""Called with the name of the bag just read, how many are done, and how many there are."""
 
 
 @dataclass(frozen=True)
@@ -84,33 +83,30 @@ def total(parts: Sequence[Sums]) -> Sums:
 def of_records(records: Sequence[Record]) -> Archive:
     """Records that have been read already, in this process."""
     paths = [record.path for record in records]
-    reread = _reader(lambda *how: (_tried(path, *how) for path in paths), _here)
-    return _archive([_parts(record) for record in records], _here, reread)
+    reread = _reader(lambda *how: (_outcome(path, *how) for path in paths), _locally)
+    return _archive([_bag_and_samples(record) for record in records], _locally, reread)
 
 
 @contextlib.contextmanager
 def opened(
-    paths: Sequence[Path],
-    config: Config,
-    jobs: int = 1,
-    dask: str = "",
-    progress: Progress | None = None,
+    paths: Sequence[Path], config: Config, jobs: int = 1, dask: str = "", say: Progress = silent
 ) -> Iterator[Archive]:
     """Read bags, in ``jobs`` processes or on a Dask cluster at the address ``dask`` ("local").
 
     Raises UserError if no bag can be read, or the cluster cannot be reached.
     """
 
-    def told(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
+    def reported(outcomes: Iterable[Outcome]) -> Iterator[Outcome]:
         for i, (path, outcome) in enumerate(zip(paths, outcomes, strict=True)):
             yield outcome
-            if progress is not None:
-                progress(path.name, i + 1, len(paths))
+            say(f"read {path.name}", (i + 1) / len(paths))
 
     if dask:
         with children.environment(), _cluster(dask, jobs) as client:
             on_dask = partial(_by_dask, client)
-            yield _reader(lambda *how: told(_on_dask(client, paths, *how)), on_dask)(config, False)
+            yield _reader(lambda *how: reported(_on_dask(client, paths, *how)), on_dask)(
+                config, False
+            )
     elif jobs > 1 and len(paths) > 1:
         # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
         with (
@@ -123,11 +119,13 @@ def opened(
             def in_processes(config: Config, columns: bool) -> Iterator[Outcome]:
                 k = next(readings)
                 files = [Path(folder) / f"{k}-{i}.npy" for i in range(len(paths))]
-                return told(pool.map(_stored, paths, repeat(config), repeat(columns), files))
+                return reported(pool.map(_stored, paths, repeat(config), repeat(columns), files))
 
             yield _reader(in_processes, partial(_by_processes, pool))(config, False)
     else:
-        yield _reader(lambda *how: told(_tried(path, *how) for path in paths), _here)(config, False)
+        yield _reader(lambda *how: reported(_outcome(path, *how) for path in paths), _locally)(
+            config, False
+        )
 
 
 def default_jobs() -> int:
@@ -167,7 +165,7 @@ def _archive(
     return Archive(bags, notes, partial(each, [where for _, where in read]), reread)
 
 
-def _parts(record: Record) -> tuple[Bag, Samples]:
+def _bag_and_samples(record: Record) -> tuple[Bag, Samples]:
     samples = smoothed(record.samples)
     bag = Bag(
         record.path,
@@ -180,15 +178,17 @@ def _parts(record: Record) -> tuple[Bag, Samples]:
     return bag, samples
 
 
-def _tried(path: Path, config: Config, columns: bool = False) -> Outcome:
+def _outcome(path: Path, config: Config, columns: bool = False) -> Outcome:
     try:
-        return _parts(read_record(path, config, columns=columns))
+        return _bag_and_samples(read_record(path, config, columns=columns))
     except UserError as error:
         text = str(error)
         return f"left out: {text if path.name in text else f'{path.name}: {text}'}"
 
 
-def _here(samples: Sequence[Samples], function: Callable[..., Any], *arguments: Any) -> list[Any]:
+def _locally(
+    samples: Sequence[Samples], function: Callable[..., Any], *arguments: Any
+) -> list[Any]:
     return [function(part, *arguments) for part in samples]
 
 
@@ -196,7 +196,7 @@ def _here(samples: Sequence[Samples], function: Callable[..., Any], *arguments: 
 
 
 def _stored(path: Path, config: Config, columns: bool, file: Path) -> Outcome:
-    outcome = _tried(path, config, columns)
+    outcome = _outcome(path, config, columns)
     if isinstance(outcome, str):
         return outcome
     np.save(file, outcome[1])
@@ -214,14 +214,14 @@ class _File(NamedTuple):
         return np.load(self.path, allow_pickle=False).view(self.dtype)
 
 
-def _of_file(file: _File, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def _of_stored(file: _File, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     return function(file.read(), *arguments)
 
 
 def _by_processes(
     pool: ProcessPoolExecutor, files: Sequence[_File], function: Callable[..., Any], *arguments: Any
 ) -> list[Any]:
-    return list(pool.map(_of_file, files, repeat(function), repeat(arguments)))
+    return list(pool.map(_of_stored, files, repeat(function), repeat(arguments)))
 
 
 # ------------------------------------------------------------------ Dask
@@ -256,7 +256,7 @@ def _on_dask(
 ) -> Iterator[Outcome]:
     """Every bag with the future of its samples, which stay on the cluster."""
     n = len(paths)
-    read = client.map(_tried, list(paths), [config] * n, [columns] * n, pure=False)
+    read = client.map(_outcome, list(paths), [config] * n, [columns] * n, pure=False)
     for whole, alone in zip(read, client.map(_bag_alone, read, pure=False), strict=True):
         bag = alone.result()
         yield (

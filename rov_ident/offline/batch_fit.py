@@ -5,7 +5,7 @@ measured, a channel whose open-loop simulation is good already is left alone, an
 motion does not show is refused, with the reason (Zhao et al. 2018).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from rov_ident.config.prior import (
 )
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONTRADICTED, State, of_fit
 from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
@@ -40,18 +41,16 @@ from rov_ident.sampling.without_velocity import is_impossible, is_without_veloci
 
 KINDS = ("ls", "iv", "ml")
 
-_MOVES = 2.0  # times the noise of its measurement, rms, from which a component of the motion shows
-_GOOD = 0.03  # open-loop error relative to the motion with which a channel is left alone,
+_MOVES = 2.0  # times the noise of its measurement, rms: then three quarters of the power are motion
+_GOOD = 0.03  # a choice: open-loop error relative to the motion with which a channel is left alone,
 _NOISY = 1.5  # or relative to the noise of what it is compared with
-AT_REST = 0.05  # of the axis's authority, rms: the wrench of keeping station, as in `check`
+AT_REST = 0.05  # of the axis's working wrench, rms: a smaller wrench is that of keeping station
 DRIVEN_UNSEEN = (
     "surge or sway is driven, and no velocity is measured: how fast it goes is unknown, and so are "
     "the moments and the depth that follow from it; drive heave, roll, pitch and yaw while surge "
     "and sway rest (or record a DVL)"
 )
 _NO_PRIOR = 1e-6  # precision that keeps what no data reach from being anything
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def fit_batch(
     config: Config,
     kind: str,
     settings: Settings | None = None,
-    say: Say | None = None,
+    say: Progress = silent,
 ) -> Fit:
     """Fit an archive.
 
@@ -110,8 +109,7 @@ def fit_batch(
         odometry = replace(config.odometry, latency_std=0.0)
         config = replace(config, current_std=0.0, odometry=odometry)
         settings = replace(settings, readings=2 * settings.readings)
-    tell = say or (lambda what: None)
-    tell("open loop, as configured")
+    say("open loop, as configured")
     read, given = archive, config
     before = open_loop(read, given)
     notes = list(archive.notes)
@@ -125,9 +123,9 @@ def fit_batch(
     for stage in settings.stages or (MOTIONS,):
         found: _Stage | None
         if effects and config.estimate_effects:
-            archive, found = _relinearised(archive, config, kind, settings, notes, tell)
+            archive, found = _relinearised(archive, config, kind, settings, notes, say)
         else:
-            found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, tell)
+            found = _stage(archive, now.with_effects_held, kind, stage, settings, notes, say)
         if found is None:
             continue
         at = np.array([prior.names.index(name) for name in found.names])
@@ -138,7 +136,7 @@ def fit_batch(
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
         now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
-    tell("open loop, fitted")
+    say("open loop, fitted")
     judged = read.as_read_by(now, config)
     after = open_loop(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
@@ -146,13 +144,14 @@ def fit_batch(
     for bag in judged.bags:
         sensors |= {p: max(r, sensors.get(p, 0.0)) for p, r in bag.contradictions.items()}
     consistency = consistency_of(config, prior, values, unexplained, lasting, sensors)
+    consistency = replace(consistency, asks=kind == "ml")
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
     if unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
         driven = float(np.max((forces / authority(config.dynamics))[:2]))
         rest = Test("surge and sway at rest", driven, AT_REST, DRIVEN_UNSEEN)
         consistency = replace(consistency, tests=(*consistency.tests, rest))
-    motion = archive.each(_range)
+    motion = archive.each(_velocity_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
         "open_loop_before": {"horizon_s": HORIZON, "rmse": numbers(before.rmse)},
@@ -180,7 +179,7 @@ def fit_batch(
 
 
 def _relinearised(
-    archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Say
+    archive: Archive, config: Config, kind: str, settings: Settings, notes: list[str], say: Progress
 ) -> tuple[Archive, _Stage]:
     """A fit with parameters of effects, and the archive as they have it.
 
@@ -220,7 +219,7 @@ def _stage(
     channels: Sequence[str],
     settings: Settings,
     notes: list[str],
-    say: Say,
+    say: Progress,
     before: _Stage | None = None,
     body: RigidBody | None = None,
 ) -> _Stage | None:
@@ -256,8 +255,8 @@ def _stage(
     coefficients = prior_of(config)
     precision = 1.0 if settings.prior else _NO_PRIOR
 
-    def progress(what: str) -> None:
-        say(f"{name}: {what}" if settings.stages else what)
+    def of_stage(what: str, share: float | None = None) -> None:
+        say(f"{name}: {what}" if settings.stages else what, share)
 
     unmeasured = any(archive.each(is_without_velocity))
     if unmeasured:  # as far as it is simulated, the motion tells least squares nothing
@@ -272,7 +271,7 @@ def _stage(
             instrumental=kind == "iv",
             weighted=settings.weighted,
             precision=precision,
-            progress=progress,
+            say=of_stage,
         )
         found, covariance, information = solution.values, solution.covariance, solution.information
     base = least_squares.base_parameters(names, information, coefficients.std)
@@ -302,7 +301,7 @@ def _stage(
             free,
             precision / prior.std**2,
             settings.process,
-            progress,
+            of_stage,
             start[len(names) :],
             noise,
         )
@@ -348,18 +347,18 @@ def _stage(
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
-    if free[0] and not any(archive.each(_pushes_ahead)):
-        notes += _said_of_scale(config, names, covariance)
+    if free[0] and not any(archive.each(_has_surge_thrust)):
+        notes += _scale_notes(config, names, covariance)
     return _Stage(names, values, covariance + arm, states, more, unexplained, lasting, noise)
 
 
-def _pushes_ahead(samples: Samples) -> bool:
+def _has_surge_thrust(samples: Samples) -> bool:
     return bool(samples["wrench"][:, 0].any())
 
 
-def _said_of_scale(config: Config, names: Sequence[str], covariance: Array) -> list[str]:
-    """What speeds alone cannot tell of a propeller, whose thrust is measured nowhere: multiply
-    m - X_udot, thrust and drag by one number, and the motion is the same."""
+def _scale_notes(config: Config, names: Sequence[str], covariance: Array) -> list[str]:
+    """A note where only speeds are measured, and not the thrust: with m - X_udot, thrust and drag
+    times any number the motion is the same."""
     there = _coefficients(config)
     own = [n for n, c in there.items() if c.row == 0 and "n" in c.inputs]
     if not own or "X_udot" not in names:
@@ -458,7 +457,7 @@ def _mean_square_wrench(samples: Samples) -> Array:
     return np.mean(samples["wrench"] ** 2, axis=0)
 
 
-def _range(samples: Samples) -> tuple[Array, Array]:
+def _velocity_range(samples: Samples) -> tuple[Array, Array]:
     """Where the motion is for all but a thousandth of the time, either side."""
     low, high = np.quantile(samples["nu"], [0.001, 0.999], axis=0)
     return low, high

@@ -53,10 +53,10 @@ def with_prior(config: Config, path: Path) -> tuple[Config, dict[str, Any]]:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     try:
         axes, coriolis_taken_off = _axes(json.loads(data, parse_int=float))
-        told = _checked(config, axes, coriolis_taken_off)
+        told = _usable_names(config, axes, coriolis_taken_off)
         values, std = dict(config.model.values), dict(config.prior.std)
         for axis in axes.values():
-            means, widths = _beside(config, axis)
+            means, widths = _conditioned(config, axis)
             values |= means
             std |= widths
         new = config.with_model(build(config.model.body, values))
@@ -129,7 +129,7 @@ def _numbers(name: str, entry: Mapping[str, Any]) -> tuple[float, float]:
     return value, max(std, 0.5 * (upper - lower) / NORMAL, _LEAST * abs(value), 1e-12)
 
 
-def _checked(config: Config, axes: Mapping[str, _Axis], coriolis_taken_off: bool) -> list[str]:
+def _usable_names(config: Config, axes: Mapping[str, _Axis], coriolis_taken_off: bool) -> list[str]:
     """The coefficients of the file. Raises UserError if one is not to be used."""
     told = []
     for axis, part in axes.items():
@@ -153,7 +153,7 @@ def _checked(config: Config, axes: Mapping[str, _Axis], coriolis_taken_off: bool
     return told
 
 
-def _beside(config: Config, axis: _Axis) -> tuple[dict[str, float], dict[str, float]]:
+def _conditioned(config: Config, axis: _Axis) -> tuple[dict[str, float], dict[str, float]]:
     """Means and standard deviations by name, of the axis beside what the configuration has."""
     prior = prior_of(config)
     known = dict(zip(prior.names, zip(prior.mean.tolist(), prior.std.tolist(), strict=True)))

@@ -39,15 +39,17 @@ _FIN_COLUMNS = {
     "s": ("stern", "stern_plane", "delta_s", "ds", "deltas", "elevator", "delta_e", "de"),
     "a": ("aileron", "delta_a", "da", "deltaa"),
 }
-_SLOWEST, _FASTEST = 1e-6, 2.0 * math.pi  # m/s, rad/s
-_MOST_ROWS = 100_000
-_ALIKE = 0.995  # cosine between two columns from which a table cannot tell them apart
-_CONDITION = 100.0  # of a structure's scaled columns, beyond which its values mean nothing apart
-_FEWEST = 6  # conditions
-_ROWS_PER_TERM = 3
-_PATIENCE = 3  # sizes without a better cross-validation until structures grow no further
-_SHOWN = 20  # candidates, beside the chosen
-_WORTH = 2.0  # standard errors
+_SLOWEST = 1e-6  # m/s; below it is a zero that was rounded
+_FASTEST = 2.0 * math.pi  # rad/s; a turn a second: beyond it are degrees
+_MOST_ROWS = 100_000  # a guard: a hundred candidate columns take 80 MB
+_ALIKE = 0.995  # cosine between two columns, which then inflate each other's variance a hundredfold
+_CONDITION = 100.0  # of a structure's scaled columns: beyond it collinearity ruins a fit (Belsley,
+# Kuh and Welsch 1980, sec. 3.2)
+_ROWS_PER_TERM = 3  # conditions, so that two of three are left to judge by
+_FEWEST = 2 * _ROWS_PER_TERM  # conditions: with one term there is nothing to choose from
+_PATIENCE = 3  # a choice: sizes without a better cross-validation until structures grow no further
+_SHOWN = 20  # candidates, beside the chosen: a screenful
+_WORTH = 2.0  # standard errors, which chance exceeds one time in forty
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 
 
@@ -148,7 +150,7 @@ def read_table(
             f"{path}: every row is the same condition: vary speed, drift, turning or fin angles"
         )
     if drift == "auto" and reader.has_flow:
-        nu = _as_a_hull_resists(nu, forces, notes)
+        nu = _with_resisting_signs(nu, forces, notes)
     unused = tuple(heading for heading in table.cells if heading not in reader.used)
     if unused:
         notes.insert(
@@ -215,7 +217,7 @@ class _Reader:
         for heading in self.table.cells:
             if heading in self.used or self._is_constant(heading):
                 continue
-            name = _likely(heading)
+            name = _guessed_name(heading)
             if (
                 name
                 and not {self.columns.get(n, n) for n in (name, *_SAME.get(name, ()))} & self.used
@@ -261,7 +263,7 @@ _WORDS = {
 }
 
 
-def _likely(heading: str) -> str:
+def _guessed_name(heading: str) -> str:
     """What a heading such as `beta(deg)` or `Speed [m/s]` may be in our names, if anything."""
     bare, _, unit = re.sub(r"[(\[\]),/ _-]+", " ", heading.lower()).strip().partition(" ")
     words = f"{bare} {unit}".split()
@@ -386,7 +388,7 @@ def _fins(reader: _Reader) -> dict[str, Array]:
     return fins
 
 
-def _as_a_hull_resists(nu: Array, forces: Mapping[str, Array], notes: list[str]) -> Array:
+def _with_resisting_signs(nu: Array, forces: Mapping[str, Array], notes: list[str]) -> Array:
     """Turns v and w round where the force would otherwise drive the hull along them."""
     out = nu.copy()
     sides = (("Y", 1, "v", "beta", "starboard"), ("Z", 2, "w", "alpha", "below"))
@@ -468,7 +470,7 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     errors = {s: _left_out(scaled[:, s], force) for s in _grow(scaled, force, most)}
     rms = {s: _rms(error) for s, error in errors.items()}
     words = {s: tuple(names[i] for i in s) for s in errors}
-    chosen, why = _smallest(errors, rms, words)
+    chosen, why = _most_parsimonious(errors, rms, words)
     terms, x, scale = words[chosen], scaled[:, chosen], size[list(chosen)]
     values = np.asarray(np.linalg.lstsq(x, force, rcond=None)[0], dtype=np.float64)
     covariance = sandwich(scaled_inverse(x.T @ x), (x.T * errors[chosen] ** 2) @ x)  # HC3
@@ -570,7 +572,7 @@ def _left_out(x: Array, y: Array) -> Array:
     return (y - q @ (q.T @ y)) / (1.0 - h)
 
 
-def _smallest(
+def _most_parsimonious(
     errors: Mapping[tuple[int, ...], Array],
     rms: Mapping[tuple[int, ...], float],
     words: Mapping[tuple[int, ...], Sequence[str]],

@@ -89,27 +89,26 @@ class Fit(Shown, Result):
             return f"{told} {doubt[0].upper()}{doubt[1:]}."
         if judged := self.more.get("validation"):
             where, before = judged["bags"][0]["file"], judged["rmse_before"]
-            return f"{told} On {where}, {falls(before, judged['rmse'])}."
+            return f"{told} On {where}, {rmse_change(before, judged['rmse'])}."
         if before := self.more.get("open_loop_before"):
-            return f"{told} On what was fitted, {falls(before['rmse'], numbers(self.rmse))}."
+            return f"{told} On what was fitted, {rmse_change(before['rmse'], numbers(self.rmse))}."
         return told
 
     @property
     def doubt(self) -> str:
-        """In what data and model disagree, or that it is not known; empty where they agree, and of
-        least squares, which does not ask."""
+        """How data and model disagree, or that it is unknown; empty where they agree, and of least
+        squares, which does not test that."""
         if not self.consistency.consistent:
             return f"data and model disagree: {self.consistency.sentence}"
-        asked = self.estimator in ("ml", *ESTIMATORS)
-        return self.consistency.sentence if asked and not self.consistency.judged else ""
+        return self.consistency.sentence if self.consistency.doubt else ""
 
-    def asked(self, tests: Sequence[Test]) -> "Fit":
+    def with_tests(self, tests: Sequence[Test]) -> "Fit":
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
         nothing has converged."""
         prior = prior_of(self.given, effects=True)
         known = dict(zip(prior.names, prior.std.tolist(), strict=True))
         std = np.array([known[name] for name in self.names])
-        consistency = Consistency((*self.consistency.tests, *tests))
+        consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
         return replace(
             self,
             consistency=consistency,
@@ -232,7 +231,7 @@ class Fit(Shown, Result):
         return as_json(result)
 
 
-def falls(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
+def rmse_change(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
     """How the RMSE of open-loop prediction changes, by velocity, in half a sentence."""
     ratios = [a / b for b, a in zip(before.values(), after.values()) if a is not None and b]
     share = 100.0 * (1.0 - float(np.median(ratios))) if ratios else 0.0
@@ -275,8 +274,6 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     before, after = open_loop(read, config), open_loop(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
     assert report.consistency is not None
-    if not report.consistency.judged:  # nobody has asked what it leaves of what was learnt last
-        states = [State.CONVERGING if s is State.CONVERGED else s for s in states]
     return Fit(
         estimator=kind,
         names=report.names,
@@ -293,4 +290,4 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=curves(read.bags, before, after),
-    ).asked(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)
+    ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)

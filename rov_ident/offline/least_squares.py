@@ -15,7 +15,7 @@ masses', not the second, that of quadratic damping. Maximum likelihood has neith
 Sums over the samples of several bags are sums over bags: an archive is one fit.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from scipy.linalg import qr
 from rov_ident.config import Config
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting, compiled
 from rov_ident.estimation.shared import add_scatter
 from rov_ident.model.equations import Array, Model
@@ -35,9 +36,9 @@ from rov_ident.offline.filtered_regression import Regression, filtered_rows, reg
 from rov_ident.sampling.records import HORIZON, predicted
 from rov_ident.sampling.sample import parts
 
-PERIOD = 0.1  # s between rows
+PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
 _LAG = 2.0  # s; window over the correlation of the residuals
-_ROUNDS = 4  # of instruments, each simulated with the coefficients of the one before
+_ROUNDS = 4  # a guard: of instruments, each simulated with the coefficients of the one before
 _KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
 # quarters of the prior variance are gone
 
@@ -83,7 +84,7 @@ def solve(
     instrumental: bool = False,
     weighted: bool = True,
     precision: float = 1.0,
-    progress: Callable[[str], None] | None = None,
+    say: Progress = silent,
 ) -> Solution:
     """Least squares over every bag, the estimated coefficients those of the configuration.
 
@@ -91,7 +92,6 @@ def solve(
     axis's own forces). ``precision`` multiplies the prior's: 1 takes the configuration as it is.
     """
     free = np.ones(6, dtype=bool) if free is None else free
-    say = progress or (lambda what: None)
     task = regression(config)
     batch = Batch(task, compiled(config.effects))
     prior: Array = np.eye(len(task.scale)) * precision
@@ -148,21 +148,21 @@ def solve(
 
 def moments_of(samples: Samples, batch: Batch) -> Moments:
     """The sums of one bag's samples (k,) of SAMPLE."""
-    phi, z = _both(samples, batch)
+    phi, z = _rows_and_instruments(samples, batch)
     return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(len(phi))))
 
 
 def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
     """Covariance (n, n) of one bag's accumulated ``sum w Z' e``, correlation in time included."""
-    phi, z = _both(samples, batch)
+    phi, z = _rows_and_instruments(samples, batch)
     error = phi[:, :, -1] - phi[:, :, :-1] @ x
     score = np.einsum("ka,kai->ki", error * weight, z[:, :, :-1])
     total, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
-    _scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
+    _accumulate_scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
     return total
 
 
-def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array]:
     samples, _ = parts(samples)
     z = phi = filtered_rows(batch.task, samples, PERIOD)
     if batch.instruments is not None:  # along the motion that the model says, through the water
@@ -179,7 +179,7 @@ def _both(samples: Samples, batch: Batch) -> tuple[Array, Array]:
 
 
 @kernel
-def _scatter(score, fade, total, lagged):
+def _accumulate_scatter(score, fade, total, lagged):
     for k in range(len(score)):
         add_scatter(score[k], fade, total, lagged)
 

@@ -45,6 +45,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.core.progress import Progress, silent
 from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.observer import (
@@ -62,32 +63,32 @@ from rov_ident.estimation.shared import (
     FOLLOWED,
     add_scatter,
     drive_sides,
+    informative_axes,
     measure,
     steps_of,
-    teachers_of,
     wrench_of,
 )
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
+from rov_ident.sampling.kinematic_filter import SUREST
 from rov_ident.sampling.reading_noise import SHARE
 from rov_ident.sampling.sample import NO_SIDES, parts
 
 T = TypeVar("T")
 
 _LAG = 1.0  # s; window over the correlation of the score in time
-_GATE = 6.0  # standard deviations; an innovation further off is an outlier
-_NOISE_SAMPLES = 12_000  # of a bag, from which its noise levels are estimated
-_ITERATIONS = 25
-_DOUBTFUL = 0.03  # of the axis's authority, lasting a second: what may be unexplained at first
+_GATE = 6.0  # standard deviations; one of 500 million normal innovations is further off
+_NOISE_SAMPLES = 12_000  # of a bag: they tell a noise level to 1 %
+_ITERATIONS = 25  # a guard: Gauss-Newton steps converge in a few, or never
+_DOUBTFUL = 0.03  # of the axis's working wrench, lasting a second: what may be unexplained at first
 _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first level to the least
 _NEAR = 0.05  # squared standard deviations of noise levels from the most likely ones
-_SUREST = 1e-4  # of the stated variance of a measurement: no sensor is better than a hundredth
-_SMALLEST = 1e-4  # floor of the process noise, relative to the axis's authority
+_SMALLEST = 1e-4  # floor of the process noise over the axis's working wrench: as good as none
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
 _NONE = np.zeros(0)
 _NO_ROWS = np.zeros((3, 0, 6))
-LIKELY = 3e-3  # the same, of what is expected of a vehicle before any fit of its noise
+LIKELY = 3e-3  # a choice: the same before a fit of the noise, stated in docs/offline.md
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Noise:
 def assumed(config: Config, least: float = _SMALLEST) -> Noise:
     """The noise that a configuration states.
 
-    ``least``: that of the wrench where there is none, relative to the axis's authority.
+    ``least``: that of the wrench where there is none, relative to the axis's working wrench.
     """
     w = config.wrench
     smallest = least * authority(config.dynamics)
@@ -226,9 +227,9 @@ def whiteness(
     samples: Samples,
     model: Model,
     noise: Noise,
-    free: NDArray[np.bool_] | None = None,
-    gate: float = np.inf,
-    effects: Array = _NONE,
+    free: NDArray[np.bool_],
+    gate: float,
+    effects: Array,
 ) -> Array:
     """(2, 6): seconds in which the vehicle moved, and the integral over them of the power of
     innovations added up over a second (:mod:`rov_ident.core.whiteness`).
@@ -244,8 +245,8 @@ def whiteness(
 # ------------------------------------------------------------------ noise
 
 
-_STEP_NOISE = 0.02  # of the logarithm of a noise level, for its sensitivities
-_KNOWN = np.log(30.0)  # prior standard deviation of such a logarithm
+_STEP_NOISE = 0.02  # of the logarithm of a noise level: its slope is then right to 1 %
+_KNOWN = np.log(30.0)  # prior standard deviation of such a logarithm: hardly anything is known
 
 
 def _levels(noise: Noise) -> Array:
@@ -339,7 +340,7 @@ def maximise(
     free: NDArray[np.bool_] | None = None,
     precision: Array | None = None,
     process: bool = True,
-    progress: Callable[[str], None] | None = None,
+    say: Progress = silent,
     effects: Array | None = None,
     first_noise: Noise | None = None,
 ) -> Likelihood:
@@ -367,7 +368,6 @@ def maximise(
         starts = [replace(likely, floor=np.zeros(6), relative=0.0, restoring=exact)]
     if first_noise is not None:
         starts = [first_noise]
-    say = progress or (lambda what: None)
 
     def at_values(theta: Array) -> Model:
         moved = model.theta.copy()
@@ -388,7 +388,7 @@ def maximise(
     looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
     of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
-    taught = teachers_of(config)
+    taught = informative_axes(config)
 
     def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
         say(f"step {next(looks)}")
@@ -424,15 +424,15 @@ def maximise(
     seconds, power = np.sum(each(whiteness, at_values(theta), noise, free, gate, theta[~own]), 0)
     known = seconds > JUDGED_TIME
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
-    bound, covariance = _considered(at.information, at.scatter, precision, held)
+    bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
     return Likelihood(theta, covariance, bound, noise, at, lasting, held, noisy, steps, converged)
 
 
-def _considered(
+def _with_consider_parameters(
     information: Array, scatter: Array, precision: Array, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Bound and covariance (n, n) of an estimate in which what is ``held`` (n,) keeps its prior:
-    an error of that moves all others (Schmidt 1966)."""
+    """Bound and covariance (n, n) of an estimate, of which the ``held`` parameters (n,) keep their
+    prior: their errors move all others (consider parameters, Schmidt 1966)."""
     ours = np.ix_(~held, ~held)
     error = np.eye(len(held))  # by the score of what is estimated, and by errors of what is held
     error[ours] = inverse_of((information + np.diag(precision))[ours])
@@ -462,7 +462,7 @@ def _noise_levels(
 ) -> Noise:
     """The most likely levels, begun from those of ``noise``."""
     start = _levels(noise) if process else np.zeros(13)
-    least = np.full(13, np.log(_SUREST))
+    least = np.full(13, np.log(SUREST))
     least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
     least[12] = np.log(1e-10)
 
@@ -575,7 +575,7 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
     for step in range(steps):
         late = step * dt - 0.5 * sample.dt
         if len(x) > 6:
-            _sink(sample, 0.5 * dt, x, p, sensitivity, work)
+            _add_depth_before(sample, 0.5 * dt, x, p, sensitivity, work)
         linearised_step(eq.structure, eq.theta, eq.one_theta, x, late, dt, s)
         if n > 0:
             momentum_columns(eq.structure, s.middle_nu_dot, work.of_rate)
@@ -591,11 +591,11 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
                 s.noise[i, j] = total / (dt * dt)
         advance_covariance(s.transition, s.noise, dt, p, s.product)
         if len(x) > 6:
-            _sunk(sample, 0.5 * dt, x, p, sensitivity, work)
+            _add_depth_after(sample, 0.5 * dt, x, p, sensitivity, work)
 
 
 @inlined
-def _sink(sample, half, x, p, sensitivity, work):
+def _add_depth_before(sample, half, x, p, sensitivity, work):
     """The depth's part of a step in the velocities before it: z += half k . v, by trapezoids.
 
     ``work.along`` (7,): covariance with k . v; ``work.deep`` (7,): with the depth after this.
@@ -615,7 +615,7 @@ def _sink(sample, half, x, p, sensitivity, work):
 
 
 @inlined
-def _sunk(sample, half, x, p, sensitivity, work):
+def _add_depth_after(sample, half, x, p, sensitivity, work):
     """The depth's part in the velocities after the step."""
     phi, cross = work.scratch[0].transition, work.scratch[0].cross
     for j in range(6):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
 Figure: TypeAlias = "matplotlib.figure.Figure"
-NORMAL = 1.959964  # half of a 95 % interval, in standard deviations
+NORMAL = 1.959963984540054  # half of a 95 % interval, in standard deviations
 
 
 class Shown(ABC):

@@ -177,7 +177,7 @@ class EffectJacobians:
             self._velocity[:, i] = change / self._width[i]
 
     def extend(self, sample: NDArray[np.void], sides: Array, acceleration: Array) -> None:
-        """Fill sides (13, k) of the sample (1,) with J, V and p0; what has acted is used up.
+        """Fill sides (13, k) of the sample (1,) with J, V and p0, and begin the next interval.
 
         ``acceleration`` (3,) [m/s2] is that over ground, in body axes, by the IMU; it is not read
         where the sample has no gyro.
@@ -223,7 +223,7 @@ class _Motion(NamedTuple):
 
 
 @inlined
-def _variant(variants, v):
+def _effects_of_variant(variants, v):
     """One of the variants, which are stacked."""
     return Acting(
         variants.inputs[v], variants.input_parameters[v], variants.wrenches[v],
@@ -236,7 +236,7 @@ def _variant(variants, v):
 def _act(variants, state, t, dt, command, impulse):
     for v in range(len(variants.inputs)):
         wrench = command.copy()
-        act(_variant(variants, v), state[v], t, dt, wrench)
+        act(_effects_of_variant(variants, v), state[v], t, dt, wrench)
         for i in range(6):
             impulse[v, i] += dt * wrench[i]
 
@@ -244,7 +244,7 @@ def _act(variants, state, t, dt, command, impulse):
 @kernel
 def _surround(variants, t, position, nu, rotation, thrust, out):
     for v in range(len(variants.inputs)):
-        add_wrenches(_variant(variants, v), t, position, nu, rotation, thrust, out[v])
+        add_wrenches(_effects_of_variant(variants, v), t, position, nu, rotation, thrust, out[v])
 
 
 @kernel

@@ -31,7 +31,7 @@ STATE = record(
     [
         ("known", "?"),  # an odometry message has been seen since the last restart
         ("inertial", "?"),  # an IMU message has
-        ("chances", "i8"),  # so often may the first odometry of all still be given up
+        ("chances", "i8"),  # how often the first odometry of all may still be discarded
         ("q", "f8", (4,)),
         ("down", "f8", (3,)),
         ("attitude_variance", "f8"),  # rad2
@@ -92,7 +92,7 @@ _ZERO = np.zeros(3)
 CHANCES = 4  # odometry that is never confirmed within so many messages is all there is
 _BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
 UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
-_SUREST = 1e-4  # of the configured variance: no message is believed to be surer (docs/trust.md)
+SUREST = 1e-4  # of the stated variance of a measurement: no sensor is surer (docs/trust.md)
 _DRIFT = 1e-8  # rad2/s; of an attitude by all that is no noise of the rate: 6 mrad in an hour
 _POWER_TIME = 5.0  # s; over which it is judged whether a component of nu moves
 _MOVING = 4.0  # mean square over noise variance from which it does; at rest it is 1. Higher values
@@ -475,13 +475,13 @@ def fuse(
         out.gyro[i] = out.odometry[i] = out.odometry[3 + i] = np.nan
     gyro_variance = s.gyro_variance
     if 0.0 < m.gyro_variance < 1.0 and has_imu:
-        gyro_variance = max(m.gyro_variance, _SUREST * s.gyro_variance)
+        gyro_variance = max(m.gyro_variance, SUREST * s.gyro_variance)
     started = k.inertial
     _assign(out.gyro_bias, k.gyro_bias)
     variance = np.empty(6)
     for i in range(6):
         given = has_odometry and 0.0 < m.variance[i] < UNKNOWN
-        least = _SUREST * s.odometry_variance[i]
+        least = SUREST * s.odometry_variance[i]
         variance[i] = max(m.variance[i], least) if given else s.odometry_variance[i]
         out.odometry_variance[i] = variance[i]
     r_linear = (variance[0] + variance[1] + variance[2]) / 3.0

@@ -10,8 +10,7 @@ import numpy as np
 
 from rov_ident.core.messages import Array, Odometry
 from rov_ident.core.quaternions import turned
-
-_LONGEST_GAP = 0.5  # s without a message: as in a sampler, nothing is interpolated across
+from rov_ident.sampling.queues import LONGEST_INTERVAL
 
 
 class LateVelocities:
@@ -37,7 +36,7 @@ class LateVelocities:
             return t, message
         begin, before = known[0]
         end, after = known[1] if len(known) > 1 else known[0]
-        if not begin <= at < end or end - begin > _LONGEST_GAP:
+        if not begin <= at < end or end - begin > LONGEST_INTERVAL:
             return None
         share = (at - begin) / (end - begin)
         return at, message._replace(

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
+from rov_ident.core.noise import robust_std
 from rov_ident.model.equations import Array
 
-_ROBUST = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 _MEASURED = ("u", "v", "w", "p", "q", "r")
 _DRIVES = ("X", "Y", "Z", "K", "M", "N", "delta_s", "delta_r", "delta_a", "rpm")
 _UNEVEN = 0.1  # of a step: by so much steps may differ where a filter takes them as even
@@ -101,7 +101,7 @@ def despiked(x: Array, width: int = 11, limit: float = 5.0) -> tuple[Array, NDAr
     middle = median_filter(x, width, mode="nearest")
     off = np.abs(x - middle)
     # many a value is the median itself, whatever the noise: those say nothing of the spread
-    spread = _ROBUST * float(np.median(off[off > 0.0])) if off.any() else 0.0
+    spread = float(robust_std(off[off > 0.0])) if off.any() else 0.0
     bad = off > limit * max(spread, 1e-12)
     return np.where(bad, middle, x), bad
 

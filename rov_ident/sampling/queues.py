@@ -12,9 +12,10 @@ from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message
 
 MERGE = 0.05  # s; an odometry message is carried to the IMU message that follows this closely: one
 # interval of the slowest odometry beside which an IMU is of use, 20 Hz
-_LONGEST_WAIT = 1.0  # s; a topic that is later than this is not waited for
-_MARGIN = 1.25  # times as late as a topic was is how long it is waited for from then on
-_LONGEST_QUEUE = 10.0  # s; of commands that are kept while nothing else comes
+LONGEST_INTERVAL = 0.5  # s without a measurement: nothing is interpolated across, all restarts
+_LONGEST_WAIT = 1.0  # s; a choice: a topic that is later than this is not waited for
+_MARGIN = 1.25  # a choice: a topic is waited for as long as it was late, times this
+_LONGEST_QUEUE = 10.0  # s; a guard: of commands that are kept while nothing else comes
 _SUCCESSORS = 2  # further messages of the IMU tell whether one is an outlier
 
 
@@ -106,17 +107,17 @@ class Queues:
         t = imu_t if has_imu else odometry_t
         if not (final or self._complete(t)):
             return None
-        if has_imu and len(self.imu) <= _SUCCESSORS and not (final or self._overdue(t)):
+        if has_imu and len(self.imu) <= _SUCCESSORS and not (final or self._is_too_far_ahead(t)):
             return None
         return Instant(t, has_imu, merged or not has_imu)
 
-    def _overdue(self, t: float) -> bool:
+    def _is_too_far_ahead(self, t: float) -> bool:
         """Whether the newest stamp is so far ahead of t [s] that nothing more is waited for."""
         return self._latest - t > max(self.grace, self._lateness)
 
     def _complete(self, t: float) -> bool:
         """Whether no topic can still bring a message up to t [s], or it is not worth waiting."""
-        if self._overdue(t):
+        if self._is_too_far_ahead(t):
             return True
         grace = max(self.grace, self._lateness)
         for reach in self._reach.values():

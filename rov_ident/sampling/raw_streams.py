@@ -16,13 +16,14 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, to_core
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
+from rov_ident.core.noise import second_differences
 from rov_ident.model.coefficients import INPUTS
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
-_USUAL = 2.0  # times what 99 % of the messages keep to
+_USUAL = 2.0  # a choice: times what 99 % of the messages keep to
 # of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
 # a tenth as noisy; without noise the sum of true velocities is a fifth of it off
 _RECKONED = 0.1
@@ -74,12 +75,12 @@ class Streams:
 
     @property
     def is_reckoned(self) -> bool:
-        """Whether the position is the sum of the velocities along the attitude, their noise
-        included: it then agrees with them whatever is wrong. Depth may be measured all the same."""
+        """Whether the position is dead reckoning, the sum of the velocities along the attitude with
+        their noise: it agrees with them whatever is wrong. Depth may still be measured."""
         v = np.einsum("kij,kj->ki", quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
         dt = np.diff(self.t)[:, None]
         step = np.diff(self.position[:, :2], axis=0)
-        noise = np.median(np.abs(np.diff(v, 2, axis=0)), axis=0) / np.sqrt(6.0) * np.median(dt)
+        noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(dt)
         rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
         left = [np.median(np.abs(step - dt * rule), axis=0) for rule in rules]
         return bool((np.min(left, axis=0) < _RECKONED * noise).all())
@@ -107,9 +108,9 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
 
     Raises UserError if odometry or wrench are missing.
     """
-    taken, counts = _taken(messages, config)
+    taken, counts = _accepted(messages, config)
     imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
-    odometry = _driven(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
+    odometry = _while_commanded(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
     for name, found in (("odometry", odometry), ("wrench", wrench)):
         if len(found) < 2:
             raise UserError(f"the bag holds no usable {name} messages")
@@ -149,7 +150,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     return Streams(**both), begins
 
 
-def _driven(
+def _while_commanded(
     odometry: list[tuple[float, Any]], commanded: list[float], hold: float, counts: Counter[str]
 ) -> list[tuple[float, Any]]:
     """The messages at times when a command acts: one that has been held for longer than ``hold``
@@ -183,7 +184,7 @@ def _driven_by(taken: list[tuple[float, Any]], config: Config) -> tuple[Array, A
     return t, x
 
 
-def _taken(
+def _accepted(
     messages: Iterable[tuple[str, Message]], config: Config
 ) -> tuple[dict[str, list[tuple[float, Any]]], Counter[str]]:
     """Time [s] and message in core axes of all that the estimators would take, and what is refused.

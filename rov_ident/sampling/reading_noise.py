@@ -13,10 +13,10 @@ import math
 import numpy as np
 
 from rov_ident.core.messages import Array
+from rov_ident.core.noise import robust_std, second_differences
 
 _BLOCK = 50  # commands in which noise is measured, to a fifth
 _ROUNDING = 1e-6  # of the largest command: 32 bits round by less
-OF_MEDIAN = 1.4826  # standard deviation of a normal number over the median of its size
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
@@ -33,21 +33,13 @@ def resting_noise(demand: Array) -> Array:
     return np.where(std > _ROUNDING * np.abs(demand).max(axis=0), std, 0.0)
 
 
-def _medians(demand: Array, size: int) -> Array:
-    """Median (B, 6) of the second differences of readings (K, 6) in each block: a command that
-    moves evenly adds nothing to these, steps that are few add little to their median."""
-    second = np.diff(demand, 2, axis=0) / np.sqrt(6.0)
-    blocks = len(second) // size
-    cut = second[: blocks * size].reshape(blocks, size, 6)
-    out: Array = np.median(np.abs(cut), axis=1)
-    return out
-
-
 def scatter(demand: Array, relative: float = 0.0) -> Array:
     """Standard deviation (B, 6) of the noise of readings (K, 6) in each block. NaN where a noise
     ``relative`` to the wrench, which is known of, makes as much by chance."""
     size = min(_BLOCK, max(len(demand) - 2, 1))
-    std = OF_MEDIAN * _medians(demand, size)
+    second = second_differences(demand)  # steps of the command are too few to move their median
+    blocks = len(second) // size
+    std = robust_std(second[: blocks * size].reshape(blocks, size, 6), axis=1)
     level = demand[: len(std) * size].reshape(len(std), size, 6)
     known = relative * np.sqrt(np.mean(level**2, axis=1))
     std[(std > 0.0) & (std <= _AS_LOUD * known)] = np.nan

@@ -1,7 +1,7 @@
 """A bag as the estimators see it: its samples, and what had to be refused."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
+from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import INPUTS
 from rov_ident.model.equations import Model
-from rov_ident.sampling.sample import believed, joined, stretches
+from rov_ident.sampling.sample import after_reset, joined, stretches
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import describe
 from rov_ident.sampling.without_velocity import IMPOSSIBLE, has_velocity, is_without_velocity
@@ -26,9 +27,6 @@ from rov_ident.simulation.virtual_sensors import Dive
 HORIZON = 10.0  # s; of the open-loop windows by which models are judged
 VELOCITIES = tuple("uvwpqr")
 UNITS = ("m/s",) * 3 + ("rad/s",) * 3
-
-Progress = Callable[[int, int], None]
-"""Called now and then with the messages read so far and in all."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Record:
 
 
 def read_record(
-    path: str | Path, config: Config, progress: Progress | None = None, columns: bool = False
+    path: str | Path, config: Config, say: Progress = silent, columns: bool = False
 ) -> Record:
     """Read a bag into samples; with ``columns`` they say how they change with the estimated
     parameters of effects (:func:`~rov_ident.sampling.sample.sample_type`).
@@ -63,26 +61,21 @@ def read_record(
     """
     bag = Bag(Path(path))
     topics = inputs.select(bag, config)
-    total = inputs.total(bag, topics)
     measured = has_velocity(bag, topics, config)
     sampler = Sampler(config if columns else config.with_effects_held, measured)
     parts: list[NDArray[np.void]] = []
     unusable: Counter[str] = Counter()
-    for done, (role, message) in enumerate(inputs.messages(bag, topics, config, unusable)):
+    for role, message in inputs.messages(bag, topics, config, unusable, say):
         part = sampler.push(role, message)
         if len(part):
             parts.append(part)
-        if progress is not None and done % 2000 == 0:
-            progress(done, total)
     parts.append(sampler.flush())
-    if progress is not None:
-        progress(total, total)
-    samples = believed(joined(parts))
+    samples = after_reset(joined(parts))
     counts = sampler.counts + unusable
     notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
     notes += [] if measured else [f"{bag.path.name}: {IMPOSSIBLE}"]
-    notes += _said_of_inputs(config, samples)
+    notes += _input_notes(config, samples)
     if len(samples) < 2:
         raise UserError(
             f"{path}: its messages make no samples"
@@ -92,8 +85,8 @@ def read_record(
     return Record(Path(path), samples, counts, tuple(notes), bag.sha256, contradictions)
 
 
-def _said_of_inputs(config: Config, samples: NDArray[np.void]) -> list[str]:
-    """Which inputs are not heard, or never change: their coefficients cannot be told."""
+def _input_notes(config: Config, samples: NDArray[np.void]) -> list[str]:
+    """Notes on inputs that are missing or never change: their coefficients cannot be estimated."""
     said = [
         f"{', '.join(names)}: held, as {name} counts as zero: name its joint in inputs.{name}.joint"
         for name, names in config.unheard.items()
@@ -146,7 +139,7 @@ def over_ground(samples: NDArray[np.void]) -> Array:
 
 
 def measured_motion(samples: NDArray[np.void]) -> Array:
-    """:func:`over_ground`, NaN where no linear velocity was measured, but simulated."""
+    """:func:`over_ground`, NaN where linear velocities were simulated, as none was measured."""
     nu = over_ground(samples)
     if is_without_velocity(samples):
         nu[:, :3] = np.nan
@@ -161,18 +154,12 @@ class Score:
     r2: Array
 
 
-def score(
-    model: Model,
-    samples: NDArray[np.void],
-    horizon: float = HORIZON,
-    free: NDArray[np.bool_] | None = None,
-    effects: Acting | None = None,
-) -> Score:
-    """Score the simulation of :func:`predicted` where the velocity was measured: NaN where none
+def score(samples: NDArray[np.void], simulated: Array) -> Score:
+    """Score velocities (k, 6) of :func:`predicted` where the velocity was measured: NaN where none
     was."""
     measured = samples["measured"]
     nu = measured_motion(samples)[measured]
-    error = predicted(model, samples, horizon, free, effects)[measured] - nu
+    error = simulated[measured] - nu
     with np.errstate(invalid="ignore", divide="ignore"):
         rmse = np.sqrt(np.mean(error**2, axis=0))
         r2 = 1.0 - np.sum(error**2, axis=0) / np.sum((nu - nu.mean(axis=0)) ** 2, axis=0)

@@ -18,7 +18,7 @@ SAMPLE = record(
         ("t", "f8"),  # s since the first message
         ("dt", "f8"),  # s since the previous sample
         ("restart", "?"),  # the interval before this sample is not known: filters restart
-        ("anew", "?"),  # the samples before were wrong, too: what they taught is given up
+        ("anew", "?"),  # the samples before were wrong, too: they are discarded
         ("measured", "?"),  # an odometry message belongs to this sample
         ("moving", "u1", (6,)),  # 1: this component of nu is well above its noise
         ("nu", "f8", (6,)),  # m/s, rad/s: through the water
@@ -56,8 +56,8 @@ def joined(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
     return np.frombuffer(bytearray().join(part.tobytes() for part in parts), dtype=parts[0].dtype)
 
 
-def believed(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """Samples (k,) of SAMPLE from the last one on that gives up all before it (``anew``)."""
+def after_reset(samples: NDArray[np.void]) -> NDArray[np.void]:
+    """Samples (k,) of SAMPLE from the last one on that makes all before it invalid (``anew``)."""
     anew = np.flatnonzero(samples["anew"])
     return samples[anew[-1] :] if len(anew) else samples
 

@@ -33,12 +33,11 @@ from rov_ident.sampling.driven import Driven
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.kinematic_filter import KinematicFilter
 from rov_ident.sampling.late_velocities import LateVelocities
-from rov_ident.sampling.queues import Instant, Queues, Waiting
+from rov_ident.sampling.queues import LONGEST_INTERVAL, Instant, Queues, Waiting
 from rov_ident.sampling.sample import joined, one_sample, sample_type
 from rov_ident.sampling.validation import CLOCK_STEP, REPEATED, RESTARTS, Validation
 from rov_ident.sampling.without_velocity import SimulatedVelocity, blank
 
-_LONGEST_INTERVAL = 0.5  # s without a measurement: restart rather than bridge
 _SILENCE = 2.0  # usual intervals, and CLOCK_STEP, without any message: the clock may have stepped
 _SHORTEN, _LENGTHEN = 0.3, 0.05  # weights of an interval in the usual one: gaps only make it longer
 _NO_VALUES = np.zeros(6)
@@ -201,7 +200,7 @@ class Sampler:
     def _sample(self, instant: Instant) -> NDArray[np.void] | None:
         """The sample (1,) of an instant, of which the messages are taken; None if it has none."""
         t, dt = instant.t, instant.t - self._previous
-        restart = not 0.0 < dt <= _LONGEST_INTERVAL or self._is_unknown(t, dt)
+        restart = not 0.0 < dt <= LONGEST_INTERVAL or self._is_unknown(t, dt)
         begin = t if restart else self._previous
         self._previous = t
         wrench = self._acting.over(begin, t, self._queues[WRENCH], self._despiker, self.commands)

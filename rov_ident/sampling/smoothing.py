@@ -64,7 +64,7 @@ def _smooth(part: NDArray[np.void]) -> None:
     t = part["t"]
     error = interpolated(t[seen], error, t)
     down = np.empty((len(part), 3))
-    _turn(ahead, error, part["orientation"], down)
+    _correct_attitude(ahead, error, part["orientation"], down)
     part["down"] = down
     dt = np.maximum(part["dt"][1:], 1e-6)
     part["down_slope"][1:] = (down[1:] - down[:-1]) / dt[:, None]
@@ -113,7 +113,7 @@ def _local_level(z, noise, walk):
 
 
 @kernel
-def _turn(q, error, orientation, down):
+def _correct_attitude(q, error, orientation, down):
     """orientation = exp(error) q, down the third row of its matrix."""
     for k in range(len(q)):
         r = rotation(q[k])

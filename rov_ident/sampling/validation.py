@@ -89,7 +89,7 @@ class Validation:
             self._votes[role] += 1
             return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
-            return f"frame {_shown(frames[-1:])} is a world frame, body axes are needed"
+            return f"frame {_printable(frames[-1:])} is a world frame, body axes are needed"
         # Boyer and Moore's vote: what most of the messages say is held, whichever came first. Two
         # in a row must agree: a frame that is another each time takes nothing over.
         suspect, self._other_frames[role] = self._other_frames.get(role), frames
@@ -97,7 +97,7 @@ class Validation:
             self._frame_ids[role], self._votes[role] = frames, 1
             return "" if held is None else NEW_FRAME
         self._votes[role] = max(self._votes[role] - 1, 0)
-        return f"frame changed from {_shown(held)} to {_shown(frames)}"
+        return f"frame changed from {_printable(held)} to {_printable(frames)}"
 
     def _stamp_fault(self, role: str, stamp: int) -> str:
         """What is wrong with the stamp [ns] after the last one of its topic, or an empty string."""
@@ -107,8 +107,8 @@ class Validation:
         step = (stamp - last) * 1e-9
         if 0.0 < step <= _LARGEST_JUMP:
             return ""
-        # A single wild stamp is an error; two in a row that agree are another clock, as are two a
-        # step behind of which the second goes on from the first: reordered ones are single.
+        # A single wild stamp is an error. Two in a row that agree are of another clock, and so are
+        # two that are both late, the second shortly after the first; reordering makes single ones.
         suspect = self._suspect.get(role)
         self._suspect[role] = stamp
         since = math.inf if suspect is None else (stamp - suspect) * 1e-9
@@ -138,7 +138,7 @@ class Validation:
         return message
 
 
-def _shown(frames: tuple[str, ...]) -> str:
+def _printable(frames: tuple[str, ...]) -> str:
     """Frame ids as they may stand in a log, whatever is in them."""
     return ", ".join(repr(frame if len(frame) <= 40 else f"{frame[:37]}...") for frame in frames)
 

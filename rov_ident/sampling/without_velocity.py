@@ -88,13 +88,13 @@ def _is_measured(message: Odometry) -> bool:
 
 
 def blanked(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
-    """The same messages, of which no odometry has a linear velocity that is not finite."""
+    """The same messages, each odometry as by :func:`blank`."""
     for role, message in messages:
         yield role, blank(message) if isinstance(message, Odometry) else message
 
 
 def blank(message: Odometry) -> Odometry:
-    """The message with a linear velocity of zero, known as well as that it works."""
+    """The message with a linear velocity of zero, uncertain by the working speed."""
     variance = message.twist_variance.copy()
     variance[:3] = WORKING_SPEED[0] ** 2
     return message._replace(linear=np.zeros(3), twist_variance=variance)

@@ -24,8 +24,8 @@ from rov_ident.steering.zigzag import Zigzag
 
 METHODS = ("oe", "fd", "iv", "rls", "ukf")
 ORDERS = (1, 2)
-_MIN_SAMPLES = 20
-_PARTS = 6  # of each run in cross-validation
+_MIN_SAMPLES = 20  # headings: three for each of six parameters, and the first state
+_PARTS = 6  # a choice: of each run in cross-validation, of which four are left out in turn
 
 
 def fit(

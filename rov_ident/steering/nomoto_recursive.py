@@ -134,11 +134,11 @@ class RecursiveNomoto:
             else:
                 span = t - last[0]
                 recursion.step(span, np.array([last[1], heading]), np.array([last[2], rudder]))
-        self.result = self._of_recursions()
+        self.result = self._estimate()
         if self.kind == "ukf":
             self._filter(sample, begins)
 
-    def _of_recursions(self) -> KandT | None:
+    def _estimate(self) -> KandT | None:
         found = [(r.c, r.result) for r in self._recursions]
         known = [(abs(math.log(c * abs(k.values[1]) / _MATCH)), k) for c, k in found if k]
         fitting = [k for off, k in known if off <= _REACH]
@@ -154,7 +154,7 @@ class RecursiveNomoto:
             rough = self.result
             if rough is None or (rough.std > _ROUGHLY * np.abs(rough.values)).any():
                 return
-            self._filters = self._begun(rough)
+            self._filters = self._first_filters(rough)
             for i, (*each, first) in enumerate(self._samples):
                 self._advance((each[0], each[1], each[2]), first or i == 0)
             self._samples = []
@@ -165,7 +165,7 @@ class RecursiveNomoto:
             own = best.p[n : n + 2, n : n + 2] * np.outer(sizes, sizes)
             self.result = _k_and_t(a0, b0, own) or self.result
 
-    def _begun(self, rough: KandT) -> list[Filter]:
+    def _first_filters(self, rough: KandT) -> list[Filter]:
         k, time = rough.values
         t, heading, rudder, _ = np.array(self._samples).T
         theta = np.array([1.0 / time, k / time, 0.0])

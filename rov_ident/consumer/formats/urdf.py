@@ -31,8 +31,8 @@ class _Place(NamedTuple):
     origin: Array
     axes: Array
 
-    def inside(self, other: "_Place") -> "_Place":
-        """What is given in ``other``, in what ``other`` is given in."""
+    def in_parent_of(self, other: "_Place") -> "_Place":
+        """The same pose, relative to ``other``, in the frame that ``other`` is relative to."""
         return _Place(other.origin + other.axes @ self.origin, other.axes @ self.axes)
 
 
@@ -55,7 +55,7 @@ def read(text: str, base: Config | None = None) -> Read:
     robot = xml_root(text, "URDF")
     joints = [_joint(element) for element in robot.findall("joint")]
     links = {link.get("name", ""): link for link in robot.findall("link")}
-    places = _places(list(links), joints)
+    places = _link_poses(list(links), joints)
     notes: list[str] = []
     mass, cog, inertia = _rigid_body(links, places)
     if moving := [j.name for j in joints if j.kind != "fixed" and not _THRUSTER.search(j.name)]:
@@ -94,10 +94,10 @@ def _joint(element: ET.Element) -> _Joint:
         raise UserError(f"the joint {name} lacks a parent or a child link")
     axis = _numbers(element.find("axis"), "xyz", [1.0, 0.0, 0.0])
     parent, child = (str(end.get("link")) for end in ends if end is not None)
-    return _Joint(name, element.get("type", ""), parent, child, _place(element), axis)
+    return _Joint(name, element.get("type", ""), parent, child, _pose_of(element), axis)
 
 
-def _place(element: ET.Element) -> _Place:
+def _pose_of(element: ET.Element) -> _Place:
     origin = element.find("origin")
     roll, pitch, yaw = _numbers(origin, "rpy", [0.0] * 3)
     axes = quaternion_to_matrix(quaternion_from_euler(roll, pitch, yaw))
@@ -119,7 +119,7 @@ def _numbers(element: ET.Element | None, name: str, default: list[float]) -> Arr
     return numbers
 
 
-def _places(links: list[str], joints: list[_Joint]) -> dict[str, _Place]:
+def _link_poses(links: list[str], joints: list[_Joint]) -> dict[str, _Place]:
     """Every link in the body frame."""
     above = {joint.child: joint for joint in joints}
     roots = [name for name in links if name not in above]
@@ -132,11 +132,11 @@ def _places(links: list[str], joints: list[_Joint]) -> dict[str, _Place]:
         if not ready:
             raise UserError(f"the joint {waiting[0].name} hangs on no link of the tree")
         for joint in ready:
-            places[joint.child] = joint.place.inside(places[joint.parent])
+            places[joint.child] = joint.place.in_parent_of(places[joint.parent])
         waiting = [joint for joint in waiting if joint not in ready]
     body = places.get("base_link", places[roots[0]])
     back = _Place(-body.axes.T @ body.origin, body.axes.T)
-    return {name: place.inside(back) for name, place in places.items()}
+    return {name: place.in_parent_of(back) for name, place in places.items()}
 
 
 def _rigid_body(
@@ -149,7 +149,7 @@ def _rigid_body(
         if inertial is None or inertial.find("mass") is None:
             continue
         (mass,) = _numbers(inertial.find("mass"), "value", [0.0])
-        own = _place(inertial).inside(places[name])
+        own = _pose_of(inertial).in_parent_of(places[name])
         tensor = np.zeros((3, 3))
         for key, (i, j) in INERTIA.items():
             tensor[i, j] = tensor[j, i] = _numbers(inertial.find("inertia"), key, [0.0])[0]

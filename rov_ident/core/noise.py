@@ -1,0 +1,20 @@
+"""The standard deviation of noise, in a signal that is not noise alone."""
+
+import numpy as np
+
+from rov_ident.core.messages import Array
+
+_NORMAL = 1.4826  # standard deviation of a normal number over the median of its absolute value
+
+
+def robust_std(error: Array, axis: int = 0) -> Array:
+    """The standard deviation of normal errors along an axis, whatever a minority of them is."""
+    std: Array = _NORMAL * np.median(np.abs(error), axis=axis)
+    return std
+
+
+def second_differences(signal: Array) -> Array:
+    """(K - 2, n) of a signal (K, n), over the square root of 6: white noise keeps its standard
+    deviation, and a signal that changes evenly leaves nothing."""
+    differences: Array = np.diff(signal, 2, axis=0) / np.sqrt(6.0)
+    return differences

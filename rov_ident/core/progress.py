@@ -1,0 +1,13 @@
+"""How long computations say how far they are."""
+
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Called now and then with what is being done, and the share of it that is, where known."""
+
+    def __call__(self, what: str, share: float | None = None) -> None: ...
+
+
+def silent(what: str, share: float | None = None) -> None:
+    """Tells nobody."""
