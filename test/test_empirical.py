@@ -16,15 +16,19 @@ DIVE = hidden.Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 
 
 @pytest.mark.parametrize(
-    "name, seed, strength",
+    "name, seed, strength, seconds",
     [
-        ("heading_moment", 2, 0.3),
-        *more(("bump", 1, 0.15), ("shaking", 1, 0.2), ("slope", 2, 0.1), ("friction", 1, 0.2)),
+        ("heading_moment", 2, 0.3, 60.0),
+        *more(
+            ("bump", 1, 0.15, 60.0), ("shaking", 1, 0.2, 60.0), ("slope", 2, 0.1, 120.0),
+            ("friction", 1, 0.2, 120.0), ("root_damping", 1, 0.3, 120.0),
+        ),
     ],
-)
-def test_an_unknown_effect_is_mended_without_a_name(name, seed, strength, tmp_path):
+)  # fmt: skip
+def test_an_unknown_effect_is_mended_without_a_name(name, seed, strength, seconds, tmp_path):
     """80 % of the gain of the true wrench; what is written simulates it, and is read again."""
-    case = hidden.draw(seed, (), strength, unknown=name, conditions=DIVE)
+    dive = dataclasses.replace(DIVE, duration=seconds)
+    case = hidden.draw(seed, (), strength, unknown=name, conditions=dive)
     streams = streams_of(case)
     found = explain([streams], case.config)
     (term,) = [f for f in found.findings.effects if f.effect == "empirical"]

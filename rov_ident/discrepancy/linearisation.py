@@ -280,7 +280,12 @@ class Linearisation:
         level = median_filter(power, max(5, size // 64)) + 1e-3 * power.max()
         peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
         strongest = peaks[np.argsort(-power[peaks] / np.maximum(level[peaks], 1e-300))]
-        return [float(frequency[i]) for i in strongest[:count]]
+        # between two frequencies by a parabola through logarithms (Smith and Serra 1987): half of
+        # their distance would be a quarter of a period by the end of the record
+        a, b, c = np.log(np.maximum(power[strongest[:count] + [[-1], [0], [1]]], 1e-300))
+        between = 0.5 * (a - c) / np.minimum(a - 2.0 * b + c, -1e-9)
+        found: list[float] = (frequency[strongest[:count]] + between * frequency[1]).tolist()
+        return found
 
 
 def linearise(
