@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 from tiers import more
 
@@ -9,7 +10,7 @@ from bench.simulators import hidden
 from bench.studies.explain import gain_of_unknown, streams_of
 from rov_ident import config as configuration
 from rov_ident.discrepancy.explain import explain
-from rov_ident.effects.empirical import OF, ON
+from rov_ident.effects.empirical import ALONE, EFFECT, OF, ON, wrench
 from rov_ident.model.coefficients import AXES
 
 DIVE = hidden.Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
@@ -54,3 +55,16 @@ def test_a_cause_that_has_a_name_is_not_hidden():
     assert "empirical" not in [
         f.effect for f in explain([streams_of(case)], case.config).findings.effects
     ]
+
+
+@pytest.mark.parametrize("first", ["v", "roll", "thrust"])
+def test_only_functions_of_a_velocity_jump(first):
+    """By their last weight, where the velocity changes its sign."""
+    names = [p.name for p in EFFECT.parameters]
+    of = {"scale": 2.0, "axis": 1.0, "first": OF.index(first), "first_low": -0.5, "first_high": 0.6}
+    p = np.array([{**of, f"w{ALONE}": -3.0}.get(name, 0.0) for name in names])
+    for v in np.linspace(-1.0, 1.0, 21):
+        out, nu = np.zeros(6), np.array([0.0, v, 0.0, 0.0, 0.0, 0.0])
+        wrench(p, 0.0, np.zeros(3), nu, np.eye(3), np.full(6, v), out)
+        jump = -6.0 * np.tanh(v / (0.03 * 0.6)) if first == "v" else 0.0
+        np.testing.assert_allclose(out, [0.0, jump, 0.0, 0.0, 0.0, 0.0], atol=1e-12)

@@ -21,6 +21,7 @@ KNOWN_TO = dict.fromkeys(ROS, "nodes") | {
     "mcap": "io",
     "numba": "core/jit.py",
     "llvmlite": "core/jit.py",
+    "matplotlib": "reports",
 }
 """Which room, or file of it, alone imports a package."""
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -54,12 +53,9 @@ from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
-from rov_ident.reports.result import Shown
+from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
 from rov_ident.sampling.raw_streams import Streams, joined
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
@@ -115,7 +111,7 @@ class Explanation(Shown):
         """The error of the three models, and every effect found with its gain."""
         return report().tables(self.findings)
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """Motion, gain and departure of the velocity that gains most."""
         return report().picture(self)
 

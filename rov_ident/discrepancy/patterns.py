@@ -23,7 +23,7 @@ from rov_ident.model.equations import Array
 
 INTERPLAY = "all|thrust of other axes"
 _KNOTS = 12.0  # s between the knots of a function of time
-_MOST_KNOTS = 40
+_MOST_KNOTS = 40  # in eight minutes; of longer records only what changes more slowly is seen
 
 # Effort: the times and rates in docs/explain-bench.md were measured with these.
 _SCORED = 10  # patterns of which stepwise selection is made, of some 75

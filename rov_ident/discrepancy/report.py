@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from rov_ident import config as configuration
 from rov_ident.config import Config
@@ -18,7 +17,7 @@ from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
-from rov_ident.reports.result import NORMAL
+from rov_ident.reports.result import NORMAL, Figure
 from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate, number
 from rov_ident.sampling import records
 
@@ -36,8 +35,8 @@ _TOLD = 3  # parameters of an effect in the verdict
 _SMALL = 0.1  # of the largest of its parameters: smaller ones are left to the card
 _STRETCH = 30.0  # s of motion that is shown
 _BIN = 5.0  # s; of the error over time
-_MOST_BINS = 60
-_SPEED_BINS = 11
+_MOST_BINS = 60  # of the error over time, and 11 over velocity, which show: choices of drawing
+_SPEED_BINS = 11  # odd: one is about rest
 _LEAST = 20  # samples in a bin, below which its error means nothing
 _STILL = 0.05  # of the largest motion: below it an axis counts as not moved
 _GAP = 1.0  # s without a measurement: curves break
