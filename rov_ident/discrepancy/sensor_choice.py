@@ -32,7 +32,7 @@ from rov_ident.sampling.raw_streams import Streams
 from rov_ident.sampling.reading_noise import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
-BIAS = "imu_bias"
+BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
@@ -216,8 +216,9 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
 def _without_refuted(data: Data, choice: Choice) -> Choice:
     """Without the corrections of velocities that make the prediction of the data surely worse."""
     late = [n for n in choice.sensors if EFFECTS[n].late]
-    if late and not data.streams.has_pose:  # the clock of the IMU may be off instead
-        choice = dataclasses.replace(choice, unsure=choice.unsure | set(late))
+    if not data.streams.has_pose:  # clock or place of the IMU may be off instead
+        unsure = choice.unsure | ({*late, ARM} & choice.sensors.keys())
+        choice = dataclasses.replace(choice, unsure=unsure)
     corrects = [n for n in choice.sensors if EFFECTS[n].sense or n in late]
     corrects = [n for n in corrects if _moves_velocity(n, choice.sensors[n])]
     squares = data.dynamics(choice.sensors) if corrects else None
