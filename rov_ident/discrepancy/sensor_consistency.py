@@ -74,8 +74,8 @@ _LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
 
 TIMING = (
     *(("thrust held", axis) for axis in "XYZ"),
-    ("clock", "imu"),
     *(("arm of the imu", axis) for axis in "xyz"),
+    ("clock", "imu"),
 )
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
@@ -148,12 +148,12 @@ def comparisons(
                 for by in (-_CLOCK, _CLOCK)
             )
             clock = (early - late) / (2.0 * _CLOCK)
-        arms = none[-3:]
+        arms = none[:3]
         if streams.has_pose:
             arms = [
                 -np.einsum("kij,kj->ki", r, velocity_of_arm(gyrating, axis)) for axis in np.eye(3)
             ]
-        columns += [c[inside] for c in (clock, *arms)]
+        columns += [c[inside] for c in (*arms, clock)]
         made.append(("imu", t, y, columns))
         y = here.angular[inside] - here.gyro[inside]
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
