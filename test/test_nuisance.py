@@ -391,3 +391,7 @@ def test_the_thrust_is_as_uncertain_as_the_righting_arm(seed):
     inside = (report.lower[at] <= true) & (true <= report.upper[at])
     assert inside.mean() > 0.85
     assert report.consistency.consistent
+    # to one side the centre of gravity is known no better than the attitude, which errs for long
+    moment = config.odometry.attitude_std * dive.parameters["vehicle"]["cob"][2]
+    least = abs(moment) * np.sqrt(2.0 * ATTITUDE_LASTS / 60.0)
+    assert report.std[report.names.index("cog_offset.dy")] > 0.9 * least
