@@ -17,6 +17,7 @@ from rov_ident.core.frames import (
     quaternion_from_euler,
     quaternion_from_rotation_vector,
     quaternion_multiply,
+    quaternion_to_matrix,
     velocity_of_arm,
 )
 from rov_ident.discrepancy import (
@@ -516,3 +517,18 @@ def test_an_imu_elsewhere_is_no_velocity_sensor_elsewhere(seed):
     for name, value in zip("xyz", arm.tolist()):
         apart = abs(found["sensor_lever_arm"][name] - value)
         assert apart < 3.5 * std["sensor_lever_arm", name] < 0.05
+
+
+@pytest.mark.parametrize("seed", [5, *more(0, 1, 2, 3, 4)])
+def test_a_turned_velocity_sensor_in_a_current_is_no_heading_for_sure(seed):
+    """Dynamics that know no current preferred a heading, which a current that is missing turns."""
+    _, streams, config = streams_of("current", "pilot", seed, 120.0)
+    rng, (fitted, held) = np.random.default_rng(seed), split(streams.duration)
+    angles = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.03, 0.08, 3)
+    r = quaternion_to_matrix(quaternion_from_euler(*angles))
+    nu = np.hstack([streams.nu[:, :3] @ r, streams.nu[:, 3:]])
+    turned = dataclasses.replace(streams, nu=nu)
+    choice = sensor_choice.chosen(turned, fitted, turned, held, config, np.full(3, 1e-4))
+    named = [n for n in ("heading_offset",) if n in choice.sensors]
+    assert all(choice.alternatives.get(n) or n in choice.unsure for n in named)
+    assert {"heading_offset", "sensor_misalignment"} & choice.sensors.keys()

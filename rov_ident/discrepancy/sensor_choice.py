@@ -19,7 +19,7 @@ from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key, bounds
-from rov_ident.discrepancy.output_error import Fitted, fit
+from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import VERY_STRONG, mean_inflation
@@ -34,6 +34,7 @@ from rov_ident.sampling.reading_noise import RESTING
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
+_WATER = (("ocean_current", "north"), ("ocean_current", "east"))
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
@@ -73,13 +74,17 @@ class Data:
     def dynamics(self, sensors: Sensors, axes: str = AXES) -> Array | None:
         """Squared errors (C, free axes) of held-out data as recorded, summed over chunks, of the
         model fitted to corrected data, on those of the ``axes`` that are simulated; None where it
-        cannot be."""
+        cannot be. A current is allowed for: what turns the velocities turns it, too, and a model
+        without it would choose what makes least of it."""
         streams, judged = (
             sensor_consistency.corrected(s, sensors) for s in (self.streams, self.judged)
         )
         fitted = Search(streams, self.config, thinned(self.spans)).start()
         if fitted is None:
             return None
+        if self.config.current_std > 0.0 and _WATER[0][0] not in self.config.effects:
+            h = fitted.hypothesis.having(dict.fromkeys(_WATER, 0.0))
+            fitted = refit(h, fitted.linearisation, update_noise=True) or fitted
         judge = Judge(WindowedProblem(judged, self.held), sensors)
         use = [i for i in np.flatnonzero(~streams.guided) if AXES[i] in axes]
         return judge.summed(fitted.hypothesis)[:, use] if use else None
