@@ -209,7 +209,12 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
     rivals = {
         name: tuple(
             dict.fromkeys(
-                n for i in left for n in variants[i].sensors if n not in variants[mine].sensors
+                n
+                for i in left
+                for n in variants[i].sensors
+                # a tilt of the sensor is in both, and its yaw in one
+                if n not in variants[mine].sensors
+                or (name not in variants[i].sensors and n in (HEADING, MOUNTING))
             )
         )
         for name in variants[mine].sensors
