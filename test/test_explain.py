@@ -515,3 +515,6 @@ def test_what_may_have_begun_before_the_bag_is_not_told_from_what_lasts():
         assert found.separable == told
         assert (found.manoeuvre is None) == told
         assert ("buoyancy" in [a.effect for a in found.alternatives]) == (not told)
+        # nor where the first window alone, with what its commands found, would have to tell it
+        assert possibly_earlier(finding, 5.0).separable == told
+        assert not possibly_earlier(finding, 39.5).separable

@@ -13,9 +13,12 @@ from bench.studies.at_sea import dive_of
 from bench.studies.explain_at_sea import CASES
 from rov_ident import config as configuration
 from rov_ident.core.frames import (
+    acceleration_of_arm,
     quaternion_from_euler,
     quaternion_from_rotation_vector,
     quaternion_multiply,
+    quaternion_to_matrix,
+    velocity_of_arm,
 )
 from rov_ident.discrepancy import (
     patterns,
@@ -539,3 +542,40 @@ def test_a_bias_of_the_gyro_is_named_and_nothing_else():
     for name, true in zip(("gx", "gy", "gz"), dive.sea.gyro_bias, strict=True):
         assert found.parameters[name].value == pytest.approx(true, abs=4e-4)
     assert at_sea.CASES["biases"]
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+def test_an_imu_elsewhere_is_no_velocity_sensor_elsewhere(seed):
+    """Only the pose tells which of the two is not where the file has it: an IMU 0.25 m off passed
+    for a velocity sensor 0.2 m off."""
+    _, streams, config = streams_of("clean", "six-axis", seed)
+    rng, spans = np.random.default_rng(seed), [(0.0, streams.duration)]
+    arm = 0.25 * rng.choice([-1.0, 1.0], 3)
+    turn = np.gradient(streams.gyro, streams.imu_t, axis=0)
+    moved = streams.specific_force + acceleration_of_arm(streams.gyro, turn, arm)
+    imu = dataclasses.replace(streams, specific_force=moved)
+    found, std = sensor_consistency.search(imu, config, spans, ["sensor_lever_arm"])
+    for name, value in found["sensor_lever_arm"].items():
+        assert abs(value) < 3.5 * std["sensor_lever_arm", name] < 0.05
+    nu = streams.nu.copy()
+    nu[:, :3] += velocity_of_arm(nu[:, 3:], arm)
+    log = dataclasses.replace(streams, nu=nu)
+    found, std = sensor_consistency.search(log, config, spans)
+    for name, value in zip("xyz", arm.tolist()):
+        apart = abs(found["sensor_lever_arm"][name] - value)
+        assert apart < 3.5 * std["sensor_lever_arm", name] < 0.05
+
+
+@pytest.mark.parametrize("seed", [5, *more(0, 1, 2, 3, 4)])
+def test_a_turned_velocity_sensor_in_a_current_is_no_heading_for_sure(seed):
+    """Dynamics that know no current preferred a heading, which a current that is missing turns."""
+    _, streams, config = streams_of("current", "pilot", seed, 120.0)
+    rng, (fitted, held) = np.random.default_rng(seed), split(streams.duration)
+    angles = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.03, 0.08, 3)
+    r = quaternion_to_matrix(quaternion_from_euler(*angles))
+    nu = np.hstack([streams.nu[:, :3] @ r, streams.nu[:, 3:]])
+    turned = dataclasses.replace(streams, nu=nu)
+    choice = sensor_choice.chosen(turned, fitted, turned, held, config, np.full(3, 1e-4))
+    named = [n for n in ("heading_offset",) if n in choice.sensors]
+    assert all(choice.alternatives.get(n) or n in choice.unsure for n in named)
+    assert {"heading_offset", "sensor_misalignment"} & choice.sensors.keys()

@@ -138,6 +138,11 @@ def test_a_height_is_known_no_better_than_what_it_stands_for(heavy, arm):
 
     assert std("cog_offset", dz, False) == pytest.approx(np.hypot(0.001, 0.15 * arm), rel=0.02)
     assert std("cog_offset", dz, True) == 1e-6
+    # to one side it is told in shares of the arm, by the heel at rest
+    dx = {"dx": Value(2e-3, 1e-6, "m")}
+    assert std("cog_offset", dx, True) == pytest.approx(2e-3 * 0.001 / arm, rel=0.02)
+    of_both = np.hypot(0.001, 0.15 * arm) / arm
+    assert std("cog_offset", dx, False) == pytest.approx(2e-3 * of_both, rel=0.02)
     assert std("thrust_scale", scale, True) == pytest.approx(1.05 * 0.001 / arm, rel=0.02)
     known = from_parameters(raw)
     assert std("cog_offset", dz, False, known) == 1e-6

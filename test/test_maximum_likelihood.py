@@ -8,6 +8,7 @@ from tiers import more
 
 from rov_ident.core.errors import UserError
 from rov_ident.io.write_messages import write_messages
+from rov_ident.model.scales import authority
 from rov_ident.offline import maximum_likelihood as ml
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.batch_fit import Settings, fit_batch
@@ -157,6 +158,19 @@ def test_noise_levels_are_found(heavy):
     np.testing.assert_allclose(np.sqrt(found.noise.measurement[:3]), 2.0, rtol=0.1)
     np.testing.assert_allclose(np.sqrt(found.noise.measurement[3:]), 1.0, rtol=0.1)
     assert found.noise.relative == pytest.approx(0.03, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+def test_noise_of_a_model_that_was_wrong_is_left_again(heavy, samples, seed):
+    """Read again about another lag, a bag begins with the noise that was found about the last one:
+    a gyro without noise and a wrench that nothing is known of is a valley of its own."""
+    rng = np.random.default_rng(seed)
+    likely, floor = ml.assumed(heavy), rng.uniform(0.03, 0.1, 6) * authority(heavy.dynamics)
+    measurement = np.where(np.arange(6) == rng.integers(3, 6), 1e-4, 0.1)
+    wrong = dataclasses.replace(likely, measurement=measurement, floor=floor**2)
+    found = ml.maximise(in_one(samples), heavy, heavy.model, first_noise=wrong)
+    assert np.max(np.sqrt(found.noise.floor) / authority(heavy.dynamics)) < 0.003
+    np.testing.assert_allclose(np.sqrt(found.noise.measurement), 1.0, rtol=0.15)
 
 
 @pytest.mark.parametrize("dives", [2, *more(6)])

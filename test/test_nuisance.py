@@ -17,6 +17,8 @@ from bench.simulators import sea
 from bench.studies import at_sea
 from rov_ident import config as configuration
 from rov_ident.config.prior import (
+    ATTITUDE_LASTS,
+    attitude_covariance,
     drift_of,
     prior_of,
     righting_arm_covariance,
@@ -328,6 +330,50 @@ def test_pilots_show_no_delay_where_there_is_none(seed, kind):
 
 
 @pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+def test_a_trim_is_told_in_shares_of_the_righting_arm(heavy, seed):
+    """A heel at rest tells how far the centre of gravity is to one side, over the arm: a height
+    that is off by a part of the arm moves both by it, as it does the thrust."""
+    rng = np.random.default_rng(seed)
+    parameters = configuration.to_parameters(heavy)
+    arm = rng.uniform(0.01, 0.05)
+    parameters["vehicle"] |= {"cob": [0.0, 0.0, -arm], "cob_std": 0.001, "cog_std": 0.005}
+    parameters["wrench"].pop("scale_std", None)
+    config = configuration.from_parameters(parameters).with_nuisance
+    names, body = prior_of(config, effects=True).names, config.model.body
+    values = prior_of(config, effects=True).mean
+    at = [names.index(f"cog_offset.{d}") for d in ("dx", "dy", "dz")]
+    values[at] = rng.normal(0.0, 0.003, 3)
+    scale = names.index("thrust_scale.scale")
+    part = righting_arm_covariance(config, names, values)[np.ix_([*at, scale], [*at, scale])]
+    share = 0.001 / (arm * body.buoyancy / body.weight)
+    moved = share * np.append(values[at], 1.0)
+    np.testing.assert_allclose(part, np.outer(moved, moved), rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+def test_the_error_of_an_attitude_lasts(heavy, seed):
+    """Of AHRS that wander by 5 mrad, the mean over a dive is a trim by the arm times it."""
+    rng = np.random.default_rng(seed)
+    parameters = configuration.to_parameters(heavy)
+    parameters["vehicle"] |= {"cog_std": 0.005}
+    parameters["odometry"] |= {"attitude_std": 0.005}
+    config = configuration.from_parameters(parameters).with_nuisance
+    names, body = prior_of(config, effects=True).names, config.model.body
+    seconds, dt, dives = rng.uniform(100.0, 300.0), 0.5, 2000
+    keep = np.exp(-dt / ATTITUDE_LASTS)
+    tilt, mean = 0.005 * rng.standard_normal(dives), np.zeros(dives)
+    for _ in range(round(seconds / dt)):
+        tilt = keep * tilt + 0.005 * np.sqrt(1.0 - keep**2) * rng.standard_normal(dives)
+        mean += tilt * dt / seconds
+    std = np.sqrt(np.diag(attitude_covariance(config, names, seconds)))
+    arm = abs(body.restoring[3, 1]) / body.weight
+    stated = dict(zip(names, std.tolist(), strict=True))
+    assert stated["cog_offset.dx"] == pytest.approx(arm * np.std(mean), rel=0.12)
+    assert stated["cog_offset.dy"] == stated["cog_offset.dx"]
+    assert not any(s for n, s in stated.items() if n not in ("cog_offset.dx", "cog_offset.dy"))
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
 def test_the_thrust_is_as_uncertain_as_the_righting_arm(seed):
     """A centre of buoyancy that is off by about a millimetre: all is wrong, and nothing sure."""
     dive = at_sea.dive_of("clean", "six-axis", seed, 60.0)
@@ -345,3 +391,7 @@ def test_the_thrust_is_as_uncertain_as_the_righting_arm(seed):
     inside = (report.lower[at] <= true) & (true <= report.upper[at])
     assert inside.mean() > 0.85
     assert report.consistency.consistent
+    # to one side the centre of gravity is known no better than the attitude, which errs for long
+    moment = config.odometry.attitude_std * dive.parameters["vehicle"]["cob"][2]
+    least = abs(moment) * np.sqrt(2.0 * ATTITUDE_LASTS / 60.0)
+    assert report.std[report.names.index("cog_offset.dy")] > 0.9 * least

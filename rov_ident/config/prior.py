@@ -72,6 +72,7 @@ def prior_of(config: Config, effects: bool = False) -> Prior:
 _REACH = 3.0  # of 1000 normal deviates, three are further off
 _CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
 _ATTITUDE_TIME = 1500.0  # s; a lasting error of the attitude wanders by its deviation in half of it
+ATTITUDE_LASTS = 15.0  # s; over which an AHRS is off in one direction, until gravity corrects it
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
@@ -113,6 +114,20 @@ def drift_of(config: Config, names: tuple[str, ...]) -> Array:
     return np.array([rate(name) for name in names])
 
 
+def attitude_covariance(
+    config: Config, names: tuple[str, ...], seconds: float, gain: Array | None = None
+) -> Array:
+    """What the attitude's error adds to the covariance (n, n) of estimates from ``seconds``.
+
+    It lasts, and the moment of weight turned by it is that of a centre of gravity that is to one
+    side by the arm times the error ("Trim" in docs/accuracy.md): by their mean over the record.
+    """
+    mean = np.sqrt(min(2.0 * ATTITUDE_LASTS / max(seconds, 1e-9), 1.0))
+    body = config.model.body
+    aside = abs(body.righting_arm) * config.odometry.attitude_std * mean
+    return _consider_covariance([{n: aside} for n in _COG_OFFSET[:2]], names, gain)
+
+
 def rigid_body_covariance(
     config: Config, names: tuple[str, ...], values: Array, gain: Array | None = None
 ) -> Array:
@@ -146,7 +161,9 @@ def righting_arm_covariance(
 
     The equations of motion stay the same with the righting moment, thrust, drag and all inertia,
     added and own, times k. So only the arm of that moment determines the scale, and a wrong height
-    scales all of these. No manoeuvre reduces this error, so convergence is judged without it.
+    scales all of these; and with them the centre of gravity, as a heel at rest tells how far it is
+    to one side in shares of the arm. No manoeuvre reduces this error, so convergence is judged
+    without it.
     """
     body, std = config.model.body, config.vehicle_uncertainty.cob_std
     arm = abs(body.righting_arm)
@@ -155,6 +172,11 @@ def righting_arm_covariance(
     masses, moments = _own_inertia(body)
     own = masses | moments
     moved = {n: share * (v - own.get(n, 0.0)) for n, v in _with_thrust(names, values).items()}
+    if moved:
+        aside = body.cog - np.array([1.0, 1.0, 0.0]) * body.cob * body.buoyancy / body.weight
+        of_all = dict(zip(names, values.tolist(), strict=True))
+        offsets = zip(_COG_OFFSET, aside.tolist(), strict=True)
+        moved |= {n: share * (off + of_all[n]) for n, off in offsets if n in of_all}
     return _consider_covariance([moved], names, gain)
 
 
@@ -194,6 +216,7 @@ def gain_of(covariance: Array, std: Array) -> Array:
 
 
 THRUST_SCALE = "thrust_scale.scale"
+_COG_OFFSET = ("cog_offset.dx", "cog_offset.dy", "cog_offset.dz")
 
 
 def moves_with_thrust(name: str) -> bool:

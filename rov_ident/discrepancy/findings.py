@@ -24,7 +24,7 @@ from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import BIAS, HEADING, NOISE, with_noise
-from rov_ident.discrepancy.windowed_problem import Spans
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
@@ -121,8 +121,15 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
             parameters=parameters,
             onset_s=None if onset is None else onset.value,
             sentence=sentence(found.effect, parameters, found.gain),
-        )
+        ),
+        _first_seen(last.linearisation.problem),
     )
+
+
+def _first_seen(problem: WindowedProblem) -> float:
+    """The end [s] of the first window: what began before it is told from what was there before
+    the bag by that window alone, whose thrust comes from commands that nobody knows."""
+    return float(problem.steps.t[problem.last[0]])
 
 
 def as_the_arm_is_known(
@@ -131,14 +138,22 @@ def as_the_arm_is_known(
     """Parameters with what the righting arm, and the thrust where no scale of it is in the model
     (``scaled``), are not known to. With the righting moment, thrust and all coefficients times k
     nothing moves otherwise (:func:`righting_arm_covariance`): what is off in height or in thrust
-    is, to the data, a height of the centre of gravity, or else that scale."""
+    is, to the data, a height of the centre of gravity, or else that scale. And what is to one side
+    is told in shares of the arm, by the heel at rest."""
     body, height = config.model.body, config.vehicle_uncertainty.cob_std
-    arm, of_thrust = abs(body.restoring[3, 1]) / body.weight, config.wrench.scale_std
+    arm, of_thrust = abs(body.righting_arm), config.wrench.scale_std
     out = dict(parameters)
-    if effect == "cog_offset" and not scaled:
-        dz = out["dz"]
-        std = float(np.hypot(dz.std, np.hypot(height, arm * of_thrust)))
-        out["dz"] = dataclasses.replace(dz, std=std)
+    if effect == "cog_offset":
+        height = float(np.hypot(height, 0.0 if scaled else arm * of_thrust))
+        aside = body.cog - body.cob * body.buoyancy / body.weight
+        share = min(height / max(arm, 1e-9), 1.0)
+        for name, off in zip(("dx", "dy"), aside.tolist(), strict=False):
+            if name in out:
+                std = np.hypot(out[name].std, share * (off + out[name].value))
+                out[name] = dataclasses.replace(out[name], std=float(std))
+        if "dz" in out and not scaled:
+            dz = out["dz"]
+            out["dz"] = dataclasses.replace(dz, std=float(np.hypot(dz.std, height)))
     elif effect == _SCALE:
         scale = out["scale"]
         share = min(height / max(arm, 1e-9), of_thrust)
@@ -147,10 +162,11 @@ def as_the_arm_is_known(
     return out
 
 
-def possibly_earlier(found: Finding) -> Finding:
-    """Not separable from what lasts, where the effect may have begun before the bag did."""
+def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:
+    """Not separable from what lasts, where the effect may have begun before the bag did, or before
+    ``seen`` [s], up to where a single window would have to tell it."""
     onset, lasting = found.parameters.get("onset"), EFFECTS[found.effect].lasting
-    if onset is None or not lasting or onset.value - 2.0 * onset.std > 0.0:
+    if onset is None or not lasting or onset.value - 2.0 * onset.std > seen:
         return found
     kept = tuple(a for a in found.alternatives if a.why_not == _EQUAL)
     equal = {a.effect for a in kept}

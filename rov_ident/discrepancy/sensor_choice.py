@@ -19,7 +19,7 @@ from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key, bounds
-from rov_ident.discrepancy.output_error import Fitted, fit
+from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import VERY_STRONG, mean_inflation
@@ -32,8 +32,9 @@ from rov_ident.sampling.raw_streams import Streams
 from rov_ident.sampling.reading_noise import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
-BIAS = "imu_bias"
+BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
+_WATER = (("ocean_current", "north"), ("ocean_current", "east"))
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
@@ -73,13 +74,17 @@ class Data:
     def dynamics(self, sensors: Sensors, axes: str = AXES) -> Array | None:
         """Squared errors (C, free axes) of held-out data as recorded, summed over chunks, of the
         model fitted to corrected data, on those of the ``axes`` that are simulated; None where it
-        cannot be."""
+        cannot be. A current is allowed for: what turns the velocities turns it, too, and a model
+        without it would choose what makes least of it."""
         streams, judged = (
             sensor_consistency.corrected(s, sensors) for s in (self.streams, self.judged)
         )
         fitted = Search(streams, self.config, thinned(self.spans)).start()
         if fitted is None:
             return None
+        if self.config.current_std > 0.0 and _WATER[0][0] not in self.config.effects:
+            h = fitted.hypothesis.having(dict.fromkeys(_WATER, 0.0))
+            fitted = refit(h, fitted.linearisation, update_noise=True) or fitted
         judge = Judge(WindowedProblem(judged, self.held), sensors)
         use = [i for i in np.flatnonzero(~streams.guided) if AXES[i] in axes]
         return judge.summed(fitted.hypothesis)[:, use] if use else None
@@ -194,7 +199,12 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
     rivals = {
         name: tuple(
             dict.fromkeys(
-                n for i in left for n in variants[i].sensors if n not in variants[mine].sensors
+                n
+                for i in left
+                for n in variants[i].sensors
+                # a tilt of the sensor is in both, and its yaw in one
+                if n not in variants[mine].sensors
+                or (name not in variants[i].sensors and n in (HEADING, MOUNTING))
             )
         )
         for name in variants[mine].sensors
@@ -206,8 +216,9 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
 def _without_refuted(data: Data, choice: Choice) -> Choice:
     """Without the corrections of velocities that make the prediction of the data surely worse."""
     late = [n for n in choice.sensors if EFFECTS[n].late]
-    if late and not data.streams.has_pose:  # the clock of the IMU may be off instead
-        choice = dataclasses.replace(choice, unsure=choice.unsure | set(late))
+    if not data.streams.has_pose:  # clock or place of the IMU may be off instead
+        unsure = choice.unsure | ({*late, ARM} & choice.sensors.keys())
+        choice = dataclasses.replace(choice, unsure=unsure)
     corrects = [n for n in choice.sensors if EFFECTS[n].sense or n in late]
     corrects = [n for n in corrects if _moves_velocity(n, choice.sensors[n])]
     squares = data.dynamics(choice.sensors) if corrects else None

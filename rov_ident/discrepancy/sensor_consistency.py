@@ -27,6 +27,7 @@ from rov_ident.core.frames import (
     quaternion_from_euler,
     quaternion_multiply,
     quaternion_to_matrix,
+    velocity_of_arm,
 )
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
@@ -72,13 +73,17 @@ class Comparison:
 
 _LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
 
-TIMING = (*(("thrust held", axis) for axis in "XYZ"), ("clock", "imu"))
+TIMING = (
+    *(("thrust held", axis) for axis in "XYZ"),
+    *(("arm of the imu", axis) for axis in "xyz"),
+    ("clock", "imu"),
+)
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
 To the accelerations of thrust that is a time offset of milliseconds, the drag that answers to them
 is not offset: together they would pass for a velocity scale of up to two percent. And the IMU's
 stamps may be early or late by milliseconds: only a pose of their own clock tells that velocities
-are old.
+are old. And the IMU may sit elsewhere than configured: only a pose tells that of the velocities.
 """
 
 
@@ -144,7 +149,12 @@ def comparisons(
                 for by in (-_CLOCK, _CLOCK)
             )
             clock = (early - late) / (2.0 * _CLOCK)
-        columns.append(clock[inside])
+        arms = none[:3]
+        if streams.has_pose:
+            arms = [
+                -np.einsum("kij,kj->ki", r, velocity_of_arm(gyrating, axis)) for axis in np.eye(3)
+            ]
+        columns += [c[inside] for c in (*arms, clock)]
         made.append(("imu", t, y, columns))
         y = here.angular[inside] - here.gyro[inside]
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]

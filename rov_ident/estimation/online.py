@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config, load
 from rov_ident.config.prior import (
+    attitude_covariance,
     first_centre,
     gain_of,
     prior_of,
@@ -435,8 +436,10 @@ class OnlineEstimator:
             for i in range(len(values))
         ]
         if not diverged:
+            seconds = float(self._state.monitor["judged"].max())
+            trim = attitude_covariance(self.config, raw.names, seconds, gain)
             arm = righting_arm_covariance(self.config, raw.names, raw.values, gain)
-            covariance = covariance + arm
+            covariance = covariance + trim + arm
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
         upper = np.minimum(values + NORMAL * std, self.prior.upper)

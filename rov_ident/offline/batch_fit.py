@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import (
     Prior,
+    attitude_covariance,
     first_centre,
     gain_of,
     prior_of,
@@ -37,6 +38,7 @@ from rov_ident.offline.fit import IDENTIFIABLE, Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
+from rov_ident.sampling.sample import parts
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
@@ -322,6 +324,8 @@ def _stage(
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
+    seconds = float(sum(archive.each(_seconds)))
+    covariance = covariance + attitude_covariance(config, names, seconds, gain)
     arm = righting_arm_covariance(config, names, found, gain)
     # What moments and tilt suggest of these is in the values, but the intervals are the prior's.
     own = _coefficients(config).items()
@@ -455,6 +459,11 @@ def predicted_information(
 def _mean_square_wrench(samples: Samples) -> Array:
     """(6,) over the samples."""
     return np.mean(samples["wrench"] ** 2, axis=0)
+
+
+def _seconds(samples: Samples) -> float:
+    samples, _ = parts(samples)
+    return float(np.sum(samples["dt"]))
 
 
 def _velocity_range(samples: Samples) -> tuple[Array, Array]:

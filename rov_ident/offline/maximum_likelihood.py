@@ -347,7 +347,7 @@ def maximise(
     """The estimates of largest likelihood, starting from the values of ``model`` and those of
     ``effects`` (p,) (None: as configured). ``precision`` (n,) is the prior's, of coefficients and
     then of parameters of effects. ``process``: the wrench has errors, else pure output error.
-    ``first_noise``: the levels to begin with; None: the best of several.
+    ``first_noise``: levels to begin with besides those of the configuration.
 
     Raises UserError if the model cannot be simulated.
     """
@@ -367,7 +367,7 @@ def maximise(
         exact = np.zeros_like(likely.restoring)
         starts = [replace(likely, floor=np.zeros(6), relative=0.0, restoring=exact)]
     if first_noise is not None:
-        starts = [first_noise]
+        starts = [starts[0], first_noise]  # that of a wrong lag may be a valley far away
 
     def at_values(theta: Array) -> Model:
         moved = model.theta.copy()
