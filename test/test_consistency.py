@@ -21,6 +21,7 @@ from rov_ident.core.states import State
 from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
+from rov_ident.model.scales import authority
 
 FALSE = {
     "velocity frozen": lambda rng: {"frozen_from": rng.uniform(20.0, 30.0)},
@@ -191,12 +192,26 @@ def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):
     prior = prior_of(heavy)
     n = len(prior.names)
     small = np.diag((0.01 * prior.std) ** 2)
+    heavy = replace(heavy, odometry=replace(heavy.odometry, attitude_std=0.0))
     four = consistency_of(heavy, prior, prior.mean, np.array([0.04, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(np.sqrt(np.diag(four.widened(small, prior.std))), 0.04 * prior.std)
     thousand = consistency_of(heavy, prior, prior.mean, np.array([10.0, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(np.sqrt(np.diag(thousand.widened(small, prior.std))), prior.std)
     assert Consistency(()).widened(small, prior.std) == pytest.approx(small)
     assert len(small) == n
+
+
+@pytest.mark.parametrize("arm", [0.01, 0.1])
+def test_what_an_error_of_the_attitude_rights_is_no_force_that_the_model_lacks(heavy, arm):
+    """Weight turns a vehicle at rest back to where it is said to be level: the longer the arm, the
+    larger the moment that an attitude off by attitude_std makes, in roll and pitch alone."""
+    body = replace(heavy.model.body, cob=np.array([0.0, 0.0, -arm]))
+    heavy = heavy.with_model(replace(heavy.model, body=body))
+    made = heavy.odometry.attitude_std * body.buoyancy * arm / authority(heavy.model)
+    expected = np.hypot(0.01, np.where([0, 0, 0, 1, 1, 0], made, 0.0))
+    found = consistency_of(heavy, prior_of(heavy), prior_of(heavy).mean, np.full(6, 0.01))
+    limits = [test.limit for test in found.tests if test.name.startswith("unexplained")]
+    np.testing.assert_allclose(limits, expected, rtol=1e-3)
 
 
 def test_a_fit_that_predicts_worse_than_its_file_is_said_to(heavy):

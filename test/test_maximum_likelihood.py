@@ -123,7 +123,7 @@ def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
     rng, n, held = np.random.default_rng(2), 5, np.arange(5) >= 3
     root = rng.standard_normal((n, n))
     information, precision = root @ root.T, rng.uniform(0.1, 1.0, n)
-    bound, covariance = ml._considered(information, information, precision, held)
+    bound, covariance = ml._with_consider_parameters(information, information, precision, held)
     ours = np.linalg.inv((information + np.diag(precision))[:3, :3])
     alike = information.copy()
     alike[3:, 3:] = information[3:, :3] @ ours @ information[:3, 3:]
@@ -132,7 +132,7 @@ def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
     np.testing.assert_allclose(np.diag(bound)[3:], 1.0 / precision[3:], rtol=1e-9)
     np.testing.assert_allclose(covariance, bound, rtol=1e-9, atol=1e-12)
     nothing = np.zeros(n, dtype=bool)
-    freely, _ = ml._considered(information, information, precision, nothing)
+    freely, _ = ml._with_consider_parameters(information, information, precision, nothing)
     np.testing.assert_allclose(freely, np.linalg.inv(information + np.diag(precision)), rtol=1e-9)
     assert (np.diag(bound)[:3] > np.diag(freely)[:3]).all()
 
@@ -141,12 +141,13 @@ def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
 def test_innovations_of_a_wrong_model_last(heavy, samples, name, axis):
     """With half of its drag they add up over a second; those of the right model do not."""
     noise, theta = ml.assumed(heavy), heavy.model.theta.copy()
-    seconds, power = ml.whiteness(samples, heavy.model, noise)
+    rest = noise, np.ones(6, dtype=bool), np.inf, np.zeros(0)
+    seconds, power = ml.whiteness(samples, heavy.model, *rest)
     assert (seconds > 40.0).all()
     # sixty seconds of sums over one: a scatter of a fifth
     np.testing.assert_allclose(power / seconds, 1.0, atol=0.6)
     theta[heavy.model.names.index(name)] *= 0.5
-    seconds, power = ml.whiteness(samples, heavy.model.with_theta(theta), noise)
+    seconds, power = ml.whiteness(samples, heavy.model.with_theta(theta), *rest)
     assert power[axis] > 4.0 * seconds[axis]
 
 

@@ -17,6 +17,7 @@ from rov_ident.core.messages import Array
 from rov_ident.core.states import State
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES
+from rov_ident.model.scales import authority
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.records import VELOCITIES
 
@@ -165,11 +166,14 @@ def consistency_of(
     ``sensors`` are test ratios of the odometry's parts against the IMU.
     """
     tests = []
-    for axis, share in zip(AXES, unexplained.tolist(), strict=True):
+    # weight rights the vehicle to the measured attitude, whose error lasts as long as such a force
+    righting = np.linalg.norm(config.model.body.restoring, axis=1) / authority(config.model)
+    limits = np.hypot(FIRST_FORCE, config.odometry.attitude_std * righting)
+    for axis, share, limit in zip(AXES, unexplained.tolist(), limits.tolist(), strict=True):
         if np.isfinite(share):
             tests.append(
                 Test(
-                    f"{_LEFT}{axis}", share, FIRST_FORCE,
+                    f"{_LEFT}{axis}", share, limit,
                     f"something acts along {axis} that the model does not have: {share:.1%} of "
                     f"the working wrench; {CAUSE}",
                 )
