@@ -59,12 +59,12 @@ class NomotoInput:
         if self._config.rudder_joint in names:  # other joints may have messages of their own
             angle = float(message.position[names.index(self._config.rudder_joint)])
             stamp = from_time(message.header.stamp)
-            self._take_heading(stamp or self._node.get_clock().now().nanoseconds, angle)
+            self._take_rudder(stamp or self._node.get_clock().now().nanoseconds, angle)
 
     def _angle(self, message: Float64) -> None:
-        self._take_heading(self._node.get_clock().now().nanoseconds, float(message.data))
+        self._take_rudder(self._node.get_clock().now().nanoseconds, float(message.data))
 
-    def _take_heading(self, stamp: int, angle: float) -> None:
+    def _take_rudder(self, stamp: int, angle: float) -> None:
         if not self._rudder or stamp > self._rudder[-1][0]:
             self._rudder.append((stamp, angle))
             self._advance()

@@ -51,7 +51,7 @@ def declare(node: Node, own: Iterable[str]) -> Config:
     for key, value in given.items():
         description = _open_description(key)
         if description:
-            _redeclare(node, key, float(value), _with_read_only(description, read_only=True))
+            _redeclare(node, key, float(value), _descriptor_of(description, read_only=True))
     return checked
 
 
@@ -126,7 +126,7 @@ def _as_declared(kind: Any, value: Any) -> Any:
 
 def _descriptor(parameter: config.Parameter) -> ParameterDescriptor:
     unit = f" [{parameter.unit}]" if parameter.unit else ""
-    descriptor = _with_read_only(parameter.description + unit, not parameter.live)
+    descriptor = _descriptor_of(parameter.description + unit, not parameter.live)
     descriptor.additional_constraints = ", ".join(parameter.choices)
     low, high = parameter.lower, parameter.upper
     if parameter.type is float:
@@ -138,7 +138,7 @@ def _descriptor(parameter: config.Parameter) -> ParameterDescriptor:
     return descriptor
 
 
-def _with_read_only(description: str, read_only: bool) -> ParameterDescriptor:
+def _descriptor_of(description: str, read_only: bool) -> ParameterDescriptor:
     # Typed dynamically: `ros2 param set ... rls.gate 5` sends a whole number.
     return ParameterDescriptor(description=description, read_only=read_only, dynamic_typing=True)
 
