@@ -574,8 +574,8 @@ def test_a_turned_velocity_sensor_in_a_current_is_no_heading_for_sure(seed):
     angles = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.03, 0.08, 3)
     r = quaternion_to_matrix(quaternion_from_euler(*angles))
     nu = np.hstack([streams.nu[:, :3] @ r, streams.nu[:, 3:]])
-    turned = dataclasses.replace(streams, nu=nu)
-    choice = sensor_choice.chosen(turned, fitted, turned, held, config, np.full(3, 1e-4))
+    turned = dataclasses.replace(streams, nu=nu, rates_std=np.full(3, 1e-4))
+    choice = sensor_choice.chosen(sensor_choice.Data(turned, fitted, turned, held, config))
     named = [n for n in ("heading_offset",) if n in choice.sensors]
     assert all(choice.alternatives.get(n) or n in choice.unsure for n in named)
     assert {"heading_offset", "sensor_misalignment"} & choice.sensors.keys()

@@ -289,3 +289,23 @@ def test_unknown_estimators_and_empty_channels_are_refused(heavy, archive_of):
     few = dataclasses.replace(heavy, estimate=("X_u",))
     with pytest.raises(UserError, match="no coefficient of yaw"):
         fit_batch(bags, few, "ml", Settings((("yaw",),)))
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+def test_a_moment_of_an_attitude_that_wanders_is_expected_to_last(heavy, samples, seed):
+    """Not white, it made of roll and pitch what the model lacks."""
+    tilt, rng, wandering = 0.03, np.random.default_rng(seed), samples.copy()
+    keep = np.exp(-samples["dt"] / 15.0)
+    off = np.zeros((len(samples), 3))
+    for k in range(1, len(samples)):
+        off[k, :2] = keep[k] * off[k - 1, :2]
+        off[k, :2] += tilt * np.sqrt(1.0 - keep[k] ** 2) * rng.standard_normal(2)
+    wandering["down"] += np.cross(samples["down"], off)
+    rest = heavy.model, ml.assumed(heavy), np.ones(6, dtype=bool), np.inf, np.zeros(0)
+    seconds, power = ml.whiteness(wandering, *rest)
+    _, expected = ml.whiteness(wandering, *rest, tilt)
+    assert (power[3:5] > 2.0 * seconds[3:5]).any()
+    assert (expected[3:5] < 1.5 * seconds[3:5]).all()
+    usual = heavy.odometry.attitude_std  # elsewhere the test stays as sharp
+    clean, less = (ml.whiteness(samples, *rest, t)[1, [0, 1, 2, 5]] for t in (0.0, usual))
+    np.testing.assert_allclose(less, clean, rtol=0.1)

@@ -230,15 +230,23 @@ def whiteness(
     free: NDArray[np.bool_],
     gate: float,
     effects: Array,
+    tilt: float = 0.0,
 ) -> Array:
     """(2, 6): seconds in which the vehicle moved, and the integral over them of the power of
     innovations added up over a second (:mod:`rov_ident.core.whiteness`).
 
-    The levels of the noise are those of the whole record, in which a vehicle may mostly rest.
+    The levels of the noise are those of the whole record, in which a vehicle may mostly rest. What
+    an attitude that is off by ``tilt`` [rad] in roll and pitch makes of innovations lasts, and is
+    expected, too.
     """
-    found, (samples, _) = innovations(samples, model, noise, free, gate, effects), parts(samples)
-    out = np.zeros((2, 6))
-    _add_power(found.e / np.sqrt(found.s), samples, out)
+    found, out = innovations(samples, model, noise, free, gate, effects), np.zeros((2, 6))
+    lasting = np.zeros((2, *found.e.shape))
+    for i in range(2 * (tilt > 0.0)):
+        tilted = samples.copy()
+        tilted["down"] += np.cross(samples["down"], tilt * np.eye(3)[i])
+        there = innovations(tilted, model, noise, free, gate, effects)
+        lasting[i] = np.nan_to_num((there.e - found.e) / np.sqrt(found.s))
+    _add_power(found.e / np.sqrt(found.s), lasting, parts(samples)[0], out)
     return out
 
 
@@ -421,7 +429,8 @@ def maximise(
         theta = np.clip(theta, *bounds)
         theta, at, more, converged = minimise(theta, bounds, there, slope_of, enough, _ITERATIONS)
         steps += more
-    seconds, power = np.sum(each(whiteness, at_values(theta), noise, free, gate, theta[~own]), 0)
+    last = at_values(theta), noise, free, gate, theta[~own], config.odometry.attitude_std
+    seconds, power = np.sum(each(whiteness, *last), 0)
     known = seconds > JUDGED_TIME
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
     bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
@@ -636,23 +645,26 @@ def _add_depth_after(sample, half, x, p, sensitivity, work):
 
 
 @kernel
-def _add_power(e, samples, out):
-    """Add to out (2, 6) what :func:`whiteness` gives; e (k, 6) are normalised innovations."""
+def _add_power(e, lasting, samples, out):
+    """Add to out (2, 6) what :func:`whiteness` gives; e (k, 6) are normalised innovations, of which
+    two errors that last are expected to make ``lasting`` (2, k, 6)."""
     for i in range(6):
-        summed, expected, since = 0.0, 0.0, 0.0
+        summed, expected, since, roll, pitch = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(len(samples)):
             since += samples[k].dt
             moving = False
             for j in range(6):
                 moving |= samples[k].moving[j] != 0
             if samples[k].restart or not moving:
-                summed, expected, since = 0.0, 0.0, 0.0
+                summed, expected, since, roll, pitch = 0.0, 0.0, 0.0, 0.0, 0.0
             elif np.isfinite(e[k, i]):
                 keep = np.exp(-since / SUM_TIME)
                 summed = keep * summed + min(max(e[k, i], -LARGEST), LARGEST)
                 expected = keep * keep * expected + 1.0
+                roll = keep * roll + lasting[0, k, i]
+                pitch = keep * pitch + lasting[1, k, i]
                 out[0, i] += since
-                out[1, i] += since * summed * summed / expected
+                out[1, i] += since * summed * summed / (expected + roll * roll + pitch * pitch)
                 since = 0.0
 
 
