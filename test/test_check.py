@@ -19,7 +19,7 @@ from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
 from rov_ident.experiment.data_quality import check
 from rov_ident.experiment.design import propose
-from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _correlation
+from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _correlation, _delay_remark
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import of_records
@@ -396,3 +396,11 @@ def test_axes_by_which_the_hull_would_capsize(checked, heavy):
     found = checked(config=dataclasses.replace(heavy, model=model))
     (remark,) = [r for r in found.remarks if r.subject == "vehicle.frame"]
     assert remark.level == BAD and "vehicle.cob" in remark.text and not found.fit
+
+
+def test_a_delay_beyond_what_is_linear_is_not_told():
+    """Of a gyro in degrees it was -2.3e23 ms."""
+    assert _delay_remark("motion behind the wrench", -0.3, 0.01).text.startswith("-300.0 ")
+    assert _delay_remark("motion behind the wrench", -2.3e20, 1e19).text.startswith(
+        "cannot be told"
+    )

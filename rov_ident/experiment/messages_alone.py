@@ -28,6 +28,7 @@ from rov_ident.sampling.without_velocity import is_without_velocity
 GOOD, WARNING, BAD = "good", "warning", "bad"
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
 _DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
+_FIRST_ORDER = 1.0  # s; a longer delay is beyond the manoeuvres about which it is linear
 _CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes, ...
 _FEWEST_TIMED = 100  # ... and fewer than these nothing of delays
@@ -246,6 +247,8 @@ def _delay_remark(subject: str, lag: float, std: float) -> Remark:
     text = f"{1e3 * lag:.1f} ± {1e3 * NORMAL * std:.1f} ms (95 %)"
     if not np.isfinite(lag):
         return Remark(subject, WARNING, "cannot be told: nothing moves")
+    if abs(lag) > _FIRST_ORDER:
+        return Remark(subject, WARNING, "cannot be told: the one does not follow the other")
     if abs(lag) > max(_DELAY, 3.0 * std):
         more = ", or let explain look for thruster lag and delay" if "wrench" in subject else ""
         return Remark(subject, WARNING, f"{text}: check the time stamps{more}")
