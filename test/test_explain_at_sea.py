@@ -566,6 +566,13 @@ def test_an_imu_elsewhere_is_no_velocity_sensor_elsewhere(seed):
         assert apart < 3.5 * std["sensor_lever_arm", name] < 0.05
 
 
+def test_where_nothing_thrusts_no_thrust_depends_on_another():
+    _, streams, config = streams_of("clean", "pilot", 0, 40.0)
+    still = dataclasses.replace(streams, demand=np.zeros_like(streams.demand))
+    search = Search(still, config, split(still.duration)[0])
+    assert search.patterns.interplay(search.start()) is None
+
+
 @pytest.mark.parametrize("seed", [5, *more(0, 1, 2, 3, 4)])
 def test_a_turned_velocity_sensor_in_a_current_is_no_heading_for_sure(seed):
     """Dynamics that know no current preferred a heading, which a current that is missing turns."""

@@ -137,6 +137,8 @@ class PatternSearch:
             force[:, i, 6 + i] = nu[:, i : i + 1] / scale[1][i] * load * scale[0][i]
         force = force.reshape(len(thrust), 6, -1)
         force = force[:, :, force.any(axis=(0, 1))]
+        if not force.size:  # with all that is commanded within a dead band, say
+            return None
         keys: list[Key] = [(UNKNOWN, f"{INTERPLAY}|{i}") for i in range(force.shape[2])]
         sensitivity = now.linearisation.sensitivity_to(force)
         scores = scores_of(now.linearisation, keys, sensitivity)
