@@ -12,10 +12,10 @@ from bench.studies.explain import streams_of
 from rov_ident.config import from_parameters, to_parameters
 from rov_ident.discrepancy import extension
 from rov_ident.discrepancy.explain import explain
-from rov_ident.discrepancy.findings import as_the_arm_is_known
-from rov_ident.discrepancy.held_out import Judge, split
+from rov_ident.discrepancy.findings import parameters_of
+from rov_ident.discrepancy.held_out import Judge, split, thinned, windows
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
-from rov_ident.discrepancy.results import Value
+from rov_ident.discrepancy.output_error import fit
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.reading_noise import resting_noise
@@ -120,33 +120,36 @@ def test_late_velocities_are_said_to_be_late(seed):
     assert found.parameters["delay"].value == pytest.approx(0.12, abs=0.006)
 
 
-@pytest.mark.parametrize("arm", [0.02, 0.2])
-def test_a_height_is_known_no_better_than_what_it_stands_for(heavy, arm):
-    """Thrust of another size is, to the data, another righting arm, and so is a centre of buoyancy
-    of another height: dz was stated to a hundredth of a millimetre, and a hundred of its standard
-    deviations off. A file that knows both leaves it as it is."""
-    raw = to_parameters(heavy)
-    raw["vehicle"]["cob"] = [0.0, 0.0, -arm]
-    raw["vehicle"]["cob_std"], raw["wrench"] = 0.001, {"scale_std": 0.15}
-    config = from_parameters(raw)
-    raw["vehicle"]["cob_std"], raw["wrench"] = 0.0, {"scale_std": 0.0}
-    dz, scale = {"dz": Value(3e-4, 1e-6, "m")}, {"scale": Value(1.05, 1e-4, "1")}
-
-    def std(effect, parameters, scaled, of=config):
-        (value,) = as_the_arm_is_known(effect, parameters, of, scaled).values()
-        return value.std
-
-    assert std("cog_offset", dz, False) == pytest.approx(np.hypot(0.001, 0.15 * arm), rel=0.02)
-    assert std("cog_offset", dz, True) == 1e-6
-    # to one side it is told in shares of the arm, by the heel at rest
-    dx = {"dx": Value(2e-3, 1e-6, "m")}
-    assert std("cog_offset", dx, True) == pytest.approx(2e-3 * 0.001 / arm, rel=0.02)
-    of_both = np.hypot(0.001, 0.15 * arm) / arm
-    assert std("cog_offset", dx, False) == pytest.approx(2e-3 * of_both, rel=0.02)
-    assert std("thrust_scale", scale, True) == pytest.approx(1.05 * 0.001 / arm, rel=0.02)
-    known = from_parameters(raw)
-    assert std("cog_offset", dz, False, known) == 1e-6
-    assert std("thrust_scale", scale, True, known) == 1e-4
+@pytest.mark.parametrize("excitation", ["steps", "pilot"])
+def test_a_force_is_known_no_better_than_thrust_and_righting_arm(excitation):
+    """Thrust of another size, or a centre of buoyancy of another height, makes forces, heights and
+    coefficients seem larger: by 20 of their standard deviations (rms), and up to 130, for one who
+    takes both for known."""
+    off, off_if_known = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        conditions = dataclasses.replace(MINUTE, excitation=excitation)
+        case = draw(seed, conditions=conditions)
+        streams, raw = streams_of(case), to_parameters(case.config)
+        scale = 1.0 + 0.15 * np.clip(rng.standard_normal(), -2.0, 2.0)
+        raw["vehicle"]["cob"][2] -= 0.001 * rng.standard_normal()
+        raw["vehicle"]["cob_std"], raw["wrench"] = 0.001, {**raw["wrench"], "scale_std": 0.15}
+        config = from_parameters(raw)
+        read = dataclasses.replace(streams, demand=streams.demand / scale)
+        keys = {(COEFFICIENTS, name): v for name, v in config.model.values.items()}
+        keys |= {("buoyancy", "delta"): 0.0, ("cog_offset", "dz"): 0.0}
+        problem = WindowedProblem(read, thinned(windows(0.0, read.duration)))
+        fitted = fit(problem, Hypothesis(config, keys))
+        for covariance, into in (
+            (fitted.covariance + fitted.covariance_of_the_file, off),
+            (fitted.covariance, off_if_known),
+        ):
+            for name, value in parameters_of(fitted, list(keys), covariance).items():
+                into.append((value.value - case.theta.get(name, 0.0)) / value.std)
+    assert np.sqrt(np.mean(np.square(off))) < 1.2
+    assert np.mean(np.abs(off) < 1.96) > 0.9
+    assert np.max(np.abs(off)) < 4.0
+    assert np.sqrt(np.mean(np.square(off_if_known))) > 5.0
 
 
 def test_what_is_left_is_told():

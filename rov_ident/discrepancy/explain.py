@@ -426,6 +426,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
         as_good = as_good or judge.better(fitted.hypothesis, term.hypothesis)
         if as_good and search.is_determined(rest, fitted) and fitted.squares < best.squares:
             best, name = fitted, rival
+    rivals.pop(name, None)
     gain = finding(search, judge, retuned, best, name, Trial(rest, rivals))
     if not is_practical(gain.gain):
         return

@@ -4,9 +4,11 @@ import dataclasses
 from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
+from scipy.special import chdtri
 
 from rov_ident.config import Config
 from rov_ident.config.prior import rigid_body_covariance
+from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved
 from rov_ident.discrepancy.hypothesis import (
@@ -37,7 +39,6 @@ _ACTS = 0.2  # of the wrench on the axis it acts on most, over the authority: ac
 _PARTIAL = "fitted in its stead, it explains only {:.0f} % of this"
 _COSTLY = "fitted in its stead, it needs more parameters to explain as much"
 _EQUAL = "fits this bag as well"
-_SCALE = "thrust_scale"
 _EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
 
 
@@ -110,11 +111,13 @@ def is_certain(search: Search, last: Fitted, name: str) -> bool:
 
 
 def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
-    """The finding with the values that all of the data give."""
-    parameters = parameters_of(last, search.keys_of(last, found.effect))
-    scaled = _SCALE in last.hypothesis.effects
-    parameters = as_the_arm_is_known(found.effect, parameters, search.config, scaled)
+    """The finding with the values that all of the data give; not sure where errors of the file may
+    have made all of it."""
+    keys, wide = search.keys_of(last, found.effect), last.covariance + last.covariance_of_the_file
+    parameters = parameters_of(last, keys, wide)
     onset = parameters.get("onset")
+    if not _differs_from_null(last, keys, wide):
+        found = unsure(found)
     return possibly_earlier(
         dataclasses.replace(
             found,
@@ -126,40 +129,19 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
     )
 
 
+def _differs_from_null(fitted: Fitted, keys: Sequence[Key], covariance: Array) -> bool:
+    """Whether the amplitudes among parameters surely differ from their nulls together (Wald)."""
+    keys = [k for k in keys if role_of(k) == "amplitude"]
+    at = fitted.linear.index(keys)
+    off = np.array([fitted.hypothesis.values[k] - bounds(k)[0] for k in keys])
+    square = off @ scaled_solve(covariance[np.ix_(at, at)], off, 1e-9)
+    return not keys or bool(square > chdtri(len(keys), 0.05))
+
+
 def _first_seen(problem: WindowedProblem) -> float:
     """The end [s] of the first window: what began before it is told from what was there before
     the bag by that window alone, whose thrust comes from commands that nobody knows."""
     return float(problem.steps.t[problem.last[0]])
-
-
-def as_the_arm_is_known(
-    effect: str, parameters: Mapping[str, Value], config: Config, scaled: bool
-) -> dict[str, Value]:
-    """Parameters with what the righting arm, and the thrust where no scale of it is in the model
-    (``scaled``), are not known to. With the righting moment, thrust and all coefficients times k
-    nothing moves otherwise (:func:`righting_arm_covariance`): what is off in height or in thrust
-    is, to the data, a height of the centre of gravity, or else that scale. And what is to one side
-    is told in shares of the arm, by the heel at rest."""
-    body, height = config.model.body, config.vehicle_uncertainty.cob_std
-    arm, of_thrust = abs(body.righting_arm), config.wrench.scale_std
-    out = dict(parameters)
-    if effect == "cog_offset":
-        height = float(np.hypot(height, 0.0 if scaled else arm * of_thrust))
-        aside = body.cog - body.cob * body.buoyancy / body.weight
-        share = min(height / max(arm, 1e-9), 1.0)
-        for name, off in zip(("dx", "dy"), aside.tolist(), strict=False):
-            if name in out:
-                std = np.hypot(out[name].std, share * (off + out[name].value))
-                out[name] = dataclasses.replace(out[name], std=float(std))
-        if "dz" in out and not scaled:
-            dz = out["dz"]
-            out["dz"] = dataclasses.replace(dz, std=float(np.hypot(dz.std, height)))
-    elif effect == _SCALE:
-        scale = out["scale"]
-        share = min(height / max(arm, 1e-9), of_thrust)
-        std = float(np.hypot(scale.std, share * scale.value))
-        out["scale"] = dataclasses.replace(scale, std=std)
-    return out
 
 
 def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:
@@ -180,10 +162,14 @@ def unsure(found: Finding) -> Finding:
     return dataclasses.replace(found, separable=False, manoeuvre=run)
 
 
-def parameters_of(final: Fitted, keys: Sequence[Key]) -> dict[str, Value]:
-    """Parameters with their standard deviations; damping for negative velocity is told as the
-    coefficient that holds there, not as its difference from the other."""
-    h, linear, wide = final.hypothesis, final.linear, final.covariance
+def parameters_of(
+    final: Fitted, keys: Sequence[Key], covariance: Array | None = None
+) -> dict[str, Value]:
+    """Parameters with their standard deviations, by the ``covariance`` (P, P) (None: what the data
+    leave); damping for negative velocity is told as the coefficient that holds there, not as its
+    difference from the other."""
+    h, linear = final.hypothesis, final.linear
+    wide = final.covariance if covariance is None else covariance
     out = {}
     for key in keys:
         at = linear.index([key])[0]
@@ -250,7 +236,8 @@ def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
     """The coefficients that refitting moves by more than two standard deviations."""
     changed, names = {}, tuple(name for _, name in retuned.hypothesis.values)
     values = np.array(list(retuned.hypothesis.values.values()))
-    covariance = retuned.covariance + rigid_body_covariance(config, names, values)
+    covariance = retuned.covariance + retuned.covariance_of_the_file
+    covariance += rigid_body_covariance(config, names, values)
     for name, value, std in zip(names, values, np.sqrt(np.diag(covariance)), strict=True):
         before = float(config.model.theta[config.model.names.index(name)])
         if abs(value - before) > 2.0 * std:

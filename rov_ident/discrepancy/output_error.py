@@ -121,6 +121,30 @@ class Fitted:
         out[np.ix_(at, at)] = wide + moves @ moves.T
         return out
 
+    @cached_property
+    def covariance_of_the_file(self) -> Array:
+        """What errors of the file that no window shows by itself add to the covariance (P, P): of
+        the thrust, unless its scale is among the parameters, and of the height of the centre of
+        buoyancy (consider parameters, Schmidt 1966), as large as the configuration says that they
+        may be and the residuals leave them. With the righting moment, thrust and all coefficients
+        times k nothing moves otherwise (:func:`prior.righting_arm_covariance`).
+        """
+        linear, at, h = self.linear, self._smooth, self.hypothesis
+        problem, config = self.linearisation.problem, h.config
+        raising = problem.raising(h.model.body) * config.vehicle_uncertainty.cob_std
+        stronger = problem.thrust(h.effects)[0] * config.wrench.scale_std
+        if "thrust_scale" in h.effects:
+            stronger = np.zeros_like(stronger)
+        error = self.linearisation.sensitivity_to(np.stack([stronger, raising], axis=2))
+        base, normal = self.linearisation.columns[:, at], linear.normal[np.ix_(at, at)]
+        moves = scaled_solve(normal, base.T @ error, 1e-9)
+        error -= base @ moves  # what the parameters do not imitate tells how large they are
+        left = np.linalg.inv(np.eye(2) + error.T @ error / self.inflation)
+        likely = left @ (error.T @ self.linearisation.error) / self.inflation
+        out = np.zeros_like(linear.normal)
+        out[np.ix_(at, at)] = moves @ (left + np.outer(likely, likely)) @ moves.T
+        return out
+
     def leave_one_out(self) -> Array:
         """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""
         return self.linearisation.leave_one_out(self._smooth)

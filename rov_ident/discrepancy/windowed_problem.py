@@ -10,6 +10,7 @@ import copy
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -342,6 +343,13 @@ class WindowedProblem:
             grown[first:last, 0, 0] = (np.arange(last - first) + 0.5) / (last - first)
         out: Array = np.concatenate([(1.0 - grown) * wrench, grown * wrench], axis=2)
         return out
+
+    def raising(self, body: RigidBody) -> Array:
+        """What a centre of buoyancy one metre further along the body's z axis adds to the wrench,
+        (K, 6)."""
+        raised = replace(body, cob=body.cob + np.array([0.0, 0.0, 1.0]))
+        wrench: Array = self.steps.middle[:, 2] @ (raised.restoring - body.restoring).T
+        return wrench
 
     def largest(self, key: Key) -> float:
         """Of what is commanded, where a parameter is a limit of it; of a rate, at which a fin would
