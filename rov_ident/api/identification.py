@@ -104,7 +104,7 @@ class Identification(Shown):
     def advice(self) -> tuple[str, ...]:
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.fit.names, self.fit.identifiable) if not known]
-        advice = [*self.fit.to_weigh]
+        advice = [*self.fit.to_measure]
         findings = self.explanation.findings if self.explanation else None
         if findings and findings.verdict == "unexplained":
             advice.append("Something is left that no known effect explains: see below what.")

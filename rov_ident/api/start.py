@@ -29,8 +29,6 @@ Then: rov-ident check DIVE --config THIS_FILE"""
 
 # of a mass that nobody has weighed: what is built onto a vehicle, and ballast, are a tenth of it
 _BORROWED = 0.1
-# m, of the height of a centre of buoyancy that nobody has measured: as of a centre of gravity
-_BORROWED_HEIGHT = 0.005
 
 
 @dataclass(frozen=True)
@@ -83,8 +81,6 @@ class _Found:
             self.remarks[f"coefficients.{name}"] = assumed
         for name in ("mass_std", "inertia_std"):
             self.put(f"vehicle.{name}", _BORROWED, "a guess: remove it once it is weighed")
-        guess = "a guess: remove it once the righting arm is measured (docs/live.md)"
-        self.put("vehicle.cob_std", _BORROWED_HEIGHT, guess)
         self.notes.append(
             f"Mass and buoyancy are those of {vehicle}.yaml. Weigh yours: thrust, mass and all "
             "coefficients k times as large move alike, so all are wrong by as much as the mass"

@@ -70,4 +70,4 @@ def _fit(options: argparse.Namespace) -> None:
         common.write_result(found, options, tell)
     if options.save:
         found.save_config(options.save)
-    common.show(found, [*found.notes, *filter(None, [found.doubt])])
+    common.show(found, [*found.notes, *found.to_measure, *filter(None, [found.doubt])])

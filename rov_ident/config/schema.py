@@ -87,7 +87,7 @@ class VehicleUncertainty:
     buoyancy_std: float = not_negative(0.02, "of the buoyancy, relative to the weight")
     cog_std: float = not_negative(0.005, "of the centre of gravity, each component", "m")
     cob_std: float = not_negative(
-        0.001, "of the height of the centre of buoyancy; it widens the thrust scale", "m"
+        0.005, "of the height of the centre of buoyancy; it widens the thrust scale", "m"
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config, dump
-from rov_ident.config.prior import THRUST_SCALE, prior_of
+from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_covariance
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
@@ -32,6 +32,7 @@ TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum 
 _SHOWN = 60.0  # s of motion in the picture of a fit
 
 
+_MOST = 0.5  # of a variance
 _NOTICED = 0.1  # of the scale's prior standard deviation: 1.5 % of thrust
 
 
@@ -117,18 +118,28 @@ class Fit(Shown, Result):
         )
 
     @property
-    def to_weigh(self) -> tuple[str, ...]:
-        """That the vehicle should be weighed, where its mass may be off instead of the thrust."""
-        scale = float(dict(zip(self.names, self.values)).get(THRUST_SCALE, 1.0))
-        if abs(scale - 1.0) <= _NOTICED * self.given.wrench.scale_std:
+    def to_measure(self) -> tuple[str, ...]:
+        """What to weigh or measure of the vehicle: where its mass may be off instead of the thrust,
+        and where its righting arm makes most of the intervals."""
+        if THRUST_SCALE not in self.names:
             return ()
-        return (f"Weigh the vehicle: {thrust_or_mass(scale)}.",)
+        i, advice = self.names.index(THRUST_SCALE), []
+        scale = float(self.values[i])
+        if abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
+            advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
+        of_arm = righting_arm_covariance(self.given, self.names, self.values)[i, i]
+        if of_arm > _MOST * self.covariance[i, i]:
+            advice.append(
+                "Measure the righting arm (docs/live.md): what is not known of it "
+                "(vehicle.cob_std) makes most of the intervals of thrust and coefficients."
+            )
+        return tuple(advice)
 
     @property
     def advice(self) -> tuple[str, ...]:
         """What to do next, the most useful first."""
         held = [n for n, known in zip(self.names, self.identifiable) if not known]
-        advice = [*self.to_weigh]
+        advice = [*self.to_measure]
         if impossible := self.more.get("impossible"):
             held = [name for name in held if name not in impossible]
             advice.append(
