@@ -181,11 +181,30 @@ def test_each_question_has_its_limit(heavy):
     far = prior.mean.copy()
     far[names.index("thrust_scale.scale")] -= 3.0 * 0.15
     far[names.index("X_uu")] *= 3.0  # nobody has said that a coefficient is well known
-    assert failed(values=far) == ["prior of thrust_scale.scale"]
+    far_off = ["prior of all together", "prior of thrust_scale.scale"]  # two: as one alone
+    assert failed(values=far) == far_off
+    far[names.index("thrust_scale.scale")] = 1.0 - 2.5 * 0.15
+    assert failed(values=far) == []
     early, std = prior.mean.copy(), 0.01 * prior.std
     early[names.index("thruster_lag.time_constant")] = -0.02  # s
     assert failed(values=early, std=4.0 * std) == []
     assert failed(values=early, std=std) == ["bound of thruster_lag.time_constant"]
+
+
+def test_nuisance_parameters_may_not_all_be_far_off():
+    """A weight that hangs below a vehicle from some minute on: thrust, trim and centre of gravity
+    were 2.2 to 2.6 standard deviations off each, and all coefficients 4 to 6."""
+    config = configuration.load("config/bluerov2_heavy.yaml").with_nuisance
+    prior = prior_of(config, effects=True)
+    assert len(config.nuisance_std) == 9
+
+    def failed(off):
+        values = np.where([n in prior.names[-9:] for n in prior.names], off, 0.0) * prior.std
+        found = consistency_of(config, prior, prior.mean + values, np.full(6, np.nan))
+        return [test.name for test in found.tests if not test.passed]
+
+    assert failed(1.3) == []
+    assert failed(1.45) == ["prior of all together"]
 
 
 def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):

@@ -24,7 +24,6 @@ from rov_ident.discrepancy import (
 from rov_ident.discrepancy.findings import (
     changes,
     finding,
-    is_certain,
     noise_finding,
     residuals,
     sensor_findings,
@@ -175,10 +174,13 @@ def explain(
     if search.config is not config:
         std = sensor_choice.noise_std(data.streams, search.config.effects[NOISE])
         of_sensors.append(noise_finding(judge, model.final, config, std))
+    minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
+    of_sensors = [f for f in of_sensors if is_practical(f.gain)]
+    final = _without_minor_noise(model.final.hypothesis, data, of_sensors)
     given = Hypothesis(config, {})
     as_recorded = Judge(WindowedProblem(data.recorded.judged, data.to_judge))
-    written = extension.kept(judge, as_recorded.summed(given), model.final.hypothesis)
-    last, notes = _with_all_data(search, data.streams, model)
+    written = extension.kept(judge, as_recorded.summed(given), final)
+    last, notes = _with_all_data(data.streams, model.final)
     of_dynamics = [with_parameters(search, last, f) for f in model.found]
     if len(bags) > 1:
         say("leaving records out", 0.95)
@@ -189,12 +191,11 @@ def explain(
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
     left = _left(data.judged, rmse[2], judge.rmse_of_noise(best))
-    found = _sure_or_not(data, [f for f in of_sensors if is_practical(f.gain)] + of_dynamics, left)
+    found = _sure_or_not(data, of_sensors + of_dynamics, left)
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
             found[i] = empirical_term.described(f, last.hypothesis)
             residual = residual or [empirical_term.residual(f, last.hypothesis)]
-    minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
     verdict = _verdict(found, residual, left, improves)
     everything = WindowedProblem(data.streams, blocks(data.streams))
@@ -293,7 +294,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
         found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
     if data.may_drift:
         found = list(map(unsure, found))
-    return [unsure(f) if _acts_on(f, left) else f for f in found]
+    return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
 
 
 def _verdict(
@@ -350,6 +351,14 @@ def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
     far = any(share > _FAR_OFF for share in left.values())
     axes = {AXES[VELOCITIES.index(c)] for c in left}
     return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
+
+
+def _gains_elsewhere(found: Finding) -> bool:
+    """Whether an effect, not of a sensor, makes a velocity better of an axis on which it hardly
+    acts: then it may stand for something that acts there."""
+    gain = found.gain
+    alone = gain.together is None and gain.component in VELOCITIES
+    return alone and AXES[VELOCITIES.index(gain.component)] not in found.axes
 
 
 def _told(left: Mapping[str, float]) -> str:
@@ -453,31 +462,24 @@ def _supports_another(search: Search, judge: Judge, model: _Model, name: str) ->
     return False
 
 
-def _with_all_data(search: Search, streams: Streams, model: _Model) -> tuple[Fitted, list[str]]:
-    """The extended model fitted to all of the data, and notes; effects that all of the data do not
-    support become minor."""
+def _with_all_data(streams: Streams, final: Fitted) -> tuple[Fitted, list[str]]:
+    """The extended model fitted to all of the data, and notes."""
     halves = [s for a, b in blocks(streams) for s in windows(a, b)]
-    last = fit(WindowedProblem(streams, thinned(halves)), model.final.hypothesis)
-    notes = [] if last is not None else [_ONLY_FITTED]
-    last = with_best_onsets(last or model.final)
-    for f in [f for f in model.found if not is_certain(search, last, f.effect)]:
-        model.found.remove(f)
-        model.minor.append(f)
-        gone = search.keys_of(model.final, f.effect)
-        kept = model.final.hypothesis.without(gone)
-        model.final = refit(kept, model.final.linearisation) or model.final
-        kept = last.hypothesis.without(gone)
-        last = refit(kept, last.linearisation, update_noise=True) or last
-    return last, notes
+    last = fit(WindowedProblem(streams, thinned(halves)), final.hypothesis)
+    return with_best_onsets(last or final), [] if last is not None else [_ONLY_FITTED]
+
+
+def _without_minor_noise(h: Hypothesis, data: _Data, found: Sequence[Finding]) -> Hypothesis:
+    """A hypothesis with the noise of the wrench's reading only if it is among what was found."""
+    if any(f.effect == NOISE for f in found):
+        return h
+    return sensor_choice.with_noise(h, data.recorded.config.effects.get(NOISE, {}))
 
 
 def _extended(h: Hypothesis, kept: Sequence[str], data: _Data, found: Sequence[Finding]) -> Config:
     """The configuration of a hypothesis with what was found; the rows of the axes ``kept`` are as
     in the file. A heading that each bag has of its own is in none."""
-    given = data.recorded.config
-    h = extension.without_rows(h, kept)
-    if all(f.effect != NOISE for f in found):
-        h = sensor_choice.with_noise(h, given.effects.get(NOISE, {}))
+    h = _without_minor_noise(extension.without_rows(h, kept), data, found)
     sensors = {n: dict(v) for n, v in data.sensors.items()}
     if any(data.headings):
         sensors.pop(HEADING, None)

@@ -17,6 +17,7 @@ from rov_ident.discrepancy.hypothesis import (
     Key,
     at_bound,
     bounds,
+    effect_of,
     role_of,
     unit_of,
 )
@@ -111,12 +112,12 @@ def is_certain(search: Search, last: Fitted, name: str) -> bool:
 
 
 def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
-    """The finding with the values that all of the data give; not sure where errors of the file may
-    have made all of it."""
+    """The finding with the values that all of the data give; not sure where these do not support
+    it, or errors of the file may have made all of it."""
     keys, wide = search.keys_of(last, found.effect), last.covariance + last.covariance_of_the_file
     parameters = parameters_of(last, keys, wide)
     onset = parameters.get("onset")
-    if not _differs_from_null(last, keys, wide):
+    if not (is_certain(search, last, found.effect) and _differs_from_null(last, keys, wide)):
         found = unsure(found)
     return possibly_earlier(
         dataclasses.replace(
@@ -208,8 +209,10 @@ def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
 def residuals(final: Fitted, trials: Trials) -> list[Residual]:
     """What the patterns in a model say: on which axis something is left that has no name. Windows
     are predicted by fits to the others; as a pattern was chosen by all windows, from many, it must
-    surely gain what an effect must gain at all. The share is one of squares."""
-    found = []
+    surely gain what an effect must gain at all, and be more than an error of the attitude makes of
+    the righting moment. The share is one of squares."""
+    found, h, problem = [], final.hypothesis, final.linearisation.problem
+    righting = np.linalg.norm(h.model.body.restoring, axis=1) * h.config.odometry.attitude_std
     for name, trial in trials.items():
         if not name.startswith(UNKNOWN):
             continue
@@ -219,7 +222,11 @@ def residuals(final: Fitted, trials: Trials) -> list[Residual]:
             *(f.leave_one_out()[:, [i]] for f in (trial.rest, final))
         )
         gain = gain_of([VELOCITIES[i]], before, after, 1.0) if len(before) > 1 else None
-        if gain is not None and gain.low >= 100.0 * PRACTICAL:
+        keys = [k for k in h.keys if effect_of(k) == name]
+        columns = problem.columns(h, final.linearisation.motion, keys)
+        force = columns[:, i] @ np.array([h.values[k] for k in keys])
+        acts = np.sqrt(np.mean(force**2)) > righting[i]
+        if acts and gain is not None and gain.low >= 100.0 * PRACTICAL:
             share = float(1.0 - after.sum() / before.sum())
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)

@@ -24,8 +24,10 @@ from rov_ident.sampling.records import VELOCITIES
 CAUSE = "rov-ident explain looks for the cause"
 _PRIOR = "prior of "  # begins the name of such a test
 _LEFT = "unexplained: "  # likewise
+_WHITENESS = "whiteness: "
 SUPPOSED = 2.8
 """Standard deviations: of nine suppositions one seems, or is, further off in 5 % of dives."""
+_SELDOM = 1.645  # normal deviate that 5 % exceed, as of SUPPOSED
 _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
@@ -48,6 +50,12 @@ class Test:
     @property
     def passed(self) -> bool:
         return self.value <= self.limit
+
+    @property
+    def inflation(self) -> float:
+        """How many times larger errors are than stated, if that is what the value comes from: of
+        innovations, which are said to add up to 1, the value, be it within the limit or not."""
+        return self.value if self.name.startswith(_WHITENESS) else self.value / self.limit
 
 
 @dataclass(frozen=True)
@@ -77,10 +85,10 @@ class Consistency:
     def widened(self, covariance: Array, prior: Array) -> Array:
         """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``.
 
-        Where a test fails, errors are taken to be as many times larger as its value is than its
-        limit; but what the file says remains.
+        Errors are taken to be as many times larger as the worst test says (:attr:`Test.inflation`);
+        but what the file says remains.
         """
-        factor = max([1.0, *(test.value / test.limit for test in self.tests)])
+        factor = max([1.0, *(test.inflation for test in self.tests)])
         variance = np.diag(covariance)
         return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, prior**2)))
 
@@ -183,13 +191,27 @@ def consistency_of(
         if np.isfinite(power):
             tests.append(
                 Test(
-                    f"whiteness: {axis}", float(np.sqrt(power)), _WHITE,
+                    f"{_WHITENESS}{axis}", float(np.sqrt(power)), _WHITE,
                     f"predictions along {axis} are off for a second by {np.sqrt(power):.1f} times "
                     f"what noise explains: {CAUSE}",
                 )
             )  # fmt: skip
     supposed = {".".join(key) for key in config.nuisance_std}
-    for i in (i for i, name in enumerate(prior.names) if name in supposed):
+    of_nuisance = [i for i, name in enumerate(prior.names) if name in supposed]
+    if k := len(of_nuisance):
+        distance = (values[of_nuisance] - prior.mean[of_nuisance]) / prior.std[of_nuisance]
+        # quantile of chi squared (Wilson and Hilferty 1931), for which scipy would be loaded
+        limit = np.sqrt(k) * (1.0 - 2.0 / (9.0 * k) + _SELDOM * np.sqrt(2.0 / (9.0 * k))) ** 1.5
+        tests.append(
+            Test(
+                f"{_PRIOR}all together",
+                float(np.linalg.norm(distance)),
+                max(SUPPOSED, float(limit)),
+                "the data ask for more of thrust, trim, current and times together than the "
+                f"configuration takes for possible: {CAUSE}",
+            )
+        )
+    for i in of_nuisance:
         name = prior.names[i]
         mean, half = prior.mean[i], NORMAL * prior.std[i]
         off = abs(values[i] - mean) / prior.std[i]

@@ -105,9 +105,15 @@ class Check(Shown):
         if not self.fit:
             return f"{told} not fit for identification: {self.why}."
         states = [p.state for p in self.prospects]
+        well = states.count(State.CONVERGED)
+        if not well:
+            return (
+                f"{told} fit for identification, but too short or too calm: a quick fit tells none "
+                f"of {len(states)} coefficients well (rov-ident plan says how to drive)."
+            )
         return (
-            f"{told} fit for identification; a quick fit tells {states.count(State.CONVERGED)} of "
-            f"{len(states)} coefficients well."
+            f"{told} fit for identification; a quick fit tells {well} of {len(states)} "
+            "coefficients well."
         )
 
     @property
