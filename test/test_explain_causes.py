@@ -18,7 +18,7 @@ from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
 from rov_ident.discrepancy.output_error import fit
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import gather
-from rov_ident.sampling.reading_noise import resting_noise
+from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
 MINUTE = Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)

@@ -17,8 +17,8 @@ from rov_ident.io.write_messages import write_messages
 from rov_ident.offline import batch_fit
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.maximum_likelihood import assumed, one_pass
-from rov_ident.sampling.reading_noise import ReadingNoise
 from rov_ident.sampling.records import read_record
+from rov_ident.sampling.wrench_scatter import ReadingNoise
 
 _RATE = 50.0  # Hz
 

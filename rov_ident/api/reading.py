@@ -92,10 +92,7 @@ def read(bag: File, config: File | Config, progress: Progress | None = None) -> 
 def axes(channels: str) -> NDArray[np.bool_]:
     """Which axes (6,) the names of channels, divided by commas, mean.
 
-    Raises
-    ------
-    UserError
-        If there is no such channel.
+    Raises UserError if there is no such channel.
     """
     wanted = channels.split(",")
     if unknown := sorted(set(wanted) - set(CHANNELS)):

@@ -151,9 +151,6 @@ def _add_model(path: Path, found: _Found, vehicle: str) -> None:
         found.parameters |= {"vehicle": {"name": path.stem, **body}, "coefficients": {}}
 
 
-# ------------------------------------------------------------------ logs of autopilots
-
-
 def _add_log(path: Path, found: _Found, vehicle: str) -> None:
     log = read_log(path)
     frame = int(log.parameters.get("FRAME_CONFIG", -1))
@@ -193,34 +190,26 @@ def _add_log(path: Path, found: _Found, vehicle: str) -> None:
     found.notes.append(f"next: rov-ident import {path.name} --config THIS_FILE --out dive.mcap")
 
 
-# ------------------------------------------------------------------ bags
-
-
 def _add_bag(path: Path, found: _Found) -> None:
     bag = Bag(path)
-    seen = topics.survey(bag)
-    for role, source in seen.sources.items():
-        count = f"{source.rate:.3g} Hz in {path.name}" + (
-            f", frame {source.frame_id}" if source.frame_id else ""
-        )
+    seen, notes = topics.survey(bag)
+    for role, source in seen.items():
+        frame = f", frame {source.frames[0]}" if source.frames[0] else ""
         if role != topics.IMU and f"inputs.{role}" in configuration.schema.BY_KEY:
             found.put(f"inputs.{role}", source.type_name, path.name)
-        found.put(f"topics.{role}", source.topic, count)
+        told = f"{source.rate:.3g} Hz in {path.name}{frame}"
+        found.put(f"topics.{role}", source.topic, told)
     for role in (topics.ODOMETRY, topics.WRENCH):
-        if role not in seen.sources:
+        if role not in seen:
             found.notes.append(
                 f"{path.name} has nothing that can be {role}: record it too (docs/inputs.md)"
             )
             found.unfit = path.name
-    if topics.IMU not in seen.sources:
+    if topics.IMU not in seen:
         found.notes.append(f"{path.name} has no IMU: angular rates come from the odometry alone")
-    for note in seen.notes:
-        found.notes.append(note)
+    found.notes += notes
     signs = FLIP_BODY if found.parameters["vehicle"].get("frame") == "flu" else np.ones(3)
-    frames = {
-        role: (source.frame_id, source.child_frame_id) for role, source in seen.sources.items()
-    }
-    mounted = topics.mounting(bag, frames)
+    mounted = topics.mounting(bag, {role: source.frames for role, source in seen.items()})
     for key, vector in mounted.items():
         found.put(key, [round(float(x), 6) + 0.0 for x in signs * vector], "/tf_static")
     if "/tf_static" in bag.topics and not mounted:

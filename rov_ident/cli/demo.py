@@ -24,7 +24,6 @@ def add(commands: Commands) -> None:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    """Replay the shipped bag over DDS into both nodes and report against the simulator's truth."""
     import numpy as np
     from rich.console import Console
     from rich.live import Live

@@ -1,6 +1,7 @@
 """Identification offline."""
 
 import argparse
+import os
 from pathlib import Path
 
 from rov_ident.cli import common
@@ -48,7 +49,6 @@ def add(commands: common.Commands) -> None:
 
 def _fit(options: argparse.Namespace) -> None:
     from rov_ident.api.functions import fit
-    from rov_ident.offline.archive import default_jobs
 
     live = options.estimator in common.LIVE
     with common.progress(options) as tell:
@@ -61,7 +61,7 @@ def _fit(options: argparse.Namespace) -> None:
             prior=not options.no_prior,
             weighted=not options.ordinary,
             process=not options.output_error,
-            jobs=options.jobs or (1 if live else default_jobs()),
+            jobs=options.jobs or (1 if live else len(os.sched_getaffinity(0))),
             dask=options.dask,
             reference=options.reference or 0.0,
             prior_from=options.prior_from,

@@ -44,7 +44,8 @@ def _forces(options: argparse.Namespace) -> None:
     if not options.config and (options.out or options.hull):
         raise UserError("--out and --hull need --config: the vehicle's mass, inertia and buoyancy")
     config = configuration.load(options.config) if options.config else None
-    hull = parse_hull(options.hull) if options.hull else {}
+    if config and options.hull:
+        config = force_tables.with_hull(config, parse_hull(options.hull))
     scale = options.nondimensional
     table = force_tables.read_table(
         options.table,
@@ -52,8 +53,6 @@ def _forces(options: argparse.Namespace) -> None:
         force_tables.parse_nondimensional(scale) if scale else None,
         options.drift,
     )
-    if config:
-        config = force_tables.with_hull(config, hull)
     with common.progress(options) as tell:
         tell("fitting")
         fits = force_tables.fit(table, config.model if config else None)

@@ -29,9 +29,6 @@ ANY = -1  # the ``size`` of a list of any length
 LARGEST = 1e20  # no number of a vehicle is larger; below it nothing computed from them overflows
 
 
-# ------------------------------------------------------------------ declarations
-
-
 def option(default: T | None, description: str, unit: str = "", **details: Any) -> T:
     """A key of the file: see :class:`Parameter`. Without a default it is required or computed."""
     details |= {"default": default, "description": description, "unit": unit}

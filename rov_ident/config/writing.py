@@ -13,6 +13,7 @@ from rov_ident.config.schema import PARAMETERS, VEHICLE_PARAMETERS, Config
 from rov_ident.core.files import write_file
 from rov_ident.core.yaml_file import Dumper
 from rov_ident.model.coefficients import DIAGONAL, catalogue, input_catalogue
+from rov_ident.model.equations import RigidBody
 
 
 def to_parameters(config: Config) -> dict[str, Any]:
@@ -20,19 +21,8 @@ def to_parameters(config: Config) -> dict[str, Any]:
 
     Settings at their defaults are left out.
     """
-    body = config.model.body
-    inertia = body.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    vehicle = {
-        "name": config.name,
-        "frame": "frd",
-        "mass": float(body.mass),
-        "weight": float(body.weight),
-        "buoyancy": float(body.buoyancy),
-        "cog": body.cog.tolist(),
-        "cob": body.cob.tolist(),
-        "inertia": inertia.tolist(),
-        **_changed(config.vehicle_uncertainty),
-    }
+    vehicle = vehicle_section(config.name, config.model.body)
+    vehicle |= _changed(config.vehicle_uncertainty)
     coefficients = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
     settings = _changed(config)
     settings.pop("estimate", None)
@@ -42,6 +32,20 @@ def to_parameters(config: Config) -> dict[str, Any]:
         parameters = (f"{effect}.{name}" for effect, name in config.estimate_effects)
         settings["estimate"] = [*config.estimate, *parameters]
     return {"vehicle": vehicle, "coefficients": coefficients, **settings}
+
+
+def vehicle_section(name: str, body: RigidBody) -> dict[str, Any]:
+    """The section `vehicle`, without negative zeros."""
+    return {
+        "name": name,
+        "frame": "frd",
+        "mass": float(body.mass),
+        "weight": float(body.weight),
+        "buoyancy": float(body.buoyancy),
+        "cog": (body.cog + 0.0).tolist(),
+        "cob": (body.cob + 0.0).tolist(),
+        "inertia": (body.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] + 0.0).tolist(),
+    }
 
 
 def dump(config: Config, path: str | os.PathLike[str], comment: str = "") -> None:
@@ -63,8 +67,8 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
     ``parameters`` are nested plain values; what they lack is commented out at its default, or
     marked UNKNOWN where there is none. ``remarks``, by dotted name, say where a value comes from.
     """
-    meanings = {c.name: f"{c.unit}: {c.meaning}" for c in catalogue()}
-    meanings |= {c.name: f"{c.unit}: {c.meaning}" for c in input_catalogue()}
+    known = (*catalogue(), *input_catalogue())
+    meanings = {c.name: f"{c.unit}: {c.meaning}" for c in known}
     sections: dict[str, dict[str, str]] = {"vehicle": {}, "coefficients": {}}
     given = {".".join(path): value for path, value in leaves(parameters) if value != {}}
     for p in VEHICLE_PARAMETERS + PARAMETERS:

@@ -133,8 +133,7 @@ def turns(q: Array) -> Array:
     between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
     size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
     angle = 2.0 * np.arctan2(size, between[:, :1])
-    out: Array = angle * between[:, 1:] / np.maximum(size, 1e-12)
-    return out
+    return angle * between[:, 1:] / np.maximum(size, 1e-12)
 
 
 def quaternion_angle(p: Array, q: Array) -> Array:

@@ -68,3 +68,9 @@ def widened(covariance: Array, variance: Array) -> Array:
 def interpolated(t: Array, y: Array, at: Array) -> Array:
     """Columns y (N, n) at times t (N,), straight in between, at the times ``at`` (k,): (k, n)."""
     return np.stack([np.interp(at, t, column) for column in y.T], axis=1)
+
+
+def integral(t: Array, y: Array) -> Array:
+    """The integral (N, n) of columns y (N, n) from the first of the times t (N,) (trapezoids)."""
+    steps = 0.5 * np.diff(t)[:, None] * (y[1:] + y[:-1])
+    return np.vstack([np.zeros(y.shape[1]), np.cumsum(steps, axis=0)])

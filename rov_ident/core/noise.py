@@ -9,12 +9,10 @@ _NORMAL = 1.4826  # standard deviation of a normal number over the median of its
 
 def robust_std(error: Array, axis: int = 0) -> Array:
     """The standard deviation of normal errors along an axis, whatever a minority of them is."""
-    std: Array = _NORMAL * np.median(np.abs(error), axis=axis)
-    return std
+    return _NORMAL * np.median(np.abs(error), axis=axis)
 
 
 def second_differences(signal: Array) -> Array:
     """(K - 2, n) of a signal (K, n), over the square root of 6: white noise keeps its standard
     deviation, and a signal that changes evenly leaves nothing."""
-    differences: Array = np.diff(signal, 2, axis=0) / np.sqrt(6.0)
-    return differences
+    return np.diff(signal, 2, axis=0) / np.sqrt(6.0)

@@ -21,12 +21,12 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
     turns,
 )
-from rov_ident.core.linalg import interpolated, scaled_solve
+from rov_ident.core.linalg import integral, interpolated, scaled_solve
 from rov_ident.discrepancy import sensor_choice, sensor_consistency
 from rov_ident.discrepancy.held_out import split, surely_less
 from rov_ident.discrepancy.sensor_consistency import CLUSTER, FEWEST, ROUNDS, whitened
 from rov_ident.model.equations import Array
-from rov_ident.sampling.raw_streams import Streams, integral
+from rov_ident.sampling.raw_streams import Streams
 
 _BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
 _FEWEST_CLUSTERS = 6  # that a record must last: of fewer the scatter is not known

@@ -29,7 +29,7 @@ from rov_ident.effects import EFFECTS, reading_noise
 from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
-from rov_ident.sampling.reading_noise import SHARE
+from rov_ident.sampling.wrench_scatter import SHARE
 
 T = TypeVar("T")
 R = TypeVar("R")

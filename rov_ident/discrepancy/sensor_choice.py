@@ -29,7 +29,7 @@ from rov_ident.effects.base import a_reading
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
-from rov_ident.sampling.reading_noise import RESTING
+from rov_ident.sampling.wrench_scatter import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"

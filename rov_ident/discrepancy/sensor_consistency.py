@@ -30,7 +30,7 @@ from rov_ident.core.frames import (
     velocity_of_arm,
 )
 from rov_ident.core.jit import kernel
-from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
+from rov_ident.core.linalg import integral, interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import turned
 from rov_ident.discrepancy.hypothesis import Key, bounds
@@ -40,7 +40,7 @@ from rov_ident.discrepancy.windowed_problem import within
 from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array, Indices
-from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
+from rov_ident.sampling.raw_streams import Streams, orientation_at
 
 # Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
 # which the white noise is nothing, about a factor of three apart.

@@ -22,7 +22,7 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
     turns,
 )
-from rov_ident.core.linalg import interpolated
+from rov_ident.core.linalg import integral, interpolated
 from rov_ident.core.noise import robust_std
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
 from rov_ident.discrepancy.multiple_shooting import (
@@ -40,8 +40,8 @@ from rov_ident.effects import EFFECTS, compiled, steered
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import Array, Model, RigidBody
-from rov_ident.sampling.raw_streams import Streams, integral, orientation_at
-from rov_ident.sampling.reading_noise import resting_noise
+from rov_ident.sampling.raw_streams import Streams, orientation_at
+from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
 MAX_STEP = 0.05  # s; of integration, where odometry is slower

@@ -24,7 +24,7 @@ from rov_ident.core.linalg import scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.discrepancy.linearisation import Linearisation, MoreNoise, linearise
 from rov_ident.discrepancy.reading_noise import jitter
-from rov_ident.sampling.reading_noise import resting, scatter
+from rov_ident.sampling.wrench_scatter import resting, scatter
 
 _BLOCKS = 180  # of readings, in which their noise is measured: three minutes at 50 Hz
 _KEPT = 35.0 / 36.0  # of what is known about trembling, from one window to the next: three minutes

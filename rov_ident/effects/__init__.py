@@ -104,7 +104,6 @@ _ALL_ACTS = _in_turn([_act(effect.act) for effect in _INPUT])
 _ALL_STEERS = _in_turn([_steer(effect.steer) for effect in _STEER])
 _ALL_WRENCHES = _in_turn([_wrench(effect.wrench) for effect in _WRENCH])
 
-
 Values = Mapping[str, Mapping[str, float]]
 """The section ``effects`` of a configuration: {effect: {parameter: value}}, complete."""
 
@@ -196,7 +195,6 @@ def affects_sensors(effects: Values) -> bool:
 
 
 def parameter(effect: str, name: str) -> EffectParameter:
-    """A parameter by its effect and its name."""
     return next(p for p in EFFECTS[effect].parameters if p.name == name)
 
 

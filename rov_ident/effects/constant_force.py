@@ -1,8 +1,6 @@
 """A force fixed in the world, at the body origin: ``f_body = R' f_world``.
 
 A pull of the umbilical in one direction, a weight forgotten on the frame (``fz``).
-
-Source: Fossen (2021), sec. 10.2: slowly varying environmental forces as a bias in the world frame.
 """
 
 from rov_ident.core.jit import kernel

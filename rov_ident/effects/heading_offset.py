@@ -7,11 +7,6 @@ velocities: only an IMU or the thrust tell one from the other.
 
 from rov_ident.effects.base import Effect, EffectParameter
 
-
-def heading(yaw: float) -> float:
-    return yaw
-
-
 EFFECT = Effect(
     place="motion",
     summary="The heading of the pose is off by a constant angle, the velocities are right.",
@@ -19,5 +14,5 @@ EFFECT = Effect(
     source="Kinsey, Whitcomb (2007), In situ alignment calibration of attitude and Doppler sensors "
     "for precision underwater vehicle navigation, IEEE J. Oceanic Eng. 32(2)",
     parameters=(EffectParameter("yaw", "rad", "measured less true", 0.0, -3.2, 3.2, 0.05),),
-    heading=heading,
+    heading=lambda yaw: yaw,
 )

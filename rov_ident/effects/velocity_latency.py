@@ -6,11 +6,6 @@ those of the stamp.
 
 from rov_ident.effects.base import Effect, EffectParameter
 
-
-def late(delay: float) -> float:
-    return delay
-
-
 EFFECT = Effect(
     place="motion",
     summary="The linear velocities are late against pose, angular velocities and thrust.",
@@ -18,5 +13,5 @@ EFFECT = Effect(
     source="Kelly, Sukhatme (2014), A general framework for temporal calibration of multiple "
     "proprioceptive and exteroceptive sensors, Experimental Robotics (Springer)",
     parameters=(EffectParameter("delay", "s", "age at the stamp", 0.0, 0.0, 1.0, 0.05),),
-    late=late,
+    late=lambda delay: delay,
 )

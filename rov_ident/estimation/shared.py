@@ -15,8 +15,8 @@ from rov_ident.estimation.innovation_monitor import TIME
 from rov_ident.estimation.process_noise import process
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Structure, in_motion
-from rov_ident.sampling.reading_noise import RECENT
 from rov_ident.sampling.sample import parts
+from rov_ident.sampling.wrench_scatter import RECENT
 
 MAX_STEP = 0.05  # s; of one step of the prediction
 LIGHTEST = 0.2  # of the rigid body's own inertia: no model that is tried is lighter

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix, turns
-from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
+from rov_ident.core.linalg import integral, interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.model.scales import authority
@@ -21,7 +21,7 @@ from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.queues import LONGEST_INTERVAL
-from rov_ident.sampling.raw_streams import Streams, integral
+from rov_ident.sampling.raw_streams import Streams
 from rov_ident.sampling.sample import SAMPLE
 from rov_ident.sampling.without_velocity import is_without_velocity
 
@@ -170,11 +170,9 @@ def _correlation_remark(
     if reverse:
         text = bad.format(", ".join(reverse))
         return Remark(subject, BAD, text, hopeless=2 * len(reverse) >= len(by_name))
-    return (
-        Remark(subject, WARNING, weak.format(", ".join(low)))
-        if low
-        else Remark(subject, GOOD, good)
-    )
+    if low:
+        return Remark(subject, WARNING, weak.format(", ".join(low)))
+    return Remark(subject, GOOD, good)
 
 
 def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:

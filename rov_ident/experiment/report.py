@@ -80,13 +80,11 @@ def _known(prospects: Sequence[Prospect], **stds: Sequence[float]) -> plots.Figu
 
 
 def check_picture(found: Check) -> plots.Figure:
-    """How well each coefficient is known, now and after a fit."""
     now, then = ([p.prior_std for p in found.prospects], [p.std for p in found.prospects])
     return _known(found.prospects, configured=now, after_a_fit=then)
 
 
 def plan_picture(found: Proposal) -> plots.Figure:
-    """How well each coefficient is known, now and after the manoeuvre."""
     now, then = ([p.std for p in known] for known in (found.before, found.after))
     return _known(found.before, now=now, after_it=then)
 

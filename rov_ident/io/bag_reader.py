@@ -55,7 +55,6 @@ _USUAL = {
     "battery": ("battery_state",),
 }
 """As robot_localization, mavros and uuv_simulator call them: taken where no topic has our name."""
-_OPTIONAL_ROLES = ("imu",)
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -247,7 +246,7 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
         raise UserError(
             f"{named[0]} in {bag.path} is {filled[named[0]]}, but {role} must be {type_name}."
         )
-    if role in _OPTIONAL_ROLES:
+    if role == "imu":  # it may well have none
         return None
     raise UserError(
         f"{bag.path} has no {name} topic ({type_name}): record it too; the bag has {holds}."

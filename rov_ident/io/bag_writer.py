@@ -146,8 +146,10 @@ class BagWriter:
         """Drops the unfinished bag; a live recording is kept as it is."""
         with suppress(OSError):  # it may be a full disk that has led here
             self._stream.close()
-        if not self._live:
-            self._remove_part()
+        if not self._live and self._part.is_dir():
+            shutil.rmtree(self._part)
+        elif not self._live:
+            self._part.unlink(missing_ok=True)
 
     def __enter__(self) -> "BagWriter":
         return self
@@ -162,12 +164,6 @@ class BagWriter:
     @property
     def _mcap_path(self) -> Path:
         return self._part / f"{self.path.name}_0.mcap" if self._is_directory else self._part
-
-    def _remove_part(self) -> None:
-        if self._part.is_dir():
-            shutil.rmtree(self._part)
-        else:
-            self._part.unlink(missing_ok=True)
 
     def _metadata(self) -> dict[str, Any]:
         """The contents of metadata.yaml as rosbag2 of ROS 2 Jazzy writes them (version 9)."""

@@ -30,7 +30,7 @@ ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 JOINTS_TYPE = "sensor_msgs/msg/JointState"
-ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE}
+ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE, "inputs": JOINTS_TYPE}
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian, no options
 _STAMP = struct.Struct("<iI")
@@ -125,8 +125,7 @@ def independent(covariance: Array) -> Array:
     share = np.minimum(np.abs(covariance) / np.outer(std, std), 1.0)
     share[~np.isfinite(share)] = 0.0
     np.fill_diagonal(share, 1.0)
-    out: Array = np.where(given, variance * share.sum(axis=1), variance)
-    return out
+    return np.where(given, variance * share.sum(axis=1), variance)
 
 
 # Each raises ValueError on malformed bytes; axes are those on the wire.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core import frames
 from rov_ident.core.errors import UserError
+from rov_ident.core.linalg import integral
 from rov_ident.core.messages import (
     DRIVE,
     ODOMETRY,
@@ -45,7 +46,6 @@ _LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but anoth
 _IN_RADIANS = (*_VELOCITIES[3:], *_ANGLES, *_FINS)
 _LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
 _WRAP_JUMP = 1.0  # rad within one row, and back in the next: no vehicle does that
-
 
 Prepare = Callable[
     [Mapping[str, Array], Mapping[str, Array]],
@@ -204,7 +204,7 @@ def parse_columns(items: Sequence[str]) -> dict[str, str]:
 def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDArray[np.bool_]]:
     """Quaternions (n, 4), and which rows have none because their angles were averaged."""
     none = np.zeros(len(angular), dtype=bool)
-    if log.has(_QUATERNION):
+    if all(name in log.data for name in _QUATERNION):
         quaternion = log.matrix(_QUATERNION)
         length = np.linalg.norm(quaternion, axis=1)
         if (bad := np.flatnonzero(np.abs(length - 1.0) > 0.1)).size:
@@ -219,7 +219,7 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
         yaw = log.data["yaw"]
     else:
         rate = (angular[:, 1] * np.sin(roll) + angular[:, 2] * np.cos(roll)) / np.cos(pitch)
-        yaw = _integrated(log.data["t_s"], rate)
+        yaw = integral(log.data["t_s"], rate[:, None])[:, 0]
         notes.append("no yaw is given: it is integrated from the rates, from 0")
     if missing := [name for name in ("roll", "pitch") if name not in log.data]:
         notes.append(f"no {' and '.join(missing)} given: taken as 0")
@@ -248,16 +248,8 @@ def _position(log: "_Log", linear: Array, orientation: Array, notes: list[str]) 
             f"no {' '.join(missing)} given: dead-reckoned from the velocities, so that comparing "
             "pose with velocity tells nothing"
         )
-    dead_reckoned = {
-        name: _integrated(log.data["t_s"], column)
-        for name, column in zip(_POSITIONS, velocity.T, strict=True)
-    }
+    dead_reckoned = dict(zip(_POSITIONS, integral(log.data["t_s"], velocity).T, strict=True))
     return np.column_stack([log.data.get(name, dead_reckoned[name]) for name in _POSITIONS])
-
-
-def _integrated(time: Array, rate: Array) -> Array:
-    """The integral of a sampled rate by the trapezoidal rule, from 0."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
 
 
 @dataclass
@@ -311,9 +303,6 @@ class _Log:
         self.places = [place for place, keep in zip(self.places, kept, strict=True) if keep]
         return notes
 
-    def has(self, names: Sequence[str]) -> bool:
-        return all(name in self.data for name in names)
-
     def matrix(self, names: Sequence[str]) -> Array:
         """Columns side by side, (n, len(names))."""
         return np.column_stack([self.data[name] for name in names])
@@ -357,7 +346,7 @@ class _Log:
             if not large.size:
                 continue
             turned = np.linalg.norm(self.matrix(_VELOCITIES[3:]), axis=1)
-            path_of_rates = _integrated(self.data["t_s"], turned)[-1]
+            path_of_rates = integral(self.data["t_s"], turned[:, None])[-1, 0]
             if name != "yaw" or np.abs(np.diff(angle)).sum() > 10.0 * path_of_rates:
                 raise UserError(
                     f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "

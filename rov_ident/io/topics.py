@@ -44,9 +44,8 @@ _FRAME = "base_link"  # of a wrench that comes without a frame: the axes are tho
 _CHOICES = {
     ODOMETRY: schema.ODOMETRY_TYPES,
     POSE: schema.POSE_TYPES,
-    WRENCH: schema.WRENCH_TYPES + schema.FORCE_TYPES + schema.PULSE_TYPES,
+    WRENCH: schema.BY_KEY["inputs.wrench"].choices,
 }
-
 
 _FOREIGN = {  # what such topics and types are called, and what they could be
     ODOMETRY: (
@@ -59,7 +58,6 @@ _FOREIGN = {  # what such topics and types are called, and what they could be
         "sensor_msgs/JointState (a force for each thruster) or geometry_msgs/WrenchStamped",
     ),
 }
-
 
 USUAL: Any = SimpleNamespace(
     inputs=Inputs(), topics=schema.Topics(), frames=schema.Frames(), thrusters=schema.Thrusters()
@@ -311,9 +309,6 @@ def _full_name(type_name: str) -> str:
     return f"{package}/msg/{name}"
 
 
-# ------------------------------------------------------------------ what a bag has
-
-
 FrameIds = tuple[str, str]
 
 
@@ -324,17 +319,12 @@ class Seen(NamedTuple):
     topic: str
     type_name: str
     rate: float
-    frame_id: str
-    child_frame_id: str
+    frames: FrameIds
 
 
-class Survey(NamedTuple):
-    sources: dict[str, Seen]
-    notes: tuple[str, ...]
-
-
-def survey(bag: Bag) -> Survey:
-    """What of a bag can serve as which input, in the order in which the types are preferred."""
+def survey(bag: Bag) -> tuple[dict[str, Seen], list[str]]:
+    """What of a bag can serve as which input, in the order in which the types are preferred; and
+    notes on what is doubtful."""
     found: dict[str, Seen] = {}
     notes: list[str] = []
 
@@ -363,7 +353,7 @@ def survey(bag: Bag) -> Survey:
         look(POSE, schema.POSE_TYPES, "pose")
     if WRENCH in found and found[WRENCH].type_name in schema.PULSE_TYPES:
         look(BATTERY, (schema.BATTERY_TYPE,))
-    return Survey(found, tuple(notes))
+    return found, notes
 
 
 def _source_of(bag: Bag, topic: str, kind: str) -> Seen:
@@ -373,8 +363,8 @@ def _source_of(bag: Bag, topic: str, kind: str) -> Seen:
         if first is None:
             first = cdr.DECODERS[_full_name(kind)](raw.data)
     span = max(times) - min(times)
-    frames = (getattr(first, name, "") for name in ("frame_id", "child_frame_id"))
-    return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, *frames)
+    frames = getattr(first, "frame_id", ""), getattr(first, "child_frame_id", "")
+    return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, frames)
 
 
 def first_frames(bag: Bag, chosen: Mapping[str, str], config: Config) -> dict[str, FrameIds]:

@@ -3,12 +3,10 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from rov_ident.core.messages import DRIVE, Message
+from rov_ident.core.messages import Message
 from rov_ident.io.bag_reader import ROLE_NAMES
 from rov_ident.io.bag_writer import BagWriter
-from rov_ident.io.cdr import JOINTS_TYPE, ROLE_TYPES, encode
-
-_TYPES = {**ROLE_TYPES, DRIVE: JOINTS_TYPE}
+from rov_ident.io.cdr import ROLE_TYPES, encode
 
 
 def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]]) -> None:
@@ -18,4 +16,4 @@ def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]
     """
     with BagWriter(path) as writer:
         for arrival, role, message in messages:
-            writer.write(f"/{ROLE_NAMES[role]}", _TYPES[role], arrival, encode(message))
+            writer.write(f"/{ROLE_NAMES[role]}", ROLE_TYPES[role], arrival, encode(message))

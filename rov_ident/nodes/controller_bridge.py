@@ -122,7 +122,7 @@ class ControllerBridge(GuardedNode):
         self.create_service(SetBool, "~/enable", self._enable, callback_group=looks)
         self.create_timer(_LOOK_PERIOD, self._compare_and_send, looks)
         self.create_timer(DIAGNOSTICS_PERIOD, self._diagnose, answers)
-        parameters.follow(self, partial(parameters.own, self, _OWN), self._take_parameters)
+        parameters.follow(self, partial(parameters.own, self, _OWN), self._settings.update)
 
     def _client(self, type_: type, service: str, group: ReentrantCallbackGroup) -> Any:
         return self.create_client(type_, f"{self._controller}/{service}", callback_group=group)
@@ -154,7 +154,6 @@ class ControllerBridge(GuardedNode):
             return dict(self._wanted), dict(self._std), self._refusal
 
     def _compare_and_send(self) -> None:
-        """Compare, and send what is due."""
         self._pending = ()
         with self._reporting():
             self._confirm()
@@ -376,9 +375,6 @@ class ControllerBridge(GuardedNode):
         status = to_status(f"{name}: bridge", self._config.name, self._level, self._words, values)
         message.status = [status]
         self._diagnostics.publish(message)
-
-    def _take_parameters(self, settings: dict[str, Any]) -> None:
-        self._settings = settings
 
 
 class _HalfChangedError(UserError):

@@ -6,7 +6,6 @@ several, or on a Dask cluster, and the result is the same.
 """
 
 import contextlib
-import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -126,11 +125,6 @@ def opened(
         yield _reader(lambda *how: reported(_outcome(path, *how) for path in paths), _locally)(
             config, False
         )
-
-
-def default_jobs() -> int:
-    """As many processes as this one may use processors."""
-    return len(os.sched_getaffinity(0))
 
 
 Outcome = tuple[Bag, Any] | str

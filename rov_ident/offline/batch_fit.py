@@ -92,11 +92,11 @@ def fit_batch(
 ) -> Fit:
     """Fit an archive.
 
-    Raises UserError if there is no such estimator, a channel has no coefficient to estimate, or the
-    configured model cannot be simulated.
+    ``kind`` is one of KINDS.
+
+    Raises UserError if a channel has no coefficient to estimate, or the configured model cannot be
+    simulated.
     """
-    if kind not in KINDS:
-        raise UserError(f"there is no estimator '{kind}': use {', '.join(KINDS)}")
     settings = settings or Settings()
     unmeasured = [bag for bag, so in zip(archive.bags, archive.each(is_without_velocity)) if so]
     if unmeasured:
@@ -451,9 +451,6 @@ def predicted_information(
     noise = maximum_likelihood.assumed(config, maximum_likelihood.LIKELY)
     parts = archive.each(maximum_likelihood.one_pass, config.dynamics, estimated, noise, free)
     return total(parts).information
-
-
-# ------------------------------------------------------------------ open loop
 
 
 def _mean_square_wrench(samples: Samples) -> Array:

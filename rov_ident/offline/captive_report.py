@@ -12,7 +12,6 @@ from rov_ident.reports.table import estimate
 
 
 def page(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
-    """The page of a force table."""
     sections = [headline(fits).html()]
     sections += [report.bullets(notes)] if notes else []
     for axis, f in fits.items():

@@ -670,9 +670,7 @@ def remarks(fits: Mapping[str, AxisFit], with_config: bool) -> list[str]:
 
 
 def with_hull(config: Config, hull: Mapping[str, float]) -> Config:
-    """The configuration with the added mass of ``hull``, if any, in the place of its own."""
-    if not hull:
-        return config
+    """The configuration with the added mass of ``hull`` in the place of its own."""
     model = config.model
     values = {n: x for n, x in model.values.items() if not parse(n).is_added_mass}
     return config.with_model(build(model.body, {**hull, **values}))

@@ -43,7 +43,6 @@ class CoastDown(Result):
     rmse: float
 
     def to_json(self) -> str:
-        """The machine-readable result."""
         result = {
             "coefficients": self.entries(),
             "speed_rmse_mps": self.rmse,

@@ -9,12 +9,11 @@ import numpy as np
 
 from rov_ident.config import Config, dump
 from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_covariance
-from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
 from rov_ident.estimation.consistency import Consistency, Test
-from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator
+from rov_ident.estimation.online import Kind, OnlineEstimator
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
@@ -26,12 +25,9 @@ from rov_ident.sampling.records import HORIZON, Record, numbers
 
 IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
-
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
 _SHOWN = 60.0  # s of motion in the picture of a fit
-
-
 _MOST = 0.5  # of a variance
 _NOTICED = 0.1  # of the scale's prior standard deviation: 1.5 % of thrust
 
@@ -189,9 +185,7 @@ class Fit(Shown, Result):
         size = np.where(before == 0.0, np.maximum(np.abs(self.values), 1e-12), np.abs(before))
         change = 100.0 * (self.values - before) / size
         half = 100.0 * self.quantile * self.std / size
-        one = next(iter(self.judged or self.curves), None)
-        if one is None:
-            return plots.fitted(self.names, (change, half), None)
+        one = (self.judged or self.curves)[0]
         part = one.t < one.t[0] + _SHOWN
         models = {"as configured": one.before[part], "retuned": one.after[part]}
         return plots.fitted(self.names, (change, half), (one.t[part], one.measured[part], models))
@@ -205,10 +199,7 @@ class Fit(Shown, Result):
     def save_config(self, path: str | Path) -> None:
         """Write :attr:`fitted` as a parameter file, whatever its ending.
 
-        Raises
-        ------
-        UserError
-            If it cannot be written.
+        Raises UserError if it cannot be written.
         """
         bags = ", ".join(bag["file"] for bag in self.provenance["bags"])
         comment = f"Fitted by rov-ident fit --estimator {self.estimator} to {bags}."
@@ -253,13 +244,8 @@ def rmse_change(before: Mapping[str, float | None], after: Mapping[str, float | 
 def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     """Fold a recursive estimator over records, one after the other, as the node would.
 
-    Raises
-    ------
-    UserError
-        If the data are too few to say anything.
+    Raises UserError if the data are too few to say anything.
     """
-    if kind not in ESTIMATORS:
-        raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")
     ensure_compiled(config, kind)
     estimator = OnlineEstimator(config, kind)
     for record in records:

@@ -72,8 +72,8 @@ from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.sampling.kinematic_filter import SUREST
-from rov_ident.sampling.reading_noise import SHARE
 from rov_ident.sampling.sample import NO_SIDES, parts
+from rov_ident.sampling.wrench_scatter import SHARE
 
 T = TypeVar("T")
 

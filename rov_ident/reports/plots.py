@@ -388,12 +388,10 @@ def motions(
 def fitted(
     names: Sequence[str],
     change: tuple[Array, Array],
-    motion: tuple[Array, Array, Mapping[str, Array]] | None,
+    motion: tuple[Array, Array, Mapping[str, Array]],
 ) -> Figure:
     """Coefficients with their intervals, and beside them the arguments of :func:`motions`."""
     label = "change by the fit [%], with its 95 % interval"
-    if motion is None:
-        return intervals(names, {"fitted": change}, label)
     figure = Figure((11.5, max(5.4, 0.22 * len(names) + 1.2)), layout="constrained")
     left, right = cast(Any, figure.subfigures(1, 2, width_ratios=(1.0, 1.7)))
     intervals(names, {"fitted": change}, label, left.subplots())

@@ -20,7 +20,7 @@ from rov_ident.sampling.despiking import Despiker
 from rov_ident.sampling.dropped_commands import SILENCE, CommandPeriod, estimated
 from rov_ident.sampling.effect_jacobians import EffectJacobians
 from rov_ident.sampling.queues import Waiting
-from rov_ident.sampling.reading_noise import ReadingNoise
+from rov_ident.sampling.wrench_scatter import ReadingNoise
 
 _ZERO = np.zeros(6)
 

@@ -163,8 +163,7 @@ class KinematicFilter:
     @property
     def acceleration(self) -> Array:
         """Of the origin over ground (3,) [m/s2], in body axes, when the IMU last measured."""
-        acceleration: Array = self.state["acceleration"][0]
-        return acceleration
+        return self.state["acceleration"][0]
 
     @property
     def test_ratios(self) -> dict[str, float]:

@@ -18,6 +18,10 @@ from rov_ident.model.equations import Array
 _MEASURED = ("u", "v", "w", "p", "q", "r")
 _DRIVES = ("X", "Y", "Z", "K", "M", "N", "delta_s", "delta_r", "delta_a", "rpm")
 _UNEVEN = 0.1  # of a step: by so much steps may differ where a filter takes them as even
+_NEIGHBOURS = 11  # rows that have a median, a choice
+_OUTLIER = 5.0  # robust standard deviations
+_AGILITY = 0.2  # m/s^1.5; of the random walk of a rate of depth
+_GATE = 5.0  # standard deviations beyond which a depth is refused
 _DRIVEN = 0.1  # of the most on an axis or of a fin; what holds a vehicle in place is below
 
 
@@ -90,19 +94,19 @@ class Preparation:
         return data, kept, notes
 
 
-def despiked(x: Array, width: int = 11, limit: float = 5.0) -> tuple[Array, NDArray[np.bool_]]:
+def despiked(x: Array) -> tuple[Array, NDArray[np.bool_]]:
     """A signal (N,) with outliers replaced by the local median, and where they were.
 
-    An outlier is further from the median of ``width`` neighbours than ``limit`` robust standard
-    deviations of that distance over the whole signal (Hampel 1974; Pearson 2002).
+    An outlier is further from the median of its neighbours than the robust standard deviation of
+    that distance over the whole signal allows (Hampel 1974; Pearson 2002).
     """
     from scipy.ndimage import median_filter  # here: a fit of dives does not need it
 
-    middle = median_filter(x, width, mode="nearest")
+    middle = median_filter(x, _NEIGHBOURS, mode="nearest")
     off = np.abs(x - middle)
     # many a value is the median itself, whatever the noise: those say nothing of the spread
     spread = float(robust_std(off[off > 0.0])) if off.any() else 0.0
-    bad = off > limit * max(spread, 1e-12)
+    bad = off > _OUTLIER * max(spread, 1e-12)
     return np.where(bad, middle, x), bad
 
 
@@ -160,21 +164,20 @@ class Source:
 
 @dataclass(frozen=True)
 class Fused:
-    """Values and rates at the instants ``t``, with their standard deviations; biases by source."""
+    """Values (N,) with their standard deviations, and rates; biases by source."""
 
-    t: Array
     value: Array
     rate: Array
     std: Array
     bias: dict[str, float]
 
 
-def fused(sources: list[Source], t: Array, agility: float = 0.2, gate: float = 5.0) -> Fused:
-    """One quantity (depth) from several sources, smoothed from both sides.
+def fused(sources: list[Source], t: Array) -> Fused:
+    """Depth from several sources at the increasing instants t (N,), smoothed from both sides.
 
     A Kalman filter over value, rate and each source's bias, a Rauch-Tung-Striebel smoother back;
-    the rate is a random walk of ``agility`` [unit / s^1.5]. Measurements beyond ``gate`` standard
-    deviations are refused, so a source that jumps does not spoil the others.
+    the rate is a random walk. Measurements that are far off are refused, so a source that jumps
+    does not spoil the others.
 
     Raises UserError if there is no source, or one is not in order of time.
     """
@@ -199,7 +202,7 @@ def fused(sources: list[Source], t: Array, agility: float = 0.2, gate: float = 5
         f = np.eye(n)
         f[0, 1] = dt
         q = np.zeros((n, n))
-        q[:2, :2] = agility**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        q[:2, :2] = _AGILITY**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         x, p = f @ x, f @ p @ f.T + q
         steps.append(f)
         before.append((x, p))
@@ -208,7 +211,7 @@ def fused(sources: list[Source], t: Array, agility: float = 0.2, gate: float = 5
             h[0], h[2 + k] = 1.0, 1.0
             size = h @ p @ h + sources[k].std ** 2
             e = z - h @ x
-            if e**2 <= gate**2 * size:
+            if e**2 <= _GATE**2 * size:
                 gain = p @ h / size
                 x, p = x + gain * e, p - np.outer(gain, h @ p)
         after.append((x, p))
@@ -219,7 +222,6 @@ def fused(sources: list[Source], t: Array, agility: float = 0.2, gate: float = 5
     wanted = [after[i] for i, e in enumerate(events) if e[1] < 0]
     values = np.array([x for x, _ in wanted])
     return Fused(
-        np.sort(np.asarray(t)),
         values[:, 0],
         values[:, 1],
         np.sqrt(np.array([max(p[0, 0], 0.0) for _, p in wanted])),

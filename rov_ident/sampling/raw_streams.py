@@ -264,9 +264,3 @@ def _rate(q: Array, omega: Array) -> Array:
     """q_dot (k, 4) = q (0, omega) / 2."""
     rates = np.insert(omega, 0, 0.0, axis=1)
     return 0.5 * quaternion_multiply(q, rates)
-
-
-def integral(t: Array, y: Array) -> Array:
-    """The integral (N, n) of columns y (N, n) from the first of the times t (N,) (trapezoids)."""
-    steps = 0.5 * np.diff(t)[:, None] * (y[1:] + y[:-1])
-    return np.vstack([np.zeros(y.shape[1]), np.cumsum(steps, axis=0)])

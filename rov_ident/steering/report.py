@@ -41,8 +41,8 @@ def page(
         *(_run(model, run, "fitted", f"run{i}-") for i, run in enumerate(runs)),
     ]
     if judge is not None:
-        sections.append(report.heading("On a run not used for the fit"))
-        sections.append(_run(model, judge, "predicted", "judge-"))
+        heading = report.heading("On a run not used for the fit")
+        sections += [heading, _run(model, judge, "predicted", "judge-")]
     sections += [report.bullets(model.notes)] if model.notes else []
     if model.cross_validation:
         errors = " and ".join(
@@ -58,10 +58,9 @@ def page(
             cells = [f"{value:.4g} ± {half:.2g}" for value, half in pairs]
             rows.append([_METHODS[name], *cells, f"{np.degrees(other.rmse):.3g}"])
         head = ["", f"K [{model.units[0]}]", "T [s]", "heading RMSE [deg]"]
+        legend = "± is half of the 95 % interval, coloured noise allowed for."
         sections += [report.heading("By other estimators"), report.table(head, rows)]
-        sections.append(
-            report.paragraph("± is half of the 95 % interval, coloured noise allowed for.")
-        )
+        sections.append(report.paragraph(legend))
     halves = model.quantile * model.std
     told = zip(model.names, model.values, halves, model.units)
     main = [

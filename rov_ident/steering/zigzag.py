@@ -10,8 +10,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, to_core
 from rov_ident.core.messages import Array, Odometry, Wrench
-from rov_ident.io.bag_reader import ROLE_NAMES, Bag, select_topic
-from rov_ident.io.cdr import ROLE_TYPES
+from rov_ident.io.bag_reader import Bag
 from rov_ident.io.csv_table import CsvTable, read_csv
 from rov_ident.io.topics import ODOMETRY, POSE, USUAL, WRENCH, messages, select
 
@@ -178,12 +177,8 @@ def from_bag(path: Path, config: Config | None = None) -> Zigzag:
     if len(steered) > 1:
         raise UserError(f"{path} has several rudders, {', '.join(steered)}: keep one")
     roles = (ODOMETRY,) if steered else (ODOMETRY, WRENCH)
-    if config is None:
-        config = USUAL
-        found = {r: select_topic(bag, r, ROLE_NAMES[r], ROLE_TYPES[r], "") for r in roles}
-        chosen = {role: topic for role, topic in found.items() if topic}
-    else:
-        chosen = select(bag, config, (*roles, POSE))
+    config = config or USUAL
+    chosen = select(bag, config, (*roles, POSE))
     rows: dict[str, list[tuple[float, float]]] = {ODOMETRY: [], WRENCH: []}
     for role, message in messages(bag, chosen, config):
         if not isinstance(message, Odometry | Wrench):

@@ -8,18 +8,12 @@ import numpy as np
 import yaml
 
 from rov_ident.config import Config
-from rov_ident.consumer.formats.base import (
-    Read,
-    Written,
-    diagonal,
-    lost_besides,
-    lost_terms,
-    plain,
-    vehicle,
-)
+from rov_ident.config.writing import vehicle_section
+from rov_ident.consumer.formats.base import Read, Written, diagonal, lost_besides, lost_terms, plain
 from rov_ident.core.errors import UserError
 from rov_ident.core.yaml_file import parse
 from rov_ident.model.coefficients import DIAGONAL
+from rov_ident.model.equations import RigidBody
 
 PARAMETERS = {
     "added_mass": DIAGONAL["added_mass"],
@@ -83,11 +77,12 @@ def read(text: str) -> Read:
         for name, x in zip(names, numbers[key], strict=True)
         if x != 0.0
     }
-    body = vehicle(
-        "vehicle", mass, float(numbers["weight"]), float(numbers["buoyancy"]), cog,
+    body = RigidBody(
+        mass, float(numbers["weight"]), float(numbers["buoyancy"]), cog,
         numbers["center_of_buoyancy"], np.diag(moments),
     )  # fmt: skip
-    return Read({"vehicle": body, "coefficients": coefficients})
+    vehicle = vehicle_section("vehicle", body)
+    return Read({"vehicle": vehicle, "coefficients": coefficients})
 
 
 def _find(node: object) -> dict[str, object] | None:

@@ -18,7 +18,7 @@ from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import DIAGONAL, Coefficient
 
 INERTIA = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
-"""The place of each element in the tensor, in the order of ``vehicle.inertia``."""
+"""The place of each element in the tensor."""
 
 
 @dataclass(frozen=True)
@@ -70,22 +70,6 @@ def lost_besides(config: Config, held: Collection[str] = ()) -> list[str]:
 def plain(vector: Any) -> list[float]:
     """A list of floats, without negative zeros."""
     return [float(x) for x in np.asarray(vector, dtype=float) + 0.0]
-
-
-def vehicle(
-    name: str, mass: float, weight: float, buoyancy: float, cog: Any, cob: Any, inertia: Any
-) -> dict[str, Any]:
-    """The section `vehicle`: cog and cob (3,) [m], inertia (3, 3) about the centre of gravity."""
-    return {
-        "name": name,
-        "frame": "frd",
-        "mass": mass,
-        "weight": weight,
-        "buoyancy": buoyancy,
-        "cog": plain(cog),
-        "cob": plain(cob),
-        "inertia": plain([inertia[place] for place in INERTIA.values()]),
-    }
 
 
 def xml_root(text: str, kind: str) -> ET.Element:

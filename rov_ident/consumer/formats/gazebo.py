@@ -17,19 +17,12 @@ from collections.abc import Callable
 import numpy as np
 
 from rov_ident.config import Config
-from rov_ident.consumer.formats.base import (
-    INERTIA,
-    Read,
-    Written,
-    lost_besides,
-    plain,
-    vehicle,
-    xml_root,
-)
+from rov_ident.config.writing import vehicle_section
+from rov_ident.consumer.formats.base import INERTIA, Read, Written, lost_besides, plain, xml_root
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FLIP_BODY, FLIP_WORLD, quaternion_from_euler, quaternion_to_matrix
 from rov_ident.model.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficient, parse
-from rov_ident.model.equations import GRAVITY
+from rov_ident.model.equations import GRAVITY, RigidBody
 
 DENSITY = 1000.0  # kg/m3, what the Buoyancy plugin assumes unless told otherwise
 
@@ -176,11 +169,11 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
         coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
     coefficients |= _fluid_added_mass(link)
     buoyancy = density * gravity * volume if volume else mass * gravity
-    body = vehicle(
-        model.get("name") or "vehicle", mass, mass * gravity, buoyancy, FLIP_BODY * pose[:3],
-        FLIP_BODY * centre, tensor,
-    )  # fmt: skip
-    parameters = {"vehicle": body, "coefficients": coefficients}
+    body = RigidBody(
+        mass, mass * gravity, buoyancy, FLIP_BODY * pose[:3], FLIP_BODY * centre, tensor
+    )
+    vehicle = vehicle_section(model.get("name") or "vehicle", body)
+    parameters = {"vehicle": vehicle, "coefficients": coefficients}
     current = _numbers(plugin, "default_current", [0.0, 0.0, 0.0])
     if np.any(current):
         ned = plain(FLIP_WORLD @ current)

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rov_ident.config import Config, to_parameters
-from rov_ident.consumer.formats.base import INERTIA, Read, plain, vehicle, xml_root
+from rov_ident.config.writing import vehicle_section
+from rov_ident.consumer.formats.base import INERTIA, Read, plain, xml_root
 from rov_ident.consumer.formats.gazebo import damping
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FLIP_BODY, quaternion_from_euler, quaternion_to_matrix
 from rov_ident.core.messages import Array
-from rov_ident.model.equations import GRAVITY
+from rov_ident.model.equations import GRAVITY, RigidBody
 
 _IMU = re.compile(r"imu", re.IGNORECASE)
 _VELOCITY = re.compile(r"dvl|velocity", re.IGNORECASE)
@@ -76,10 +77,9 @@ def read(text: str, base: Config | None = None) -> Read:
     else:
         notes.append("it says nothing of buoyancy: taken as neutral, about the centre of gravity")
     name = base.name if base else robot.get("name") or "vehicle"
-    parameters["vehicle"] = vehicle(
-        name, mass, mass * gravity, mass * gravity + lift, FLIP_BODY * cog, cob,
-        np.outer(FLIP_BODY, FLIP_BODY) * inertia,
-    )  # fmt: skip
+    weight, tensor = mass * gravity, np.outer(FLIP_BODY, FLIP_BODY) * inertia
+    rigid_body = RigidBody(mass, weight, weight + lift, FLIP_BODY * cog, cob, tensor)
+    parameters["vehicle"] = vehicle_section(name, rigid_body)
     if coefficients:
         parameters["coefficients"] = coefficients
     _mount(parameters, places, notes)
