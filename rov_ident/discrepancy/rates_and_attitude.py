@@ -1,11 +1,11 @@
 """Whether the odometry's angular velocities are those of its attitude, and which are believed.
 
-Rates that are copied from a gyro have its bias, which would pass for forces that turn the vehicle;
-filtered ones are late, which would pass for late thrust; and an attitude whose heading drifts turns
-more than the vehicle. Bias and drift look the same in a level vehicle's attitude and rates. The
-other sensors tell them apart: the position, as the heading turns velocities into the world, and
-the IMU, as a vehicle that moves and turns accelerates to the side. So do the dynamics, as thrust
-turns the vehicle.
+Rates that are copied from a gyro have its bias and its scale, which would pass for forces that turn
+the vehicle; filtered ones are late, which would pass for late thrust; and an attitude whose heading
+drifts turns more than the vehicle. Bias and drift look the same in a level vehicle's attitude and
+rates. The other sensors tell them apart: the position, as the heading turns velocities into the
+world, and the IMU, as a vehicle that moves and turns accelerates to the side. So do the dynamics,
+as thrust turns the vehicle.
 """
 
 import dataclasses
@@ -48,21 +48,27 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     """The streams with what surely differs set right: the rates, or the heading."""
     body = [np.broadcast_to(axis, (len(streams.t), 3)) for axis in np.eye(3)]
     between = _between(streams, config)
-    value, std = _apart(streams, between, body)
+    errors = body
+    if len(streams.imu_t) > 1:  # else trapezoids leave out of quick turns what a scale would, too
+        errors = [*body, *_scaled(streams.nu[:, 3:])]
+        streams = _with_gyro_set_right(streams, between, body, config)
+    value, std = _apart(streams, between, errors)
     value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
     if std.any():
         streams = dataclasses.replace(streams, rates_std=std[:3])
     if not value.any():
         return Agreed(streams)
-    late = bool(value[3] > 0.5 * np.median(np.diff(streams.t)))
+    late = bool(value[-1] > 0.5 * np.median(np.diff(streams.t)))
     biases = [f"{c} {bias:.2g}" for c, bias in zip("pqr", value) if bias]
+    scales = [f"{c} {100.0 * part:.2g} %" for c, part in zip("pqr", value[3:-1]) if part]
     told = [f"{', '.join(biases)} rad/s too much"] if biases else []
-    told += [f"{value[3]:.2g} s late"] if value[3] else []
+    told += [f"{', '.join(scales)} too much"] if scales else []
+    told += [f"{value[-1]:.2g} s late"] if value[-1] else []
     note = (
         f"the odometry's angular velocities are not those of its attitude: {', '.join(told)}; "
         "set right"
     )
-    biased = _noted(streams, _rates(streams, body, value), note)
+    biased = _noted(streams, _rates(streams, errors, value), note)
     drift = _drift(streams, between, body) if value[:3].any() else 0.0
     if not drift:
         return Agreed(biased, late)
@@ -71,9 +77,28 @@ def agreed(streams: Streams, config: Config) -> Agreed:
         f"the heading of the odometry's attitude drifts by {drift:.2g} rad/s beside its angular "
         "velocities and the other sensors; set right"
     )
-    drifts = _noted(turned, _rates(turned, body, value * [0.0, 0.0, 0.0, 1.0]), note)
+    value[:3] = 0.0
+    drifts = _noted(turned, _rates(turned, errors, value), note)
     streams, may_drift = _chosen(biased, drifts, config)
     return Agreed(streams, late, may_drift)
+
+
+def _scaled(rates: Array) -> list[Array]:
+    """What a scale of each of the angular velocities (N, 3) adds to them: three of (N, 3)."""
+    return [rates * axis for axis in np.eye(3)]
+
+
+def _with_gyro_set_right(
+    streams: Streams, between: Array, body: Sequence[Array], config: Config
+) -> Streams:
+    """The streams with a gyro whose scale is that of the attitude, as velocities are carried from
+    one message to the next by it. Its bias is looked for elsewhere (`sensor_consistency`)."""
+    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    gyro = streams.gyro @ mounting.T
+    rates = interpolated(streams.imu_t, gyro, streams.t)
+    of_gyro = dataclasses.replace(streams, nu=np.hstack([streams.nu[:, :3], rates]))
+    value, _ = _apart(of_gyro, between, [*body, *_scaled(rates)])
+    return dataclasses.replace(streams, gyro=gyro * (1.0 - value[3:6]) @ mounting)
 
 
 def _chosen(biased: Streams, drifts: Streams, config: Config) -> tuple[Streams, bool]:
