@@ -23,6 +23,7 @@ from rov_ident.config.prior import (
     prior_of,
     righting_arm_covariance,
     rigid_body_covariance,
+    velocity_scale_covariance,
 )
 from rov_ident.core.states import State
 from rov_ident.estimation.online import OnlineEstimator
@@ -249,6 +250,28 @@ def test_where_the_thrust_is_not_known_the_mass_scales_everything(heavy):
             assert change == pytest.approx(abs(value[name] - moment))
         elif "." not in name or name.startswith("thrust_scale"):
             assert change == pytest.approx(abs(value[name]))
+
+
+@pytest.mark.parametrize("off", [0.01, -0.015])
+def test_a_scale_of_the_velocity_sensor_is_one_of_inertia_and_drag(heavy, off):
+    """Velocities that read too much, and coefficients that are as much smaller as is added to their
+    variance, need the same wrench, along one axis at a time."""
+    names, theta = heavy.model.names, heavy.model.theta
+    covariance = velocity_scale_covariance(heavy, names, theta, abs(off))
+    moved = (
+        -np.sign(off)
+        * np.sqrt(np.diag(covariance))
+        * np.sign(theta - [heavy.model.body.mass * n.endswith("dot") for n in names])
+    )
+    moved = np.where(moved == 0.0, 0.0, moved)
+    there = heavy.model.with_theta(theta + moved)
+    for axis in np.eye(6)[:3]:
+        nu, nu_dot = 0.4 * axis, -0.3 * axis
+        wrench = heavy.model.wrench(nu, nu_dot, np.array([0.0, 0.0, 1.0]))
+        read = there.wrench(nu * (1.0 + off), nu_dot * (1.0 + off), np.array([0.0, 0.0, 1.0]))
+        assert read @ axis == pytest.approx(wrench @ axis, rel=10.0 * off**2)
+    turning = [n[0] in "KMN" for n in names]
+    assert not np.any(moved[turning])
 
 
 @pytest.mark.parametrize("factor", [1.05, 0.97])

@@ -180,6 +180,19 @@ def righting_arm_covariance(
     return _consider_covariance([moved], names, gain)
 
 
+def velocity_scale_covariance(
+    config: Config, names: tuple[str, ...], values: Array, off: float
+) -> Array:
+    """What a velocity sensor that reads too much, or too little, by the share ``off`` adds: the
+    same forces belong to velocities, and accelerations, that are as much smaller or larger."""
+    masses, _ = _own_inertia(config.model.body)
+    moved = {}
+    for name, value in zip(names, values.tolist(), strict=True):
+        degree = sum(map(name.partition("_")[2].count, "uvw")) if "." not in name else 0
+        moved[name] = off * degree * (value - masses.get(name, 0.0))
+    return _consider_covariance([moved], names, None)
+
+
 def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
     """The mass and the moments of inertia, by the name of the added mass that a motion shows with
     it."""

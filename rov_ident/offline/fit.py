@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config, dump
-from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_covariance
+from rov_ident.config.prior import (
+    THRUST_SCALE,
+    prior_of,
+    righting_arm_covariance,
+    velocity_scale_covariance,
+)
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
@@ -101,15 +106,18 @@ class Fit(Shown, Result):
 
     def with_tests(self, tests: Sequence[Test]) -> "Fit":
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
-        nothing has converged."""
+        nothing has converged. What is within the limit of a velocity sensor's scale is as large an
+        error, too."""
         prior = prior_of(self.given, effects=True)
         known = dict(zip(prior.names, prior.std.tolist(), strict=True))
         std = np.array([known[name] for name in self.names])
         consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
+        off = max((t.value for t in tests if t.name.endswith("velocity_scale")), default=0.0)
+        of_scale = velocity_scale_covariance(self.given, self.names, self.values, off)
         return replace(
             self,
             consistency=consistency,
-            covariance=Consistency(tuple(tests)).widened(self.covariance, std),
+            covariance=Consistency(tuple(tests)).widened(self.covariance, std) + of_scale,
             states=consistency.of_states(self.states),
         )
 
