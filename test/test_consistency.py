@@ -217,6 +217,10 @@ def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):
     thousand = consistency_of(heavy, prior, prior.mean, np.array([10.0, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(np.sqrt(np.diag(thousand.widened(small, prior.std))), prior.std)
     assert Consistency(()).widened(small, prior.std) == pytest.approx(small)
+    lasting = np.array([1.5**2, 1.0, np.nan, 0.5, 1.0, 1.0])  # power: within its limit of 2 x 2
+    half = consistency_of(heavy, prior, prior.mean, np.full(6, np.nan), lasting)
+    assert half.consistent
+    np.testing.assert_allclose(half.widened(small, prior.std), 1.5**2 * small)
     assert len(small) == n
 
 
