@@ -30,6 +30,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 _BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
 _FEWEST_CLUSTERS = 6  # that a record must last: of fewer the scatter is not known
+_LARGEST_SCALE = 0.1  # some times what gyros are sold with; beyond it axes or units are wrong
 _LATEST = 1.0  # s; as late as velocities may be
 
 
@@ -54,6 +55,7 @@ def agreed(streams: Streams, config: Config) -> Agreed:
         streams = _with_gyro_set_right(streams, between, body, config)
     value, std = _apart(streams, between, errors)
     value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
+    value[3:-1] *= np.abs(value[3:-1]) < _LARGEST_SCALE
     if std.any():
         streams = dataclasses.replace(streams, rates_std=std[:3])
     if not value.any():
@@ -97,8 +99,10 @@ def _with_gyro_set_right(
     gyro = streams.gyro @ mounting.T
     rates = interpolated(streams.imu_t, gyro, streams.t)
     of_gyro = dataclasses.replace(streams, nu=np.hstack([streams.nu[:, :3], rates]))
-    value, _ = _apart(of_gyro, between, [*body, *_scaled(rates)])
-    return dataclasses.replace(streams, gyro=gyro * (1.0 - value[3:6]) @ mounting)
+    scale = _apart(of_gyro, between, [*body, *_scaled(rates)])[0][3:6]
+    if not 0.0 < np.abs(scale).max() < _LARGEST_SCALE:
+        return streams
+    return dataclasses.replace(streams, gyro=gyro * (1.0 - scale) @ mounting)
 
 
 def _chosen(biased: Streams, drifts: Streams, config: Config) -> tuple[Streams, bool]:
