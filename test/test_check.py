@@ -170,6 +170,20 @@ def test_a_late_wrench_is_noticed(checked):
     assert float(remark.text.split()[0]) == pytest.approx(60.0, abs=15.0)
 
 
+def test_clocks_that_run_apart_are_noticed(checked):
+    begin: list[int] = []
+
+    def change(role, m):
+        begin.append(m.stamp)
+        early = int(0.004 * (m.stamp - begin[0]))  # of a minute 240 ms
+        return m._replace(stamp=m.stamp - early) if isinstance(m, Wrench) else m
+
+    remark = of(checked(change), "motion behind the wrench, by halves")
+    assert remark.level == WARNING and "run apart" in remark.text
+    unchanged = checked(lambda role, m: m).remarks
+    assert not any("by halves" in r.subject for r in unchanged)
+
+
 def test_a_late_odometry_is_noticed(checked):
     def change(role, m):
         return m._replace(stamp=m.stamp + 50_000_000) if isinstance(m, Odometry) else m

@@ -70,7 +70,8 @@ class Report:
     information's root in prior units: 1 before any data, and an estimate has some
     ``16 - log10(condition)`` digits; NaN where it is not known. ``consistency`` says whether model
     and data agree, None where it is not known; where they do not, intervals are wider, and nothing
-    has converged.
+    has converged. ``of_arm`` (n,) is the part of the variances that is due to the righting arm,
+    without which convergence is judged; None where it is not known.
     """
 
     stamp: int
@@ -86,6 +87,7 @@ class Report:
     messages: tuple[str, ...]
     condition: float = math.nan
     consistency: Consistency | None = None
+    of_arm: Array | None = None
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -435,11 +437,12 @@ class OnlineEstimator:
             else self._judge(i, values, std, raw.values, excitation, consistency, waiting.get(i))
             for i in range(len(values))
         ]
+        of_arm = np.zeros(len(values))
         if not diverged:
             seconds = float(self._state.monitor["judged"].max())
             trim = attitude_covariance(self.config, raw.names, seconds, gain)
             arm = righting_arm_covariance(self.config, raw.names, raw.values, gain)
-            covariance = covariance + trim + arm
+            covariance, of_arm = covariance + trim + arm, np.diag(arm)
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
         upper = np.minimum(values + NORMAL * std, self.prior.upper)
@@ -458,6 +461,7 @@ class OnlineEstimator:
             tuple(text for _, text in judged),
             self._module.condition(self._task, self._state),
             consistency,
+            of_arm,
         )
 
     def _waiting(self, values: Array) -> dict[int, str]:

@@ -28,6 +28,7 @@ from rov_ident.sampling.without_velocity import is_without_velocity
 GOOD, WARNING, BAD = "good", "warning", "bad"
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
 _DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
+_SURELY = 5.0  # standard deviations: these are of the noise alone, and clean dives reach 4.5
 _FIRST_ORDER = 1.0  # s; a longer delay is beyond the manoeuvres about which it is linear
 _CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes, ...
@@ -212,7 +213,10 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         "the vehicle goes where it is pushed",
         -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
-    return [push, _delay_remark("motion behind the wrench", *_wrench_lag(driven, phi, wrench))]
+    late = _delay_remark("motion behind the wrench", *_wrench_lag(driven, phi, wrench))
+    half = len(phi) // 2
+    halves = [_wrench_lag(driven, phi[part], wrench[part]) for part in np.s_[:half, half:]]
+    return [push, late, *_drift_remark(*halves)]
 
 
 def _correlation(a: Array, b: Array) -> float:
@@ -251,6 +255,18 @@ def _delay_remark(subject: str, lag: float, std: float) -> Remark:
         more = ", or let explain look for thruster lag and delay" if "wrench" in subject else ""
         return Remark(subject, WARNING, f"{text}: check the time stamps{more}")
     return Remark(subject, GOOD, text)
+
+
+def _drift_remark(first: tuple[float, float], last: tuple[float, float]) -> list[Remark]:
+    """That a delay, with its error, differs between the halves of the record; else nothing."""
+    moved, std = last[0] - first[0], float(np.hypot(first[1], last[1]))
+    if not max(_DELAY, _SURELY * std) < abs(moved) < _FIRST_ORDER:
+        return []
+    text = (
+        f"{1e3 * first[0]:.0f} ms in the first half, {1e3 * last[0]:.0f} ms in the second: do the "
+        "clocks that stamp them run apart, or did something change?"
+    )
+    return [Remark("motion behind the wrench, by halves", WARNING, text)]
 
 
 def _lag(t: Array, early: Array, late: Array) -> tuple[float, float]:

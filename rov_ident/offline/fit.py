@@ -66,6 +66,8 @@ class Fit(Shown, Result):
     duration: float
     rmse: Array
     consistency: Consistency
+    of_arm: Array | None = field(default=None, repr=False)
+    """(n,) the part of the variances that is due to the righting arm, of `rls` and `ukf`."""
     more: dict[str, Any] = field(default_factory=dict)
     """Further parts of the JSON that only some estimators have."""
     curves: tuple[Curves, ...] = field(default=(), repr=False)
@@ -264,12 +266,14 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         else:
             estimator.take(record.samples)
     report = estimator.report()
+    assert report.consistency is not None and report.of_arm is not None
+    own = np.sqrt(np.maximum(report.std**2 - report.of_arm, 0.0))
     states = [
         of_fit(value, std, prior, 1.0 - (std / prior) ** 2 > IDENTIFIABLE, now is State.AT_BOUND)
         if now is not State.DIVERGED
         else now
         for value, std, prior, now in zip(
-            report.values, report.std, estimator.prior.std, report.states, strict=True
+            report.values, own, estimator.prior.std, report.states, strict=True
         )
     ]
     config = estimator.config
@@ -278,7 +282,6 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     judged = read.as_read_by(found, config)
     before, after = open_loop(read, config), open_loop(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
-    assert report.consistency is not None
     return Fit(
         estimator=kind,
         names=report.names,
@@ -295,4 +298,5 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=curves(read.bags, before, after),
+        of_arm=report.of_arm,
     ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)
