@@ -30,6 +30,7 @@ from rov_ident.discrepancy import search as discrepancy
 from rov_ident.discrepancy.explain import (
     CUT_SHORT,
     _gains_elsewhere,
+    _is_between_readings,
     _with_all_data,
     _with_reading,
     explain,
@@ -399,6 +400,19 @@ def test_what_gains_where_it_does_not_act_may_stand_for_something_else():
     among_sensors = dataclasses.replace(gain, component="kinematic")
     of_sensor = dataclasses.replace(of_sway, axes=(), gain=among_sensors)
     assert [_gains_elsewhere(f) for f in (of_sway, of_both, of_sensor)] == [True, False, False]
+
+
+def test_a_delay_within_an_interval_of_the_imu_is_not_sure(fitted):
+    streams = fitted[0].problem.streams
+    interval = float(np.median(np.diff(streams.imu_t)))
+    gain = Gain("kinematic", 2.0, 1.9, 5.0, 4.0, 6.0)
+
+    def unsure_of(delay):
+        late = {"delay": Value(delay, 1e-4, "s")}
+        found = Finding("velocity_latency", (), late, None, gain, True, None, (), "")
+        return _is_between_readings(found, streams)
+
+    assert unsure_of(0.4 * interval) and not unsure_of(0.6 * interval)
 
 
 def test_one_window_does_not_make_a_pattern():

@@ -282,10 +282,8 @@ def test_a_channel_that_is_not_excited_is_refused_with_the_reason(heavy, off, ar
     np.testing.assert_array_equal(fit.values, off.model.theta)
 
 
-def test_unknown_estimators_and_empty_channels_are_refused(heavy, archive_of):
+def test_empty_channels_are_refused(heavy, archive_of):
     bags = archive_of(heavy, "short", duration=10.0, seed=4)
-    with pytest.raises(UserError, match="no estimator 'best'"):
-        fit_batch(bags, heavy, "best")
     few = dataclasses.replace(heavy, estimate=("X_u",))
     with pytest.raises(UserError, match="no coefficient of yaw"):
         fit_batch(bags, few, "ml", Settings((("yaw",),)))

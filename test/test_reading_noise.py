@@ -65,7 +65,8 @@ def _case(seed: int, noise: float, seconds: float) -> hidden.Case:
 def _dive(
     kind: Kind, seed: int, noise: float, seconds: float = 40.0
 ) -> list[tuple[float, float, str]]:
-    """Thrust scale, its standard deviation and what is said of it, every five seconds."""
+    """Thrust scale, its standard deviation with the righting arm as configured, which is exact, and
+    what is said of it, every five seconds."""
     case = _case(seed, noise, seconds)
     online = OnlineEstimator(by_default(case.config), kind)
     found, due = [], 5.0
@@ -76,7 +77,9 @@ def _dive(
             due += 5.0
             report = online.report()
             i = report.names.index("thrust_scale.scale")
-            found.append((float(report.values[i]), float(report.std[i]), report.messages[i]))
+            assert report.of_arm is not None
+            std = float(np.sqrt(report.std[i] ** 2 - report.of_arm[i]))
+            found.append((float(report.values[i]), std, report.messages[i]))
     return found
 
 

@@ -294,6 +294,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
         found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
     if data.may_drift:
         found = list(map(unsure, found))
+    found = [unsure(f) if _is_between_readings(f, data.streams) else f for f in found]
     return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
 
 
@@ -351,6 +352,15 @@ def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
     far = any(share > _FAR_OFF for share in left.values())
     axes = {AXES[VELOCITIES.index(c)] for c in left}
     return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
+
+
+def _is_between_readings(found: Finding, streams: Streams) -> bool:
+    """Whether velocities are late by less than half an interval of the IMU, in which nothing is
+    known of how they went on."""
+    if found.effect != "velocity_latency" or len(streams.imu_t) < 2:
+        return False
+    interval = float(np.median(np.diff(streams.imu_t)))
+    return abs(found.parameters["delay"].value) < 0.5 * interval
 
 
 def _gains_elsewhere(found: Finding) -> bool:

@@ -240,7 +240,6 @@ def _model_remarks(quick: Fit) -> Iterator[Remark]:
     agree = quick.consistency.consistent
     yield Remark(_MODEL, GOOD if agree else BAD, quick.consistency.sentence)
     prior = prior_of(quick.given, effects=True)
-    assert quick.of_arm is not None
     # a righting arm that is off is one of the reasons that are told
     own = np.sqrt(np.maximum(quick.std**2 - quick.of_arm, 0.0))
     columns = quick.values, own, prior.mean, prior.std

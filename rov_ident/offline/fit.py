@@ -66,8 +66,8 @@ class Fit(Shown, Result):
     duration: float
     rmse: Array
     consistency: Consistency
-    of_arm: Array | None = field(default=None, repr=False)
-    """(n,) the part of the variances that is due to the righting arm, of `rls` and `ukf`."""
+    of_arm: Array | float = field(default=0.0, repr=False)
+    """(n,) the part of the variances that is due to the righting arm; of batch fits not told."""
     more: dict[str, Any] = field(default_factory=dict)
     """Further parts of the JSON that only some estimators have."""
     curves: tuple[Curves, ...] = field(default=(), repr=False)
