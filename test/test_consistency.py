@@ -221,6 +221,8 @@ def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):
     half = consistency_of(heavy, prior, prior.mean, np.full(6, np.nan), lasting)
     assert half.consistent
     np.testing.assert_allclose(half.widened(small, prior.std), 1.5**2 * small)
+    by_chance = consistency_of(heavy, prior, prior.mean, np.full(6, np.nan), np.full(6, 1.2**2))
+    np.testing.assert_array_equal(by_chance.widened(small, prior.std), small)
     assert len(small) == n
 
 

@@ -30,6 +30,7 @@ SUPPOSED = 2.8
 _SELDOM = 1.645  # normal deviate that 5 % exceed, as of SUPPOSED
 _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
+_BY_CHANCE = 1.25  # of summed white innovations over what is expected, in one dive of a thousand
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
 _RUINED = 3.0  # times the error before, whatever the uncertainty: clean dives fitted from the right
@@ -54,8 +55,10 @@ class Test:
     @property
     def inflation(self) -> float:
         """How many times larger errors are than stated, if that is what the value comes from: of
-        innovations, which are said to add up to 1, the value, be it within the limit or not."""
-        return self.value if self.name.startswith(_WHITENESS) else self.value / self.limit
+        innovations, which are said to add up to 1, the value, also within the limit, but for what
+        chance makes of it."""
+        not_white = self.name.startswith(_WHITENESS) and self.value > _BY_CHANCE
+        return self.value if not_white else self.value / self.limit
 
 
 @dataclass(frozen=True)
