@@ -162,7 +162,7 @@ def dive_of(true: Config, trial: Trial) -> Dive:
         value = secret.theta[secret.names.index(trial.change)]
         later = secret.with_values({trial.change: 1.3 * value})
 
-    def simulated(model: Model, t: Array, wrench: Array, effects: object) -> Trajectory:
+    def simulated(model: Model, t: Array, wrench: Array, *_: object, **__: object) -> Trajectory:
         k = int(np.searchsorted(t, CHANGE_TIME)) if trial.change else len(t) - 1
         first = simulate(secret, t[: k + 1], wrench[: k + 1])
         if not trial.change:
