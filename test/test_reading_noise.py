@@ -77,8 +77,8 @@ def _dive(
             due += 5.0
             report = online.report()
             i = report.names.index("thrust_scale.scale")
-            assert report.of_arm is not None
-            std = float(np.sqrt(report.std[i] ** 2 - report.of_arm[i]))
+            assert report.of_scales is not None
+            std = float(np.sqrt(report.std[i] ** 2 - report.of_scales[i]))
             found.append((float(report.values[i]), std, report.messages[i]))
     return found
 

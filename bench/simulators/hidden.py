@@ -676,7 +676,7 @@ def _configuration(seed: int, vehicle: Vehicle, lacking: set[str], off: float) -
             "cog_std": 0.0,
         },
         "wrench": {"scale_std": 0.0, "lag_std": 0.0},
-        "odometry": {"latency_std": 0.0},
+        "odometry": {"latency_std": 0.0, "scale_std": 0.0},
         "current_std": 0.0,
         "coefficients": {n: v for n, v in believed.items() if n not in lacking},
         "imu": {"position": vehicle.imu.tolist()},

@@ -211,6 +211,7 @@ LIES: dict[str, Draw] = {
 KNOWN: dict[str, Any] = {
     "vehicle.mass_std": 0.0, "vehicle.inertia_std": 0.0, "wrench.scale_std": 0.0,
     "wrench.lag_std": 0.0, "current_std": 0.0, "odometry.latency_std": 0.0,
+    "odometry.scale_std": 0.0,
     "vehicle.buoyancy_std": 0.0, "vehicle.cog_std": 0.0, "vehicle.cob_std": 0.0,
 }  # fmt: skip
 """What the file of the case "known" says besides; keys that do not exist are left out."""

@@ -24,7 +24,7 @@ def by_default(config: Config) -> Config:
     for section, names in (
         ("vehicle", ("mass_std", "inertia_std", "buoyancy_std", "cog_std")),
         ("wrench", ("scale_std", "lag_std")),
-        ("odometry", ("latency_std",)),
+        ("odometry", ("latency_std", "scale_std")),
     ):
         for name in names:
             document.get(section, {}).pop(name, None)

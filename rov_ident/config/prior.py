@@ -1,5 +1,7 @@
 """What is known before any data: values, standard deviations and bounds of what is estimated."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +75,10 @@ _REACH = 3.0  # of 1000 normal deviates, three are further off
 _CURRENT_TIME = 1200.0  # s; a choice: tens of minutes, over which a stream or a depth changes
 _ATTITUDE_TIME = 1500.0  # s; a lasting error of the attitude wanders by its deviation in half of it
 ATTITUDE_LASTS = 15.0  # s; over which an AHRS is off in one direction, until gravity corrects it
+ONE_AXIS = 1.0 / 3.0
+"""of the standard deviation of the thrust's scale: how far the thrust of one axis may be off by
+itself, 5 % by default. Hull and wakes take that from the thrusters of one axis and not of another
+("thrust deduction": Faltinsen 1990, Sea Loads on Ships and Offshore Structures, ch. 8)."""
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
@@ -153,44 +159,56 @@ def rigid_body_covariance(
     return _consider_covariance(sources, names, gain)
 
 
-def righting_arm_covariance(
+def scale_covariance(
     config: Config, names: tuple[str, ...], values: Array, gain: Array | None = None
 ) -> Array:
-    """What an uncertain height of the centre of buoyancy adds to the same; nothing where the scale
-    of the thrust is known.
+    """What scales that no manoeuvre tells add to the same: as driving does not reduce it,
+    convergence is judged without it.
 
     The equations of motion stay the same with the righting moment, thrust, drag and all inertia,
-    added and own, times k. So only the arm of that moment determines the scale, and a wrong height
-    scales all of these; and with them the centre of gravity, as a heel at rest tells how far it is
-    to one side in shares of the arm. No manoeuvre reduces this error, so convergence is judged
-    without it.
+    added and own, times k. So only the righting arm, and the thrust in roll and pitch, determine a
+    scale of the thrust that is estimated, and an error of either scales all of these; and with them
+    the centre of gravity, as a heel at rest tells how far it is to one side in shares of the arm.
+    The thrust of each other axis may be off by itself. And a velocity sensor that reads too much
+    makes the same forces belong to velocities and accelerations that are as much smaller.
     """
-    body, std = config.model.body, config.vehicle_uncertainty.cob_std
-    arm = abs(body.righting_arm)
-    # no more than is supposed of the scale: a body without an arm tells nothing of it
-    share = min(std / max(arm, 1e-9), config.wrench.scale_std)
-    masses, moments = _own_inertia(body)
+    masses, moments = _own_inertia(config.model.body)
     own = masses | moments
-    moved = {n: share * (v - own.get(n, 0.0)) for n, v in _with_thrust(names, values).items()}
-    if moved:
-        aside = body.cog - np.array([1.0, 1.0, 0.0]) * body.cob * body.buoyancy / body.weight
-        of_all = dict(zip(names, values.tolist(), strict=True))
-        offsets = zip(_COG_OFFSET, aside.tolist(), strict=True)
-        moved |= {n: share * (off + of_all[n]) for n, off in offsets if n in of_all}
-    return _consider_covariance([moved], names, gain)
+    of_all = dict(zip(names, values.tolist(), strict=True))
+    scaled = {n: v - own.get(n, 0.0) for n, v in _with_thrust(names, values).items()}
+    sources = []
+    if scaled:
+        by_axis = ONE_AXIS * config.wrench.scale_std
+        # no more than is supposed of the scale: a body without an arm tells nothing of it
+        share = min(math.hypot(righting_arm_share(config), by_axis), config.wrench.scale_std)
+        moved = {n: share * v for n, v in scaled.items()}
+        moved |= {n: share * off for n, off in _off_centre(config, of_all).items()}
+        sources.append(moved)
+        for row in ("X", "Y", "Zb", "N"):  # a buoyancy is what heave thrust balances
+            sources.append({n: by_axis * v for n, v in scaled.items() if n[0] in row})
+    of_velocity = {n: _degree(n) * (v - masses.get(n, 0.0)) for n, v in of_all.items()}
+    sources.append({n: config.odometry.scale_std * v for n, v in of_velocity.items()})
+    return _consider_covariance(sources, names, gain)
 
 
-def velocity_scale_covariance(
-    config: Config, names: tuple[str, ...], values: Array, off: float
-) -> Array:
-    """What a velocity sensor that reads too much, or too little, by the share ``off`` adds: the
-    same forces belong to velocities, and accelerations, that are as much smaller or larger."""
-    masses, _ = _own_inertia(config.model.body)
-    moved = {}
-    for name, value in zip(names, values.tolist(), strict=True):
-        degree = sum(map(name.partition("_")[2].count, "uvw")) if "." not in name else 0
-        moved[name] = off * degree * (value - masses.get(name, 0.0))
-    return _consider_covariance([moved], names, None)
+def righting_arm_share(config: Config) -> float:
+    """The standard deviation of the righting arm, relative to it."""
+    arm = abs(config.model.body.righting_arm)
+    return config.vehicle_uncertainty.cob_std / max(arm, 1e-9)
+
+
+def _off_centre(config: Config, values: Mapping[str, float]) -> dict[str, float]:
+    """How far the centre of gravity is from above or below that of buoyancy, and its height, by the
+    names of what is estimated of it."""
+    body = config.model.body
+    aside = body.cog - np.array([1.0, 1.0, 0.0]) * body.cob * body.buoyancy / body.weight
+    offsets = zip(_COG_OFFSET, aside.tolist(), strict=True)
+    return {n: off + values[n] for n, off in offsets if n in values}
+
+
+def _degree(name: str) -> int:
+    """In linear velocities, or accelerations, of the force of a coefficient."""
+    return sum(map(name.partition("_")[2].count, "uvw")) if "." not in name else 0
 
 
 def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:

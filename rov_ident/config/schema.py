@@ -280,6 +280,9 @@ class OdometrySensor:
     latency_std: float = not_negative(
         0.1, "how late linear velocities may be against their stamps; zero: not at all", "s"
     )
+    scale_std: float = not_negative(
+        0.01, "of the factor by which linear velocities read too much; zero: none"
+    )
     gate: float = positive(5.0, "a velocity further off the integrated IMU is refused", "sigma")
 
 

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import stdtrit
 
+from rov_ident.config.prior import ONE_AXIS
 from rov_ident.core.linalg import scaled_inverse, scaled_solve
 from rov_ident.discrepancy.hypothesis import (
     Hypothesis,
@@ -27,6 +28,7 @@ from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, li
 from rov_ident.discrepancy.reading_noise import DRAWS
 from rov_ident.discrepancy.selection import variance_inflation
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
+from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array, Indices
 
 _FEWEST_CLUSTERS = 8  # windows; from fewer a variance is uncertain by more than half (chi-squared)
@@ -124,22 +126,26 @@ class Fitted:
     @cached_property
     def covariance_of_the_file(self) -> Array:
         """What errors of the file that no window shows by itself add to the covariance (P, P): of
-        the thrust, unless its scale is among the parameters, and of the height of the centre of
-        buoyancy (consider parameters, Schmidt 1966), as large as the configuration says that they
-        may be and the residuals leave them. With the righting moment, thrust and all coefficients
-        times k nothing moves otherwise (:func:`prior.righting_arm_covariance`).
+        the thrust and of that of each axis, unless such a scale is among the parameters, and of the
+        height of the centre of buoyancy (consider parameters, Schmidt 1966), as large as the
+        configuration says that they may be and the residuals leave them. With the righting moment,
+        thrust and all coefficients times k nothing moves otherwise
+        (:func:`prior.scale_covariance`).
         """
         linear, at, h = self.linear, self._smooth, self.hypothesis
         problem, config = self.linearisation.problem, h.config
         raising = problem.raising(h.model.body) * config.vehicle_uncertainty.cob_std
-        stronger = problem.thrust(h.effects)[0] * config.wrench.scale_std
-        if "thrust_scale" in h.effects:
-            stronger = np.zeros_like(stronger)
-        error = self.linearisation.sensitivity_to(np.stack([stronger, raising], axis=2))
+        stronger = problem.thrust(h.effects)[0][:, :, None] * config.wrench.scale_std
+        fitted = {name for _, name in linear.keys}
+        axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]
+        errors = [raising[:, :, None], ONE_AXIS * stronger * np.eye(6)[:, axes]]
+        if "thrust_scale" not in h.effects:
+            errors.append(stronger)
+        error = self.linearisation.sensitivity_to(np.concatenate(errors, axis=2))
         base, normal = self.linearisation.columns[:, at], linear.normal[np.ix_(at, at)]
         moves = scaled_solve(normal, base.T @ error, 1e-9)
         error -= base @ moves  # what the parameters do not imitate tells how large they are
-        left = np.linalg.inv(np.eye(2) + error.T @ error / self.inflation)
+        left = np.linalg.inv(np.eye(error.shape[1]) + error.T @ error / self.inflation)
         likely = left @ (error.T @ self.linearisation.error) / self.inflation
         out = np.zeros_like(linear.normal)
         out[np.ix_(at, at)] = moves @ (left + np.outer(likely, likely)) @ moves.T

@@ -17,8 +17,8 @@ from rov_ident.config.prior import (
     first_centre,
     gain_of,
     prior_of,
-    righting_arm_covariance,
     rigid_body_covariance,
+    scale_covariance,
 )
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array, Message
@@ -70,8 +70,9 @@ class Report:
     information's root in prior units: 1 before any data, and an estimate has some
     ``16 - log10(condition)`` digits; NaN where it is not known. ``consistency`` says whether model
     and data agree, None where it is not known; where they do not, intervals are wider, and nothing
-    has converged. ``of_arm`` (n,) is the part of the variances that is due to the righting arm,
-    without which convergence is judged; None where it is not known.
+    has converged. ``of_scales`` (n,) is the part of the variances that no driving reduces (of
+    :func:`~rov_ident.config.prior.scale_covariance`), without which convergence is judged; None
+    where it is not known.
     """
 
     stamp: int
@@ -87,7 +88,7 @@ class Report:
     messages: tuple[str, ...]
     condition: float = math.nan
     consistency: Consistency | None = None
-    of_arm: Array | None = None
+    of_scales: Array | None = None
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -437,12 +438,12 @@ class OnlineEstimator:
             else self._judge(i, values, std, raw.values, excitation, consistency, waiting.get(i))
             for i in range(len(values))
         ]
-        of_arm = np.zeros(len(values))
+        of_scales = np.zeros(len(values))
         if not diverged:
             seconds = float(self._state.monitor["judged"].max())
             trim = attitude_covariance(self.config, raw.names, seconds, gain)
-            arm = righting_arm_covariance(self.config, raw.names, raw.values, gain)
-            covariance, of_arm = covariance + trim + arm, np.diag(arm)
+            scales = scale_covariance(self.config, raw.names, raw.values, gain)
+            covariance, of_scales = covariance + trim + scales, np.diag(scales)
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
         upper = np.minimum(values + NORMAL * std, self.prior.upper)
@@ -461,7 +462,7 @@ class OnlineEstimator:
             tuple(text for _, text in judged),
             self._module.condition(self._task, self._state),
             consistency,
-            of_arm,
+            of_scales,
         )
 
     def _waiting(self, values: Array) -> dict[int, str]:

@@ -19,8 +19,8 @@ from rov_ident.config.prior import (
     first_centre,
     gain_of,
     prior_of,
-    righting_arm_covariance,
     rigid_body_covariance,
+    scale_covariance,
 )
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
@@ -107,8 +107,8 @@ def fit_batch(
                 f"{unmeasured[0].path.name} has no linear velocity, and other bags have: fit those "
                 "with and those without apart (the one result as the other's configuration)"
             )
-        # of a horizontal current nothing shows, and no velocity is late
-        odometry = replace(config.odometry, latency_std=0.0)
+        # of a horizontal current nothing shows, and no velocity is late or scaled
+        odometry = replace(config.odometry, latency_std=0.0, scale_std=0.0)
         config = replace(config, current_std=0.0, odometry=odometry)
         settings = replace(settings, readings=2 * settings.readings)
     say("open loop, as configured")
@@ -326,12 +326,12 @@ def _stage(
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
     seconds = float(sum(archive.each(_seconds)))
     covariance = covariance + attitude_covariance(config, names, seconds, gain)
-    arm = righting_arm_covariance(config, names, found, gain)
+    of_scales = scale_covariance(config, names, found, gain)
     # What moments and tilt suggest of these is in the values, but the intervals are the prior's.
     own = _coefficients(config).items()
     impossible = [n for n, c in own if unmeasured and is_impossible(c)]
     for i in (names.index(n) for n in impossible):
-        covariance[i] = covariance[:, i] = arm[i] = arm[:, i] = 0.0
+        covariance[i] = covariance[:, i] = of_scales[i] = of_scales[:, i] = 0.0
         covariance[i, i] = prior.std[i] ** 2
     more |= {"impossible": impossible} if unmeasured else {}
     removed = 1.0 - np.diag(covariance) / prior.std**2
@@ -353,7 +353,7 @@ def _stage(
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
     if free[0] and not any(archive.each(_has_surge_thrust)):
         notes += _scale_notes(config, names, covariance)
-    return _Stage(names, values, covariance + arm, states, more, unexplained, lasting, noise)
+    return _Stage(names, values, covariance + of_scales, states, more, unexplained, lasting, noise)
 
 
 def _has_surge_thrust(samples: Samples) -> bool:

@@ -8,12 +8,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config, dump
-from rov_ident.config.prior import (
-    THRUST_SCALE,
-    prior_of,
-    righting_arm_covariance,
-    velocity_scale_covariance,
-)
+from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_share
 from rov_ident.core.messages import Array
 from rov_ident.core.states import State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
@@ -66,8 +61,8 @@ class Fit(Shown, Result):
     duration: float
     rmse: Array
     consistency: Consistency
-    of_arm: Array | float = field(default=0.0, repr=False)
-    """(n,) the part of the variances that is due to the righting arm; of batch fits not told."""
+    of_scales: Array | float = field(default=0.0, repr=False)
+    """(n,) the part of the variances that no driving reduces; of batch fits not told."""
     more: dict[str, Any] = field(default_factory=dict)
     """Further parts of the JSON that only some estimators have."""
     curves: tuple[Curves, ...] = field(default=(), repr=False)
@@ -108,18 +103,15 @@ class Fit(Shown, Result):
 
     def with_tests(self, tests: Sequence[Test]) -> "Fit":
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
-        nothing has converged. What is within the limit of a velocity sensor's scale is as large an
-        error, too."""
+        nothing has converged."""
         prior = prior_of(self.given, effects=True)
         known = dict(zip(prior.names, prior.std.tolist(), strict=True))
         std = np.array([known[name] for name in self.names])
         consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
-        off = max((t.value for t in tests if t.name.endswith("velocity_scale")), default=0.0)
-        of_scale = velocity_scale_covariance(self.given, self.names, self.values, off)
         return replace(
             self,
             consistency=consistency,
-            covariance=Consistency(tuple(tests)).widened(self.covariance, std) + of_scale,
+            covariance=Consistency(tuple(tests)).widened(self.covariance, std),
             states=consistency.of_states(self.states),
         )
 
@@ -133,8 +125,8 @@ class Fit(Shown, Result):
         scale = float(self.values[i])
         if abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
             advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
-        of_arm = righting_arm_covariance(self.given, self.names, self.values)[i, i]
-        if of_arm > _MOST * self.covariance[i, i]:
+        of_arm = min(righting_arm_share(self.given), self.given.wrench.scale_std) * scale
+        if of_arm**2 > _MOST * self.covariance[i, i]:
             advice.append(
                 "Measure the righting arm (docs/live.md): what is not known of it "
                 "(vehicle.cob_std) makes most of the intervals of thrust and coefficients."
@@ -266,8 +258,8 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         else:
             estimator.take(record.samples)
     report = estimator.report()
-    assert report.consistency is not None and report.of_arm is not None
-    own = np.sqrt(np.maximum(report.std**2 - report.of_arm, 0.0))
+    assert report.consistency is not None and report.of_scales is not None
+    own = np.sqrt(np.maximum(report.std**2 - report.of_scales, 0.0))
     states = [
         of_fit(value, std, prior, 1.0 - (std / prior) ** 2 > IDENTIFIABLE, now is State.AT_BOUND)
         if now is not State.DIVERGED
@@ -298,5 +290,5 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=curves(read.bags, before, after),
-        of_arm=report.of_arm,
+        of_scales=report.of_scales,
     ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)
