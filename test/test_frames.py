@@ -194,6 +194,16 @@ def test_rotation_vector_turns_about_its_own_axis(vector):
     assert 1 + 2 * np.cos(np.linalg.norm(vector)) == pytest.approx(np.trace(matrix))
 
 
+@given(vectors, st.sampled_from([1.0, -1.0]))
+def test_a_rotation_vector_is_the_shortest_of_its_attitude(vector, sign):
+    """Of either quaternion of it: a driver that changes the sign does not turn the vehicle."""
+    q = sign * frames.quaternion_from_rotation_vector(vector)
+    found = frames.rotation_vector(q)
+    assert np.linalg.norm(found) <= np.pi + 1e-12
+    again = frames.quaternion_from_rotation_vector(found)
+    assert abs(again @ q) == pytest.approx(1.0, abs=1e-12)
+
+
 def test_small_rotation_vector_is_exact():
     q = frames.quaternion_from_rotation_vector([1e-200, 0, 0])
     np.testing.assert_array_equal(q, [1, 0.5e-200, 0, 0])

@@ -34,7 +34,7 @@ def stepped(structure, theta, one_theta, nu, dt, estimated, scale, work, drive):
     s = work.scratch[0]
     observer.linearised_step(structure, theta, one_theta, nu, -0.5 * dt, dt, s)
     momentum_columns(structure, s.middle_nu_dot, work.of_rate)
-    observer.drive_of(structure, s.middle, estimated, scale, 0, len(scale), work, drive)
+    observer.drive_of(structure, s.middle, estimated, scale, len(scale), work, drive)
 
 
 @pytest.fixture

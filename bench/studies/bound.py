@@ -184,7 +184,7 @@ def _filter(
                     o.force[i] += restoring[i, j] * 0.5 * (down[n - 1, j] + down[n, j])
             linearised_step(structure, theta, one_theta, x, -0.5 * dt, dt, o)
             momentum_columns(structure, o.middle_nu_dot, work.of_rate)
-            drive_of(structure, o.middle, all_of_them, scale, 0, m, work, drive)
+            drive_of(structure, o.middle, all_of_them, scale, m, work, drive)
             for i in range(6):
                 x[i] = o.end[i]
                 for j in range(6):
@@ -217,7 +217,7 @@ def _filter(
                         o.force[i] += restoring[i, j] * down[n, j]
                 linearised_step(structure, theta, one_theta, x, 0.0, _MOMENT, o)
                 momentum_columns(structure, o.nu_dot, work.of_rate)
-                drive_of(structure, o.middle, all_of_them, scale, 0, m, work, drive)
+                drive_of(structure, o.middle, all_of_them, scale, m, work, drive)
                 a, b = (axis + 1) % 3, (axis + 2) % 3
                 expected = o.nu_dot[axis] + x[3 + a] * x[b] - x[3 + b] * x[a]
                 expected -= gravity * down[n, axis]

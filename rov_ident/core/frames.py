@@ -128,12 +128,17 @@ def quaternion_from_rotation_vector(vector: ArrayLike) -> Array:
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * vector], axis=-1)
 
 
+def rotation_vector(q: Array) -> Array:
+    """Rotation vectors (..., 3) [rad], of at most half a turn, of quaternions (..., 4)."""
+    real, vector = q[..., :1], q[..., 1:]
+    size = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, np.abs(real))
+    return np.copysign(angle, real) * vector / np.maximum(size, 1e-12)
+
+
 def turns(q: Array) -> Array:
     """Rotation vectors (N - 1, 3) [rad] from each attitude (N, 4) to the next, in the body."""
-    between = quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:])
-    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, between[:, :1])
-    return angle * between[:, 1:] / np.maximum(size, 1e-12)
+    return rotation_vector(quaternion_multiply(q[:-1] * [1.0, -1.0, -1.0, -1.0], q[1:]))
 
 
 def quaternion_angle(p: Array, q: Array) -> Array:

@@ -7,8 +7,9 @@ from rov_ident.core.messages import Array
 _NORMAL = 1.4826  # standard deviation of a normal number over the median of its absolute value
 
 
-def robust_std(error: Array, axis: int = 0) -> Array:
-    """The standard deviation of normal errors along an axis, whatever a minority of them is."""
+def robust_std(error: Array, axis: int | None = 0) -> Array:
+    """The standard deviation of normal errors along an axis (None: of all), whatever a minority of
+    them is."""
     return _NORMAL * np.median(np.abs(error), axis=axis)
 
 

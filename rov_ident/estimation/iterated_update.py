@@ -65,7 +65,7 @@ class IteratedUpdate:
         little is known yet, and the state stays. So it does while kernels are interpreted, when all
         this would take minutes.
         """
-        about, std = rls.solution_of(task, state)
+        about, std = rls.solution_of(state)
         if interpreting() or not self._samples or not _differ(about, self._about, std):
             return state
         samples = joined(self._samples)
@@ -73,7 +73,7 @@ class IteratedUpdate:
             again = rls.fold_about(task, self._before, samples, about)
             if again is None:
                 break
-            solution, std = rls.solution_of(task, again)
+            solution, std = rls.solution_of(again)
             if not _differ(solution, about, std):
                 self._about = about
                 return again

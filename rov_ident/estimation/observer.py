@@ -110,15 +110,15 @@ def linearised_step(structure, theta, one_theta, nu, late, dt, s):
 
 
 @inlined
-def drive_of(structure, nu, estimated, scale, first, end, work, out):
-    """out (6, n): the wrench that a unit more of each coefficient adds, from ``first`` to ``end``.
+def drive_of(structure, nu, estimated, scale, n, work, out):
+    """out (6, n): the wrench that a unit more of each of the n coefficients adds.
 
     The coefficients are theta[estimated] = scale x. ``work`` has momentum and of_motion (6, m), a
     ``scratch`` of OBSERVER, and of_rate (6, m): the caller's momentum_columns of nu_dot.
     """
     columns(structure, nu, work.momentum, work.of_motion, work.scratch[0].one_extended)
     for i in range(6):
-        for a in range(first, end):
+        for a in range(n):
             e = estimated[a]
             out[i, a] = -scale[a] * (work.of_rate[i, e] + work.of_motion[i, e])
 

@@ -236,7 +236,7 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     )
 
 
-def solution_of(task: Problem, state: State) -> tuple[Array, Array]:
+def solution_of(state: State) -> tuple[Array, Array]:
     """The coordinates and their standard deviations, both (n,) in the order of the coefficients."""
     place, inverse = np.argsort(state.order), inverse_of(state.root)
     return (inverse @ state.root[:, -1])[place], np.linalg.norm(inverse, axis=1)[place]
@@ -516,7 +516,7 @@ def _predict(task, state, work, sample, side):
             task.structure, work.theta, work.one_theta, nu, step * dt - 0.5 * sample.dt, dt, s
         )
         momentum_columns(task.structure, s.middle_nu_dot, work.of_rate)
-        drive_of(task.structure, s.middle, work.estimated, work.scale, 0, n, work, work.drive)
+        drive_of(task.structure, s.middle, work.estimated, work.scale, n, work, work.drive)
         drive_sides(len(task.theta) - side.shape[1], work.estimated, work.scale, side, work.drive)
         if task.thrust >= 0:
             _by_coordinates(task, state, work)

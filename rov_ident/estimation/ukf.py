@@ -243,7 +243,7 @@ def _steps(task, state, work, samples, sides, infos):
                 state.monitor[i].nis = 1.0
             info.reason = RESTARTED
         else:
-            _take_root(task, work, info)
+            _take_root(work, info)
             _predict(task, state.x, work, sample, side)
             if not _collect(task, state, work, sample):
                 info.reason = UNPREDICTABLE
@@ -277,7 +277,7 @@ def _restart(state, p, sample):
 
 
 @inlined
-def _take_root(task, work, out):
+def _take_root(work, out):
     """work.root of work.p, which is repaired where rounding has made a direction negative."""
     p, size = work.p, len(work.p)
     for attempt in range(3):

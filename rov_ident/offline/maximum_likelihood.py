@@ -588,7 +588,7 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
         linearised_step(eq.structure, eq.theta, eq.one_theta, x, late, dt, s)
         if n > 0:
             momentum_columns(eq.structure, s.middle_nu_dot, work.of_rate)
-            drive_of(eq.structure, s.middle, eq.estimated, scale, 0, n, work, work.drive)
+            drive_of(eq.structure, s.middle, eq.estimated, scale, n, work, work.drive)
             drive_sides(len(eq.theta) - side.shape[1], eq.estimated, scale, side, work.drive)
             advance(s.transition, sensitivity, s.into, work.drive, work.spare)
         for i in range(6):

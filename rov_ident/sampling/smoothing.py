@@ -15,18 +15,17 @@ noise times the factor of highest likelihood, as integration has errors of its o
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.core.frames import quaternion_multiply
+from rov_ident.core.frames import quaternion_multiply, rotation_vector
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import interpolated
+from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import rotation, turned
-from rov_ident.model.equations import Array
 from rov_ident.sampling.sample import stretches
 
 _LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
 # odometry's rates have told it to a tenth of their own noise
 _FACTORS = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])
 _FEWEST = 10  # measured attitudes; fewer do not tell their noise
-_ROBUST = 0.6745  # median absolute deviation of a Gaussian over its standard deviation
 
 
 def smoothed(samples: NDArray[np.void]) -> NDArray[np.void]:
@@ -52,9 +51,11 @@ def _smooth(part: NDArray[np.void]) -> None:
     rate_variance = np.where(inertial, part["gyro_variance"], part["odometry_variance"][:, 3])
     ahead = np.empty((len(part), 4))
     _integrate(part["attitude"][seen[0]], seen[0], part["nu"], part["dt"], ahead)
-    off = _rotation_vector(part["attitude"][seen], ahead[seen])
+    # the turn in world axes from what the rates make of the first attitude to each measured one
+    conjugate = ahead[seen] * [1.0, -1.0, -1.0, -1.0]
+    off = rotation_vector(quaternion_multiply(part["attitude"][seen], conjugate))
     steps = np.diff(off, axis=0)
-    noise = 0.5 * float(np.median(np.abs(steps)) / _ROBUST) ** 2 + 1e-12
+    noise = 0.5 * float(robust_std(steps, axis=None)) ** 2 + 1e-12
     walk = np.add.reduceat(rate_variance * part["dt"] ** 2, seen)[:-1] + 1e-12
     error, best = off, np.inf
     for factor in _FACTORS:
@@ -68,16 +69,6 @@ def _smooth(part: NDArray[np.void]) -> None:
     part["down"] = down
     dt = np.maximum(part["dt"][1:], 1e-6)
     part["down_slope"][1:] = (down[1:] - down[:-1]) / dt[:, None]
-
-
-def _rotation_vector(q: Array, reference: Array) -> Array:
-    """log(q reference^-1) (k, 3): the turn in world axes from the reference to q."""
-    product = quaternion_multiply(q, reference * [1.0, -1.0, -1.0, -1.0])
-    real, vector = product[:, 0], product[:, 1:]
-    vector = np.where(real[:, None] < 0.0, -vector, vector)
-    size = np.linalg.norm(vector, axis=1)
-    angle = 2.0 * np.arctan2(size, np.abs(real))
-    return vector * (angle / np.maximum(size, 1e-12))[:, None]
 
 
 @kernel
