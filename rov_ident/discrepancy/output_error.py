@@ -12,9 +12,10 @@ from functools import cached_property
 import numpy as np
 from scipy.special import stdtrit
 
-from rov_ident.config.prior import ONE_AXIS
+from rov_ident.config.prior import ONE_AXIS, scale_covariance
 from rov_ident.core.linalg import scaled_inverse, scaled_solve
 from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
     Hypothesis,
     Key,
     bounds,
@@ -130,7 +131,7 @@ class Fitted:
         height of the centre of buoyancy (consider parameters, Schmidt 1966), as large as the
         configuration says that they may be and the residuals leave them. With the righting moment,
         thrust and all coefficients times k nothing moves otherwise
-        (:func:`prior.scale_covariance`).
+        (:func:`prior.scale_covariance`, of which the velocity sensor's scale is taken as it is).
         """
         linear, at, h = self.linear, self._smooth, self.hypothesis
         problem, config = self.linearisation.problem, h.config
@@ -149,7 +150,8 @@ class Fitted:
         likely = left @ (error.T @ self.linearisation.error) / self.inflation
         out = np.zeros_like(linear.normal)
         out[np.ix_(at, at)] = moves @ (left + np.outer(likely, likely)) @ moves.T
-        return out
+        names = tuple(name if effect == COEFFICIENTS else "" for effect, name in linear.keys)
+        return out + scale_covariance(config, names, np.array([h.values[k] for k in linear.keys]))
 
     def leave_one_out(self) -> Array:
         """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""
