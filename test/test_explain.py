@@ -29,6 +29,7 @@ from rov_ident.discrepancy import screening, sensor_consistency
 from rov_ident.discrepancy import search as discrepancy
 from rov_ident.discrepancy.explain import (
     CUT_SHORT,
+    _beside_a_payload,
     _gains_elsewhere,
     _is_between_readings,
     _with_all_data,
@@ -400,6 +401,17 @@ def test_what_gains_where_it_does_not_act_may_stand_for_something_else():
     among_sensors = dataclasses.replace(gain, component="kinematic")
     of_sensor = dataclasses.replace(of_sway, axes=(), gain=among_sensors)
     assert [_gains_elsewhere(f) for f in (of_sway, of_both, of_sensor)] == [True, False, False]
+
+
+def test_inertia_beside_a_payload_may_be_its_own():
+    gain = Gain("q", 0.1, 0.05, 50.0, 40.0, 60.0)
+    coupling, payload, drag = (
+        Finding(name, ("M",), {}, None, gain, True, None, (), "")
+        for name in ("added_mass_coupling", "payload", "quadratic_damping")
+    )
+    assert _beside_a_payload([coupling, drag]) == [coupling, drag]
+    beside = _beside_a_payload([payload, coupling, drag])
+    assert [f.separable for f in beside] == [True, False, True]
 
 
 def test_a_delay_within_an_interval_of_the_imu_is_not_sure(fitted):

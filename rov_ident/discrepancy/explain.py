@@ -295,6 +295,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
     if data.may_drift:
         found = list(map(unsure, found))
     found = [unsure(f) if _is_between_readings(f, data.streams) else f for f in found]
+    found = _beside_a_payload(found)
     return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
 
 
@@ -361,6 +362,14 @@ def _is_between_readings(found: Finding, streams: Streams) -> bool:
         return False
     interval = float(np.median(np.diff(streams.imu_t)))
     return abs(found.parameters["delay"].value) < 0.5 * interval
+
+
+def _beside_a_payload(found: list[Finding]) -> list[Finding]:
+    """Findings of inertia are not sure where there is a payload: the effect of that has a weight in
+    water, and what it weighs in air is inertia, off the diagonal, too."""
+    if all(f.effect != "payload" for f in found):
+        return found
+    return [unsure(f) if f.effect in ("added_mass_coupling", "coriolis") else f for f in found]
 
 
 def _gains_elsewhere(found: Finding) -> bool:
