@@ -130,11 +130,12 @@ def _agree(of: Sequence[Value]) -> bool:
 
 def _with(f: Finding, repetition: Repetition) -> Finding:
     """A finding that says what each record says."""
-    several = [", ".join(f"{of[n].value:.3g}" for of in repetition.records) for n in f.parameters]
+    names = repetition.records[0]  # an onset belongs to one record
+    several = [", ".join(f"{of[n].value:.3g}" for of in repetition.records) for n in names]
     if repetition.same:
         words = " It is the same in each record."
     else:
-        told = "; ".join(f"{n} {v}" for n, v in zip(f.parameters, several))
+        told = "; ".join(f"{n} {v}" for n, v in zip(names, several))
         words = f" The records differ: {told}."
     if repetition.repeats is False:
         words += " Fitted to the others, it does not predict a record that was left out."
