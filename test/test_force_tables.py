@@ -410,3 +410,45 @@ def test_hull_in_words():
     for wrong in ("cylinder", "spheroid:L=0.1,R=0.1", "cylinder:L=2", "cylinder:L=-1,R=1"):
         with pytest.raises(UserError):
             parse_hull(wrong)
+
+
+def test_repeated_runs_do_not_vouch_for_one_another():
+    """Six runs of each condition share its error: 95 % intervals hold the truth as they say."""
+    inside = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        nu = np.zeros((25, 6))
+        nu[:, 0], nu[:, 1] = rng.uniform(0.5, 2.0, 25), rng.uniform(-0.5, 0.5, 25)
+        force = -30.0 * nu[:, 0] * nu[:, 1] - 80.0 * np.abs(nu[:, 1]) * nu[:, 1]
+        common = force + 0.5 * rng.standard_normal(25)
+        runs = np.repeat(common, 6) + 0.1 * rng.standard_normal(150)
+        found = force_tables.fit_axis("Y", np.repeat(nu, 6, axis=0), {}, runs)
+        if set(found.names) == {"Y_uv", "Y_vv"}:
+            truth = np.array([{"Y_uv": -30.0, "Y_vv": -80.0}[name] for name in found.names])
+            inside += list((found.lower <= truth) & (truth <= found.upper))
+    assert len(inside) >= 30  # the structure is found; as separate rows in 12 of 20
+    assert np.mean(inside) > 0.8
+
+
+@pytest.mark.parametrize("separator", ";\t")
+def test_another_separator_is_named(separator, tmp_path, capsys):
+    path = tmp_path / "t.csv"
+    path.write_text("u,X\n1,-1\n2,-4\n".replace(",", separator))
+    assert main(["forces", str(path)]) == 2
+    assert f"separates its columns by {separator!r}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change, sentence", [("resistance", "X_uu is positive"), ("slip", "far off the fit")]
+)
+def test_what_spoils_a_table_is_said(change, sentence):
+    rng = np.random.default_rng(1)
+    nu = np.zeros((60, 6))
+    nu[:, 0] = rng.uniform(0.3, 2.0, 60)
+    force = -20.0 * nu[:, 0] ** 2 + 0.2 * rng.standard_normal(60)
+    proportional = force * (1.0 + 0.05 * rng.standard_normal(60))
+    clean = force_tables.ForceTable("clean", nu, {}, {"X": proportional})
+    assert not force_tables.remarks(force_tables.fit(clean), True)
+    wrong = -force if change == "resistance" else np.where(np.arange(60) == 7, -3.0 * force, force)
+    fits = force_tables.fit(force_tables.ForceTable("wrong", nu, {}, {"X": wrong}))
+    assert any(sentence in remark for remark in force_tables.remarks(fits, True))

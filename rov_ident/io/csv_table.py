@@ -67,6 +67,11 @@ def read_csv(path: Path) -> CsvTable:
             cells = [cell.strip() for cell in cells]
             if not header:
                 header = cells
+                if len(cells) == 1 and (other := {";", "\t"} & set(cells[0])):
+                    raise UserError(
+                        f"{path} separates its columns by {min(other)!r}: save it with commas, and "
+                        "points in its numbers"
+                    )
                 continue
             if len(cells) != len(header):
                 raise UserError(

@@ -8,6 +8,9 @@ exceeds the best's by less than two standard errors of the difference, row by ro
 that acts on a few rows alone makes that standard error large by itself; if clearly seen, it is
 kept.)
 
+Repeated runs of a condition are averaged first: they share what is wrong with it (setting, mesh),
+so that as separate rows they would vouch for one another.
+
 Intervals allow for noise that grows with the force: heteroscedastic covariance HC3 (MacKinnon and
 White 1985), Student's distribution. Steady forces hold the Coriolis forces of the added mass
 (Munk's moment and its kind): with ``added_mass`` they are taken off first, or a model would count
@@ -50,6 +53,8 @@ _FEWEST = 2 * _ROWS_PER_TERM  # conditions: with one term there is nothing to ch
 _PATIENCE = 3  # a choice: sizes without a better cross-validation until structures grow no further
 _SHOWN = 20  # candidates, beside the chosen: a screenful
 _WORTH = 2.0  # standard errors, which chance exceeds one time in forty
+_FAR = 12.0  # median errors: eight standard deviations (0.674 each) of a normal distribution
+_SLIP = 0.5  # of the force itself: noise in proportion to it is less, a sign or unit more
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 
 
@@ -455,7 +460,11 @@ def fit(table: ForceTable, added_mass: Model | None = None) -> dict[str, AxisFit
 
 def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> AxisFit:
     """The structure of one axis, see the head of this module."""
-    conditions = len(np.unique(np.column_stack([nu, *fins.values()]).round(9), axis=0))
+    states = np.column_stack([nu, *fins.values()])
+    _, first, which = np.unique(states.round(9), axis=0, return_index=True, return_inverse=True)
+    conditions = len(first)
+    force = np.bincount(which.ravel(), force) / np.bincount(which.ravel())
+    nu, fins = nu[first], {letter: angle[first] for letter, angle in fins.items()}
     if conditions < _FEWEST:
         raise UserError(
             f"{axis}: {conditions} different conditions are too few to tell structures apart: give "
@@ -653,6 +662,21 @@ def remarks(fits: Mapping[str, AxisFit], with_config: bool) -> list[str]:
     """What a reader of the coefficients should know."""
     out = []
     for axis, f in fits.items():
+        hull = [n for n, low in zip(f.names, f.lower) if low > 0.0 and not n.endswith("_0")]
+        if driven := [name for name in hull if parse(name).is_diagonal]:
+            out.append(
+                f"{driven[0]} is positive, so {axis} would drive the vehicle along its own motion: "
+                "the table must hold the forces on the vehicle, not its resistance, in axes "
+                f"forward, starboard, down; reverse the sign of {axis} if it does not"
+            )
+        off = np.abs(f.measured - f.fitted)
+        if (far := (off > _FAR * np.median(off)) & (off > _SLIP * np.abs(f.measured))).any():
+            shown = ", ".join(f"{x:.4g}" for x in f.measured[far][:5])
+            out.append(
+                f"{axis}: {far.sum()} of {len(far)} conditions are far off the fit (forces {shown}"
+                f"{' ...' if far.sum() > 5 else ''}) and may have spoilt it: check these rows for "
+                "slips of sign or unit, and correct or remove them"
+            )
         if f.aliases:
             pairs = ", ".join(f"{a} for {b}" for a, b in f.aliases.items())
             out.append(f"{axis}: this table would be fitted as well with {pairs}")
