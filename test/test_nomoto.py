@@ -169,6 +169,17 @@ def test_instruments_cure_what_noise_does_to_differences():
     assert abs(instruments.value("T") / clean.value("T") - 1.0) < 0.03
 
 
+def test_what_the_intervals_do_not_contain_is_said():
+    run = every(simulated(0.3, 4.0, 0.2, noise=0.003), 0.1)
+    late = replace(run, heading=np.interp(run.t - 0.6, run.t, run.heading))
+    late = replace(
+        late, heading=late.heading + 0.003 * np.random.default_rng(1).normal(size=len(run.t))
+    )
+    assert len(nomoto.fit([run]).notes) == 1  # of stability
+    assert any("no white noise" in note for note in nomoto.fit([late]).notes)
+    assert any("biases fd" in note for note in nomoto.fit([run], method="fd").notes)
+
+
 def test_recursive_follows_a_change():
     """A vehicle whose K doubles half-way: with forgetting the last estimate is the new one."""
     rng = np.random.default_rng(0)

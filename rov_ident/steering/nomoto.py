@@ -25,6 +25,8 @@ from rov_ident.steering.zigzag import Zigzag
 METHODS = ("oe", "fd", "iv", "rls", "ukf")
 ORDERS = (1, 2)
 _MIN_SAMPLES = 20  # headings: three for each of six parameters, and the first state
+_BIASED = 1.5  # times the least RMSE; data of the model itself leave 1.0
+_COLOURED = 0.3  # between neighbours; white noise of 100 rows exceeds it one time in 700
 _PARTS = 6  # a choice: of each run in cross-validation, of which four are left out in turn
 
 
@@ -65,14 +67,14 @@ def fit(
         model = cross_validated(used, nonlinear)
     else:
         model = output_error(used, order, nonlinear)
+    fitted = model.rmse
     if method == "ukf":
         model = unscented(used, model)
     elif method != "oe":
         model = equation_error(used, model, method)
-    measured = np.concatenate(
-        [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
-    )
-    notes = [_stability(model), *model.notes]
+    errors = [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
+    measured = np.concatenate(errors)
+    notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted)]
     if model.order == 2 and "T1" not in model.names:
         notes.append("T1 and T2 are complex: only T1T2 and T1_plus_T2 are given")
     return dataclasses.replace(
@@ -81,6 +83,28 @@ def fit(
         notes=tuple(notes),
         provenance=provenance((run.name, run.sha256) for run in runs),
     )
+
+
+def _remarks(model: Nomoto, errors: Sequence[Array], fitted: float) -> list[str]:
+    """What the errors of the simulated heading, run by run, say against the model; ``fitted`` is
+    the RMSE of output error [rad]."""
+    seen = [error[~np.isnan(error)] for error in errors]
+    off = rmse(np.concatenate(seen))
+    if off > _BIASED * fitted:
+        return [
+            f"with these values the simulated heading is {np.degrees(off):.3g} deg off (RMSE), "
+            f"with those of --method oe {np.degrees(fitted):.3g} deg: noise or the step "
+            f"size biases {model.estimator}, and its intervals do not contain that"
+        ]
+    alike = sum(e[1:] @ e[:-1] for e in seen) / (sum(e @ e for e in seen) + 1e-300)
+    if alike < max(_COLOURED, 3.0 / np.sqrt(sum(map(len, seen)))):
+        return []
+    return [
+        f"the error of the simulated heading is no white noise (correlation {alike:.2f} between "
+        "neighbours): K and T are those of the best model of this structure, and the vehicle's may "
+        "lie outside their intervals; try --order 2 and --nonlinear, and check that the rudder "
+        "angle is measured rather than commanded, and that both columns have one clock"
+    ]
 
 
 def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:

@@ -22,6 +22,7 @@ from rov_ident.steering.nomoto_model import (
 from rov_ident.steering.zigzag import Zigzag
 
 _NO_CUBIC = "the cubic term would help the turn instead of resisting it and is held at zero"
+_RIVAL = 3.0  # times the least RMSE: nine times the squared error is no doubt of the sign of K
 _DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
 
 
@@ -56,7 +57,9 @@ def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
     best = min(found, key=lambda m: m.rmse)
     if not math.isfinite(best.rmse):
         raise UserError("the fit does not converge: try --order 1 without --nonlinear")
-    others = [m for m in found if math.isfinite(m.rmse) and m.value("K") * best.value("K") < 0.0]
+    others = [
+        m for m in found if m.rmse < _RIVAL * best.rmse and m.value("K") * best.value("K") < 0
+    ]
     if others:
         other = min(others, key=lambda m: m.rmse)
         note = (
