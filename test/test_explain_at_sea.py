@@ -385,7 +385,10 @@ def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy)
     streams = rates_and_attitude.agreed(streams, config).streams
     there = Search(streams, config, split(streams.duration)[0])
     assert there.problem.reading_std[3:5].all()
-    assert bool(noise_of_wrench(there, there.start())) == noisy
+    start = there.start()
+    assert bool(noise_of_wrench(there, start)) == noisy
+    assert sensor_choice.may_be_noise(start, "XYZKMN") == noisy
+    assert not sensor_choice.may_be_noise(start, "")
 
 
 # ------------------------------------------------------------------ accelerometer and attitude

@@ -60,6 +60,14 @@ def test_a_current_that_is_always_there_is_the_same_and_repeats(seed):
     assert "It is the same in each record." in found.sentence
 
 
+def test_a_payload_of_one_dive_is_said_to_be_of_that_dive():
+    """Its onset belongs to that dive alone: nothing to compare."""
+    bags = [record(9, payload={"mass_wet": 0.4, "x": 0.2, "onset": 20.0}), record(10)]
+    found = told_in_each(bags, "payload", mass_wet=0.2, x=0.01, y=0.01, z=0.01, onset=20.0)
+    assert not found.repetition.same
+    assert "mass_wet" in found.sentence and "onset" not in found.sentence
+
+
 def test_headings_are_compared_between_records():
     bags = [record(7, heading_offset={"yaw": yaw}) for yaw in (0.1, 0.1, -0.5)]
     turned, headings = repetition.turned(bags, TODAY)

@@ -60,6 +60,7 @@ _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its p
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
 _NEAR_NOISE = 3.0  # times what noise makes of a prediction: coefficients are not exact, either
 _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
+_LIKE_ITS_MASS = ("added_mass_coupling", "coriolis", "battery_sag")  # ... of a payload
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
@@ -365,11 +366,11 @@ def _is_between_readings(found: Finding, streams: Streams) -> bool:
 
 
 def _beside_a_payload(found: list[Finding]) -> list[Finding]:
-    """Findings of inertia are not sure where there is a payload: the effect of that has a weight in
-    water, and what it weighs in air is inertia, off the diagonal, too."""
+    """Inertia, and what grows with time, are not sure where there is a payload: the effect of that
+    has a weight in water, and its mass is inertia from then on, off the diagonal, too."""
     if all(f.effect != "payload" for f in found):
         return found
-    return [unsure(f) if f.effect in ("added_mass_coupling", "coriolis") else f for f in found]
+    return [unsure(f) if f.effect in _LIKE_ITS_MASS else f for f in found]
 
 
 def _gains_elsewhere(found: Finding) -> bool:

@@ -26,7 +26,14 @@ from rov_ident.discrepancy.results import Alternative, Change, Finding, Gain, Re
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import HULL_DAMPING_ASKED, Search, Trial, Trials
 from rov_ident.discrepancy.selection import VERY_STRONG
-from rov_ident.discrepancy.sensor_choice import BIAS, HEADING, NOISE, with_noise
+from rov_ident.discrepancy.sensor_choice import (
+    BIAS,
+    HEADING,
+    NEGLECTING,
+    NOISE,
+    may_be_noise,
+    with_noise,
+)
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -59,6 +66,9 @@ def finding(
         without = retuned.hypothesis
     gain = judge.gain(without, final.hypothesis, except_for, axes)
     alternatives, separable = _alternatives(search, judge, final, name, trial, except_for)
+    if name in NEGLECTING and may_be_noise(trial.rest, axes):
+        same = tuple(a for a in alternatives if a.why_not == _EQUAL)
+        alternatives, separable = (*same, Alternative(NOISE, _EQUAL)), False
     stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
     values = final.hypothesis.values
     separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)

@@ -8,7 +8,7 @@ commands rest, is believed if the dynamics fit better without it.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,6 +33,10 @@ from rov_ident.sampling.wrench_scatter import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"
+NEGLECTING = (
+    "thruster_deadband", "thruster_failure", "thruster_gain", "thrust_scale", "thrust_curve",
+)  # fmt: skip
+"""Effects with which a model may follow the wrench as read less, and noise with it."""
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _WATER = (("ocean_current", "north"), ("ocean_current", "east"))
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
@@ -283,6 +287,16 @@ def noise_of_wrench(search: Search, start: Fitted) -> dict[str, float]:
     free = ~problem.guided
     likelier = np.log(there.noise[free]).sum() < np.log(start.noise[free]).sum()
     return values if likelier else {}
+
+
+def may_be_noise(rest: Fitted, axes: Container[str]) -> bool:
+    """Whether the vehicle surely does not follow what looks like noise on one of the axes, although
+    no noise is in the configuration: what follows it less then explains more than there is."""
+    problem = rest.linearisation.problem
+    if NOISE in rest.hypothesis.config.effects or not problem.reading_std.any():
+        return False
+    surely = _evidence_of_noise(rest) >= VERY_STRONG
+    return any(yes and axis in axes for axis, yes in zip(AXES, surely.tolist(), strict=True))
 
 
 def _evidence_of_noise(fitted: Fitted) -> Array:
