@@ -45,12 +45,17 @@ def off(config, seed):
 
 
 def test_table_and_dive_are_better_than_either_and_honest(tmp_path):
-    """Drawn tables and dives; the vehicle's file is 30 % off. Neither thrust nor mass is exact.
+    """Drawn tables and dives; the vehicle's file is 30 % off, and its mass is not exact.
 
-    The righting arm is, or a dive would make what the table tells less certain (docs/forces.md).
+    Thrust and velocity sensor are, or a dive would make what the table tells less certain
+    (docs/forces.md).
     """
     heavy = load(shipped("config/bluerov2_heavy.yaml"))
-    heavy = replace(heavy, vehicle_uncertainty=replace(heavy.vehicle_uncertainty, cob_std=0.0))
+    heavy = replace(
+        heavy,
+        wrench=replace(heavy.wrench, scale_std=0.0),
+        odometry=replace(heavy.odometry, scale_std=0.0),
+    )
     inside, ratios = [], []
     path = tmp_path / "forces.json"
     for seed in range(5):

@@ -254,6 +254,11 @@ def test_angles_in_degrees_are_refused(tmp_path):
     np.savetxt(log, rows, delimiter=",", header=",".join(columns), comments="")
     with pytest.raises(UserError, match="delta_r is 20, which looks like degrees"):
         import_csv([log], tmp_path / "log.mcap")
+    columns["delta_r"], columns["r"] = 0.2 + 0.0 * t, 30.0 * np.sin(7.0 * t)
+    np.savetxt(log, np.column_stack(list(columns.values())), delimiter=",",
+               header=",".join(columns), comments="")  # fmt: skip
+    with pytest.raises(UserError, match="r exceeds .* more than a turn a second"):
+        import_csv([log], tmp_path / "log.mcap")
 
 
 # ------------------------------------------------------------------ coefficients from dives

@@ -348,6 +348,7 @@ def test_values_without_intervals_are_not_judged(tmp_path, capsys):
 
 def test_every_kind_of_result_can_be_compared(tmp_path, fit, results):
     same = ri.compare(fit, fit)
+    assert any("count from vehicle.cog" in n for n in same.notes) == ("buoyancy.delta" in fit.names)
     assert same.changed == () and "same data" in same.notes[0]
     assert ri.compare(HEAVY, fit).deviations == pytest.approx(
         (fit.values - [fit.given.value(n) for n in fit.names]) / fit.std

@@ -26,6 +26,7 @@ _WITH_INTERVALS = (
     "Results have intervals, parameter files have none: compare result.json of identify, or the "
     "JSON that fit --json writes."
 )
+_RELATIVE = ("cog_offset.", "buoyancy.")
 _LARGEST_FILE = 100 << 20  # bytes; more than any result has
 
 
@@ -202,13 +203,19 @@ def compare(
         "both are made from the same data: their errors go together, and the standard deviation of "
         "the difference is an upper bound of it"
     )
+    notes = [same_data] if one.bags & two.bags else []
+    if any(name.startswith(_RELATIVE) for name in names):
+        notes.append(
+            "cog_offset and buoyancy.delta count from vehicle.cog and vehicle.buoyancy of the file "
+            "that each began with: where these differ, so do they, with nothing changed"
+        )
     labels = (one.label, two.label) if one.label != two.label else ("a", "b")
     return Comparison(
         labels, names, units,
         one.values[first], one.std[first], two.values[second], two.std[second],
         tuple(n for n in one.names if n not in names),
         tuple(n for n in two.names if n not in names),
-        (same_data,) if one.bags & two.bags else (),
+        tuple(notes),
     )  # fmt: skip
 
 

@@ -338,7 +338,14 @@ class _Log:
             )
 
     def check_angles(self) -> None:
-        """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates."""
+        """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates, of
+        which a few may be wild."""
+        for name in _VELOCITIES[3:]:
+            if (fast := float(np.quantile(np.abs(self.data[name]), 0.9))) > 2.0 * np.pi:
+                raise UserError(
+                    f"{self.headings[name]} exceeds {fast:.3g} rad/s in a tenth of the rows, more "
+                    "than a turn a second: convert it from degrees, or name it in --degrees."
+                )
         for name in (*_FINS, *_ANGLES):
             angle = self.data.get(name, np.zeros(1))
             most = _LARGEST_FIN if name in _FINS else 2.0 * np.pi

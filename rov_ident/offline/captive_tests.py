@@ -12,9 +12,9 @@ Repeated runs of a condition are averaged first: they share what is wrong with i
 so that as separate rows they would vouch for one another.
 
 Intervals allow for noise that grows with the force: heteroscedastic covariance HC3 (MacKinnon and
-White 1985), Student's distribution. Steady forces hold the Coriolis forces of the added mass
-(Munk's moment and its kind): with ``added_mass`` they are taken off first, or a model would count
-them twice.
+White 1985), Student's distribution; and for the choice of the structure. Steady forces hold the
+Coriolis forces of the added mass (Munk's moment and its kind): with ``added_mass`` they are taken
+off first, or a model would count them twice.
 """
 
 import math
@@ -28,7 +28,7 @@ from scipy.special import stdtrit
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.linalg import sandwich, scaled_inverse
+from rov_ident.core.linalg import sandwich, scaled_inverse, widened
 from rov_ident.core.messages import Array
 from rov_ident.io.csv_table import CsvTable, read_csv
 from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, parse
@@ -54,6 +54,7 @@ _PATIENCE = 3  # a choice: sizes without a better cross-validation until structu
 _SHOWN = 20  # candidates, beside the chosen: a screenful
 _WORTH = 2.0  # standard errors, which chance exceeds one time in forty
 _FAR = 12.0  # median errors: eight standard deviations (0.674 each) of a normal distribution
+_LIGHT = 1e-3  # weight of a structure, the best one's being 1, which changes no standard deviation
 _SLIP = 0.5  # of the force itself: noise in proportion to it is less, a sign or unit more
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 
@@ -483,6 +484,8 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     terms, x, scale = words[chosen], scaled[:, chosen], size[list(chosen)]
     values = np.asarray(np.linalg.lstsq(x, force, rcond=None)[0], dtype=np.float64)
     covariance = sandwich(scaled_inverse(x.T @ x), (x.T * errors[chosen] ** 2) @ x)  # HC3
+    apart = _of_structures(scaled, force, rms, chosen, values)
+    covariance = widened(covariance, np.diag(covariance) + apart)
     fitted = x @ values
     every = {name: matrix[:, i] for i, name in enumerate(names)}
     every |= {name: column(name, nu, fins) for name in aliases}
@@ -612,6 +615,27 @@ def _most_parsimonious(
     return chosen, why
 
 
+def _of_structures(
+    x: Array, y: Array, rms: Mapping[tuple[int, ...], float], chosen: tuple[int, ...], values: Array
+) -> Array:
+    """What the choice among structures adds to the variances (n,) of the ``values`` of the chosen
+    one: the mean square by which a term is another in the structures that have it, weighted by how
+    well they predict (Burnham and Anderson 2002, sec. 4.3; a cross-validated error weighs as AIC
+    does: Stone 1977)."""
+    least = min(rms.values())
+    total, apart = np.zeros((2, len(chosen)))
+    for structure, error in rms.items():
+        weight = (least / max(error, 1e-300)) ** len(y) if least > 0.0 else float(error == least)
+        shared = [(i, structure.index(term)) for i, term in enumerate(chosen) if term in structure]
+        if weight < _LIGHT or not shared:
+            continue
+        own, there = np.array(shared).T
+        total[own] += weight
+        off = np.linalg.lstsq(x[:, structure], y, rcond=None)[0][there] - values[own]
+        apart[own] += weight * off**2
+    return apart / np.maximum(total, _LIGHT)
+
+
 def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
@@ -662,12 +686,18 @@ def remarks(fits: Mapping[str, AxisFit], with_config: bool) -> list[str]:
     """What a reader of the coefficients should know."""
     out = []
     for axis, f in fits.items():
-        hull = [n for n, low in zip(f.names, f.lower) if low > 0.0 and not n.endswith("_0")]
-        if driven := [name for name in hull if parse(name).is_diagonal]:
+        own = {n for n in f.names if not n.endswith("_0") and parse(n).is_diagonal}
+        driven = [n for n, low in zip(f.names, f.lower) if n in own and low > 0.0]
+        if driven and len(driven) == len(own):
             out.append(
                 f"{driven[0]} is positive, so {axis} would drive the vehicle along its own motion: "
                 "the table must hold the forces on the vehicle, not its resistance, in axes "
                 f"forward, starboard, down; reverse the sign of {axis} if it does not"
+            )
+        if len(f.names) == len(f.measured) // _ROWS_PER_TERM < len(f.pool):
+            out.append(
+                f"{axis}: {len(f.measured)} conditions allow for no more than these "
+                f"{len(f.names)} terms; if the force has others, intervals do not hold: add rows"
             )
         off = np.abs(f.measured - f.fitted)
         if (far := (off > _FAR * np.median(off)) & (off > _SLIP * np.abs(f.measured))).any():
