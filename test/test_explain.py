@@ -150,7 +150,7 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
 
     spans = split(there.streams.duration)[0]
     search, _ = _with_reading(Search(there.streams, there.case.config, spans), spans)
-    first_step = search.problem.steps_simulated
+    first_step = search.problem.steps_moved
     monkeypatch.setattr(discrepancy, "BUDGET", first_step)
     findings = explain([there.streams], there.case.config).findings
     assert [f.effect for f in findings.effects] == ["thruster_lag"]
@@ -166,7 +166,7 @@ def test_an_interrupt_does_not_wait_for_the_fits():
     search = Search(streams, case.config, split(streams.duration)[0])
     start = fit(search.problem, search.given)
     candidates = search.screening.candidates(start)
-    begun = search.problem.steps_simulated
+    begun = search.problem.steps_moved
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -175,7 +175,7 @@ def test_an_interrupt_does_not_wait_for_the_fits():
         patch.setattr(search, "_fit_candidate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             search.fit_best(start, candidates)
-    assert search.problem.steps_simulated == begun
+    assert search.problem.steps_moved == begun
     with pytest.raises(CancelledError):
         fit(search.problem, search.given)
 

@@ -177,6 +177,7 @@ class Linearisation:
     def _tangent(self, force: Array | None = None) -> Array:
         """The same (N, 6, C) in m/s and rad/s."""
         e = self.problem
+        e.count(6 if force is None else force.shape[2])
         return tangent(self.motion, e.first, e.last, e.nodes, force)
 
     def _of_tilts(self) -> list[tuple[Array, Array]]:

@@ -63,7 +63,7 @@ _MOST_PATTERNS = 3  # without a name, which are told, not mended
 _ROUNDS = 3  # in which effects may give way to rivals
 _SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
 _FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
-BUDGET = 24_000  # steps simulated for each second of data (docs/explain.md, the card of an effect)
+BUDGET = 500_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Search:
     def _budget_spent(self) -> bool:
         """Whether nothing further is tried; ``cut_short`` from then on. Steps are counted, not
         timed: a bag gives the same findings however busy the computer is."""
-        self.cut_short = self.problem.steps_simulated > BUDGET
+        self.cut_short = self.problem.steps_moved > BUDGET
         return self.cut_short
 
     def start(self) -> Fitted | None:

@@ -51,6 +51,7 @@ ONSET_STEP = 0.2  # s; of the difference quotient: several messages, as thrust a
 _AMPLITUDE_STEP = 0.05  # typical sizes; the same for an input effect, whose thrust has kinks
 _SMALL_STEP = 1e-3  # typical sizes; the same where the wrench is smooth
 _COUNTED_RATE = 50.0  # Hz; the search allows more time for data that are denser (docs/explain.md)
+_COUNTED_SECONDS = 120.0  # to fit, of three minutes: a shorter dive may take as long as these
 _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
@@ -135,7 +136,7 @@ class WindowedProblem:
         self.measured = streams.nu[keep][inside]
         self.times = t[inside]
         self.patterns: dict[Key, Array] = {}
-        self._simulations = 0  # of all windows, so far
+        self._steps_moved = 0.0
         self._stopped = False
         self._driven = _Remembered(_REMEMBERED_THRUSTS)
         self._tilted: Array | None = None
@@ -154,11 +155,19 @@ class WindowedProblem:
         return interpolated(self.streams.t[good], self.streams.nu[good], t)
 
     @property
-    def steps_simulated(self) -> float:
-        """For each second of data, so far; data count as if they came at _COUNTED_RATE at most."""
+    def steps_moved(self) -> float:
+        """Steps through which velocities were simulated, or moved by a wrench (each of
+        ``sensitivities``), for each second of data, so far; data count as if they came at
+        _COUNTED_RATE at most, and for _COUNTED_SECONDS at least."""
+        return self._steps_moved
+
+    def count(self, sensitivities: int) -> None:
+        """Count a simulation, or sensitivities to so many wrenches, of all windows."""
         t, first, last = self.steps.t, self.first, self.last
-        rate = float(np.sum(last - first) / np.sum(t[last] - t[first]))
-        return self._simulations * min(rate, _COUNTED_RATE)
+        steps, seconds = float(np.sum(last - first)), float(np.sum(t[last] - t[first]))
+        rate = min(steps / seconds, _COUNTED_RATE)
+        with self._counting:
+            self._steps_moved += sensitivities * rate * min(seconds / _COUNTED_SECONDS, 1.0)
 
     def stop(self) -> None:
         """Every further simulation, in any thread, raises CancelledError."""
@@ -224,8 +233,7 @@ class WindowedProblem:
                 wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
         if self._stopped:
             raise CancelledError
-        with self._counting:
-            self._simulations += 1
+        self.count(1)
         equations = guided_by(h.equations, self.guided)
         motion = shoot(equations, self.driven(h.effects), wrench, self.first, self.last, starts)
         return motion if np.isfinite(motion.nu[self.nodes]).all() else None
