@@ -46,6 +46,7 @@ CONTRACT = {
     "sensor_misalignment": "roll pitch yaw", "velocity_scale": "scale",
     "imu_bias": "ax ay az gx gy gz", "velocity_latency": "delay", "heading_offset": "yaw",
     "wrench_noise": "std_X std_Y std_Z std_K std_M std_N",
+    "thrust_line": "arm_Y_K arm_Z_K arm_X_M arm_Z_M arm_X_N arm_Y_N",
     "thrust_advance": "k", "coriolis": "", "crossflow": "", "fin_lift": "",
     "fin_offset": "delta_s delta_r delta_a", "fin_lag": "time_constant",
     "fin_saturation": "delta_s delta_r delta_a rate",
@@ -647,7 +648,18 @@ def smooth(t, nu, rotation, scale, axis, first, second, first_low, first_high, s
 
 POSITION = np.array([3.0, -2.0, 1.2])
 
+
+def aside(t, nu, rotation, **arms):
+    """The moment of each force that misses the origin by an arm."""
+    out = np.zeros(6)
+    for name, arm in arms.items():
+        _, force, moment = name.split("_")
+        out[AXES.index(moment)] += arm * THRUST[AXES.index(force)]
+    return out
+
+
 WRENCH_FORMS = {
+    "thrust_line": aside,
     "empirical": smooth,
     "thrust_advance": advancing,
     "payload": payload,

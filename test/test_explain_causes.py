@@ -40,6 +40,7 @@ def hidden(name, rng):
         "velocity_latency": ({"delay": u(0.06, 0.2)}, {}),
         "heading_offset": ({"yaw": u(0.1, 0.6)}, {}),
         "coriolis": ({}, {"X_vr": u(15.0, 25.0), "Y_ur": -u(10.0, 20.0), "X_wq": -u(10.0, 20.0)}),
+        "thrust_line": ({"arm_X_N": u(0.006, 0.015), "arm_Z_M": -u(0.008, 0.02)}, {}),
         "crossflow": ({}, {"Y_v_abs_r": -u(50.0, 90.0), "N_v_abs_r": -u(10.0, 15.0)}),
         "oblique_damping": ({}, {"X_u_abs_v": -u(60.0, 120.0), "Z_w_abs_u": -u(80.0, 160.0)}),
     }[name]
@@ -66,6 +67,7 @@ def findings_of(world, config, suite=None, seed=0, name="steps"):
     [
         "battery_resistance",
         "coriolis",
+        "thrust_line",
         # the first four are found in a test of their own, too
         *more(
             "thrust_curve",

@@ -1,5 +1,7 @@
 """Several records: what they share, what each has for itself, and whether a cause repeats."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from tiers import more
@@ -7,8 +9,10 @@ from tiers import more
 from bench import HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition
-from rov_ident.discrepancy.held_out import blocks, windows
-from rov_ident.discrepancy.output_error import fit
+from rov_ident.discrepancy.explain import explain
+from rov_ident.discrepancy.held_out import blocks, split, windows
+from rov_ident.discrepancy.hypothesis import THRUST_SCALE, precision
+from rov_ident.discrepancy.output_error import fit, with_best_onsets
 from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
@@ -91,3 +95,59 @@ def test_a_heading_is_each_dives_own():
     assert "The records differ: yaw" in own.sentence
     page = _card(own)
     assert "record 2" in page and "The records differ in it." in page
+
+
+def test_a_delay_of_one_record_is_not_averaged():
+    rng = np.random.default_rng(21)
+    delay = rng.uniform(0.1, 0.2)
+    bags = [record(15), record(16, velocity_latency={"delay": delay})]
+    timed, late = repetition.in_time(bags, TODAY)
+    assert len(timed) == 2
+    for value, true in zip(late, (0.0, delay)):
+        assert abs(value.value - true) < max(4.0 * value.std, 0.004)
+    same, none = repetition.in_time([bags[1], bags[1]], TODAY)
+    assert none == [] and same[0] is bags[1]
+
+
+def test_what_each_record_has_of_its_own_is_told():
+    """A heading and a delay that only the second has: the first one's are nothing."""
+    own = {"heading_offset": {"yaw": 0.4}, "velocity_latency": {"delay": 0.15}}
+    bags = [record(17), record(18, **own)]
+    found = explain(bags, TODAY).findings
+    told = {f.effect: f for f in found.effects}
+    for effect, values in own.items():
+        ((name, true),) = values.items()
+        first, second = (of[name].value for of in told[effect].repetition.records)
+        assert not told[effect].repetition.same
+        assert abs(first) < 0.02 and abs(second - true) < 0.02
+    assert any("delay of their own" in note for note in found.notes)
+    assert any("heading of its own" in note for note in found.notes)
+
+
+def test_what_is_taken_up_between_two_dives_begins_with_the_second():
+    """And not in the last seconds of the first, which no fit sees."""
+    bags = [record(19), record(20, payload={"mass_wet": 0.8, "x": 0.1})]
+    streams, begins = joined(bags)
+    to_fit = [(b + s, b + e) for bag, b in zip(bags, begins) for s, e in split(bag.duration)[0]]
+    search = Search(streams, TODAY, to_fit)
+    values = {"mass_wet": 0.5, "x": 0.05, "y": 0.01, "z": 0.01, "onset": begins[1] - 3.0}
+    there = search.given.having({("payload", n): v for n, v in values.items()})
+    fitted = with_best_onsets(fit(search.problem, there))
+    at = fitted.hypothesis.values["payload", "onset"]
+    assert at == pytest.approx(begins[1], abs=0.5)
+    records = repetition.Records(streams, bags, begins)
+    gain = Gain("w", 1.0, 0.5, 50.0, 40.0, 60.0)
+    found = Finding("payload", ("Z",), {}, at, gain, True, None, (), "")
+    (own,) = repetition.in_each(search, records, fitted, [found])
+    assert not own.repetition.same and "begins in record 2" in own.sentence
+
+
+def test_a_thrust_scale_that_nothing_tells_stays_what_the_file_says_of_it():
+    h = Search(record(22), TODAY, windows(0.0, 40.0)).given.having({THRUST_SCALE: 1.0})
+    scale = TODAY.wrench.scale_std
+    unsure = configuration.from_parameters(
+        configuration.to_parameters(TODAY) | {"wrench": {"scale_std": 0.15}}
+    )
+    assert scale == 0.0  # said to be known
+    width = precision(dataclasses.replace(h, config=unsure))[h.keys.index(THRUST_SCALE)] ** -0.5
+    assert width == pytest.approx(0.15)

@@ -134,7 +134,8 @@ def test_every_effect_in_every_tier(tier):
 NOT_DRAWN = {
     "thrust_scale", "thrust_curve", "thrust_advance", "thruster_saturation", "battery_resistance",
     "velocity_latency", "heading_offset", "wrench_noise", "coriolis", "crossflow",
-    "oblique_damping", "fin_lag", "fin_lift", "fin_offset", "fin_saturation", "empirical",
+    "oblique_damping", "thrust_line", "fin_lag", "fin_lift", "fin_offset", "fin_saturation",
+    "empirical",
 }  # fmt: skip
 """Hidden by other means in test_explain_causes.py, test_explain_fins.py and test_empirical.py."""
 

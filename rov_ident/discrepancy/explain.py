@@ -74,6 +74,12 @@ _NO_TORQUE = (
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"
 )
+_OWN_DELAYS = (
+    "each record's velocities have a delay of their own: the extended configuration has none"
+)
+_OWN_VALUES = (
+    "the records differ in {}: the extended configuration has one value for all, which suits none"
+)
 _FILTERED = (
     "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
     "cause beside it is sure; record what the filter is fed with"
@@ -202,6 +208,9 @@ def explain(
     everything = WindowedProblem(data.streams, blocks(data.streams))
     notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
     notes += [_OWN_HEADINGS] if any(data.headings) else []
+    notes += [_OWN_DELAYS] if any(_has_own_delay(f) for f in data.findings) else []
+    own = [f.effect for f in of_dynamics if f.repetition is not None and not f.repetition.same]
+    notes += [_OWN_VALUES.format(", ".join(own))] if own else []
     notes += [_FILTERED] if data.late else []
     notes += [_NO_TORQUE] if data.streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
@@ -261,6 +270,8 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     turned, headings = repetition.turned(with_others, config)
     bags = turned[: len(bags)]
     validate = None if validate is None else turned[-1]
+    as_timed = bags
+    bags, late = repetition.in_time(bags, config)
     streams, to_fit, held = _divided(bags, validate)
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
     recorded = sensor_choice.Data(streams, to_fit, judged, to_judge, config)
@@ -271,6 +282,11 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     )  # fmt: skip
     if len(bags) > 1:
         findings = repetition.of_sensors(bags, config, findings, headings[: len(bags)])
+    own_delays = []
+    if late:
+        spans = held if validate is None else to_fit
+        before = joined(as_timed)[0]
+        own_delays = [repetition.late_finding(before, streams, config, spans, choice.sensors, late)]
     sensors = {f.effect: choice.sensors[f.effect] for f in findings if is_practical(f.gain)}
     return _Data(
         bags,
@@ -281,7 +297,7 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
         recorded,
         headings,
         choice,
-        findings,
+        [*findings, *own_delays],
         sensors,
         any(r.late for r in rates),
         any(r.may_drift for r in rates),
@@ -354,6 +370,11 @@ def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
     far = any(share > _FAR_OFF for share in left.values())
     axes = {AXES[VELOCITIES.index(c)] for c in left}
     return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
+
+
+def _has_own_delay(f: Finding) -> bool:
+    """Whether velocities are late by another delay in each record, which was taken off each."""
+    return f.effect == repetition.LATENCY and f.repetition is not None and not f.repetition.same
 
 
 def _is_between_readings(found: Finding, streams: Streams) -> bool:

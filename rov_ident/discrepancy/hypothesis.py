@@ -23,6 +23,7 @@ from rov_ident.model.scales import semi_axes
 
 Key = tuple[str, str]
 COEFFICIENTS = "coefficients"
+THRUST_SCALE: Key = ("thrust_scale", "scale")
 
 _WIDE = 10.0  # times the size of a coefficient: one that is configured as zero, on an axis without
 # other damping, has a size of 2 N s/m where drag is 80, and would be held near zero
@@ -147,6 +148,10 @@ def precision(h: Hypothesis) -> Array:
     width = {key: _WIDE * size for key, size in coefficient_sizes(h.config.model).items()}
     width |= {key: 1e3 * parameter(key).typical for key in h.keys if key[0] in EFFECTS}
     width |= reach(h.config, h.keys)
+    # what all thrusters lack alike is what every coefficient has more: where only mass and weight
+    # could tell, and do not, the file says how far off thrust may be
+    if (scale := h.config.wrench.scale_std) > 0.0:
+        width[THRUST_SCALE] = scale
     return np.array([width.get(key, np.inf) for key in h.keys]) ** -2.0
 
 

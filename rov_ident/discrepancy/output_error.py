@@ -31,6 +31,7 @@ from rov_ident.discrepancy.selection import variance_inflation
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array, Indices
+from rov_ident.sampling.raw_streams import PAUSE
 
 _FEWEST_CLUSTERS = 8  # windows; from fewer a variance is uncertain by more than half (chi-squared)
 _ITERATIONS = 15  # of Gauss-Newton; a guard: fits of the study end after at most ten
@@ -325,6 +326,27 @@ def with_best_onsets(fitted: Fitted, keys: Container[Key] | None = None) -> Fitt
             again = refit(there, fitted.linearisation)
             if again is not None and again.rss < fitted.rss:
                 fitted = again
+        fitted = _between_records(fitted, key)
+    return fitted
+
+
+def _between_records(fitted: Fitted, key: Key) -> Fitted:
+    """The same with an onset at the beginning of a record, where no window that is fitted lies
+    between: the data do not tell the two apart, and what is there throughout one record and not
+    in the last was taken up on deck, not in the last seconds of the dive, which are held out."""
+    problem, now = fitted.linearisation.problem, fitted.hypothesis.values[key]
+    first, last = problem.steps.t[problem.first], problem.steps.t[problem.last]
+    begins = first[1:][first[1:] - last[:-1] >= PAUSE]
+    for begin in begins.tolist():
+        low, high = sorted((now, begin))
+        if now != begin and not ((last > low) & (first < high)).any():
+            there = linearise(
+                problem,
+                fitted.hypothesis.having({key: begin}),
+                fitted.linearisation.starts,
+                fitted.noise,
+            )
+            return fitted if there is None else Fitted(there.hypothesis, there, fitted.converged)
     return fitted
 
 

@@ -7,15 +7,23 @@ whole and predicted by fits to the others, with the effect and without (Stone 19
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.findings import parameters_of, unsure
-from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
+from rov_ident.discrepancy.findings import parameters_of, sentence, unsure
+from rov_ident.discrepancy.held_out import (
+    BLOCK,
+    CHUNK,
+    Judge,
+    gain_of,
+    surely_less,
+    thinned,
+    windows,
+)
 from rov_ident.discrepancy.hypothesis import role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
@@ -26,6 +34,7 @@ from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
 
+LATENCY = "velocity_latency"
 _LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
 
 
@@ -38,6 +47,10 @@ class Records:
 
     def __len__(self) -> int:
         return len(self.spans)
+
+    def at(self, t: float) -> int:
+        """In which record something begins at a time; in the next one if between two."""
+        return min(sum(end <= t for _, end in self.spans), len(self.spans) - 1)
 
     def blocks(self, which: Sequence[int]) -> Spans:
         """Some of the records, in blocks."""
@@ -60,9 +73,23 @@ def in_each(
         keys = search.keys_of(last, f.effect)
         names = [k for k in keys if role_of(k) in _LINEAR]
         each = tuple(parameters_of(there or last, names) for there in alone)
-        same = all(_agree([of[n] for of in each]) for n in each[0])
-        out.append(_with(f, Repetition(same, repeats.get(f.effect), each)))
+        first = 0 if f.onset_s is None else records.at(f.onset_s)
+        same = all(_agree([of[n] for of in each[first:]]) for n in each[0])
+        told = _with(f, Repetition(same and not first, repeats.get(f.effect), each), first)
+        out.append(told if f.onset_s is None else _begun(told, records, f.onset_s, same))
     return out
+
+
+def _begun(f: Finding, records: Records, onset: float, lasts: bool) -> Finding:
+    """In which record an effect begins, and when: no clock of the user's shows the time of all
+    records joined. A record that ends before says nothing of it but that it is not there."""
+    b = records.at(onset)
+    late, count = max(onset - records.spans[b][0], 0.0), len(records)
+    words = f" It begins in record {b + 1}, {late:.0f} s after its first message"
+    words += ", and not before." if b else "."
+    if b + 1 < count:
+        words += " It is the same in those after it." if lasts else " Those after it differ."
+    return dataclasses.replace(f, sentence=f.sentence + words)
 
 
 def _fitted(records: Records, which: Sequence[int], last: Fitted) -> Fitted | None:
@@ -87,7 +114,7 @@ def of_sensors(
     for f in found:
         values = [
             {
-                name: Value(at[f.effect][name], std.get((f.effect, name), 0.0), v.unit)
+                name: Value(at[f.effect][name], std.get((f.effect, name), np.inf), v.unit)
                 for name, v in f.parameters.items()
             }
             for at, std in each
@@ -112,13 +139,49 @@ def turned(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list
     yaw = []
     for bag in bags:
         found, std = sensor_consistency.search(bag, config, windows(0.0, bag.duration), [HEADING])
-        yaw.append(Value(found[HEADING]["yaw"], std[HEADING, "yaw"], "rad"))
+        own = float(np.hypot(std[HEADING, "yaw"], config.odometry.attitude_std))
+        yaw.append(Value(found[HEADING]["yaw"], own, "rad"))
     apart = [float(np.angle(np.exp(1j * (v.value - yaw[0].value)))) for v in yaw]
     if _agree([dataclasses.replace(v, value=a) for v, a in zip(yaw, apart, strict=True)]):
         return list(bags), none
     return [
         sensor_consistency.corrected(bag, {HEADING: {"yaw": y}}) for bag, y in zip(bags, apart)
     ], apart
+
+
+def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list[Value]]:
+    """Records whose velocities are of the time of their stamps, and how late they were [s], where
+    the sensors of each show that this differs: a delay of some records, fitted to all, is an
+    average that none of them has. Nothing where it is the same in each."""
+    if len(bags) < 2 or not all(bag.has_pose for bag in bags):
+        return list(bags), []
+    late = []
+    for bag in bags:
+        spans = windows(0.0, bag.duration)
+        found, _ = sensor_consistency.search(bag, config, spans)
+        names = [*(n for n in found if n != LATENCY), LATENCY]
+        found, std = sensor_consistency.search(bag, config, spans, names)
+        late.append(Value(found[LATENCY]["delay"], std[LATENCY, "delay"], "s"))
+    if _agree(late):
+        return list(bags), []
+    off = [{LATENCY: {"delay": v.value}} for v in late]
+    return [sensor_consistency.corrected(b, of) for b, of in zip(bags, off, strict=True)], late
+
+
+def late_finding(
+    before: Streams, after: Streams, config: Config, held: Spans,
+    sensors: Mapping[str, Mapping[str, float]], late: Sequence[Value],
+) -> Finding:  # fmt: skip
+    """Velocities that are late by another delay in each record: what taking that off gains."""
+    pair = [sensor_consistency.comparisons(s, config, sensors) for s in (before, after)]
+    of = sensor_consistency.common_squares(pair, held, unit=1, length=CHUNK)
+    of = of[:, :, of[:, 2].any(axis=0)]
+    gain = gain_of(["kinematic"] * of.shape[2], of[:, 0], of[:, 1], of[:, 2].sum(axis=0))
+    most = max(late, key=lambda v: abs(v.value))
+    each = tuple({"delay": v} for v in late)
+    words = sentence(LATENCY, {"delay": most}, gain)
+    f = Finding(LATENCY, (), {"delay": most}, None, gain, True, None, (), words)
+    return _with(f, Repetition(False, None, each))
 
 
 def _agree(of: Sequence[Value]) -> bool:
@@ -128,8 +191,10 @@ def _agree(of: Sequence[Value]) -> bool:
     return bool(weight @ apart**2 <= PENALTY * (len(x) - 1))
 
 
-def _with(f: Finding, repetition: Repetition) -> Finding:
-    """A finding that says what each record says."""
+def _with(f: Finding, repetition: Repetition, first: int = 0) -> Finding:
+    """A finding that says what each record says; those before the ``first`` have nothing of it."""
+    if first:
+        return dataclasses.replace(f, repetition=repetition)
     names = repetition.records[0]  # an onset belongs to one record
     several = [", ".join(f"{of[n].value:.3g}" for of in repetition.records) for n in names]
     if repetition.same:

@@ -107,10 +107,10 @@ def chosen(data: Data, turned: bool = False) -> Choice:
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
-    return _beside_tilt(data, _without_refuted(data, choice))
+    return _beside_tilt(data, _without_refuted(data, choice), turned)
 
 
-def _beside_tilt(data: Data, choice: Choice) -> Choice:
+def _beside_tilt(data: Data, choice: Choice, turned: bool) -> Choice:
     """What the attitude is needed for is known as well as the attitude: tilted by delta, it makes
     delta x f of a bias of the accelerometer and delta x omega of a gyro's, of the mean f and omega,
     and turns a velocity sensor that is compared with positions. So an effect is none if it is no
@@ -126,6 +126,8 @@ def _beside_tilt(data: Data, choice: Choice) -> Choice:
         keys = [(name, parameter) for parameter in values]
         for key, more in zip(keys, wider.get(name, ())):
             std[key] = float(np.hypot(std.get(key, 0.0), more))
+        if turned and name == HEADING:
+            continue  # it is what the records differ by, beside which the first one's is nothing
         if all(abs(values[k[1]] - bounds(k)[0]) <= _SURE * std.get(k, 0.0) for k in keys):
             words = f"{name}: no more than chance, or odometry.attitude_std, explains"
             rest = {n: of for n, of in choice.sensors.items() if n != name}

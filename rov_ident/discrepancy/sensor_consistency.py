@@ -35,7 +35,7 @@ from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import turned
 from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
-from rov_ident.discrepancy.selection import VERY_STRONG, Rows, Scores, variance_inflation
+from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, Rows, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
 from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
@@ -401,6 +401,28 @@ def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> S
     return dataclasses.replace(streams, nu=np.hstack([here.linear, here.angular]))
 
 
+def _shown_by_a_fit(
+    streams: Streams,
+    config: Config,
+    spans: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    keys: Sequence[Key],
+    fixed: Container[Key],
+) -> list[Key]:
+    """Those of the parameters ``keys`` that a fit shows, where the linear view from far off did
+    not: a delay of a fifth of a period is no longer its derivative, and what the first step leaves
+    is as coloured as what it takes. At the end of the fit it is small, and so is what is left
+    (Wald)."""
+    values, std = search(streams, config, spans, names, fixed)
+    shown = []
+    for name in dict.fromkeys(name for name, _ in keys):
+        own = [k for k in keys if k[0] == name and std.get(k, 0.0) > 0.0]
+        square = sum(((values[name][k[1]] - bounds(k)[0]) / std[k]) ** 2 for k in own)
+        if square > VERY_STRONG + PENALTY * len(own):
+            shown += [k for k in keys if k[0] == name]
+    return shown
+
+
 def search(
     streams: Streams,
     config: Config,
@@ -425,6 +447,9 @@ def search(
         if allowed is None:
             best, score, _ = _scores(rows, [*chosen, *TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
+            if best.keys and not added:
+                names = list(dict.fromkeys(name for name, _ in best.keys))
+                added = _shown_by_a_fit(streams, config, spans, [*found, *names], best.keys, fixed)
         both = [*chosen, *added]
         if not both:
             break

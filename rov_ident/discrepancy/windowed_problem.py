@@ -7,6 +7,7 @@ its parameters.
 
 import contextlib
 import copy
+import itertools
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -260,7 +261,9 @@ class WindowedProblem:
             effect = EFFECTS[section]
             mine = [p for p in effect.parameters if (section, p.name) in place]
             # parameters of single axes act apart: one difference quotient for all of them
-            groups = [[p] for p in mine if not p.axis] + [[p for p in mine if p.axis]]
+            groups = [[p] for p in mine if not p.axis]
+            of_axis = [[p for p in mine if p.axis == a] for a in AXES]
+            groups += [[p for p in g if p] for g in itertools.zip_longest(*of_axis)]
             for group in filter(None, groups):
                 change = self._difference(h, motion, effect, group)
                 for p in group:

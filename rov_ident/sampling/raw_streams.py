@@ -27,7 +27,7 @@ _USUAL = 2.0  # a choice: times what 99 % of the messages keep to
 # of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
 # a tenth as noisy; without noise the sum of true velocities is a fifth of it off
 _RECKONED = 0.1
-_PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
+PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     begins, begin = [], 0.0
     for bag in bags:
         begins.append(begin)
-        begin += bag.duration + _PAUSE
+        begin += bag.duration + PAUSE
     if len(bags) == 1:
         return bags[0], begins
 
@@ -201,7 +201,7 @@ def _accepted(
             continue
         origin = message.stamp if origin is None else origin
         if reason == NEW_CLOCK and message.stamp < latest:
-            origin -= latest - message.stamp + round(_PAUSE * 1e9)
+            origin -= latest - message.stamp + round(PAUSE * 1e9)
             latest = 0
         latest = max(latest, message.stamp)
         validation.counts[role] += 1
