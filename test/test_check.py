@@ -388,6 +388,24 @@ def test_the_prediction_holds_in_simulation(heavy, surge_only, proposal, tmp_pat
     assert np.sqrt(np.mean(np.square(ratios))) < 1.3
 
 
+def test_what_is_promised_is_what_a_fit_then_states(tmp_path):
+    """Of a vehicle of which nothing but the file is known, and whose coefficients are 30 % off."""
+    shipped = configuration.load("config/bluerov2_heavy.yaml")
+    proposal = propose(shipped, None, 15.0)
+    factor = np.random.default_rng(1).choice([0.7, 1.3], len(shipped.model.theta))
+    true = shipped.with_model(shipped.model.with_theta(shipped.model.theta * factor))
+    write_messages(tmp_path / "flown.mcap", proposal.best.dive(true, seed=1).messages)
+    flown = of_records([read_record(tmp_path / "flown.mcap", shipped)])
+    fit = fit_batch(flown, shipped, "ml")
+    n = len(shipped.estimate)
+    driven = np.array([p.std for p in proposal.after])
+    stated = fit.std[:n] / np.hypot(driven, proposal.of_scales)
+    assert stated.min() > 0.5 and stated.max() < 2.0
+    error = (fit.values[:n] - true.model.theta) / driven
+    assert np.sqrt(np.mean(error**2)) < 1.5
+    assert "no driving tells" in proposal.sentence
+
+
 def test_no_room_is_said(heavy):
     with pytest.raises(UserError, match="leaves no room"):
         propose(heavy, None, 20.0, Limits((0.3, 0.3, 0.3)))

@@ -1,7 +1,7 @@
 """Which motion shows which coefficient: the tables of docs/driving.md.
 
 Predicted standard deviations relative to the value, from the information along simulated motions of
-a BlueROV2 Heavy, whose coefficients are taken as known to 50 % before.
+a BlueROV2 Heavy, whose coefficients are taken as known to 50 % before, and all else as known.
 """
 
 from collections import Counter
@@ -14,10 +14,8 @@ from bench import HEAVY
 from bench.harness import announce, table
 from rov_ident import config
 from rov_ident.config import Config
-from rov_ident.experiment.data_quality import prospects
-from rov_ident.experiment.design import propose
+from rov_ident.experiment.design import information_of, known_after, propose
 from rov_ident.offline import archive
-from rov_ident.offline.batch_fit import predicted_information
 from rov_ident.sampling.records import Record, samples_of
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
@@ -29,14 +27,14 @@ def percent(share: float) -> str:
 
 
 def row(settings: Config, information: np.ndarray) -> list[str]:
-    return [percent(p.std / abs(p.value)) for p in prospects(settings, information)]
+    return [percent(p.std / abs(p.value)) for p in known_after(settings, information)]
 
 
 def measured(settings: Config, name: str, duration: float, suite: Suite) -> np.ndarray:
     run = dive(settings, name, duration, suite, seed=1)
     samples = np.concatenate(list(samples_of(settings, run)))
     record = Record(Path(name), samples, Counter(), (), "")
-    return predicted_information(archive.of_records([record]), settings)
+    return information_of(archive.of_records([record]), settings)
 
 
 def main() -> None:

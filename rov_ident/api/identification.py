@@ -122,8 +122,10 @@ class Identification(Shown):
                 "Fly next: heave, roll, pitch and yaw at changing levels while surge and sway "
                 "rest; a velocity sensor (DVL) alone tells surge and sway."
             )
-        if self.next is not None:
+        if self.next is not None and not self._doubt:
             advice.append(f"Fly next: {self.next.sentence}.")
+        elif self.next is not None:  # what it would tell supposes that the model is right
+            advice.append(f"Fly next: {self.next.manoeuvre}; {self.next.extent}.")
         better = float(np.median([after / before for before, after in self.errors.values()])) < 1.0
         if not better:
             advice.append("Keep the configuration: extended.yaml predicts no better than it does.")

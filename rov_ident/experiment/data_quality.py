@@ -31,7 +31,6 @@ from rov_ident.model.scales import authority
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import AT_REST, fit_batch
 from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online, thrust_or_mass
-from rov_ident.offline.maximum_likelihood import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.raw_streams import Streams, gather
@@ -93,7 +92,7 @@ class Check(Shown):
         """What the quick fit makes of each coefficient; the prior where there is none."""
         prior, quick = prior_of(self.config), self.quick
         if quick is None:
-            return prospects(self.config, np.zeros((len(prior.names),) * 2))
+            return prospects(self.config, prior.std)
         rows = zip(prior.names, prior.mean.tolist(), prior.units, prior.std.tolist(), strict=True)
         found = dict(zip(quick.names, zip(quick.std.tolist(), quick.states), strict=True))
         return tuple(Prospect(n, x, unit, *found[n], wide) for n, x, unit, wide in rows)
@@ -201,11 +200,11 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
     return Check(path.name, streams.duration, config, tuple(remarks), quick, record, streams)
 
 
-def prospects(config: Config, information: Array) -> tuple[Prospect, ...]:
-    """How well each coefficient would be known from this information (n, n) and the prior."""
+def prospects(config: Config, std: Array) -> tuple[Prospect, ...]:
+    """Each coefficient, known to a standard deviation (n,)."""
     prior = prior_of(config)
-    std = np.sqrt(np.diag(inverse_of(information + np.diag(prior.std**-2.0)))).tolist()
-    rows = zip(prior.names, prior.mean.tolist(), prior.units, std, prior.std.tolist(), strict=True)
+    columns = (prior.mean.tolist(), prior.units, std.tolist(), prior.std.tolist())
+    rows = zip(prior.names, *columns, strict=True)
     return tuple(
         Prospect(name, x, unit, s, of_fit(x, s, wide, s**2 < (1.0 - IDENTIFIABLE) * wide**2), wide)
         for name, x, unit, s, wide in rows

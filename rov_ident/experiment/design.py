@@ -3,7 +3,8 @@
 Candidates (`closed_loop_manoeuvres`) are simulated with the present coefficients, and with some
 that their uncertainty allows; those that leave the tank are made smaller. The information that each
 adds is predicted along its simulated motion, and the one after which the worst coefficient is known
-best is proposed.
+best is proposed. As in a fit, what no vehicle's file knows (thrust scale, lag, current, trim) is
+estimated beside the coefficients, and what no driving tells is left out of the choice.
 """
 
 from collections.abc import Callable
@@ -11,9 +12,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import prior_of, typical
+from rov_ident.config.prior import (
+    first_centre,
+    gain_of,
+    prior_of,
+    rigid_body_covariance,
+    scale_covariance,
+    theta_of,
+    typical,
+)
 from rov_ident.core.errors import UserError
 from rov_ident.core.progress import Progress, silent
 from rov_ident.estimation.physical import is_passive
@@ -22,10 +32,9 @@ from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Flig
 from rov_ident.experiment.data_quality import Prospect, prospects
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.coefficients import parse
-from rov_ident.model.equations import Array
-from rov_ident.offline.archive import Archive
-from rov_ident.offline.batch_fit import predicted_information
-from rov_ident.offline.maximum_likelihood import LIKELY, assumed, inverse_of, one_pass
+from rov_ident.model.equations import Array, Model
+from rov_ident.offline.archive import Archive, total
+from rov_ident.offline.maximum_likelihood import LIKELY, Noise, assumed, inverse_of, one_pass
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
 from rov_ident.sampling.records import samples_of
@@ -48,7 +57,8 @@ _OTHERS = 0.05  # weight of the mean over all coefficients, which decides where 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A safe manoeuvre and the information (n, n) that it is predicted to add."""
+    """A safe manoeuvre and the information (n, n) that it is predicted to add, about the
+    coefficients and what is estimated beside them."""
 
     manoeuvre: AlternatingTargets
     flight: Flight
@@ -65,13 +75,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Proposal(Shown):
-    """The best candidate, what is known before it and what is predicted after it."""
+    """The best candidate, what is known before it and what is predicted after it, but for what no
+    driving tells: the standard deviations ``of_scales``, which a fit adds."""
 
     config: Config = field(repr=False)
     best: Candidate
     worst: str
     before: tuple[Prospect, ...]
     after: tuple[Prospect, ...]
+    of_scales: tuple[float, ...]
     others: tuple[tuple[str, float], ...]
     """Every candidate's name and the relative standard deviation of its worst coefficient."""
     left_out: tuple[str, ...]
@@ -79,12 +91,29 @@ class Proposal(Shown):
 
     @property
     def sentence(self) -> str:
-        pairs = zip(self.before, self.after, strict=True)
-        now, then = next(pair for pair in pairs if pair[0].name == self.worst)
+        rows = zip(self.before, self.after, self.of_scales, strict=True)
+        now, then, beside = next(row for row in rows if row[0].name == self.worst)
+        told = (
+            f"{self.worst}, known worst, goes from ± {NORMAL * now.std:.2g} to "
+            f"± {NORMAL * then.std:.2g} {now.unit} (95 %)"
+        )
+        if beside > then.std:
+            told += (
+                f", beside ± {NORMAL * beside:.2g} that no driving tells (mass, righting arm, "
+                "scales: docs/live.md)"
+            )
+        return f"{self.manoeuvre}: {told}; {self.extent}"
+
+    @property
+    def manoeuvre(self) -> str:
+        """What to run, for how long."""
+        return f"{self.best.manoeuvre.name}, {self.best.duration:g} s"
+
+    @property
+    def extent(self) -> str:
+        """Where the vehicle stays meanwhile."""
         f = self.best.flight
         return (
-            f"{self.best.manoeuvre.name}, {self.best.duration:g} s: {self.worst}, known worst, "
-            f"goes from ± {NORMAL * now.std:.2g} to ± {NORMAL * then.std:.2g} {now.unit} (95 %); "
             f"stays within {f.reach[0]:.1f} m north, {f.reach[1]:.1f} m east, {f.reach[2]:.1f} m "
             f"down of the start and leans {np.degrees(f.tilt):.0f} deg at most"
         )
@@ -92,11 +121,12 @@ class Proposal(Shown):
     def table(self) -> Table:
         """What is known of every coefficient now, and what after the manoeuvre."""
         rows = [
-            [b.name, f"{b.value:.4g}", *(f"{NORMAL * p.std:.2g}" for p in (b, a)), b.unit]
-            for b, a in zip(self.before, self.after, strict=True)
+            [b.name, f"{b.value:.4g}", *(f"{NORMAL * x:.2g}" for x in (b.std, a.std, s)), b.unit]
+            for b, a, s in zip(self.before, self.after, self.of_scales, strict=True)
         ]
-        head = ["", "configured", f"{PLUS_MINUS} now", f"{PLUS_MINUS} after it", "unit"]
-        return Table("what the manoeuvre would tell", head, rows, text=(4,))
+        columns = (f"{PLUS_MINUS} {label}" for label in ("now", "after it", "scales"))
+        head = ["", "configured", *columns, "unit"]
+        return Table("what the manoeuvre would tell", head, rows, text=(5,))
 
     def plot(self) -> Figure:
         """How well each coefficient is known, now and after the manoeuvre."""
@@ -118,8 +148,8 @@ class Proposal(Shown):
             "worst": self.worst,
             "sentence": self.sentence,
             "coefficients": {
-                b.name: {"std_now": b.std, "std_after": a.std, "unit": b.unit}
-                for b, a in zip(self.before, self.after, strict=True)
+                b.name: {"std_now": b.std, "std_after": a.std, "std_of_scales": s, "unit": b.unit}
+                for b, a, s in zip(self.before, self.after, self.of_scales, strict=True)
             },
             "candidates": [
                 {"name": n, "worst_relative_std": s if np.isfinite(s) else None}
@@ -150,15 +180,16 @@ def propose(
         raise UserError(
             f"a manoeuvre of {duration:g} s shows nothing: {_SHORTEST:g} s are the least"
         )
-    n = len(config.estimate)
-    now = predicted_information(bags, config) if bags is not None else np.zeros((n, n))
     velocity = bags is None or not any(bags.each(is_without_velocity))
-    before = prospects(config, now)
+    about = supposed(config, velocity)
+    n = len(prior_of(about, effects=True).names)
+    now = information_of(bags.reread(about, True), about) if bags else np.zeros((n, n))
+    before = known_after(about, now)
     # what a standard deviation is compared with: the value, or a share of what matters
     prior = prior_of(config)
     size = np.maximum(np.abs(prior.mean), 0.2 * typical(config.dynamics)[prior.estimated])
     relative = np.array([p.std for p in before]) / size
-    vehicles = _vehicles(config, now)
+    vehicles = _vehicles(config, covariance_of(about, now))
     candidates, left_out, predicted = [], [], []
     for one in closed_loop_manoeuvres.library(limits):
         if not velocity and any(one.amplitude[:2]):
@@ -169,8 +200,10 @@ def propose(
         if found is None:
             left_out.append(f"{one.name}: not safe within the limits, however small")
             continue
-        information = _information(config, found[0], duration, limits, velocity)
-        std = np.array([p.std for p in prospects(config, now + information)])
+        run = closed_loop_manoeuvres.dive(config, found[0], duration, limits, Suite())
+        samples = smoothed(joined(list(samples_of(about, run, velocity))))
+        information = one_pass(samples, *_model(about)).information
+        std = np.array([p.std for p in known_after(about, now + information)])
         candidates.append(Candidate(*found, information, duration, limits))
         predicted.append(std / size)
     if not candidates:
@@ -184,18 +217,63 @@ def propose(
     worst = before[int(np.argmax(np.where(shown, relative, 0.0)))].name
     scores = [float(r[shown].max() * (1.0 + _OTHERS * np.mean(r[shown]))) for r in predicted]
     best = int(np.argmin(scores))
-    after = prospects(config, now + candidates[best].information)
+    after = known_after(about, now + candidates[best].information)
+    of_scales = _not_by_driving(about, now + candidates[best].information)
     others = [(c.manoeuvre.name, s) for c, s in zip(candidates, scores, strict=True)]
     return Proposal(
-        config, candidates[best], worst, before, after, tuple(sorted(others, key=lambda o: o[1])),
-        tuple(left_out), tuple(candidates),
+        config, candidates[best], worst, before, after, of_scales,
+        tuple(sorted(others, key=lambda o: o[1])), tuple(left_out), tuple(candidates),
     )  # fmt: skip
 
 
-def _vehicles(config: Config, information: Array) -> list[Config]:
+def supposed(config: Config, velocity: bool = True) -> Config:
+    """The configuration as a fit takes it: with what no vehicle's file knows to be estimated, about
+    the values at which samples are linear. Without a velocity sensor nothing shows of some of it.
+    """
+    if not velocity:
+        odometry = replace(config.odometry, latency_std=0.0, scale_std=0.0)
+        config = replace(config, current_std=0.0, odometry=odometry)
+    config = config.with_nuisance
+    return config.with_values(first_centre(config))
+
+
+def _model(about: Config) -> tuple[Model, NDArray[np.int64], Noise, None, float, Array]:
+    """The arguments of :func:`one_pass` for what is `supposed`."""
+    estimated = prior_of(about, effects=True).estimated
+    effects = theta_of(about)[len(about.model.theta) :]
+    return about.dynamics, estimated, assumed(about, LIKELY), None, np.inf, effects
+
+
+def information_of(bags: Archive, about: Config) -> Array:
+    """Information (n, n) in the motion of bags that were read by what is `supposed`."""
+    return total(bags.each(one_pass, *_model(about))).information
+
+
+def covariance_of(about: Config, information: Array) -> Array:
+    """The covariance (n, n) after information (n, n) beside the prior, of all that is estimated."""
+    return inverse_of(information + np.diag(prior_of(about, effects=True).std ** -2.0))
+
+
+def known_after(about: Config, information: Array) -> tuple[Prospect, ...]:
+    """How well each coefficient is known after information (n, n), whatever the rest may be."""
+    std = np.sqrt(np.diag(covariance_of(about, information)))
+    return prospects(about, std[: len(about.estimate)])
+
+
+def _not_by_driving(about: Config, information: Array) -> tuple[float, ...]:
+    """The standard deviations that a fit adds, for each coefficient, after information (n, n)."""
+    prior, covariance = prior_of(about, effects=True), covariance_of(about, information)
+    with_data = prior.names, prior.mean, gain_of(covariance, prior.std)
+    added = rigid_body_covariance(about, *with_data) + scale_covariance(about, *with_data)
+    std: list[float] = np.sqrt(np.diag(added)).tolist()
+    return tuple(std[: len(about.estimate)])
+
+
+def _vehicles(config: Config, covariance: Array) -> list[Config]:
     """The configured vehicle and some that what is known allows."""
     prior = prior_of(config)
-    covariance = inverse_of(information + np.diag(prior.std**-2.0))
+    n = len(prior.names)
+    covariance = covariance[:n, :n]
     rng = np.random.default_rng(0)
     found = [config]
     for values in rng.multivariate_normal(prior.mean, covariance, 30 * _DRAWS):
@@ -224,12 +302,3 @@ def _largest_safe(
             return trial, replace(flights[0], reach=reach, tilt=tilt)
         factor *= _SHRINK
     return None
-
-
-def _information(
-    config: Config, one: AlternatingTargets, duration: float, limits: Limits, velocity: bool
-) -> Array:
-    run = closed_loop_manoeuvres.dive(config, one, duration, limits, Suite())
-    samples = smoothed(joined(list(samples_of(config, run, velocity))))
-    estimated, noise = prior_of(config).estimated, assumed(config, LIKELY)
-    return one_pass(samples, config.dynamics, estimated, noise).information
