@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import faults
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "own-effects.md").read_text()
 
@@ -90,6 +93,11 @@ def test_nothing_is_taken_from_the_current_folder(installed):
     assert python(LIST, cwd="/", path=(installed, ROOT)).stdout == "True\n"
 
 
+def test_ours_pass_as_well():
+    """What is asked of an effect that was written elsewhere is asked of none without reason."""
+    assert {name: fault for name, e in EFFECTS.items() if (fault := faults(e))} == {}
+
+
 @pytest.mark.parametrize(
     ("code", "words"),
     [
@@ -99,6 +107,16 @@ def test_nothing_is_taken_from_the_current_folder(installed):
             "from rov_ident.effects.base import Effect\n"
             "EFFECT = Effect(place='wrench', summary='', manoeuvre='', source='')",
             "must have exactly one of",
+        ),
+        ("raise SystemExit(3)", "cannot be loaded (SystemExit: 3)"),
+        (block("python").replace("out[3]", "out[6]"), "fails in its wrench (IndexError"),
+        (block("python").replace("position, nu", "nu"), "fails in its wrench (TypeError"),
+        (block("python").replace("@kernel", ""), "must have a kernel as its wrench"),
+        (block("python").replace('"wrench"', '"thrust"'), "must have one of input, motion, wrench"),
+        (block("python").replace("0.02),)", "0.02),) * 2"), "a name of its own for each"),
+        (
+            block("python").replace("=wrench,", "=None, water=lambda ratio: (ratio, 0.0),"),
+            "must return numbers of the shape (3,) from its water",
         ),
     ],
 )

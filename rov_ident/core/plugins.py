@@ -38,7 +38,7 @@ def loaded(package: str, point: EntryPoint) -> Any:
     try:
         with _without_current_folder():
             return point.load()
-    except Exception as error:  # it is code of others
+    except (Exception, SystemExit) as error:  # it is code of others
         raise UserError(
             f"the effect {point.name} of the installed package {package} cannot be loaded "
             f"({type(error).__name__}: {error}): mend or uninstall that package"

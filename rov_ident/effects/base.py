@@ -41,18 +41,20 @@ An effect says what it does by exactly one of these, each in the file of the eff
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
 from rov_ident.model.coefficients import INPUTS, parse
+from rov_ident.model.equations import RigidBody
 
 Array = NDArray[np.float64]
 
 SIZE = 44  # the most parameters that a kernel takes
 
+Place = Literal["input", "motion", "wrench"]
 Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed", "shape"]
 Axes = tuple[str, str, str]
 
@@ -158,7 +160,7 @@ class Effect:
     this is a special case.
     """
 
-    place: Literal["input", "motion", "wrench"]
+    place: Place
     summary: str
     source: str
     manoeuvre: str
@@ -198,6 +200,8 @@ def faults(effect: Any) -> str:
     """What is wrong with an effect that was written elsewhere, in words; empty if nothing is."""
     if not isinstance(effect, Effect):
         return "is no rov_ident.effects.base.Effect"
+    if effect.place not in get_args(Place):
+        return f"must have one of {', '.join(get_args(Place))} as its place"
     if sum(bool(getattr(effect, hook)) for hook in _HOOKS) != 1:
         return f"must have exactly one of {', '.join(_HOOKS)}"
     if bool(effect.sense) != bool(effect.correct):
@@ -206,6 +210,8 @@ def faults(effect: Any) -> str:
         return f"has {len(effect.parameters)} parameters, but may have {SIZE} at most"
     if bool(effect.parameters) == bool(effect.coefficients):
         return "must have parameters, or coefficients"
+    if len({p.name for p in effect.parameters}) < len(effect.parameters):
+        return "must have a name of its own for each parameter"
     for p in effect.parameters:
         if not (p.lower <= p.null <= p.upper and p.typical > 0.0):
             return f"needs lower <= null <= upper and typical > 0 of its parameter {p.name}"
@@ -214,4 +220,48 @@ def faults(effect: Any) -> str:
             parse(name)
     except UserError as error:
         return f"has a coefficient that is none: {error}"
+    return _fault_of_hooks(effect)
+
+
+def _fault_of_hooks(effect: Effect) -> str:
+    """What goes wrong when the hooks are called once; empty if nothing.
+
+    Kernels are called as the Python functions they are: compiled, an index beyond the end of an
+    array would read and write other numbers, and nobody would be told.
+    """
+    values = {p.name: min(p.null + p.typical, p.upper) for p in effect.parameters}
+    p, six, three = np.zeros(SIZE), np.full(6, 0.1), np.ones(3)
+    p[: len(values)] = list(values.values())
+    body = RigidBody(1.0, 10.0, 10.0, np.zeros(3), np.zeros(3), np.eye(3))
+    kernels: dict[str, tuple[Any, ...]] = {
+        "wrench": (p, 1.0, three, six, np.eye(3), six.copy(), six.copy()),
+        "act": (p, np.zeros(MEMORY), 1.0, 0.1, six.copy()),
+        "steer": (p, np.zeros(STEER_MEMORY), 0.1, np.full((2, len(INPUTS)), 0.1)),
+    }
+    functions: dict[str, tuple[tuple[Any, ...], tuple[int, ...] | None]] = {
+        "body": ((body,), None),
+        "water": ((), (3,)),
+        "late": ((), ()),
+        "heading": ((), ()),
+        "noise": ((), (6,)),
+        "sense": ((a_reading(),), (4, 3)),
+        "correct": ((a_reading(),), (4, 3)),
+    }
+    name = ""
+    try:
+        with np.errstate(all="ignore"):
+            for name, arguments in kernels.items():
+                if (hook := getattr(effect, name)) is not None:
+                    if not hasattr(hook, "py_func"):
+                        return f"must have a kernel as its {name} (rov_ident.core.jit.kernel)"
+                    hook.py_func(*arguments)
+            for name, (arguments, shape) in functions.items():
+                if (hook := getattr(effect, name)) is not None:
+                    found = hook(*arguments, **values)
+                    if arguments and not isinstance(found, type(arguments[0])):
+                        return f"must return a {type(arguments[0]).__name__} from its {name}"
+                    if shape is not None and np.shape(found) != shape:
+                        return f"must return numbers of the shape {shape} from its {name}"
+    except Exception as error:  # it is code of others
+        return f"fails in its {name} ({type(error).__name__}: {error})"
     return ""
