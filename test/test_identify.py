@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 from program import run
@@ -94,11 +95,19 @@ def test_a_fit_that_the_data_contradict_is_doubted_in_the_headline(dives, agree)
     fit = dataclasses.replace(
         fit, consistency=consistency.Consistency((failed,)), notes=("has not settled",)
     )
-    errors = {"rmse_before": {"w": 0.2}, "rmse": {"w": 0.1}}
-    found = identification.Identification(fit, None, (), {}, "", None, errors, fit.notes)
+    errors = {
+        "rmse_before": {"v": 0.2, "w": 0.2, "q": 0.2, "r": 0.2},
+        "rmse": {"v": 0.1, "w": 0.1, "q": 0.3, "r": 0.2},
+    }
+    flown = SimpleNamespace(sentence="swing: X_u to 1 N s/m; in 1 m", manoeuvre="swing", extent="")
+    found = identification.Identification(fit, None, (), {}, "", flown, errors, fit.notes)
     head = found.page().partition("<h2>")[0]
     assert ("Data and model disagree" in head and "w is predicted worse" in head) != agree
     assert ("not to be relied on" in found.advice[-1]) != agree
+    assert "(but q worse)" in found.advice[-1]
+    # what a manoeuvre would tell supposes that the model is right
+    assert ("X_u to 1 N s/m" in " ".join(found.advice)) == agree
+    assert "Fly next: swing" in " ".join(found.advice)
     assert "has not settled" in found.page()
 
 

@@ -31,6 +31,7 @@ from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, numbers
 from rov_ident.sampling.without_velocity import is_without_velocity
 
+_WORSE = 1.05  # of two errors: 5 % is the scatter between dives, as in `estimation.consistency`
 _UNEXPLAINED = "Without linear velocity it cannot be told what the model lacks."
 
 
@@ -126,17 +127,19 @@ class Identification(Shown):
             advice.append(f"Fly next: {self.next.sentence}.")
         elif self.next is not None:  # what it would tell supposes that the model is right
             advice.append(f"Fly next: {self.next.manoeuvre}; {self.next.extent}.")
-        better = float(np.median([after / before for before, after in self.errors.values()])) < 1.0
-        if not better:
+        ratio = {n: after / before for n, (before, after) in self.errors.items()}
+        worse = [n for n, r in ratio.items() if r > _WORSE]
+        but = f" (but {' and '.join(worse)} worse)" if worse else ""
+        if float(np.median([*ratio.values()])) >= 1.0:
             advice.append("Keep the configuration: extended.yaml predicts no better than it does.")
         elif self._doubt:
             advice.append(
-                "Use extended.yaml to predict, better than the configuration does; its "
+                f"Use extended.yaml to predict, better than the configuration does{but}; its "
                 "coefficients are not to be relied on, as data and model disagree."
             )
         else:
             advice.append(
-                "Use extended.yaml in place of the configuration, for nodes and commands."
+                f"Use extended.yaml in place of the configuration, for nodes and commands{but}."
             )
         return tuple(advice)
 
