@@ -219,6 +219,16 @@ def test_no_name_and_no_state_is_cut_in_a_terminal(width):
         assert [row[-1] for row in cells if row[-1]] == ["converging"] * len(table.rows)
 
 
+KEEP_WHAT_IS_WRITTEN = """
+window.written = [];
+const { fillText } = CanvasRenderingContext2D.prototype;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...where) {
+  written.push(text);
+  fillText.call(this, text, ...where);
+};
+"""
+
+
 async def _zoom(path):
     async with chromium() as browser:
 
@@ -237,8 +247,10 @@ async def _zoom(path):
                 "[...document.querySelectorAll('.uplot canvas')].map(each => each.toDataURL())"
             )
 
+        await browser.send("Page.addScriptToEvaluateOnNewDocument", source=KEEP_WHAT_IS_WRITTEN)
         await browser.open(path.as_uri())
         await browser.until("document.querySelectorAll('.uplot').length == 2")
+        await browser.until("['time [s]', 'u [m/s]'].every(text => written.includes(text))")
         whole = await shown()
         assert await browser.evaluate("document.querySelector('.zoom > svg').clientHeight") == 0
         await mouse("mouseMoved", 0.5)

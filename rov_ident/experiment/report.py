@@ -53,7 +53,7 @@ def of_plan(found: Proposal) -> str:
     others = [[name, f"{100.0 * s:.1f} %"] for name, s in found.others if np.isfinite(s)]
     sections = [
         report.heading("What it would tell"),
-        report.beside([_precision(plan_picture(found))], [found.table().html()]),
+        report.beside_table([found.table().html()], [_precision(plan_picture(found))]),
         report.heading("The manoeuvre"),
         _demand(best.flight.t, best.flight.demand),
         _path_panel(dive.truth.position, best.limits.tank),

@@ -28,7 +28,10 @@
         x: { time: false, range: (u, low, high) => (low == null ? x : [Math.max(low, x[0]), Math.min(high, x[1])]) },
         y: { range: (u, low, high) => (whole(u) || low == null ? y : uPlot.rangeNum(low, high, 0.1, true)) },
       },
-      axes: [{ ...axis, size: 30 }, { ...axis, size: 52, label, labelSize: 16, labelFont: "11px system-ui" }],
+      axes: [
+        { ...axis, size: 22, label: "time [s]", labelSize: 16, labelFont: "11px system-ui" },
+        { ...axis, size: 52, label, labelSize: 16, labelFont: "11px system-ui" },
+      ],
       series: [
         { label: "t", value: (u, v) => (v == null ? "–" : `${v.toFixed(2)} s`) },
         ...lines.map((l) => ({
