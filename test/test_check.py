@@ -17,7 +17,7 @@ from rov_ident.core.messages import Imu, Odometry, Wrench
 from rov_ident.core.states import State
 from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
-from rov_ident.experiment.data_quality import check
+from rov_ident.experiment.data_quality import _inertia_remarks, check
 from rov_ident.experiment.design import propose
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _correlation, _delay_remark
 from rov_ident.io.write_messages import write_messages
@@ -428,6 +428,15 @@ def test_axes_by_which_the_hull_would_capsize(checked, heavy):
     found = checked(config=dataclasses.replace(heavy, model=model))
     (remark,) = [r for r in found.remarks if r.subject == "vehicle.frame"]
     assert remark.level == BAD and "vehicle.cob" in remark.text and not found.fit
+
+
+@pytest.mark.parametrize(("zz", "possible"), [(0.37, True), (0.49, True), (0.6, False)])
+def test_moments_of_inertia_that_no_body_has(heavy, zz, possible):
+    """0.26, 0.23 and at most 0.49 kg m2, of a flat plate."""
+    body = dataclasses.replace(heavy.model.body, inertia=np.diag([0.26, 0.23, zz]))
+    config = heavy.with_model(dataclasses.replace(heavy.model, body=body))
+    said = [remark.text for remark in _inertia_remarks(config)]
+    assert said == [] if possible else "moments 0.23, 0.26, 0.6 kg m2" in said[0]
 
 
 def test_a_delay_beyond_what_is_linear_is_not_told():

@@ -579,6 +579,7 @@ BAD = {
     ),
     "empty": (lambda p, r: p.write_text(""), "has no rows"),
     "binary": (lambda p, r: p.write_bytes(bytes(range(128, 256))), "is not a CSV text file"),
+    "UTF-16": (lambda p, r: p.write_text("t_s,psi\n", "utf-16"), "start byte): save it as one"),
 }  # fmt: skip
 
 

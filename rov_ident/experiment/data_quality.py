@@ -41,6 +41,7 @@ UNITS = (("m/s", "N"),) * 3 + (("rad/s", "N m"),) * 3  # of velocity and wrench 
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
 _MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
+_THIN = 1.02  # a flat plate has 1; the rest is for rounded numbers
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
 
 
@@ -185,6 +186,7 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
     frames = inputs.first_frames(bag, topics, config)
     remarks = [*of_messages(streams, config), *notes, *_excitation_remarks(streams, config)]
     remarks += _mounting_remarks(inputs.mounting(bag, frames), config)
+    remarks += _inertia_remarks(config)
     failed = (test for test in tests_of(streams, config) if not test.passed)
     remarks += [Remark("velocity sensor", BAD, test.failure) for test in failed]
     motion, quick = of_dynamics(record.samples, config), None
@@ -229,6 +231,18 @@ def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Rem
                 f"{bag} by /tf_static of the bag, {file} in the configuration (forward, starboard, "
                 "down): correct the wrong one",
             )  # fmt: skip
+
+
+def _inertia_remarks(config: Config) -> Iterator[Remark]:
+    """Whether a body can have the moments of inertia: none is more than the sum of the others."""
+    moments = np.linalg.eigvalsh(config.model.body.inertia)
+    if moments[2] > _THIN * (moments[0] + moments[1]):
+        told = ", ".join(f"{x:.3g}" for x in moments.tolist())
+        yield Remark(
+            "vehicle.inertia", WARNING,
+            f"no body has the principal moments {told} kg m2, of which one is more than the sum of "
+            "the others: check the values and their order xx yy zz xy xz yz",
+        )  # fmt: skip
 
 
 _MODEL = "model and data"

@@ -83,7 +83,9 @@ def read_csv(path: Path) -> CsvTable:
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): check the path") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path} is not a CSV text file: {error}") from error
+        raise UserError(
+            f"{path} is not a CSV text file in UTF-8 ({error}): save it as one"
+        ) from error
     if not rows:
         raise UserError(f"{path} has no rows below its headings: give a CSV table with data")
     if twice := {name for name in header if name and header.count(name) > 1}:
