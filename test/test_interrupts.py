@@ -1,12 +1,18 @@
 """SIGINT and SIGTERM while a program loads its modules, while it works, and as it ends."""
 
+import contextlib
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
+from rich.console import Console
 
 from bench import HEAVY, ROOT
+from rov_ident.core.interrupts import Interrupted
+from rov_ident.dashboard.store import Store
+from rov_ident.nodes import watch_terminal
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 # Runs a program, and has it interrupted in the middle of loading a module.
@@ -105,3 +111,16 @@ def test_a_file_in_the_making_goes(tmp_path, number):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=600)
     assert b"Interrupted" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_look_at_the_nodes_is_no_answer(monkeypatch):
+    """`watch --once` had status 0 and printed nothing, before any node was heard."""
+
+    @contextlib.contextmanager
+    def interrupted():
+        yield Store(time.monotonic), time.sleep, [signal.SIGINT]
+
+    monkeypatch.setattr(watch_terminal, "_listening", interrupted)
+    with pytest.raises(Interrupted) as raised:
+        watch_terminal.watch_once(10.0, True, Console())
+    assert raised.value.status == 130

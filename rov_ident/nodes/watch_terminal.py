@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.interrupts import noted_interrupts
+from rov_ident.core.interrupts import Interrupted, noted_interrupts
 from rov_ident.core.states import Level
 from rov_ident.dashboard.store import GONE, Estimator, Store, plain
 from rov_ident.estimation.online import Report
@@ -69,14 +69,16 @@ def watch_once(patience: float, as_json: bool, out: Console) -> None:
             elif known and all(known.values()) and time.monotonic() - since > _SETTLING:
                 break
         heard = store.reports
-        if not heard and not interrupts:
+        if not heard and interrupts:  # a script must not take it for an answer
+            raise Interrupted(interrupts[0])
+        if not heard:
             raise UserError(
                 f"no estimator was heard within {patience:g} s: start rls_node or ukf_node, and "
                 "use its ROS_DOMAIN_ID here"
             )
-    if heard and as_json:
+    if as_json:
         _print_json(heard, out)
-    elif heard:
+    else:
         out.print(_picture(heard, out))
 
 
