@@ -64,6 +64,7 @@ def test_matrices(hydrodynamics):
     assert np.linalg.eigvalsh(D + D.T)[0] >= 0.0
     np.testing.assert_array_equal(hydrodynamics.g(gravity_direction(q)), g)
     np.testing.assert_allclose(hydrodynamics.g(2.0 * q), g, rtol=1e-14)
+    np.testing.assert_allclose(hydrodynamics.g(9.81 * gravity_direction(q)), g, rtol=1e-14)
     # 1.6 N lighter than water: to hold still it must be pushed down.
     np.testing.assert_allclose(hydrodynamics.g([0.0, 0.0, 1.0])[2], 134.0 - 9.81 * 13.5)
 

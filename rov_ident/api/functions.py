@@ -340,8 +340,9 @@ def plan(
         If a bag cannot be read, or no manoeuvre is safe within these limits.
     """
     given, say = load(config), progress or silent
-    length, width, depth = tank
-    limits = Limits((length, width, depth), thrust)
+    if len(tank) != 3:
+        raise UserError(f"tank is {tank}, but must be three lengths, such as (6, 6, 2)")
+    limits = Limits(tuple(tank), thrust)
     known = (
         contextlib.nullcontext() if bag is None else archive.opened(several(bag), given, say=say)
     )

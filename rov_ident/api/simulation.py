@@ -163,6 +163,8 @@ def simulate(
     free = None if channels is None else axes(channels)
     if (bag is None) == (manoeuvre is None):
         raise UserError("give either a bag or a manoeuvre to simulate")
+    if not 0.0 < duration < math.inf:
+        raise UserError(f"duration is {duration:g} s, but must be positive")
     if progress:
         progress("simulating")
     if manoeuvre is not None:

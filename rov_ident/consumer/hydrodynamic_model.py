@@ -175,4 +175,6 @@ class HydrodynamicModel:
 
 def _down(attitude: Array) -> Array:
     attitude = np.asarray(attitude, dtype=float)
-    return gravity_direction(quaternion_normalise(attitude)) if len(attitude) == 4 else attitude
+    is_down = len(attitude) != 4
+    down: Array = attitude if is_down else gravity_direction(quaternion_normalise(attitude))
+    return down / np.linalg.norm(down)  # it may be given as gravity [m/s2]

@@ -176,7 +176,7 @@ def propose(
     """The manoeuvre to run next, after ``bags`` or, without, from the prior alone. UserError if no
     manoeuvre is safe within the limits."""
     limits = limits or Limits()
-    if duration < _SHORTEST:
+    if not duration >= _SHORTEST:
         raise UserError(
             f"a manoeuvre of {duration:g} s shows nothing: {_SHORTEST:g} s are the least"
         )
