@@ -30,8 +30,8 @@ def of_check(found: Check) -> str:
     sections = [
         *([report.bullets(bad + doubtful)] if bad or doubtful else []),
         report.heading("What a quick fit tells"),
-        report.beside(
-            [_precision(check_picture(found))], [p.html() for p in found.table().parts[1:]]
+        report.beside_table(
+            [p.html() for p in found.table().parts[1:]], [_precision(check_picture(found))]
         ),
         report.heading("Excitation"),
         _excitation(found, config),
