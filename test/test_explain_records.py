@@ -10,11 +10,12 @@ from bench import HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition
 from rov_ident.discrepancy.explain import explain
+from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.held_out import blocks, split, windows
 from rov_ident.discrepancy.hypothesis import THRUST_SCALE, precision
 from rov_ident.discrepancy.output_error import fit, with_best_onsets
 from rov_ident.discrepancy.report import _card
-from rov_ident.discrepancy.results import Finding, Gain, Value
+from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.sampling.raw_streams import gather, joined
@@ -107,6 +108,14 @@ def test_a_delay_of_one_record_is_not_averaged():
         assert abs(value.value - true) < max(4.0 * value.std, 0.004)
     same, none = repetition.in_time([bags[1], bags[1]], TODAY)
     assert none == [] and same[0] is bags[1]
+
+
+def test_what_is_not_sure_names_no_rival_that_was_refuted():
+    gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
+    rivals = (Alternative("lift", "fits this bag as well"), Alternative("wave", "explains 12 %"))
+    found = Finding("buoyancy", ("Z",), {}, None, gain, True, None, rivals, "")
+    assert unsure(found).alternatives == rivals[:1] and found.alternatives == rivals
+    assert not unsure(found).separable and unsure(found).manoeuvre
 
 
 def test_what_each_record_has_of_its_own_is_told():

@@ -480,11 +480,12 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     gain = finding(search, judge, retuned, best, name, Trial(rest, rivals))
     if not is_practical(gain.gain):
         return
-    others = gain.alternatives
+    gain = unsure(gain)
     if name != empirical_term.NAME:
-        others = (*others, Alternative(empirical_term.NAME, "fits this bag as well"))
+        term_too = Alternative(empirical_term.NAME, "fits this bag as well")
+        gain = dataclasses.replace(gain, alternatives=(*gain.alternatives, term_too))
     model.final = best
-    model.found.append(dataclasses.replace(unsure(gain), alternatives=others))
+    model.found.append(gain)
 
 
 def _supports_another(search: Search, judge: Judge, model: _Model, name: str) -> bool:

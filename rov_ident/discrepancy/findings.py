@@ -67,16 +67,14 @@ def finding(
     gain = judge.gain(without, final.hypothesis, except_for, axes)
     alternatives, separable = _alternatives(search, judge, final, name, trial, except_for)
     if name in NEGLECTING and may_be_noise(trial.rest, axes):
-        same = tuple(a for a in alternatives if a.why_not == _EQUAL)
-        alternatives, separable = (*same, Alternative(NOISE, _EQUAL)), False
+        alternatives, separable = (*alternatives, Alternative(NOISE, _EQUAL)), False
     stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
     values = final.hypothesis.values
     separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)
-    manoeuvre, begin = EFFECTS[name].manoeuvre, None if onset is None else onset.value
-    return Finding(
-        name, axes, parameters, begin, gain, separable, None if separable else manoeuvre,
-        alternatives, sentence(name, parameters, gain),
-    )  # fmt: skip
+    begin = None if onset is None else onset.value
+    words = sentence(name, parameters, gain)
+    found = Finding(name, axes, parameters, begin, gain, True, None, alternatives, words)
+    return found if separable else unsure(found)
 
 
 def _alternatives(
@@ -161,16 +159,17 @@ def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:
     onset, lasting = found.parameters.get("onset"), EFFECTS[found.effect].lasting
     if onset is None or not lasting or onset.value - 2.0 * onset.std > seen:
         return found
-    kept = tuple(a for a in found.alternatives if a.why_not == _EQUAL)
-    equal = {a.effect for a in kept}
+    found = unsure(found)
+    equal = {a.effect for a in found.alternatives}
     earlier = tuple(Alternative(name, _EARLIER) for name in lasting if name not in equal)
-    return dataclasses.replace(unsure(found), alternatives=kept + earlier)
+    return dataclasses.replace(found, alternatives=found.alternatives + earlier)
 
 
 def unsure(found: Finding) -> Finding:
-    """The finding as one that something else may be behind."""
+    """The finding as one that something else may be behind, but no rival that was refuted."""
     run = EFFECTS[found.effect].manoeuvre
-    return dataclasses.replace(found, separable=False, manoeuvre=run)
+    kept = tuple(a for a in found.alternatives if a.why_not in (_EQUAL, _EARLIER))
+    return dataclasses.replace(found, separable=False, manoeuvre=run, alternatives=kept)
 
 
 def parameters_of(

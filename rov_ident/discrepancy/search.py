@@ -63,7 +63,7 @@ _MOST_PATTERNS = 3  # without a name, which are told, not mended
 _ROUNDS = 3  # in which effects may give way to rivals
 _SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
 _FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
-BUDGET = 500_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
+BUDGET = 600_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
 
 
 @dataclass(frozen=True)

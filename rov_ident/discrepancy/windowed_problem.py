@@ -137,7 +137,7 @@ class WindowedProblem:
         self.measured = streams.nu[keep][inside]
         self.times = t[inside]
         self.patterns: dict[Key, Array] = {}
-        self._steps_moved = 0.0
+        self._moves = 0  # through all windows
         self._stopped = False
         self._driven = _Remembered(_REMEMBERED_THRUSTS)
         self._tilted: Array | None = None
@@ -160,15 +160,15 @@ class WindowedProblem:
         """Steps through which velocities were simulated, or moved by a wrench (each of
         ``sensitivities``), for each second of data, so far; data count as if they came at
         _COUNTED_RATE at most, and for _COUNTED_SECONDS at least."""
-        return self._steps_moved
-
-    def count(self, sensitivities: int) -> None:
-        """Count a simulation, or sensitivities to so many wrenches, of all windows."""
         t, first, last = self.steps.t, self.first, self.last
         steps, seconds = float(np.sum(last - first)), float(np.sum(t[last] - t[first]))
         rate = min(steps / seconds, _COUNTED_RATE)
+        return self._moves * rate * min(seconds / _COUNTED_SECONDS, 1.0)
+
+    def count(self, moves: int) -> None:
+        """Count simulations, or sensitivities to so many wrenches, of all windows."""
         with self._counting:
-            self._steps_moved += sensitivities * rate * min(seconds / _COUNTED_SECONDS, 1.0)
+            self._moves += moves
 
     def stop(self) -> None:
         """Every further simulation, in any thread, raises CancelledError."""
