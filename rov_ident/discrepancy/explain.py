@@ -43,11 +43,11 @@ from rov_ident.discrepancy.held_out import (
 )
 from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
-from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Verdict
+from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Value, Verdict
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.selection import VERY_STRONG
-from rov_ident.discrepancy.sensor_choice import HEADING, NOISE
+from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES
@@ -208,7 +208,7 @@ def explain(
     everything = WindowedProblem(data.streams, blocks(data.streams))
     notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
     notes += [_OWN_HEADINGS] if any(data.headings) else []
-    notes += [_OWN_DELAYS] if any(_has_own_delay(f) for f in data.findings) else []
+    notes += [_OWN_DELAYS] if data.delays else []
     own = [f.effect for f in of_dynamics if f.repetition is not None and not f.repetition.same]
     notes += [_OWN_VALUES.format(", ".join(own))] if own else []
     notes += [_FILTERED] if data.late else []
@@ -241,10 +241,10 @@ def explain(
 class _Data:
     """The bags with what their sensors contradict set right: ``streams``, all of them joined, to
     fit in the spans ``to_fit``, and those ``judged`` in the spans ``to_judge``; the latter as
-    ``recorded``. ``headings`` that were taken off each bag; the ``choice`` of sensor effects, their
-    ``findings``, and those of practical weight, ``sensors``, which were taken off. Whether
-    velocities are ``late``, and whether the heading ``may_drift`` where a gyro was taken for
-    biased."""
+    ``recorded``. ``headings`` and ``delays`` that were taken off each bag; the ``choice`` of sensor
+    effects, their ``findings``, and those of practical weight, ``sensors``, which were taken off.
+    Whether a filter makes velocities ``late``, and whether the heading ``may_drift`` where a gyro
+    was taken for biased."""
 
     bags: Sequence[Streams]
     streams: Streams
@@ -253,6 +253,7 @@ class _Data:
     to_judge: Spans
     recorded: sensor_choice.Data
     headings: Sequence[float]
+    delays: Sequence[Value]
     choice: sensor_choice.Choice
     findings: Sequence[Finding]
     sensors: Sensors
@@ -271,7 +272,7 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     bags = turned[: len(bags)]
     validate = None if validate is None else turned[-1]
     as_timed = bags
-    bags, late = repetition.in_time(bags, config)
+    bags, delays = repetition.in_time(bags, config)
     streams, to_fit, held = _divided(bags, validate)
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
     recorded = sensor_choice.Data(streams, to_fit, judged, to_judge, config)
@@ -283,10 +284,12 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     if len(bags) > 1:
         findings = repetition.of_sensors(bags, config, findings, headings[: len(bags)])
     own_delays = []
-    if late:
+    if delays:
         spans = held if validate is None else to_fit
         before = joined(as_timed)[0]
-        own_delays = [repetition.late_finding(before, streams, config, spans, choice.sensors, late)]
+        own_delays = [
+            repetition.late_finding(before, streams, config, spans, choice.sensors, delays)
+        ]
     sensors = {f.effect: choice.sensors[f.effect] for f in findings if is_practical(f.gain)}
     return _Data(
         bags,
@@ -296,6 +299,7 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
         to_judge,
         recorded,
         headings,
+        delays,
         choice,
         [*findings, *own_delays],
         sensors,
@@ -372,15 +376,10 @@ def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
     return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
 
 
-def _has_own_delay(f: Finding) -> bool:
-    """Whether velocities are late by another delay in each record, which was taken off each."""
-    return f.effect == repetition.LATENCY and f.repetition is not None and not f.repetition.same
-
-
 def _is_between_readings(found: Finding, streams: Streams) -> bool:
     """Whether velocities are late by less than half an interval of the IMU, in which nothing is
     known of how they went on."""
-    if found.effect != "velocity_latency" or len(streams.imu_t) < 2:
+    if found.effect != LATENCY or len(streams.imu_t) < 2:
         return False
     interval = float(np.median(np.diff(streams.imu_t)))
     return abs(found.parameters["delay"].value) < 0.5 * interval

@@ -29,12 +29,11 @@ from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import PENALTY
-from rov_ident.discrepancy.sensor_choice import HEADING
+from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
 
-LATENCY = "velocity_latency"
 _LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
 
 

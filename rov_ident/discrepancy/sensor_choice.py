@@ -32,6 +32,7 @@ from rov_ident.sampling.raw_streams import Streams
 from rov_ident.sampling.wrench_scatter import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
+LATENCY = "velocity_latency"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"
 NEGLECTING = (
     "thruster_deadband", "thruster_failure", "thruster_gain", "thrust_scale", "thrust_curve",
