@@ -8,11 +8,11 @@ from tiers import more
 
 from bench import HEAVY
 from rov_ident import config as configuration
-from rov_ident.discrepancy import repetition
+from rov_ident.discrepancy import repetition, sensor_consistency
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.findings import unsure
-from rov_ident.discrepancy.held_out import blocks, split, windows
-from rov_ident.discrepancy.hypothesis import THRUST_SCALE, precision
+from rov_ident.discrepancy.held_out import Judge, blocks, split, windows
+from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, precision
 from rov_ident.discrepancy.output_error import fit, with_best_onsets
 from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
@@ -25,11 +25,11 @@ TODAY = configuration.load(HEAVY)
 LEAN = Suite(odometry_rate=10.0, imu_rate=0.0)
 
 
-def record(seed, duration=40.0, **effects):
+def record(seed, duration=40.0, suite=LEAN, **effects):
     """A dive of the vehicle with effects that its configuration does not have."""
     document = configuration.to_parameters(TODAY) | {"effects": effects}
     true = configuration.from_parameters(document)
-    messages = dive(true, "steps", duration, LEAN, seed).messages
+    messages = dive(true, "steps", duration, suite, seed).messages
     return gather(((role, message) for _, role, message in messages), TODAY)
 
 
@@ -43,7 +43,8 @@ def told_in_each(bags, effect, **parameters):
     gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
     found = Finding(effect, ("X",), dict.fromkeys(parameters), None, gain, True, None, (), "")
     records = repetition.Records(streams, bags, begins)
-    return repetition.in_each(search, records, last, [found])[0]
+    alone = repetition.alone(records, last)
+    return repetition.in_each(search, records, last, [found], alone)[0][0]
 
 
 def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
@@ -54,6 +55,40 @@ def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
     for of, true in zip(found.repetition.records, (0.3, 0.0)):
         assert abs(of["north"].value - true) < 4.0 * of["north"].std < 0.2
     assert "The records differ" in found.sentence
+
+
+@pytest.mark.parametrize("seed", [31, *more(5)])
+def test_what_the_records_share_is_not_pulled_along_by_what_each_has_of_its_own(seed):
+    """Currents of three dives, and drag that the file has wrong: what is written simulates a dive
+    in still water as the truth does, and what is told of the dives is with the current of each."""
+    rng = np.random.default_rng(seed)
+    drag = {n: float(rng.uniform(0.6, 1.5)) for n in ("X_uu", "Y_vv", "Z_ww")}
+    currents = [dict(zip(("north", "east"), rng.uniform(-0.3, 0.3, 2).tolist())) for _ in range(3)]
+    document = configuration.to_parameters(TODAY)
+    own = {n: v * drag.get(n, 1.0) for n, v in document["coefficients"].items()}
+    guessed = configuration.from_parameters(document | {"coefficients": own})
+    bags = [record(seed + i, 60.0, ocean_current=of) for i, of in enumerate(currents)]
+    found = explain(bags, guessed)
+    told = {f.effect: f for f in found.findings.effects}["ocean_current"].repetition
+    for of, true in zip(told.records, currents):
+        assert all(abs(of[n].value - true[n]) < 0.03 for n in true)
+    assert "ocean_current" not in found.extended.effects
+    assert any("has ocean_current of its own" in note for note in found.findings.notes)
+    still = record(seed + 9, 60.0)
+    judge = Judge(WindowedProblem(still, blocks(still)))
+    rmse = {
+        name: np.array(list(judge.rmse(Hypothesis(config, {})).values()))
+        for name, config in (("true", TODAY), ("file", guessed), ("extended", found.extended))
+    }
+    assert np.all(rmse["extended"] < 1.1 * rmse["true"])
+    assert np.any(rmse["file"] > 1.5 * rmse["true"])
+    squares = []
+    for bag, current in zip(bags, currents):
+        dives = Judge(WindowedProblem(bag, split(bag.duration)[1]))
+        values = {("ocean_current", name): value for name, value in current.items()}
+        squares.append(dives.squares(Hypothesis(TODAY, values)))
+    left = np.array(list(found.findings.extended.values()))
+    assert np.all(left < 1.2 * np.sqrt(np.concatenate(squares).mean(axis=0)))
 
 
 @pytest.mark.parametrize("seed", [3, *more(5)])
@@ -110,6 +145,24 @@ def test_a_delay_of_one_record_is_not_averaged():
     assert none == [] and same[0] is bags[1]
 
 
+def test_where_one_record_ends_and_the_next_begins_the_sensors_show_nothing():
+    """The position begins anew there: taken for a velocity it made a delay of milliseconds, and
+    standard deviations a fifth as large as those of the records together."""
+    suite = Suite(odometry_rate=20.0, imu_rate=50.0)
+    adrift = {"north": 0.3, "east": -0.2}
+    bags = [record(seed, 60.0, suite, ocean_current=adrift) for seed in (41, 42, 43)]
+    assert np.linalg.norm(bags[0].position[-1] - bags[1].position[0]) > 10.0
+    delays = []
+    for bag in [*bags, joined(bags)[0]]:
+        spans = windows(0.0, bag.duration)
+        found, std = sensor_consistency.search(bag, TODAY, spans, ["velocity_latency"])
+        delays.append((found["velocity_latency"]["delay"], std["velocity_latency", "delay"]))
+    *each, (of_all, std_of_all) = delays
+    weight = np.array([std for _, std in each]) ** -2.0
+    mean, std = weight @ [delay for delay, _ in each] / weight.sum(), weight.sum() ** -0.5
+    assert abs(of_all - mean) < std and 0.5 < std_of_all / std < 3.0
+
+
 def test_what_is_not_sure_names_no_rival_that_was_refuted():
     gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
     rivals = (Alternative("lift", "fits this bag as well"), Alternative("wave", "explains 12 %"))
@@ -147,7 +200,8 @@ def test_what_is_taken_up_between_two_dives_begins_with_the_second():
     records = repetition.Records(streams, bags, begins)
     gain = Gain("w", 1.0, 0.5, 50.0, 40.0, 60.0)
     found = Finding("payload", ("Z",), {}, at, gain, True, None, (), "")
-    (own,) = repetition.in_each(search, records, fitted, [found])
+    alone = repetition.alone(records, fitted)
+    (own,), _ = repetition.in_each(search, records, fitted, [found], alone)
     assert not own.repetition.same and "begins in record 2" in own.sentence
 
 

@@ -16,6 +16,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import (
     empirical_term,
     extension,
+    own_parameters,
     rates_and_attitude,
     repetition,
     sensor_choice,
@@ -35,20 +36,21 @@ from rov_ident.discrepancy.held_out import (
     PRACTICAL,
     Judge,
     blocks,
+    improved,
     is_practical,
     is_sure,
     split,
     thinned,
     windows,
 )
-from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis
+from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, Key
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
 from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Value, Verdict
 from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
-from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
@@ -78,8 +80,10 @@ _OWN_DELAYS = (
     "each record's velocities have a delay of their own: the extended configuration has none"
 )
 _OWN_VALUES = (
-    "the records differ in {}: the extended configuration has one value for all, which suits none"
+    "each record has {} of its own: the extended configuration has none, and is judged here with "
+    "what each record has"
 )
+_ONE_VALUE = "the records differ in {}: the extended configuration has one value for all"
 _FILTERED = (
     "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
     "cause beside it is sure; record what the filter is fed with"
@@ -183,21 +187,29 @@ def explain(
         of_sensors.append(noise_finding(judge, model.final, config, std))
     minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
     of_sensors = [f for f in of_sensors if is_practical(f.gain)]
-    final = _without_minor_noise(model.final.hypothesis, data, of_sensors)
-    given = Hypothesis(config, {})
-    as_recorded = Judge(WindowedProblem(data.recorded.judged, data.to_judge))
-    written = extension.kept(judge, as_recorded.summed(given), final)
     last, notes = _with_all_data(data.streams, model.final)
     of_dynamics = [with_parameters(search, last, f) for f in model.found]
+    shared = _Shared(model.final.hypothesis, last.hypothesis)
     if len(bags) > 1:
         say("leaving records out", 0.95)
-        records = repetition.Records(data.streams, data.bags, joined(data.bags)[1])
-        of_dynamics = repetition.in_each(search, records, last, of_dynamics)
-    best = given if written.model is None else written.model
-    compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
+        of_dynamics, shared = _in_each_record(
+            search, judge, data, retuned, model, last, of_dynamics
+        )
+    given = Hypothesis(config, {})
+    as_recorded = Judge(WindowedProblem(data.recorded.judged, data.to_judge))
+    final = _without_minor_noise(shared.judged, data, of_sensors)
+    written = extension.kept(judge, as_recorded.summed(given), final)
+    if written.model is None:
+        shared = _Shared(given, given)
+    best = written.model or given
+    compared: dict[str, Simulated] = {
+        "as configured": given,
+        "retuned": retuned.hypothesis,
+        "extended": shared.with_own(judge.problem, best),
+    }
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
-    left = _left(data.judged, rmse[2], judge.rmse_of_noise(best))
+    left = _left(data.judged, rmse[2], judge.rmse_of_noise(compared["extended"]))
     found = _sure_or_not(data, of_sensors + of_dynamics, left)
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
@@ -206,11 +218,11 @@ def explain(
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
     verdict = _verdict(found, residual, left, improves)
     everything = WindowedProblem(data.streams, blocks(data.streams))
+    compared["extended"] = shared.with_own(everything, best)
     notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
     notes += [_OWN_HEADINGS] if any(data.headings) else []
     notes += [_OWN_DELAYS] if data.delays else []
-    own = [f.effect for f in of_dynamics if f.repetition is not None and not f.repetition.same]
-    notes += [_OWN_VALUES.format(", ".join(own))] if own else []
+    notes += shared.notes
     notes += [_FILTERED] if data.late else []
     notes += [_NO_TORQUE] if data.streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
@@ -229,11 +241,11 @@ def explain(
     return Explanation(
         findings,
         config,
-        config if written.model is None else _extended(last.hypothesis, written.axes, data, found),
+        config if written.model is None else _extended(shared.written, written.axes, data, found),
         everything.times,
         everything.measured,
         {label: everything.measured - everything.errors(h) for label, h in compared.items()},
-        data.to_judge if validate is None else [],
+        [] if data.validated else data.to_judge,
     )
 
 
@@ -259,6 +271,11 @@ class _Data:
     sensors: Sensors
     late: bool
     may_drift: bool
+
+    @property
+    def validated(self) -> bool:
+        """Whether another bag is judged."""
+        return self.recorded.judged is not self.recorded.streams
 
 
 def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None) -> _Data:
@@ -306,6 +323,81 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
         any(r.late for r in rates),
         any(r.may_drift for r in rates),
     )
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What the records share of the model found, fitted to the part of the data that fits may see
+    (``judged``) and to all (``written``), with the ``notes`` on it; ``own``: what each of the
+    ``records`` has besides, none where they share all."""
+
+    judged: Hypothesis
+    written: Hypothesis
+    records: repetition.Records | None = None
+    own: Sequence[Mapping[Key, float]] = ()
+    notes: Sequence[str] = ()
+
+    def with_own(self, problem: WindowedProblem, h: Hypothesis) -> Simulated:
+        """A model with what each record has of its own, for the windows of a problem."""
+        if self.records is None or not self.own:
+            return h
+        each = [h.having(values) for values in self.own]
+        return [each[self.records.at(t)] for t in problem.steps.t[problem.first].tolist()]
+
+
+def _in_each_record(
+    search: Search,
+    judge: Judge,
+    data: _Data,
+    retuned: Fitted,
+    model: _Model,
+    last: Fitted,
+    found: Sequence[Finding],
+) -> tuple[list[Finding], _Shared]:
+    """The findings with what each record says of them, and the model without what belongs to each
+    record, unless that predicts worse; ``last`` is the model fitted to all of the data."""
+    records = repetition.Records(data.streams, data.bags, joined(data.bags)[1])
+    alone = repetition.alone(records, last)
+    found, own = repetition.in_each(search, records, last, found, alone)
+    final = model.final.hypothesis
+    shared = _Shared(final, records.from_beginning(last.hypothesis))
+    if own:
+        keys = [k for name in own for k in search.keys_of(last, name)]
+        there = repetition.alone(records, model.final, data.to_fit)
+        judged, values = own_parameters.parted(there, final, keys)
+        written, _ = own_parameters.parted(alone, last.hypothesis, keys)
+        parted = _Shared(
+            judged,
+            records.from_beginning(written),
+            records,
+            () if data.validated else values,  # nobody knows those of another bag
+            [_OWN_VALUES.format(", ".join(own))],
+        )
+        after = parted.with_own(judge.problem, judged)
+        if judge.better(after, final):
+            rest = {name: search.rest(model.final, name) for name in own}
+            found = [
+                _gaining(f, judge, [retuned, rest[f.effect]], after) if f.effect in own else f
+                for f in found
+            ]
+            return found, parted
+    differ = [f.effect for f in found if f.repetition is not None and not f.repetition.same]
+    notes = [_ONE_VALUE.format(", ".join(differ))] if differ else []
+    return found, dataclasses.replace(shared, notes=notes)
+
+
+def _gaining(
+    found: Finding, judge: Judge, without: Sequence[Fitted | None], after: Simulated
+) -> Finding:
+    """The finding with what it gains where each record has values of its own, over the best of the
+    models ``without`` it."""
+    rests = [f.hypothesis for f in without if f is not None]
+    best = rests[0]
+    for rest in rests[1:]:
+        best = rest if judge.better(rest, best) else best
+    gain = judge.gain(best, after, None, found.axes)
+    words = found.sentence.replace(improved(found.gain), improved(gain))
+    return dataclasses.replace(found, gain=gain, sentence=words)
 
 
 def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -> list[Finding]:

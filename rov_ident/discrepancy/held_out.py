@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.reading_noise import draws
 from rov_ident.discrepancy.results import Gain, Together
-from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
 from rov_ident.effects import sense
 from rov_ident.effects.base import Reading
 from rov_ident.model.coefficients import AXES, VELOCITIES
@@ -84,15 +83,15 @@ class Judge:
         self, problem: WindowedProblem, sensors: Mapping[str, Mapping[str, float]] | None = None
     ) -> None:
         """``sensors``: the effects that were taken off the data, which are judged as recorded."""
-        self._problem, self._sensors = problem, sensors or {}
+        self.problem, self._sensors = problem, sensors or {}
         self._guided, self.free = problem.guided, ~problem.guided  # axes (6,)
         self._limit = _FAILED * problem.measured.std(axis=0) + 1e-9
         chunk = (problem.times / CHUNK).astype(int)
         self._number, self._chunk = np.unique(chunk, return_inverse=True)
 
-    def squares(self, h: Hypothesis) -> Array:
+    def squares(self, h: Simulated) -> Array:
         """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
-        error = np.abs(self._as_recorded(self._problem.errors(h)))
+        error = np.abs(self._as_recorded(self.problem.errors(h)))
         capped: Array = np.where(error < self._limit, error, self._limit) ** 2
         return capped
 
@@ -100,21 +99,21 @@ class Judge:
         """Errors (N, 6) of the corrected velocities as those of the recorded ones."""
         if not self._sensors:
             return error
-        measured, none = self._problem.measured, np.zeros_like(error[:, :3])
+        measured, none = self.problem.measured, np.zeros_like(error[:, :3])
         measured, simulated = (
             sense(Reading(x[:, :3], x[:, 3:], none, none), self._sensors)
             for x in (measured, measured - error)
         )
         return np.hstack([measured.linear - simulated.linear, error[:, 3:]])
 
-    def rmse(self, h: Hypothesis) -> dict[str, float]:
+    def rmse(self, h: Simulated) -> dict[str, float]:
         error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
 
-    def rmse_of_noise(self, h: Hypothesis) -> Array:
+    def rmse_of_noise(self, h: Simulated) -> Array:
         """What the errors (6,) are where nothing but noise is wrong: that of the velocities, and
         what that of each window's first state and of the wrench's reading makes of the motion."""
-        problem, std, random = self._problem, self._problem.noise_std(), np.random.default_rng(0)
+        problem, std, random = self.problem, self.problem.noise_std(), np.random.default_rng(0)
         here, squares = problem.errors(h), []
         for taken in draws(problem.reading_std, len(problem.streams.demand)):
             aside = std * random.standard_normal((len(problem.first), len(std)))
@@ -124,8 +123,8 @@ class Judge:
 
     def gain(
         self,
-        before: Hypothesis,
-        after: Hypothesis,
+        before: Simulated,
+        after: Simulated,
         except_for: tuple[float, float] | None = None,
         axes: Sequence[str] = (),
     ) -> Gain:
@@ -146,7 +145,7 @@ class Judge:
 
     def _used(self, except_for: tuple[float, float] | None) -> NDArray[np.bool_]:
         """Which chunks count."""
-        e, use = self._problem, np.ones(len(self._number), dtype=bool)
+        e, use = self.problem, np.ones(len(self._number), dtype=bool)
         if except_for is not None:
             begin, end = e.steps.t[e.first], e.steps.t[e.last]
             out = (end > except_for[0]) & (begin < except_for[1])
@@ -154,19 +153,19 @@ class Judge:
         return use if use.any() else ~use
 
     def better(
-        self, rival: Hypothesis, h: Hypothesis, except_for: tuple[float, float] | None = None
+        self, rival: Simulated, h: Simulated, except_for: tuple[float, float] | None = None
     ) -> bool:
         """Whether a rival predicts better, all velocities taken together."""
         free, use = ~self._guided, self._used(except_for)
         a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
         return bool(log_ratio(a, b).sum() < 0.0)
 
-    def surely_better(self, rival: Hypothesis, h: Hypothesis) -> bool:
+    def surely_better(self, rival: Simulated, h: Simulated) -> bool:
         """The same beyond chance."""
         a, b = (self.summed(x)[:, self.free] for x in (rival, h))
         return surely_less(a, b)
 
-    def summed(self, h: Hypothesis) -> Array:
+    def summed(self, h: Simulated) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
         return np.stack([np.bincount(self._chunk, x) for x in self.squares(h).T], axis=1)
 

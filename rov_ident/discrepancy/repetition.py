@@ -2,7 +2,8 @@
 
 The model found is fitted to each record alone: where an effect's parameters differ by more than
 chance, the records differ in it, as in a current or a payload. Then each record is left out as a
-whole and predicted by fits to the others, with the effect and without (Stone 1974).
+whole and predicted by fits to the others, with the effect and without (Stone 1974). An effect that
+differs, and does not predict other records, belongs to each record (`own_parameters.py`).
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ from rov_ident.discrepancy.held_out import (
     thinned,
     windows,
 )
-from rov_ident.discrepancy.hypothesis import role_of
+from rov_ident.discrepancy.hypothesis import Hypothesis, onsets, role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
 from rov_ident.discrepancy.search import Search
@@ -51,6 +52,12 @@ class Records:
         """In which record something begins at a time; in the next one if between two."""
         return min(sum(end <= t for _, end in self.spans), len(self.spans) - 1)
 
+    def from_beginning(self, h: Hypothesis) -> Hypothesis:
+        """The model with onsets counted from the first message of the record they lie in."""
+        dates = {k: h.values[k] for k in onsets(h)}
+        begins = {k: self.spans[self.at(onset)][0] for k, onset in dates.items()}
+        return h.having({k: max(onset - begins[k], 0.0) for k, onset in dates.items()})
+
     def blocks(self, which: Sequence[int]) -> Spans:
         """Some of the records, in blocks."""
         out: Spans = []
@@ -61,22 +68,40 @@ class Records:
 
 
 def in_each(
-    search: Search, records: Records, last: Fitted, found: Sequence[Finding]
-) -> list[Finding]:
-    """Findings of the dynamics with what each record says of them; ``last`` is the model fitted to
-    all. One that does not repeat cannot be told for sure."""
-    alone = [_fitted(records, [b], last) for b in range(len(records))]
+    search: Search,
+    records: Records,
+    last: Fitted,
+    found: Sequence[Finding],
+    alone: Sequence[Fitted | None],
+) -> tuple[list[Finding], list[str]]:
+    """Findings of the dynamics with what each record says of them, and the names of those that
+    belong to each record; ``last`` is the model fitted to all, ``alone`` that fitted to each. One
+    that does not repeat cannot be told for sure."""
     repeats = _left_out(search, records, last, [f.effect for f in found], alone)
-    out = []
+    out, own = [], []
     for f in found:
         keys = search.keys_of(last, f.effect)
         names = [k for k in keys if role_of(k) in _LINEAR]
         each = tuple(parameters_of(there or last, names) for there in alone)
         first = 0 if f.onset_s is None else records.at(f.onset_s)
         same = all(_agree([of[n] for of in each[first:]]) for n in each[0])
+        if not same and not repeats.get(f.effect):
+            own.append(f.effect)
         told = _with(f, Repetition(same and not first, repeats.get(f.effect), each), first)
         out.append(told if f.onset_s is None else _begun(told, records, f.onset_s, same))
-    return out
+    return out, own
+
+
+def alone(records: Records, last: Fitted, spans: Spans | None = None) -> list[Fitted | None]:
+    """The model ``last`` fitted to each record, in ``spans`` [s] (None: to all of it); None where
+    there is too little odometry."""
+    if spans is None:
+        every = range(len(records))
+        spans = [s for a, b in records.blocks(every) for s in windows(a, b)]
+    return [
+        _fitted(records.streams, [s for s in spans if records.at(s[0]) == b], last)
+        for b in range(len(records))
+    ]
 
 
 def _begun(f: Finding, records: Records, onset: float, lasts: bool) -> Finding:
@@ -91,11 +116,10 @@ def _begun(f: Finding, records: Records, onset: float, lasts: bool) -> Finding:
     return dataclasses.replace(f, sentence=f.sentence + words)
 
 
-def _fitted(records: Records, which: Sequence[int], last: Fitted) -> Fitted | None:
-    """The model ``last`` fitted to some of the records."""
-    halves = [s for a, b in records.blocks(which) for s in windows(a, b)]
+def _fitted(streams: Streams, spans: Spans, last: Fitted) -> Fitted | None:
+    """The model ``last`` fitted in some spans."""
     try:
-        return fit(WindowedProblem(records.streams, thinned(halves)), last.hypothesis)
+        return fit(WindowedProblem(streams, thinned(spans)), last.hypothesis)
     except UserError:  # too little odometry
         return None
 
@@ -221,7 +245,11 @@ def _left_out(
     after: list[Array] = []
     for b in range(len(records)):
         others = [i for i in range(len(records)) if i != b]
-        there = alone[others[0]] if len(others) == 1 else _fitted(records, others, last)
+        if len(others) == 1:
+            there = alone[others[0]]
+        else:
+            spans = [s for begin, end in records.blocks(others) for s in windows(begin, end)]
+            there = _fitted(records.streams, spans, last)
         try:
             judge = Judge(WindowedProblem(records.streams, records.blocks([b])))
         except UserError:  # too little odometry

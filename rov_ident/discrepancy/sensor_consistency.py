@@ -13,6 +13,7 @@ effects are linear to first order, and the fit is repeated about its own result.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -51,6 +52,7 @@ _DRIFT = 1.0  # s; from which the pose tells velocity better than the IMU
 _STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
 _ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
 _MAX_GAP = 0.5  # s without a message: no step of dead reckoning reaches across
+_REACH = 4.0  # standard deviations of a Gaussian filter, beyond which its weights are below 1e-4
 _CLOCK = 0.05  # s by which the IMU's clock is set on and back: less than an ROV's response
 _FEWEST_IMU = 8  # messages of the IMU; fewer are none
 FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
@@ -101,8 +103,6 @@ def comparisons(
     streams: Streams, config: Config, effects: Mapping[str, Mapping[str, float]]
 ) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
-    from scipy.ndimage import gaussian_filter1d  # here, as all of it: fits do not need 30 MB
-
     keys = sensor_parameters()
     if not streams.has_pose:  # nor has it one because it is corrected
         streams = dataclasses.replace(streams, position=np.zeros_like(streams.position))
@@ -114,7 +114,10 @@ def comparisons(
     # A regressor made of the very readings that it explains shares their noise: what the velocity
     # sensor's errors are made of is taken from the other sensors where there are any.
     width = _SMOOTHING / float(np.median(np.diff(streams.t)))
-    turning, gyrating = (gaussian_filter1d(x, width, axis=0) for x in (here.angular, here.gyro))
+    turning, gyrating = (
+        np.concatenate([_smoothed(x[piece], width) for piece in _pieces(streams.t, _SMOOTHING)])
+        for x in (here.angular, here.gyro)
+    )
     velocity = None if inertial is None else inertial.velocity
     moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
     reading = Reading(moving, turning, gyrating, here.specific_force)
@@ -245,19 +248,37 @@ class _DeadReckoning:
 def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | None) -> Array:
     """Velocity (N, 3) in the world: long term from the pose, short term from the IMU, ``inertial``
     (N, 3), whose integral drifts. The velocity sensor stands in for either where it is missing."""
-    from scipy.ndimage import gaussian_filter1d
-
-    t = streams.t
-    even = np.arange(t[0], t[-1], float(np.median(np.diff(t))))
-    width = (_STEADY if inertial is None else _DRIFT) / (even[1] - even[0])
+    t, width = streams.t, _STEADY if inertial is None else _DRIFT
     inertial = np.zeros_like(measured) if inertial is None else inertial
     if streams.has_pose:
-        drifted = interpolated(t, streams.position - integral(t, inertial), even)
-        correction = gaussian_filter1d(drifted, width, axis=0, order=1) / (even[1] - even[0])
+        drifted = streams.position - integral(t, inertial)
     else:
         drifted = np.einsum("kij,kj->ki", r, measured) - inertial
-        correction = gaussian_filter1d(interpolated(t, drifted, even), width, axis=0)
-    return inertial + interpolated(even, correction, t)
+    order, step = int(streams.has_pose), float(np.median(np.diff(t)))
+    out = inertial.copy()
+    for piece in _pieces(t, width):
+        even = t[piece][0] + step * np.arange(1 + round((t[piece][-1] - t[piece][0]) / step))
+        rows = _smoothed(interpolated(t[piece], drifted[piece], even), width / step, order)
+        out[piece] += interpolated(even, rows / step**order, t[piece])
+    return out
+
+
+def _pieces(t: Array, width: float) -> list[slice]:
+    """The times t (N,) between gaps across which a filter of this width [s] does not reach: after
+    one the position of another record may begin."""
+    edges = np.flatnonzero(np.diff(t) > _REACH * width) + 1
+    return [slice(a, b) for a, b in itertools.pairwise([0, *edges.tolist(), len(t)])]
+
+
+def _smoothed(x: Array, width: float, order: int = 0) -> Array:
+    """Columns x (N, k) through a Gaussian filter of a width in steps, or their derivative; what
+    grows steadily goes on beyond the ends."""
+    from scipy.ndimage import gaussian_filter1d  # here, as all of it: fits do not need 30 MB
+
+    n = min(len(x) - 1, int(np.ceil(_REACH * width)))
+    longer = np.pad(x, ((n, n), (0, 0)), mode="reflect", reflect_type="odd")
+    out: Array = gaussian_filter1d(longer, width, axis=0, order=order, truncate=_REACH)
+    return out[n : n + len(x)]
 
 
 def _attitude(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:

@@ -58,6 +58,7 @@ _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of can
 
 
 Spans = list[tuple[float, float]]  # from and to [s] each
+Simulated = Hypothesis | Sequence[Hypothesis]  # one model, or that of each window
 
 
 class _Remembered:
@@ -371,30 +372,30 @@ class WindowedProblem:
         inputs = np.abs(self.steps.inputs).max(axis=0)
         return float(inputs[INPUTS.index(p.input)] if p.input else 4.0 * inputs[:3].max())
 
-    def errors(self, h: Hypothesis, aside: Array | None = None) -> Array:
+    def errors(self, h: Simulated, aside: Array | None = None) -> Array:
         """Measured minus simulated velocity (N, 6) in open loop, each window from its measured
         state, or from so far ``aside`` (W, 9) of its attitude [rad] and velocity; NaN where that
         diverges."""
-        (mean, slope), inputs = self.thrust(h.effects), self.driven(h.effects).inputs
-        acting, guide = compiled(h.effects), None
-        nu = self._measured_at(self.steps.t)
+        guide, nu = None, self._measured_at(self.steps.t)
         simulated = np.full((len(self.steps.t), 6), np.nan)
         starts, attitudes = self.measured_starts(), self.orientation[self.first]
         if aside is not None:
             turn = quaternion_from_rotation_vector(aside[:, :3])
             starts, attitudes = starts + aside[:, 3:], quaternion_multiply(attitudes, turn)
-        for first, last, start, attitude in zip(
-            self.first, self.last, starts, attitudes, strict=True
+        each = [h] * len(self.first) if isinstance(h, Hypothesis) else h
+        for there, first, last, start, attitude in zip(
+            each, self.first, self.last, starts, attitudes, strict=True
         ):
+            (mean, slope), inputs = self.thrust(there.effects), self.driven(there.effects).inputs
             nodes = slice(first, last + 1)
             at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
             if self.guided.any():
                 guide = Guide(~self.guided, nu[nodes], self.orientation[nodes])
             with contextlib.suppress(UserError):
                 simulated[nodes] = simulate(
-                    h.model, self.steps.t[nodes], mean[at], start, self.steps.position[at[0]],
+                    there.model, self.steps.t[nodes], mean[at], start, self.steps.position[at[0]],
                     orientation=attitude, wrench_slope=slope[at], guide=guide,
-                    effects=acting, inputs=inputs[at],
+                    effects=compiled(there.effects), inputs=inputs[at],
                 ).nu  # fmt: skip
         return self.measured - simulated[self.nodes]
 
