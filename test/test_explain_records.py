@@ -201,8 +201,9 @@ def test_what_is_taken_up_between_two_dives_begins_with_the_second():
     gain = Gain("w", 1.0, 0.5, 50.0, 40.0, 60.0)
     found = Finding("payload", ("Z",), {}, at, gain, True, None, (), "")
     alone = repetition.alone(records, fitted)
-    (own,), _ = repetition.in_each(search, records, fitted, [found], alone)
+    (own,), left_out = repetition.in_each(search, records, fitted, [found], alone)
     assert not own.repetition.same and "begins in record 2" in own.sentence
+    assert left_out == ["payload"]
 
 
 def test_a_thrust_scale_that_nothing_tells_stays_what_the_file_says_of_it():

@@ -355,12 +355,12 @@ def _in_each_record(
     found: Sequence[Finding],
 ) -> tuple[list[Finding], _Shared]:
     """The findings with what each record says of them, and the model without what belongs to each
-    record, unless that predicts worse; ``last`` is the model fitted to all of the data."""
+    record, unless that surely predicts worse; ``last`` is the model fitted to all of the data."""
     records = repetition.Records(data.streams, data.bags, joined(data.bags)[1])
     alone = repetition.alone(records, last)
     found, own = repetition.in_each(search, records, last, found, alone)
     final = model.final.hypothesis
-    shared = _Shared(final, records.from_beginning(last.hypothesis))
+    shared = _Shared(final, last.hypothesis)
     if own:
         keys = [k for name in own for k in search.keys_of(last, name)]
         there = repetition.alone(records, model.final, data.to_fit)
@@ -368,13 +368,13 @@ def _in_each_record(
         written, _ = own_parameters.parted(alone, last.hypothesis, keys)
         parted = _Shared(
             judged,
-            records.from_beginning(written),
+            written,
             records,
             () if data.validated else values,  # nobody knows those of another bag
             [_OWN_VALUES.format(", ".join(own))],
         )
         after = parted.with_own(judge.problem, judged)
-        if judge.better(after, final):
+        if not judge.surely_better(final, after):
             rest = {name: search.rest(model.final, name) for name in own}
             found = [
                 _gaining(f, judge, [retuned, rest[f.effect]], after) if f.effect in own else f

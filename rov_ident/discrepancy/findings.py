@@ -7,7 +7,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from rov_ident.config import Config
-from rov_ident.config.prior import rigid_body_covariance
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved
@@ -253,7 +252,6 @@ def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
     changed, names = {}, tuple(name for _, name in retuned.hypothesis.values)
     values = np.array(list(retuned.hypothesis.values.values()))
     covariance = retuned.covariance + retuned.covariance_of_the_file
-    covariance += rigid_body_covariance(config, names, values)
     for name, value, std in zip(names, values, np.sqrt(np.diag(covariance)), strict=True):
         before = float(config.model.theta[config.model.names.index(name)])
         if abs(value - before) > 2.0 * std:

@@ -28,9 +28,11 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.reading_noise import DRAWS
 from rov_ident.discrepancy.selection import variance_inflation
-from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import INERTIA, ONSET_STEP, WindowedProblem
+from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array, Indices
+from rov_ident.model.scales import semi_axes
 from rov_ident.sampling.raw_streams import PAUSE
 
 _FEWEST_CLUSTERS = 8  # windows; from fewer a variance is uncertain by more than half (chi-squared)
@@ -47,6 +49,7 @@ _ONSET_TRIALS = 7  # to either side, every 2 s: as far apart as two onsets look 
 _ONSET_RSS = 4.0  # scaled squared residuals: likelihood-ratio interval of two standard deviations
 _ONSET_UNKNOWN = 30.0  # s; an onset less certain than that is not known at all
 _UNPREDICTED = 2.0  # simulated over predicted squared residuals: beyond it linearity has failed
+_TURNED = 0.01  # rad by which thrust may be turned, half a degree, seen from the hull's middle
 _STRAY = 10.0  # standard deviations of a window's initial velocity from what was measured there
 
 
@@ -127,23 +130,15 @@ class Fitted:
 
     @cached_property
     def covariance_of_the_file(self) -> Array:
-        """What errors of the file that no window shows by itself add to the covariance (P, P): of
-        the thrust and of that of each axis, unless such a scale is among the parameters, and of the
-        height of the centre of buoyancy (consider parameters, Schmidt 1966), as large as the
-        configuration says that they may be and the residuals leave them. With the righting moment,
-        thrust and all coefficients times k nothing moves otherwise
+        """What errors of the file that no window shows by itself add to the covariance (P, P),
+        unless they are among the parameters: of the thrust, that of each axis and its line, of the
+        rigid body, and of the height of the centre of buoyancy (consider parameters, Schmidt 1966),
+        as large as the configuration says that they may be and the residuals leave them. With the
+        righting moment, thrust and all coefficients times k nothing moves otherwise
         (:func:`prior.scale_covariance`, of which the velocity sensor's scale is taken as it is).
         """
         linear, at, h = self.linear, self._smooth, self.hypothesis
-        problem, config = self.linearisation.problem, h.config
-        raising = problem.raising(h.model.body) * config.vehicle_uncertainty.cob_std
-        stronger = problem.thrust(h.effects)[0][:, :, None] * config.wrench.scale_std
-        fitted = {name for _, name in linear.keys}
-        axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]
-        errors = [raising[:, :, None], ONE_AXIS * stronger * np.eye(6)[:, axes]]
-        if "thrust_scale" not in h.effects:
-            errors.append(stronger)
-        error = self.linearisation.sensitivity_to(np.concatenate(errors, axis=2))
+        error = self.linearisation.sensitivity_to(self._errors_of_the_file())
         base, normal = self.linearisation.columns[:, at], linear.normal[np.ix_(at, at)]
         moves = scaled_solve(normal, base.T @ error, 1e-9)
         error -= base @ moves  # what the parameters do not imitate tells how large they are
@@ -152,7 +147,36 @@ class Fitted:
         out = np.zeros_like(linear.normal)
         out[np.ix_(at, at)] = moves @ (left + np.outer(likely, likely)) @ moves.T
         names = tuple(name if effect == COEFFICIENTS else "" for effect, name in linear.keys)
-        return out + scale_covariance(config, names, np.array([h.values[k] for k in linear.keys]))
+        values = np.array([h.values[k] for k in linear.keys])
+        return out + scale_covariance(h.config, names, values)
+
+    def _errors_of_the_file(self) -> Array:
+        """The wrench (K, 6, E) of one standard deviation of each error of the file."""
+        h, problem = self.hypothesis, self.linearisation.problem
+        config, body = h.config, h.model.body
+        fitted = {name for _, name in self.linear.keys}
+        known = config.vehicle_uncertainty
+        moments = np.diag(body.inertia)
+        own = [known.mass_std * body.mass]
+        own += [known.inertia_std * np.sqrt(moments[i] * moments[j]) for i, j in INERTIA]
+        thrust = problem.thrust(h.effects)[0]
+        stronger = thrust[:, :, None] * config.wrench.scale_std
+        axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]
+        errors = [
+            problem.raising(body)[:, :, None] * known.cob_std,
+            problem.of_rigid_body(body, self.linearisation.motion) * own,
+            ONE_AXIS * stronger * np.eye(6)[:, axes],
+        ]
+        if "thrust_scale" not in h.effects:
+            errors.append(stronger)
+        if config.wrench.scale_std > 0.0:
+            beside = float(_TURNED * np.mean(semi_axes(body)))
+            for arm in (p for p in EFFECTS["thrust_line"].parameters if p.name not in fitted):
+                _, force, moment = arm.name.split("_")
+                turning = np.zeros((*thrust.shape, 1))
+                turning[:, AXES.index(moment), 0] = beside * thrust[:, AXES.index(force)]
+                errors.append(turning)
+        return np.concatenate(errors, axis=2)
 
     def leave_one_out(self) -> Array:
         """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""

@@ -25,7 +25,7 @@ from rov_ident.discrepancy.held_out import (
     thinned,
     windows,
 )
-from rov_ident.discrepancy.hypothesis import Hypothesis, onsets, role_of
+from rov_ident.discrepancy.hypothesis import role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
 from rov_ident.discrepancy.search import Search
@@ -51,12 +51,6 @@ class Records:
     def at(self, t: float) -> int:
         """In which record something begins at a time; in the next one if between two."""
         return min(sum(end <= t for _, end in self.spans), len(self.spans) - 1)
-
-    def from_beginning(self, h: Hypothesis) -> Hypothesis:
-        """The model with onsets counted from the first message of the record they lie in."""
-        dates = {k: h.values[k] for k in onsets(h)}
-        begins = {k: self.spans[self.at(onset)][0] for k, onset in dates.items()}
-        return h.having({k: max(onset - begins[k], 0.0) for k, onset in dates.items()})
 
     def blocks(self, which: Sequence[int]) -> Spans:
         """Some of the records, in blocks."""
@@ -85,9 +79,9 @@ def in_each(
         each = tuple(parameters_of(there or last, names) for there in alone)
         first = 0 if f.onset_s is None else records.at(f.onset_s)
         same = all(_agree([of[n] for of in each[first:]]) for n in each[0])
-        if not same and not repeats.get(f.effect):
-            own.append(f.effect)
         told = _with(f, Repetition(same and not first, repeats.get(f.effect), each), first)
+        if not (same and not first) and not repeats.get(f.effect):
+            own.append(f.effect)
         out.append(told if f.onset_s is None else _begun(told, records, f.onset_s, same))
     return out, own
 

@@ -57,6 +57,8 @@ _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
 
+INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
+
 Spans = list[tuple[float, float]]  # from and to [s] each
 Simulated = Hypothesis | Sequence[Hypothesis]  # one model, or that of each window
 
@@ -362,6 +364,17 @@ class WindowedProblem:
         raised = replace(body, cob=body.cob + np.array([0.0, 0.0, 1.0]))
         wrench: Array = self.steps.middle[:, 2] @ (raised.restoring - body.restoring).T
         return wrench
+
+    def of_rigid_body(self, body: RigidBody, motion: Motion) -> Array:
+        """What a kilogram more of mass (of the same weight) and 1 kg m2 more of each moment and
+        product of inertia, in the order of ``inertia``, adds to the wrench, (K, 6, 7)."""
+        others = [replace(body, mass=body.mass + 1.0)]
+        for i, j in INERTIA:
+            more = np.zeros((3, 3))
+            more[i, j] = more[j, i] = 1.0
+            others.append(replace(body, inertia=body.inertia + more))
+        here = _of_body(body, motion, self.steps)
+        return np.stack([_of_body(b, motion, self.steps) - here for b in others], axis=2)
 
     def largest(self, key: Key) -> float:
         """Of what is commanded, where a parameter is a limit of it; of a rate, at which a fin would
