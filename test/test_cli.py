@@ -28,6 +28,24 @@ def bag(tmp_path_factory):
     return path
 
 
+def test_the_same_data_count_once(tmp_path, bag):
+    """Twice they would make intervals narrower by a third, and a copy to judge on is no other
+    dive."""
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes(bag.read_bytes())
+    told = []
+    for bags in ((bag,), (bag, copy)):
+        to = ("--json", tmp_path / "fit.json")
+        done = run("fit", *bags, "--config", HEAVY, "--estimator", "ls", *to, "--validate", copy)
+        assert done.returncode == 0, done.stderr
+        told.append(json.loads((tmp_path / "fit.json").read_text()))
+    assert told[0]["coefficients"] == told[1]["coefficients"]
+    assert f"{copy} holds the same data as {bag}: it counts once" in told[1]["notes"]
+    assert all(any("tells nothing of other dives" in n for n in of["notes"]) for of in told)
+    out = ("--out", tmp_path / "explained")
+    refused(run("explain", bag, "--config", HEAVY, "--validate", copy, *out), "another dive")
+
+
 def refused(done, *parts):
     """Exit status 2, one sentence on standard error with the given parts, nothing else."""
     assert done.returncode == 2, done.stderr
@@ -85,17 +103,21 @@ def test_fit_writes_the_agreed_json_and_a_configuration(tmp_path, bag, estimator
     given = configuration.load(HEAVY)
     off = given.with_model(given.model.with_theta(1.3 * given.model.theta))
     configuration.dump(off, tmp_path / "off.yaml")
+    second, third = tmp_path / "second.mcap", tmp_path / "third.mcap"
+    for seed, path in ((2, second), (3, third)):
+        how = "--manoeuvre", "steps", "--duration", 20, "--seed", seed
+        assert run("simulate", "--config", HEAVY, *how, "--out", path).returncode == 0
     done = run(
-        "fit", bag, bag, "--config", tmp_path / "off.yaml", "--estimator", estimator,
+        "fit", bag, second, "--config", tmp_path / "off.yaml", "--estimator", estimator,
         "--json", tmp_path / "fit.json", "--save", tmp_path / "fitted.yaml",
-        "--validate", bag, "--report", tmp_path / "fit.html",
+        "--validate", third, "--report", tmp_path / "fit.html",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "fit.json").read_text())
     judged = result["validation"]
-    assert judged["horizon_s"] == 10.0 and judged["bags"][0]["file"] == bag.name
+    assert judged["horizon_s"] == 10.0 and judged["bags"][0]["file"] == third.name
     assert judged["rmse"]["u"] < 0.5 * judged["rmse_before"]["u"]
-    assert "On what no fit has seen" in (tmp_path / "fit.html").read_text()
+    assert "On the bag to validate" in (tmp_path / "fit.html").read_text()
     assert result["estimator"] == estimator
     assert result["samples"] > 3000 and result["duration_s"] == pytest.approx(40.0, abs=0.5)
     assert result["open_loop"]["horizon_s"] == 10.0

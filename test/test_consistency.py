@@ -210,19 +210,25 @@ def test_nuisance_parameters_may_not_all_be_far_off():
 def test_intervals_grow_with_the_disagreement_up_to_what_the_file_says(heavy):
     prior = prior_of(heavy)
     n = len(prior.names)
-    small = np.diag((0.01 * prior.std) ** 2)
+    small, still = np.diag((0.01 * prior.std) ** 2), np.zeros(n)
     heavy = replace(heavy, odometry=replace(heavy.odometry, attitude_std=0.0))
     four = consistency_of(heavy, prior, prior.mean, np.array([0.04, 0, 0, 0, 0, 0]))
-    np.testing.assert_allclose(np.sqrt(np.diag(four.widened(small, prior.std))), 0.04 * prior.std)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(four.widened(small, prior.std, still))), 0.04 * prior.std
+    )
     thousand = consistency_of(heavy, prior, prior.mean, np.array([10.0, 0, 0, 0, 0, 0]))
-    np.testing.assert_allclose(np.sqrt(np.diag(thousand.widened(small, prior.std))), prior.std)
-    assert Consistency(()).widened(small, prior.std) == pytest.approx(small)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(thousand.widened(small, prior.std, still))), prior.std
+    )
+    far = thousand.widened(small, prior.std, 4.0 * prior.std)  # what was believed is within reach
+    np.testing.assert_allclose(np.sqrt(np.diag(far)), 4.0 * prior.std)
+    assert Consistency(()).widened(small, prior.std, still) == pytest.approx(small)
     lasting = np.array([1.5**2, 1.0, np.nan, 0.5, 1.0, 1.0])  # power: within its limit of 2 x 2
     half = consistency_of(heavy, prior, prior.mean, np.full(6, np.nan), lasting)
     assert half.consistent
-    np.testing.assert_allclose(half.widened(small, prior.std), 1.5**2 * small)
+    np.testing.assert_allclose(half.widened(small, prior.std, still), 1.5**2 * small)
     by_chance = consistency_of(heavy, prior, prior.mean, np.full(6, np.nan), np.full(6, 1.2**2))
-    np.testing.assert_array_equal(by_chance.widened(small, prior.std), small)
+    np.testing.assert_array_equal(by_chance.widened(small, prior.std, still), small)
     assert len(small) == n
 
 

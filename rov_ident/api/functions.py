@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rov_ident.api.reading import File, Files, axes, existing, load, read, several
+from rov_ident.api.reading import File, Files, axes, existing, load, once, read, same_data, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
@@ -132,7 +132,7 @@ def fit(
     table: dict[str, Any] = {}
     if prior_from is not None:
         given, table = with_prior(given, Path(prior_from))
-    paths, say = several(bags), progress or silent
+    (paths, repeated), say = once(several(bags)), progress or silent
     groups = [channels] if isinstance(channels, str) else channels or ()
     stages = tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
     settings = Settings(stages, prior, weighted, process)
@@ -156,9 +156,14 @@ def fit(
         found = found.with_tests(_velocity_sensor_tests([bag.path for bag in many.bags], given))
         if table:
             found = _with_table_notes(found, given, table)
+        found = dataclasses.replace(found, notes=(*repeated, *found.notes))
         if validate is None:
             return found
-        judge = stack.enter_context(archive.opened([existing(validate)], given, say=say))
+        other = existing(validate)
+        if same := same_data(other, paths):
+            note = f"{other} is what was fitted ({same}): it tells nothing of other dives"
+            found = dataclasses.replace(found, notes=(note, *found.notes))
+        judge = stack.enter_context(archive.opened([other], given, say=say))
         say("simulating in open loop")
         reread = judge.as_read_by(found.fitted, given)
         runs = judge.bags, open_loop(judge, given), open_loop(reread, found.fitted)
@@ -254,8 +259,12 @@ def explain(
     from rov_ident.discrepancy.explain import explain as explain_streams  # here: no other needs it
 
     given, say = load(config), progress or silent
-    read_bags = [_streams(path, given, say) for path in several(bags)]
-    judge = None if validate is None else _streams(existing(validate), given, say)
+    paths, repeated = once(several(bags))
+    other = None if validate is None else existing(validate)
+    if other and (same := same_data(other, paths)):
+        raise UserError(f"{other} is what is searched ({same}): validate on a bag of another dive")
+    read_bags = [_streams(path, given, say) for path in paths]
+    judge = None if other is None else _streams(other, given, say)
     for streams, _ in read_bags:
         seen = messages_alone.samples_of(streams)
         messages_alone.refuse_reversed(messages_alone.of_dynamics(seen, given))
@@ -266,7 +275,9 @@ def explain(
     made: dict[str, Any] = {"rov_ident": version("rov_ident"), "config": name}
     made |= {"bags": [source for _, source in read_bags]}
     made |= {"validate": judge[1]} if judge else {}
-    return dataclasses.replace(found, findings=dataclasses.replace(found.findings, provenance=made))
+    findings = found.findings
+    findings = dataclasses.replace(findings, provenance=made, notes=(*repeated, *findings.notes))
+    return dataclasses.replace(found, findings=findings)
 
 
 def _streams(path: Path, config: Config, say: Progress) -> tuple[Streams, dict[str, str]]:

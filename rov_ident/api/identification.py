@@ -115,9 +115,7 @@ class Identification(Shown):
             if effect.manoeuvre
         ]
         if held:
-            advice.append(
-                f"Not determined by these dives (the prior made the value): {', '.join(held)}."
-            )
+            advice.append(f"Not determined by these dives: {', '.join(held)}.")
         if self.explanation is None:
             advice.append(
                 "Fly next: heave, roll, pitch and yaw at changing levels while surge and sway "

@@ -12,6 +12,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
+from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
 from rov_ident.sampling.records import Record, read_record
 
@@ -30,6 +31,26 @@ def several(files: Files) -> list[Path]:
     """The paths of one file or of several, each as :func:`existing` gives it."""
     one = isinstance(files, str | os.PathLike)
     return [existing(files)] if one else [existing(file) for file in files]  # type: ignore[arg-type, union-attr]
+
+
+def once(paths: Sequence[Path]) -> tuple[list[Path], tuple[str, ...]]:
+    """The files of different data, as none may count twice, and a note on each that is left out."""
+    kept: list[Path] = []
+    notes = []
+    for path in paths:
+        same = same_data(path, kept)
+        if same is None:
+            kept.append(path)
+        else:
+            notes.append(f"{path} holds the same data as {same}: it counts once")
+    return kept, tuple(notes)
+
+
+def same_data(path: Path, others: Sequence[Path]) -> Path | None:
+    """Which of other files holds the same data, if any does."""
+    size = path.stat().st_size
+    of_size = [other for other in others if other.stat().st_size == size]
+    return next((other for other in of_size if Bag(other).sha256 == Bag(path).sha256), None)
 
 
 def existing(file: File) -> Path:

@@ -15,6 +15,11 @@ CONTRADICTED = 2.0
 said to be at its bound: chance alone does so one time in forty."""
 
 
+IDENTIFIABLE = 0.75
+"""Share of the prior's variance that data must have removed, for them to have decided about a
+coefficient: its interval is then half as wide as what the file says."""
+
+
 class Level(enum.IntEnum):
     """As in diagnostic_msgs/DiagnosticStatus."""
 

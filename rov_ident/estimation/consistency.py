@@ -14,7 +14,7 @@ from rov_ident.config import Config
 from rov_ident.config.prior import Prior
 from rov_ident.core.linalg import widened
 from rov_ident.core.messages import Array
-from rov_ident.core.states import State
+from rov_ident.core.states import IDENTIFIABLE, State
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.scales import authority
@@ -85,15 +85,17 @@ class Consistency:
         """Whether any axis moved enough to test what the model leaves unexplained on it."""
         return any(test.name.startswith(_LEFT) for test in self.tests)
 
-    def widened(self, covariance: Array, prior: Array) -> Array:
-        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``.
+    def widened(self, covariance: Array, prior: Array, moved: Array) -> Array:
+        """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``, from
+        whose mean it has ``moved`` (n,).
 
         Errors are taken to be as many times larger as the worst test says (:attr:`Test.inflation`);
-        but what the file says remains.
+        but what the file says remains, within reach of what the data say against it.
         """
         factor = max([1.0, *(test.inflation for test in self.tests)])
         variance = np.diag(covariance)
-        return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, prior**2)))
+        limit = np.maximum(prior, np.abs(moved)) ** 2
+        return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, limit)))
 
     @property
     def sentence(self) -> str:
@@ -118,10 +120,17 @@ class Consistency:
             return "data and model disagree"
         return "too little motion yet to judge the model" if self.asks and not self.judged else ""
 
-    def of_states(self, states: Iterable[State]) -> tuple[State, ...]:
-        """The states of a fit: in :attr:`doubt` nothing has converged."""
-        doubted = {State.CONVERGED: State.CONVERGING} if self.doubt else {}
-        return tuple(doubted.get(state, state) for state in states)
+    def of_states(self, states: Iterable[State], removed: Array) -> tuple[State, ...]:
+        """The states of a fit: in :attr:`doubt` nothing has converged, and of what the intervals
+        have then ``removed`` too little of the prior's variance, as shares (n,), is held."""
+        if not self.doubt:
+            return tuple(states)
+        doubted = {State.CONVERGED: State.CONVERGING}
+        out = (doubted.get(state, state) for state in states)
+        return tuple(
+            State.HELD if state is State.CONVERGING and share <= IDENTIFIABLE else state
+            for state, share in zip(out, removed.tolist(), strict=True)
+        )
 
     def with_open_loop(self, before: Array, after: Array, chance: Array) -> "Consistency":
         """The same, asked also whether a fit predicts worse than what it began with.

@@ -421,7 +421,8 @@ class OnlineEstimator:
         covariance = raw.covariance + rigid_body_covariance(
             self.config, raw.names, raw.values, gain
         )
-        raw = replace(raw, covariance=consistency.widened(covariance, self.prior.std))
+        moved = raw.values - self.prior.mean
+        raw = replace(raw, covariance=consistency.widened(covariance, self.prior.std, moved))
         values = physical(self.config.dynamics, self.prior, raw)
         diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
         if diverged:

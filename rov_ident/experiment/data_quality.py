@@ -19,7 +19,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_angle, quaternion_from_euler
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.progress import Progress, silent
-from rov_ident.core.states import CONVERGED, State, of_fit
+from rov_ident.core.states import CONVERGED, IDENTIFIABLE, State, of_fit
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
@@ -30,7 +30,7 @@ from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import AT_REST, fit_batch
-from rov_ident.offline.fit import IDENTIFIABLE, Fit, fit_online, thrust_or_mass
+from rov_ident.offline.fit import Fit, fit_online, thrust_or_mass
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.raw_streams import Streams, gather

@@ -25,7 +25,7 @@ from rov_ident.config.prior import (
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.progress import Progress, silent
-from rov_ident.core.states import CONTRADICTED, State, of_fit
+from rov_ident.core.states import CONTRADICTED, IDENTIFIABLE, State, of_fit
 from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
@@ -34,7 +34,7 @@ from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
 from rov_ident.offline.archive import Archive, Bag, Samples, total
-from rov_ident.offline.fit import IDENTIFIABLE, Fit
+from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
@@ -153,6 +153,8 @@ def fit_batch(
         driven = float(np.max((forces / authority(config.dynamics))[:2]))
         rest = Test("surge and sway at rest", driven, AT_REST, DRIVEN_UNSEEN)
         consistency = replace(consistency, tests=(*consistency.tests, rest))
+    covariance = consistency.widened(covariance, prior.std, values - prior.mean)
+    removed = 1.0 - np.diag(covariance) / prior.std**2
     motion = archive.each(_velocity_range)
     low, high = np.min(motion, axis=0)[0], np.max(motion, axis=0)[1]
     more: dict[str, Any] = {
@@ -165,8 +167,8 @@ def fit_batch(
         names=prior.names,
         units=prior.units,
         values=values,
-        covariance=consistency.widened(covariance, prior.std),
-        states=consistency.of_states(states.values()),
+        covariance=covariance,
+        states=consistency.of_states(states.values(), removed),
         given=config,
         fitted=now,
         samples=archive.samples,

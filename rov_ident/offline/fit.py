@@ -10,7 +10,7 @@ import numpy as np
 from rov_ident.config import Config, dump
 from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_share
 from rov_ident.core.messages import Array
-from rov_ident.core.states import State, of_fit
+from rov_ident.core.states import IDENTIFIABLE, State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
 from rov_ident.estimation.consistency import Consistency, Test
 from rov_ident.estimation.online import Kind, OnlineEstimator
@@ -22,8 +22,6 @@ from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_l
 from rov_ident.reports.result import Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, Record, numbers
-
-IDENTIFIABLE = 0.75  # share of the prior's variance that the data must have removed
 
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
@@ -106,13 +104,17 @@ class Fit(Shown, Result):
         nothing has converged."""
         prior = prior_of(self.given, effects=True)
         known = dict(zip(prior.names, prior.std.tolist(), strict=True))
+        of_file = dict(zip(prior.names, prior.mean.tolist(), strict=True))
         std = np.array([known[name] for name in self.names])
+        mean = np.array([of_file[name] for name in self.names])
         consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
+        further = Consistency(tuple(tests))
+        covariance = further.widened(self.covariance, std, self.values - mean)
         return replace(
             self,
             consistency=consistency,
-            covariance=Consistency(tuple(tests)).widened(self.covariance, std),
-            states=consistency.of_states(self.states),
+            covariance=covariance,
+            states=consistency.of_states(self.states, 1.0 - np.diag(covariance) / std**2),
         )
 
     @property
@@ -280,7 +282,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         units=report.units,
         values=report.values,
         covariance=report.covariance,
-        states=report.consistency.of_states(states),
+        states=report.consistency.of_states(states, 1.0 - (own / estimator.prior.std) ** 2),
         given=config,
         fitted=found,
         samples=read.samples,

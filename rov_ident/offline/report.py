@@ -33,7 +33,7 @@ def page(fit: Fit) -> str:
                 if label in (_BEFORE, _AFTER)}),
     ]  # fmt: skip
     if judged:
-        sections += [heading("On what no fit has seen"), *_curves(judged, "judged")]
+        sections += [heading("On the bag to validate"), *_curves(judged, "judged")]
     if drawn:
         sections += [heading("On what was fitted"), *_curves(drawn, "fitted")]
     if fit.notes:
