@@ -169,7 +169,8 @@ def _refusal(path: Path, inputs: list[Path], bag: bool) -> str:
         source = Path(os.path.realpath(given))
         if place == source or (kind and source.exists() and place.samefile(source)):
             return "the result would replace what it is made from, so choose another name"
-        if source.is_dir() and place.is_relative_to(source):
+        is_bag = (source / "metadata.yaml").exists()
+        if is_bag and place.is_relative_to(source):
             return f"it lies within the bag {_shortened(given)}, so choose another folder"
     if kind and bag and place.suffix != ".mcap":
         return "it exists already, so remove it or choose another name"

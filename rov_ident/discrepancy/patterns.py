@@ -123,7 +123,9 @@ class PatternSearch:
     def interplay(self, now: Fitted) -> Fitted | None:
         """With thrust along one axis that depends on the thrust along others: what the supply
         lacks, all thrusters lack, and one at an angle loses thrust with the speed along it, for
-        whichever axis it works (Fossen 2021, sec. 9.5). Which thrusters these are no wrench tells.
+        whichever axis it works (Fossen 2021, sec. 9.5). A propeller that pushes less astern than
+        ahead turns some of what is commanded along one axis into thrust along others, to the same
+        side whichever way it is commanded. Which thrusters these are no wrench tells.
         """
         thrust, nu = (
             self._problem.thrust(now.hypothesis.effects)[0],
@@ -131,10 +133,11 @@ class PatternSearch:
         )
         scale = [np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-6) for x in (thrust, nu)]
         load = np.abs(thrust) / scale[0]
-        force = np.zeros((*thrust.shape, 12, 6))
+        force = np.zeros((*thrust.shape, 18, 6))
         for i in np.flatnonzero(~self._problem.guided).tolist():
             force[:, i, i] = thrust[:, i : i + 1] * load
             force[:, i, 6 + i] = nu[:, i : i + 1] / scale[1][i] * load * scale[0][i]
+            force[:, i, 12 + i] = load * scale[0][i]
         force = force.reshape(len(thrust), 6, -1)
         force = force[:, :, force.any(axis=(0, 1))]
         if not force.size:  # with all that is commanded within a dead band, say

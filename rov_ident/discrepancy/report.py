@@ -283,7 +283,10 @@ def _yaml(value: Any) -> str:
 
 def _gains(rmse: Mapping[str, Mapping[str, float]], held: bool) -> list[str]:
     pictures = []
-    for name, group in (("linear", VELOCITIES[:3]), ("angular", VELOCITIES[3:])):
+    for name, of_kind in (("linear", VELOCITIES[:3]), ("angular", VELOCITIES[3:])):
+        group = [c for c in of_kind if np.isfinite(rmse["as configured"][c])]
+        if not group:
+            continue
         values = {label: np.array([by[c] for c in group]) for label, by in rmse.items()}
         figure = plots.bars([MOTIONS[c] for c in group], values, "", f"RMSE [{UNITS[group[0]]}]")
         pictures.append(plots.zoomable(figure, f"bars-{name}-"))
@@ -295,7 +298,7 @@ def _gains(rmse: Mapping[str, Mapping[str, float]], held: bool) -> list[str]:
 def _motion(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
     t, measured, runs = _stretch(explanation, shown)
     pictures = []
-    for i, c in enumerate(VELOCITIES):
+    for i, c in _simulated(explanation):
         figure = plots.curves(
             t, {label: run[:, i] for label, run in runs.items()}, MOTIONS[c], "time [s]",
             f"{c} [{UNITS[c]}]", measured=measured[:, i], shaded=explanation.held,
@@ -337,7 +340,8 @@ def _stretch(
 def _worst(explanation: Explanation, baseline: Mapping[str, float]) -> str:
     size = explanation.measured.std(axis=0)
     largest = np.repeat([size[:3].max(), size[3:].max()], 3)
-    moving = {c: float(s) for c, s, m in zip(VELOCITIES, size, largest) if s > _STILL * m}
+    moving = {VELOCITIES[i]: float(size[i]) for i, _ in _simulated(explanation)
+              if size[i] > _STILL * largest[i]}  # fmt: skip
     if not moving:
         return "The vehicle does not move."
     worst = max(moving, key=lambda c: baseline[c] / moving[c])
@@ -348,13 +352,19 @@ def _worst(explanation: Explanation, baseline: Mapping[str, float]) -> str:
     )
 
 
+def _simulated(explanation: Explanation) -> list[tuple[int, str]]:
+    """The velocities that are simulated, and not taken as measured: number and name."""
+    rmse = explanation.findings.baseline
+    return [(i, c) for i, c in enumerate(VELOCITIES) if np.isfinite(rmse[c])]
+
+
 def _departures(explanation: Explanation, shown: Mapping[str, Array]) -> list[str]:
     t, measured = explanation.t, explanation.measured
     errors = {label: run - measured for label, run in shown.items()}
     step = max(_BIN, float(t[-1]) / _MOST_BINS)
     edges = np.arange(0.0, float(t[-1]) + step, step)
     over_time, over_speed = [], []
-    for i, c in enumerate(VELOCITIES):
+    for i, c in _simulated(explanation):
         unit, slots = UNITS[c], 0.5 * (edges[1:] + edges[:-1])
         by_time = {label: binned(t, e[:, i], edges) for label, e in errors.items()}
         figure = plots.curves(

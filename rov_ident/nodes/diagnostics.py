@@ -183,7 +183,7 @@ class Diagnostics:
             level = Level.ERROR
             words = ", ".join([words, *(f"{s.value}: {values[s.value]}" for s in wrong)])
         elif stopped:
-            level, words = Level.STALE, f"stale: no samples, {words}"
+            level, words = Level.STALE, f"stale: {stopped}, {words}"
         elif agreement is not None and not agreement.consistent:
             level, words = Level.WARN, f"data and model disagree: {agreement.sentence}"
         else:
