@@ -274,14 +274,21 @@ def _times(a, b, scale, out):
 
 @inner
 def _advance(inverse, dt, s, phi, gamma):
-    """How a change of nu and of the wrench reaches the end of a step, phi and gamma (6, 6)."""
+    """How a change of nu and of the wrench reaches the end of a step, phi and gamma (6, 6): as
+    Runge and Kutta's step of fourth order has it, which moves nu. One of second order is far off
+    where drag stops a motion within a step or two, and grows where the motion does not."""
     _times(inverse, s.by_velocity, dt, s.jacobian)
     _times(s.jacobian, s.jacobian, 1.0, s.square)
     for i in range(6):
         for j in range(6):
-            unit = 1.0 if i == j else 0.0
-            phi[i, j] = unit + s.jacobian[i, j] + 0.5 * s.square[i, j]
-            s.square[i, j] = unit + 0.5 * s.jacobian[i, j] + s.square[i, j] / 6.0
+            gamma[i, j] = s.jacobian[i, j] / 24.0 + (1.0 / 6.0 if i == j else 0.0)
+    _times(s.square, gamma, 1.0, phi)
+    for i in range(6):
+        for j in range(6):
+            s.square[i, j] = phi[i, j] + 0.5 * s.jacobian[i, j] + (1.0 if i == j else 0.0)
+    _times(s.jacobian, s.square, 1.0, phi)
+    for i in range(6):
+        phi[i, i] += 1.0
     _times(s.square, inverse, dt, gamma)
 
 
