@@ -18,8 +18,9 @@ from rov_ident.core.linalg import scaled_solve, unit_diagonal
 from rov_ident.core.noise import robust_std
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key
 from rov_ident.discrepancy.multiple_shooting import Motion, adjoint, tangent
-from rov_ident.discrepancy.windowed_problem import MAX_STEP, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.equations import Array, Indices
+from rov_ident.sampling.raw_streams import MAX_STEP
 
 _OUTLIER = 8.0
 """Robust standard deviations beyond which a residual is an outlier.

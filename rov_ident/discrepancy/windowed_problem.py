@@ -45,7 +45,6 @@ from rov_ident.sampling.raw_streams import Streams, orientation_at
 from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
-MAX_STEP = 0.05  # s; of integration, where odometry is slower
 _MAX_GAP = 0.5  # s without odometry: no window reaches across; stated in the error message below
 _FEWEST = 8  # odometry messages in a window: the initial velocity takes one
 ONSET_STEP = 0.2  # s; of the difference quotient: several messages, as thrust acts in steps
@@ -96,7 +95,7 @@ class WindowedProblem:
         keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
         keep &= within(spans, streams.t)
         t = streams.t[keep]
-        nodes = _subdivided(t)
+        nodes = _subdivided(t, streams.max_step)
         pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
         pieces = pieces[(pieces >= nodes[0]) & (pieces <= nodes[-1])]
         held = self._held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
@@ -453,10 +452,10 @@ def _driven(streams: Streams, nodes: Array) -> tuple[Array, Array]:
     return means, interpolated(streams.inputs_t, streams.inputs, nodes[1:])
 
 
-def _subdivided(t: Array) -> Array:
-    """The instants t and as many between them that no step is longer than MAX_STEP, gaps aside."""
+def _subdivided(t: Array, longest: float) -> Array:
+    """The instants t and as many between that no step is longer than ``longest``, gaps aside."""
     length = np.diff(t)
-    count = np.where(length > _MAX_GAP, 1, np.ceil(length / MAX_STEP - 1e-6)).astype(int)
+    count = np.where(length > _MAX_GAP, 1, np.ceil(length / longest - 1e-6)).astype(int)
     count = np.maximum(count, 1)
     at = np.repeat(np.arange(len(length)), count)
     part = np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)

@@ -5,8 +5,8 @@ Over an interval the mean moves by a Runge-Kutta step; covariance P and sensitiv
 ``S = d nu / d theta`` move by the linearised motion (Ljung 1999, sec. 7.4 and 11.4)::
 
     nu_dot = M^-1 (tau - h(nu)) + noise,      J = d nu_dot / d nu in the middle of the interval
-    P <- Phi P Phi' + Q,                      Phi = 1 + J dt + (J dt)^2 / 2
-    S <- Phi S - Gamma Y(nu, nu_dot),         Gamma = dt (1 + J dt / 2 + (J dt)^2 / 6) M^-1
+    P <- Phi P Phi' + Q,                      Phi = 1 + J dt + ... + (J dt)^4 / 24
+    S <- Phi S - Gamma Y(nu, nu_dot),         Gamma = dt (1 + J dt / 2 + ... + (J dt)^3 / 24) M^-1
 
 with the regressor Y of ``tau = known + Y theta``. A measurement corrects nu, P and S alike.
 """
@@ -93,20 +93,32 @@ def linearised_step(structure, theta, one_theta, nu, late, dt, s):
             for j in range(6):
                 total -= s.inverse[i, j] * (s.h[j, 1 + k] - s.h[j, 0])
             s.jacobian[i, k] = total * (dt / _SHIFT)
+    _product(s.jacobian, s.jacobian, s.square)
     for i in range(6):
         for j in range(6):
-            square = 0.0
-            for a in range(6):
-                square += s.jacobian[i, a] * s.jacobian[a, j]
+            s.into[i, j] = s.jacobian[i, j] / 24.0 + (1.0 / 6.0 if i == j else 0.0)
+    _product(s.square, s.into, s.transition)
+    for i in range(6):
+        for j in range(6):
             unit = 1.0 if i == j else 0.0
-            s.transition[i, j] = unit + s.jacobian[i, j] + 0.5 * square
-            s.square[i, j] = dt * (unit + 0.5 * s.jacobian[i, j] + square / 6.0)
+            s.square[i, j] = unit + 0.5 * s.jacobian[i, j] + s.transition[i, j]
+    _product(s.jacobian, s.square, s.transition)
+    for i in range(6):
+        s.transition[i, i] += 1.0
+        for j in range(6):
+            s.square[i, j] *= dt
+    _product(s.square, s.inverse, s.into)
+
+
+@inlined
+def _product(a, b, out):
+    """out = a @ b, all (6, 6)."""
     for i in range(6):
         for j in range(6):
             total = 0.0
-            for a in range(6):
-                total += s.square[i, a] * s.inverse[a, j]
-            s.into[i, j] = total
+            for k in range(6):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
 
 
 @inlined
