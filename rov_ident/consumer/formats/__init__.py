@@ -10,6 +10,7 @@ from rov_ident.core.files import read_input
 
 WRITERS = {"auv_controllers": auv_controllers, "gazebo": gazebo, "mss": mss}
 READERS = {"auv_controllers": auv_controllers, "gazebo": gazebo}
+"""Those with a ``read`` of their own; a URDF needs what else is known as well."""
 
 _LARGEST = 1 << 24  # bytes; a model without meshes has a thousandth
 
