@@ -258,6 +258,63 @@ def test_added_mass_of_either_sign(tmp_path):
         assert added[1, 5] == -1.0
 
 
+TURNED = """<sdf version="1.9"><model name="m"><link name="base_link"><inertial>
+{}
+<mass>10</mass><inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.3</izz></inertia></inertial>
+<collision name="hull"><pose>0 0 0.1 0 0 0</pose><geometry><box><size>1 0.1 0.1</size></box>
+</geometry></collision>{}</link>
+<plugin name="gz::sim::systems::Hydrodynamics" filename="gz-sim-hydrodynamics-system">
+<link_name>base_link</link_name><xU>-1</xU></plugin></model></sdf>"""
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        '<pose degrees="true">0.1 0 0 0 0 90</pose>',
+        '<pose degrees="true" rotation_format="euler_rpy">0.1 0 0 0 0 90</pose>',
+        '<pose relative_to="base_link">0.1 0 0 0 0 1.5707963267948966</pose>',
+        '<pose rotation_format="quat_xyzw">0.1 0 0 0 0 0.70710678 0.70710678</pose>',
+    ],
+)
+def test_a_pose_in_each_notation_of_sdformat(tmp_path, pose):
+    path = tmp_path / "m.sdf"
+    path.write_text(TURNED.format(pose, ""))
+    config, notes = import_model(path)
+    body = config.model.body
+    assert body.cog.tolist() == [0.1, 0.0, 0.0]
+    np.testing.assert_allclose(body.inertia, np.diag([0.2, 0.1, 0.3]), atol=1e-9)
+    assert notes == ()
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        ('<pose relative_to="__model__">0 0 0 0 0 0</pose>', "relative to '__model__'"),
+        ('<pose rotation_format="matrix">0 0 0 0 0 0</pose>', "must be euler_rpy or quat_xyzw"),
+        ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>', "of length 0"),
+        ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0</pose>', "must be numbers"),
+    ],
+)
+def test_a_pose_that_cannot_be_read_is_refused(tmp_path, pose, words):
+    path = tmp_path / "m.sdf"
+    path.write_text(TURNED.format(pose, ""))
+    with pytest.raises(UserError, match=words):
+        import_model(path)
+
+
+def test_a_volume_that_is_left_out_is_named(tmp_path):
+    path = tmp_path / "m.sdf"
+    mesh = (
+        '<collision name="frame"><geometry><mesh><uri>a.dae</uri></mesh></geometry></collision>'
+        "<collision><geometry><plane/></geometry></collision>"
+    )
+    path.write_text(TURNED.format("", mesh))
+    config, notes = import_model(path)
+    assert config.model.body.buoyancy == pytest.approx(98.1)
+    assert len(notes) == 1
+    assert "the collision frame (mesh) is left out" in notes[0]
+
+
 # ------------------------------------------------------------------ auv_controllers
 
 
