@@ -9,6 +9,7 @@ from scipy.integrate import quad
 
 from bench import DATA
 from rov_ident import config
+from rov_ident.api.comparison import compare
 from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
 from rov_ident.model.added_mass import cylinder, parse_hull, spheroid
@@ -371,6 +372,7 @@ def test_what_is_left_unused_is_named(tmp_path):
     result = tmp_path / "f.json"
     assert main(["forces", str(path), "--json", str(result)]) == 0
     assert json.loads(result.read_text())["not_understood"] == ["lift force", "remark"]
+    assert "same data" in compare(result, result).notes[0]  # by the sha256 of the table
 
 
 @pytest.mark.parametrize(

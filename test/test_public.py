@@ -23,7 +23,7 @@ from tiers import more
 
 import rov_ident as ri
 from rov_ident.cli.program import main
-from rov_ident.config import dump
+from rov_ident.config import dump, from_parameters, to_parameters
 
 ROOT = Path(__file__).parent.parent
 CONTRACT = (
@@ -347,6 +347,37 @@ def test_values_without_intervals_are_not_judged(tmp_path, capsys):
     assert "fit --json" in shown and "95 % interval of the difference" not in shown
     (row,) = [line for line in shown.splitlines() if name in line]
     assert ("-25.0" if given.value(name) < 0.0 else "+25.0") in row
+
+
+def test_what_only_one_configuration_has_and_its_body_are_told(tmp_path, fit, capsys):
+    given = ri.load(HEAVY)
+    changed = to_parameters(given)
+    changed["coefficients"].pop("X_udot")
+    changed["vehicle"] |= {"mass": 14.0, "cob": [0.0, 0.0, -0.02]}
+    dump(from_parameters(changed), tmp_path / "b.yaml")
+    assert main(["compare", str(HEAVY), str(tmp_path / "b.yaml")]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    n = len(given.model.names) - 1
+    assert f"0 of {n} coefficients differ, and so do vehicle.mass, vehicle.cob.z;" in shown
+    assert f"Only {HEAVY.name} has X_udot." in shown
+    found = ri.compare(HEAVY, tmp_path / "b.yaml")
+    assert dict(zip(found.names, found.difference))["vehicle.mass"] == 0.5
+    # A fit takes the body as it is: nothing of it is missing there.
+    assert not any(name.startswith("vehicle") for name in ri.compare(HEAVY, fit).only_a)
+
+
+def test_intervals_are_those_that_the_results_state(tmp_path):
+    """Few data leave wider intervals than the normal distribution's."""
+    entries = [{"value": x, "std": 1.0, "unit": "N s/m"} for x in (-10.0, -14.0)]
+    for entry in entries:
+        entry |= {"lower": entry["value"] - 3.2, "upper": entry["value"] + 3.2}
+    paths = [tmp_path / "a.json", tmp_path / "b.json"]
+    for path, entry in zip(paths, entries):
+        path.write_text(json.dumps({"axes": {"X": {"terms": {"X_u": entry}}}}))
+    found = ri.compare(*paths)
+    assert found.a_half == pytest.approx([3.2]) and "3.2" in str(found)
+    assert found.difference_half == pytest.approx([3.2 * np.sqrt(2.0)])
+    assert abs(found.deviations[0]) > 1.96 and found.changed == ()
 
 
 def test_every_kind_of_result_can_be_compared(tmp_path, fit, results):
