@@ -53,9 +53,7 @@ def read(text: str, base: Config | None = None) -> Read:
 
     Raises UserError if it is no URDF, has no mass, or nothing says the coefficients.
     """
-    if "${" in text or "<xacro:" in text:
-        raise UserError("is a xacro file: expand it first, with `xacro FILE > robot.urdf`")
-    robot = xml_root(text, "URDF")
+    robot = _robot(text)
     joints = [_joint(element) for element in robot.findall("joint")]
     links = {link.get("name", ""): link for link in robot.findall("link")}
     block = robot.find("hydrodynamics")
@@ -83,6 +81,25 @@ def read(text: str, base: Config | None = None) -> Read:
     return Read(parameters, tuple(notes))
 
 
+def holds_hydrodynamics(text: str) -> bool:
+    """Whether the robot has coefficients, in whichever way. Raises UserError as :func:`read`."""
+    robot = _robot(text)
+    plugins = _plugins(robot)[:1]
+    return robot.find("hydrodynamics") is not None or any(damping(p, []) for p in plugins)
+
+
+def _robot(text: str) -> ET.Element:
+    if "${" in text or "<xacro:" in text:
+        raise UserError("is a xacro file: expand it first, with `xacro FILE > robot.urdf`")
+    return xml_root(text, "URDF")
+
+
+def _plugins(robot: ET.Element) -> list[ET.Element]:
+    """Those of Gazebo that give the hull its forces."""
+    named = ((p, p.get("name", "") + p.get("filename", "")) for p in robot.iter("plugin"))
+    return [plugin for plugin, name in named if "hydrodynamics" in name.lower()]
+
+
 def _of_the_tree(
     robot: ET.Element,
     links: Mapping[str, ET.Element],
@@ -96,9 +113,8 @@ def _of_the_tree(
     if moving := [j.name for j in joints if j.kind != "fixed" and not _THRUSTER.search(j.name)]:
         notes.append(f"joints that move are taken at their zero: {', '.join(moving)}")
 
-    named = ((p, p.get("name", "") + p.get("filename", "")) for p in robot.iter("plugin"))
-    plugins = (plugin for plugin, name in named if "hydrodynamics" in name.lower())
-    coefficients = next((damping(plugin, notes) for plugin in plugins), {})
+    plugins = _plugins(robot)
+    coefficients = damping(plugins[0], notes) if plugins else {}
     if not coefficients and base is None:
         raise UserError("holds no hydrodynamics: give --config with the coefficients to start from")
     gravity = base.gravity if base else GRAVITY
