@@ -1,6 +1,7 @@
 """The public face: `import rov_ident as ri`, what it offers, and what it leaves alone."""
 
 import ast
+import errno
 import inspect
 import json
 import math
@@ -304,6 +305,16 @@ def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
         (lambda bag: ri.simulate(HEAVY, manoeuvre="steps", duration=-1.0), "must be positive"),
         (lambda bag: ri.plan(HEAVY, tank=(6.0, 6.0)), "must be three lengths"),
         (lambda bag: ri.plan(HEAVY, duration=float("nan")), "10 s are the least"),
+        (lambda bag: ri.plan(HEAVY, tank="666"), "must be three lengths"),
+        (lambda bag: ri.plan(HEAVY, tank=(6.0, -6.0, 2.0)), "must be three lengths"),
+        (lambda bag: ri.fit(None, HEAVY), "None is no path, nor several"),
+        (lambda bag: ri.fit([None], HEAVY), "None is no path"),
+        (lambda bag: ri.fit(bag, None), "None is no configuration"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", jobs=0), "jobs is 0"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", jobs=-1), "jobs is -1"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", jobs=1.5), "jobs is 1.5"),
+        (lambda bag: ri.fit(bag, HEAVY, "ukf", reference=-5), "reference is -5 s"),
+        (lambda bag: ri.simulate(HEAVY, manoeuvre="steps", seed=-1), "seed is -1"),
         (lambda bag: ri.OnlineEstimator(HEAVY, "ols"), "there is no estimator 'ols'"),
         (lambda bag: ri.compare(HEAVY, bag), "no JSON of a result"),
         (lambda bag: ri.compare(HEAVY, "nowhere.json"), "nowhere.json cannot be read"),
@@ -312,6 +323,30 @@ def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
 def test_what_the_caller_can_mend_is_a_user_error(bag, call, message):
     with pytest.raises(ri.UserError, match=message):
         call(bag)
+
+
+def test_a_name_that_a_result_does_not_have_is_refused(fit):
+    with pytest.raises(ri.UserError, match="there is no 'foo' in this result: use X_udot"):
+        fit.value("foo")
+
+
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path, fit, monkeypatch):
+    """Of a disk that is full, what was there stays; and a bag is no picture to replace."""
+    path, dive = tmp_path / "p.png", tmp_path / "dive.png"
+    fit.save(path)
+    before = path.read_bytes()
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(ri.UserError, match="No space left"):
+            fit.save(path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+    dive.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(ri.UserError, match="there is a bag"):
+        fit.save(dive)
 
 
 # ------------------------------------------------------------------ comparison
