@@ -42,7 +42,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "layout",
             default_value="none",
-            description="none, or a known set of parameters: auv_controllers",
+            description="none, or a known set of parameters: auv_controllers (before 0.1.0)",
         ),
         DeclareLaunchArgument(
             "approval",

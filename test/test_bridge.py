@@ -16,11 +16,11 @@ from std_srvs.srv import SetBool, Trigger
 from bench import HEAVY
 from bench.simulators.live import end_node
 from rov_ident.consumer import parameter_bridge as bridge
-from rov_ident.consumer.formats import auv_controllers
 from rov_ident.consumer.parameter_bridge import Target
 from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level, State
 from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.model.coefficients import DIAGONAL
 from rov_ident.nodes.conversions import to_diagnostics
 
 TWO = 'mapping:=["X_u=hydrodynamics.X_u", "X_uu=hydrodynamics.X_uu"]'
@@ -86,19 +86,21 @@ def test_dead_band():
     assert bridge.changes(held, beyond, std, 5.0, 1.0) == []
 
 
-def test_layout_is_that_of_the_exported_file(heavy):
-    """What the bridge reads out of the parameters that `export` writes is the model."""
-    written = auv_controllers.write(heavy).content
-    import yaml
-
-    section = yaml.safe_load(written)["/**"]["ros__parameters"]["hydrodynamics"]
+def test_layout_is_that_of_auv_controllers_before_0_1_0(heavy):
+    """Of each kind a list, in the order X Y Z K M N; and the layout says whom it reaches."""
+    model = dict(zip(heavy.model.names, heavy.model.theta.tolist(), strict=True))
+    kinds = {
+        "added_mass": "added_mass",
+        "linear_damping": "linear",
+        "quadratic_damping": "quadratic",
+    }
     parameters = {
-        f"hydrodynamics.{key}": tuple(map(float, value)) if isinstance(value, list) else value
-        for key, value in section.items()
+        f"hydrodynamics.{key}": tuple(model.get(name, 0.0) for name in DIAGONAL[kind])
+        for key, kind in kinds.items()
     }
     read = bridge.read(bridge.targets(heavy, "", (), "auv_controllers"), parameters)
-    model = dict(zip(heavy.model.names, heavy.model.theta.tolist(), strict=True))
     assert read == {name: model[name] for name in heavy.estimate}
+    assert "before 0.1.0 only" in bridge.LAYOUT_NOTES["auv_controllers"]
 
 
 # ------------------------------------------------------------------ over DDS

@@ -214,6 +214,18 @@ def test_hold_after(heavy):
         HydrodynamicModel(heavy, hold_after=0.0)
 
 
+@pytest.mark.parametrize("attitude", [[0.0] * 4, [0.0] * 3, [np.nan, 0.0, 0.0, 1.0]])
+def test_an_attitude_without_a_direction_is_refused(heavy, attitude):
+    """Zeros are what an IMU without orientation sends: they made NaN of the thrust."""
+    hydrodynamics = HydrodynamicModel(heavy)
+    for ask in (
+        lambda: hydrodynamics.wrench(np.zeros(6), np.zeros(6), attitude),
+        lambda: hydrodynamics.g(attitude),
+    ):
+        with pytest.raises(UserError, match="of any length but zero"):
+            ask()
+
+
 texts = st.one_of(
     st.floats().map(repr), st.floats(-300.0, 300.0).map(repr), st.text(max_size=5), st.none()
 )

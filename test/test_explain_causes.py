@@ -4,13 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+import yaml
 from scipy.signal import lfilter
 from tiers import more
 
+from bench import HEAVY
 from bench.simulators.hidden import LINEAR_STD, Conditions, draw
 from bench.studies.explain import streams_of
-from rov_ident.config import from_parameters, to_parameters
+from rov_ident.config import from_parameters, load, to_parameters
+from rov_ident.core.files import shipped
 from rov_ident.core.frames import quaternion_from_rotation_vector, quaternion_multiply
+from rov_ident.core.messages import WRENCH
 from rov_ident.discrepancy import extension
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.findings import parameters_of
@@ -321,3 +325,24 @@ def test_an_axis_on_which_what_was_found_loses_stays_as_it_was(heavy):
     assert extension.kept(judge, before, both).model.values == {}
     lagging = {("thruster_lag", "time_constant"): 0.5}
     assert extension.kept(judge, before, both.having(lagging)).model is None
+
+
+@pytest.mark.parametrize("seed", [5, *more(1, 2, 3, 4, 6)])
+def test_thrusters_that_push_less_astern_are_no_property_of_the_hull(seed):
+    """Each propeller by itself, of which the wrench shows only the sum along each axis: drag that
+    differs ahead and astern, lift and dead bands were named for it, surely."""
+    file = shipped("config/bluerov2_heavy.yaml")
+    raw = yaml.safe_load(file.read_text())["/**"]["ros__parameters"]["thrusters"]
+    position, direction = (np.reshape(raw[key], (-1, 3)) for key in ("position", "direction"))
+    direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    allocation = np.vstack([direction.T, np.cross(position, direction).T])
+    astern, config = np.random.default_rng(seed).uniform(0.7, 0.85), load(HEAVY)
+    suite, messages = Suite(odometry_rate=10.0, imu_rate=50.0), []
+    for _, role, message in dive(config, "steps", 120.0, suite, seed).messages:
+        if role == WRENCH:
+            acting = np.linalg.pinv(allocation) @ [*message.force, *message.torque]
+            read = allocation @ np.where(acting < 0.0, acting / astern, acting)
+            message = message._replace(force=read[:3], torque=read[3:])
+        messages.append((role, message))
+    findings = explain([gather(messages, config)], config).findings
+    assert {f.effect for f in findings.effects if f.separable} <= {"thruster_asymmetry"}

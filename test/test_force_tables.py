@@ -1,6 +1,8 @@
 """Force tables: structures found again, values within intervals, tables as people write them."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +11,13 @@ from scipy.integrate import quad
 
 from bench import DATA
 from rov_ident import config
+from rov_ident.api.comparison import compare
 from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
 from rov_ident.model.added_mass import cylinder, parse_hull, spheroid
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.fins import X
+from rov_ident.offline import captive_report
 from rov_ident.offline import captive_tests as force_tables
 from rov_ident.steering import autopilot
 
@@ -371,6 +375,7 @@ def test_what_is_left_unused_is_named(tmp_path):
     result = tmp_path / "f.json"
     assert main(["forces", str(path), "--json", str(result)]) == 0
     assert json.loads(result.read_text())["not_understood"] == ["lift force", "remark"]
+    assert "same data" in compare(result, result).notes[0]  # by the sha256 of the table
 
 
 @pytest.mark.parametrize(
@@ -403,6 +408,19 @@ def test_headline_of_the_report(tmp_path, capsys):
     assert all(word in out for word in ("X_uu", low, high, "N s2/m2"))
     first = text[text.index("<h1") : text.index("<h2")]
     assert "X_uu = -3.00" in first and low in first and high in first and "N s2/m2" in first
+
+
+def test_the_chosen_structure_is_in_the_table_of_its_page(tmp_path):
+    """Where ten others have less error than the simplest that is as good, too."""
+    u = np.linspace(0.2, 2.0, 12)
+    path = write(tmp_path / "t.csv", {"u": u, "X": -3.0 * u**2 + 0.01 * np.cos(9.0 * u)})
+    fit = force_tables.fit(force_tables.read_table(path))["X"]
+    others = tuple(
+        force_tables.Candidate((*fit.names, f"X_{i}"), 0.1 * i * fit.cv_rmse) for i in range(10)
+    )
+    own = force_tables.Candidate(fit.names, fit.cv_rmse)
+    page = captive_report.page("t", {"X": replace(fit, candidates=(*others, own))})
+    assert re.search(rf"<td[^>]*>{' '.join(fit.names)}</td>", page[page.index("structure</th>") :])
 
 
 def test_hull_in_words():

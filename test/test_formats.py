@@ -15,6 +15,7 @@ from test_cli import refused, run
 from rov_ident import config as configuration
 from rov_ident.consumer.formats import READERS, WRITERS, export, import_model
 from rov_ident.core.errors import UserError
+from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import catalogue, input_catalogue, parse
 from rov_ident.model.equations import GRAVITY
@@ -257,32 +258,169 @@ def test_added_mass_of_either_sign(tmp_path):
         assert added[1, 5] == -1.0
 
 
+TURNED = """<sdf version="1.9"><model name="m"><link name="base_link"><inertial>
+{}
+<mass>10</mass><inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.3</izz></inertia></inertial>
+<collision name="hull"><pose>0 0 0.1 0 0 0</pose><geometry><box><size>1 0.1 0.1</size></box>
+</geometry></collision>{}</link>
+<plugin name="gz::sim::systems::Hydrodynamics" filename="gz-sim-hydrodynamics-system">
+<link_name>base_link</link_name><xU>-1</xU></plugin></model></sdf>"""
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        '<pose degrees="true">0.1 0 0 0 0 90</pose>',
+        '<pose degrees="true" rotation_format="euler_rpy">0.1 0 0 0 0 90</pose>',
+        '<pose relative_to="base_link">0.1 0 0 0 0 1.5707963267948966</pose>',
+        '<pose rotation_format="quat_xyzw">0.1 0 0 0 0 0.70710678 0.70710678</pose>',
+    ],
+)
+def test_a_pose_in_each_notation_of_sdformat(tmp_path, pose):
+    path = tmp_path / "m.sdf"
+    path.write_text(TURNED.format(pose, ""))
+    config, notes = import_model(path)
+    body = config.model.body
+    assert body.cog.tolist() == [0.1, 0.0, 0.0]
+    np.testing.assert_allclose(body.inertia, np.diag([0.2, 0.1, 0.3]), atol=1e-9)
+    assert notes == ()
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        ('<pose relative_to="__model__">0 0 0 0 0 0</pose>', "relative to '__model__'"),
+        ('<pose rotation_format="matrix">0 0 0 0 0 0</pose>', "must be euler_rpy or quat_xyzw"),
+        ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>', "of length 0"),
+        ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0</pose>', "must be numbers"),
+    ],
+)
+def test_a_pose_that_cannot_be_read_is_refused(tmp_path, pose, words):
+    path = tmp_path / "m.sdf"
+    path.write_text(TURNED.format(pose, ""))
+    with pytest.raises(UserError, match=words):
+        import_model(path)
+
+
+def test_a_volume_that_is_left_out_is_named(tmp_path):
+    path = tmp_path / "m.sdf"
+    mesh = (
+        '<collision name="frame"><geometry><mesh><uri>a.dae</uri></mesh></geometry></collision>'
+        "<collision><geometry><plane/></geometry></collision>"
+    )
+    path.write_text(TURNED.format("", mesh))
+    config, notes = import_model(path)
+    assert config.model.body.buoyancy == pytest.approx(98.1)
+    assert len(notes) == 1
+    assert "the collision frame (mesh) is left out" in notes[0]
+
+
 # ------------------------------------------------------------------ auv_controllers
 
 
-def test_ros_reads_the_parameters_of_auv_controllers(diagonal, tmp_path):
-    from rclpy.parameter import parameter_dict_from_yaml_file
+def hydrodynamics(urdf):
+    """What the library of auv_controllers makes of a robot description, in its own formulas.
 
-    path = written(diagonal, "auv_controllers", tmp_path)
-    read = parameter_dict_from_yaml_file(str(path), use_wildcard=True)
-    values = {name: p.value for name, p in read.items()}
-    body = diagonal.model.body
-    assert values["hydrodynamics.mass"].double_value == body.mass
-    assert list(values["hydrodynamics.added_mass"].double_array_value) == [
-        -6.36, -7.12, -18.68, -0.189, -0.135, -0.222,
-    ]  # fmt: skip
-    assert list(values["hydrodynamics.linear_damping"].double_array_value) == [
-        -13.7, -6.0, -33.0, -0.3, -0.8, 0.0,
-    ]  # fmt: skip
-    about_origin = list(values["hydrodynamics.moments_of_inertia"].double_array_value)
-    assert about_origin[0] == pytest.approx(0.26 + 13.5 * 0.03**2)
-    assert about_origin[2] == 0.37
+    `parse_model_from_xml` and `inverse_dynamics` of hydrodynamics 0.0.1: every attribute but the
+    centres' and the products of inertia's is required. Gives ``wrench(acc, vel, R)``, R from body
+    to north-east-down.
+    """
+    block = ET.fromstring(urdf).find("hydrodynamics")
+
+    def six(path, keys):
+        return np.diag([float(block.find(path).attrib[key]) for key in keys.split()])
+
+    def three(path):
+        return np.array([float(block.find(path).get(key, 0.0)) for key in "xyz"])
+
+    def skew(v):
+        return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+    mass = float(block.find("inertial/mass").attrib["value"])
+    cog, cob = three("inertial/center_of_gravity"), three("hydrostatics/center_of_buoyancy")
+    s = mass * skew(cog)
+    rigid = np.block([[mass * np.eye(3), -s], [s, six("inertial/inertia", "ixx iyy izz")]])
+    m = rigid - six("inertial/added_mass", "Xdu Ydv Zdw Kdp Mdq Ndr")
+    linear = -six("damping/linear", "Xu Yv Zw Kp Mq Nr")
+    quadratic = -six("damping/quadratic", "Xuu Yvv Zww Kpp Mqq Nrr")
+    buoyancy = float(block.find("hydrostatics/buoyancy").attrib["value"])
+
+    def wrench(acc, vel, rotation):
+        p = m @ vel
+        zero = np.zeros((3, 3))
+        coriolis = np.block([[zero, -skew(p[:3])], [-skew(p[:3]), -skew(p[3:])]])
+        drag = linear + quadratic @ np.diag(np.abs(vel))
+        fg = rotation.T @ [0.0, 0.0, mass * 9.81]
+        fb = rotation.T @ [0.0, 0.0, -buoyancy]
+        restoring = -np.concatenate([fg + fb, np.cross(cog, fg) + np.cross(cob, fb)])
+        return m @ acc + coriolis @ vel + drag @ vel + restoring
+
+    return wrench
 
 
-def test_auv_controllers_names_what_it_cannot_hold(coupled):
+def test_auv_controllers_computes_the_same_wrench(diagonal):
+    """Today's reader, of a vehicle whose centre of gravity is off the origin."""
+    there = hydrodynamics(export(diagonal, "auv_controllers").content)
+    assert export(diagonal, "auv_controllers").lost == ()
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        acc, vel, angles = rng.normal(size=6), rng.normal(size=6), rng.normal(size=3)
+        rotation = quaternion_to_matrix(quaternion_from_euler(*angles))
+        expected = diagonal.dynamics.wrench(vel, acc, rotation.T @ [0.0, 0.0, 1.0])
+        np.testing.assert_allclose(there(acc, vel, rotation), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_auv_controllers_names_what_it_cannot_hold(coupled, heavy):
     lost = " ".join(export(coupled, "auv_controllers").lost)
-    for name in (*COUPLED, "centre of gravity", "products of inertia"):
+    for name in (*COUPLED, "products of inertia"):
         assert name in lost
+    # It makes the weight of the mass: the force that floats the vehicle is kept.
+    out = export(configuration.from_parameters(parameters(heavy, weight=130.0)), "auv_controllers")
+    assert any("130 N" in what for what in out.lost)
+    buoyancy = ET.fromstring(out.content).find("hydrodynamics/hydrostatics/buoyancy")
+    net = float(buoyancy.get("value")) - 13.5 * 9.81
+    assert net == pytest.approx(heavy.model.body.buoyancy - 130.0)
+
+
+OLD = """/**:
+  ros__parameters:
+    hydrodynamics:
+      mass: 13.5
+      weight: 132.435
+      buoyancy: 134.0
+      moments_of_inertia: [0.27215, 0.24215, 0.37]
+      added_mass: [-6.36, -7.12, -18.68, -0.189, -0.135, -0.222]
+      center_of_buoyancy: [0.0, 0.0, -0.01]
+      center_of_gravity: [0.0, 0.0, 0.03]
+      linear_damping: [-13.7, -6.0, -33.0, -0.3, -0.8, 0.0]
+      quadratic_damping: [-141.0, -217.0, -190.0, -1.19, -0.47, -1.5]
+"""
+
+
+def test_parameters_of_auv_controllers_before_0_1_0_are_read(tmp_path):
+    path = tmp_path / "old.yaml"
+    path.write_text(OLD)
+    config, notes = import_model(path)
+    assert notes == ()
+    values = dict(zip(config.model.names, config.model.theta.tolist(), strict=True))
+    assert (values["X_udot"], values["Y_v"], values["N_rr"]) == (-6.36, -6.0, -1.5)
+    assert "N_r" not in values
+    np.testing.assert_allclose(config.model.body.inertia, np.diag([0.26, 0.23, 0.37]))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("damping>", "dragging>"), "<damping><linear> is missing"),
+        (("Xdu", "Xudot"), "has no attribute Xdu"),
+        (('Ydv="-', 'Ydv="minus '), "must be a number"),
+    ],
+)
+def test_a_description_that_auv_controllers_refuses_is_refused(diagonal, tmp_path, change, words):
+    path = tmp_path / "r.urdf"
+    path.write_text(export(diagonal, "auv_controllers").content.replace(*change))
+    with pytest.raises(UserError, match=re.escape(words)):
+        import_model(path)
 
 
 # ------------------------------------------------------------------ MSS
@@ -383,10 +521,14 @@ def without(config, lost):
     assert not left.model.fins
     model = left.dynamics
     body = model.body
-    if "products of inertia" in words:
-        body = dataclasses.replace(body, inertia=np.diag(np.diag(body.inertia)))
+    if "products of inertia about the origin" in words:
+        about_origin = body.mass_matrix[3:, 3:]
+        inertia = body.inertia - about_origin + np.diag(np.diag(about_origin))
+        body = dataclasses.replace(body, inertia=inertia)
     if "a weight of" in words:
-        heavier = config.gravity * body.mass - body.weight
+        # What the other program takes instead of it: its own gravity, or that of the vehicle.
+        gravity = GRAVITY if "mass times 9.81" in words else config.gravity
+        heavier = gravity * body.mass - body.weight
         body = dataclasses.replace(
             body, weight=body.weight + heavier, buoyancy=body.buoyancy + heavier
         )

@@ -209,6 +209,28 @@ def test_files_that_continue_each_other(tmp_path, out):
         import_csv(paths, out)
 
 
+def test_columns_that_are_left_out_are_named(tmp_path, out):
+    columns = table([*BASE, "x", "y", "z", *EULER, "rudder_rad", "yaw_deg", "depth"])
+    path = save(tmp_path / "log.csv", columns)
+    (note,) = import_csv([path], out).notes
+    assert note == "columns left out (--map names them): rudder_rad, yaw_deg, depth"
+    (note,) = import_csv([path], out, depths=["depth"]).notes
+    assert note.endswith(": rudder_rad, yaw_deg")
+    mapped = import_csv([path], out, {"delta_r": "rudder_rad"}).notes
+    assert mapped[0].endswith(": yaw_deg, depth")
+
+
+def test_headings_that_numpy_wrote_as_a_comment_are_headings(tmp_path, out):
+    columns = table([*BASE, "x", "y", "z", *EULER])
+    path, rows = tmp_path / "log.csv", np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, delimiter=",", header="of a dive\n" + ",".join(columns))
+    report = import_csv([path], out)
+    assert (report.rows, report.notes) == (20, ())
+    path.write_text("# m s, N\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    with pytest.raises(UserError):  # a comment of other length has no headings
+        import_csv([path], out)
+
+
 def test_times_before_zero_are_moved(tmp_path, out):
     columns = table(BASE)
     columns["t_s"] -= 5.0
@@ -234,7 +256,7 @@ def with_cell(columns, heading, row, text):
         (with_cell(table(BASE), "w", 3, ""), r"line 5, column `w`"),
         (with_cell(table(BASE), "w", 3, "nan"), r"line 5, column `w`"),
         (with_cell(table(BASE), "w", 3, "1,2"), r"line 5: 14 cells under 13 headings"),
-        (with_cell(table(BASE), "t_s", 3, "0.2"), r"line 5: t_s goes from 0\.2 to 0\.2"),
+        (with_cell(table(BASE), "t_s", 3, "0.2"), r"line 5: t_s is 0\.2 as in the row before"),
         (with_cell(table(BASE, step=100.0), "u", 0, "0"), "must be in seconds"),
         (with_cell(table([*BASE, *EULER], pitch=30.0), "u", 0, "0"), "line 2: pitch is 30.*rad"),
         (

@@ -231,3 +231,21 @@ def test_a_relative_cache_home_is_ignored(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "cache")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert jit._cache_folder().parent == tmp_path / ".cache" / "rov_ident"
+
+
+def test_a_cache_that_cannot_be_written_is_told_once_and_leaves_nothing(tmp_path):
+    """A file stands where the folder should be: nobody can write there, root neither."""
+    blocked, temporary = tmp_path / "blocked", tmp_path / "tmp"
+    blocked.write_text("")
+    temporary.mkdir()
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    environment |= {"ROV_IDENT_CACHE": str(blocked), "TMPDIR": str(temporary)}
+    done = subprocess.run(
+        [sys.executable, "-c", "from rov_ident.core import frames, jit; print(jit.CACHE)"],
+        env=environment | {"PYTHONPATH": str(PACKAGE.parent)}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(temporary))
+    assert done.stderr.count("compiles anew: set ROV_IDENT_CACHE") == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert list(temporary.iterdir()) == []

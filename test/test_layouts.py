@@ -180,6 +180,9 @@ def test_shipped(tmp_path, capsys):
     bad = ["layouts", "--config", str(HEAVY), "--out", str(tmp_path), "--namespace", "a b"]
     assert main(bad) == 2
     assert "is no namespace" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["layouts", "--config", str(HEAVY), "--out", ""])
+    assert "an empty name is no folder" in capsys.readouterr().err
 
 
 def test_every_shipped_vehicle():

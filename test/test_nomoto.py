@@ -180,6 +180,20 @@ def test_what_the_intervals_do_not_contain_is_said():
     assert any("biases fd" in note for note in nomoto.fit([run], method="fd").notes)
 
 
+def test_only_what_was_not_tried_is_advised():
+    run = every(simulated(0.3, 4.0, 0.2, noise=0.003), 0.1)
+    swaying = replace(run, heading=run.heading + 0.02 * np.sin(0.9 * run.t))  # by waves
+    for options, advice in (
+        ({"order": 1}, "try --order 2 and --nonlinear, and check"),
+        ({"order": 1, "nonlinear": True}, "try --order 2, and check"),
+        ({"order": 2}, "try --nonlinear, and check"),
+        ({"order": "auto"}, "try --nonlinear, and check"),  # which has tried both orders
+        ({"order": 2, "nonlinear": True}, "intervals; check"),
+    ):
+        (note,) = (n for n in nomoto.fit([swaying], **options).notes if "no white noise" in n)
+        assert advice in note
+
+
 def test_recursive_follows_a_change():
     """A vehicle whose K doubles half-way: with forgetting the last estimate is the new one."""
     rng = np.random.default_rng(0)

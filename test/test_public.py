@@ -1,6 +1,7 @@
 """The public face: `import rov_ident as ri`, what it offers, and what it leaves alone."""
 
 import ast
+import errno
 import inspect
 import json
 import math
@@ -23,7 +24,7 @@ from tiers import more
 
 import rov_ident as ri
 from rov_ident.cli.program import main
-from rov_ident.config import dump
+from rov_ident.config import dump, from_parameters, to_parameters
 
 ROOT = Path(__file__).parent.parent
 CONTRACT = (
@@ -304,6 +305,16 @@ def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
         (lambda bag: ri.simulate(HEAVY, manoeuvre="steps", duration=-1.0), "must be positive"),
         (lambda bag: ri.plan(HEAVY, tank=(6.0, 6.0)), "must be three lengths"),
         (lambda bag: ri.plan(HEAVY, duration=float("nan")), "10 s are the least"),
+        (lambda bag: ri.plan(HEAVY, tank="666"), "must be three lengths"),
+        (lambda bag: ri.plan(HEAVY, tank=(6.0, -6.0, 2.0)), "must be three lengths"),
+        (lambda bag: ri.fit(None, HEAVY), "None is no path, nor several"),
+        (lambda bag: ri.fit([None], HEAVY), "None is no path"),
+        (lambda bag: ri.fit(bag, None), "None is no configuration"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", jobs=0), "jobs is 0"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", jobs=-1), "jobs is -1"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", jobs=1.5), "jobs is 1.5"),
+        (lambda bag: ri.fit(bag, HEAVY, "ukf", reference=-5), "reference is -5 s"),
+        (lambda bag: ri.simulate(HEAVY, manoeuvre="steps", seed=-1), "seed is -1"),
         (lambda bag: ri.OnlineEstimator(HEAVY, "ols"), "there is no estimator 'ols'"),
         (lambda bag: ri.compare(HEAVY, bag), "no JSON of a result"),
         (lambda bag: ri.compare(HEAVY, "nowhere.json"), "nowhere.json cannot be read"),
@@ -312,6 +323,30 @@ def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
 def test_what_the_caller_can_mend_is_a_user_error(bag, call, message):
     with pytest.raises(ri.UserError, match=message):
         call(bag)
+
+
+def test_a_name_that_a_result_does_not_have_is_refused(fit):
+    with pytest.raises(ri.UserError, match="there is no 'foo' in this result: use X_udot"):
+        fit.value("foo")
+
+
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path, fit, monkeypatch):
+    """Of a disk that is full, what was there stays; and a bag is no picture to replace."""
+    path, dive = tmp_path / "p.png", tmp_path / "dive.png"
+    fit.save(path)
+    before = path.read_bytes()
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(ri.UserError, match="No space left"):
+            fit.save(path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+    dive.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(ri.UserError, match="there is a bag"):
+        fit.save(dive)
 
 
 # ------------------------------------------------------------------ comparison
@@ -347,6 +382,37 @@ def test_values_without_intervals_are_not_judged(tmp_path, capsys):
     assert "fit --json" in shown and "95 % interval of the difference" not in shown
     (row,) = [line for line in shown.splitlines() if name in line]
     assert ("-25.0" if given.value(name) < 0.0 else "+25.0") in row
+
+
+def test_what_only_one_configuration_has_and_its_body_are_told(tmp_path, fit, capsys):
+    given = ri.load(HEAVY)
+    changed = to_parameters(given)
+    changed["coefficients"].pop("X_udot")
+    changed["vehicle"] |= {"mass": 14.0, "cob": [0.0, 0.0, -0.02]}
+    dump(from_parameters(changed), tmp_path / "b.yaml")
+    assert main(["compare", str(HEAVY), str(tmp_path / "b.yaml")]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    n = len(given.model.names) - 1
+    assert f"0 of {n} coefficients differ, and so do vehicle.mass, vehicle.cob.z;" in shown
+    assert f"Only {HEAVY.name} has X_udot." in shown
+    found = ri.compare(HEAVY, tmp_path / "b.yaml")
+    assert dict(zip(found.names, found.difference))["vehicle.mass"] == 0.5
+    # A fit takes the body as it is: nothing of it is missing there.
+    assert not any(name.startswith("vehicle") for name in ri.compare(HEAVY, fit).only_a)
+
+
+def test_intervals_are_those_that_the_results_state(tmp_path):
+    """Few data leave wider intervals than the normal distribution's."""
+    entries = [{"value": x, "std": 1.0, "unit": "N s/m"} for x in (-10.0, -14.0)]
+    for entry in entries:
+        entry |= {"lower": entry["value"] - 3.2, "upper": entry["value"] + 3.2}
+    paths = [tmp_path / "a.json", tmp_path / "b.json"]
+    for path, entry in zip(paths, entries):
+        path.write_text(json.dumps({"axes": {"X": {"terms": {"X_u": entry}}}}))
+    found = ri.compare(*paths)
+    assert found.a_half == pytest.approx([3.2]) and "3.2" in str(found)
+    assert found.difference_half == pytest.approx([3.2 * np.sqrt(2.0)])
+    assert abs(found.deviations[0]) > 1.96 and found.changed == ()
 
 
 def test_every_kind_of_result_can_be_compared(tmp_path, fit, results):

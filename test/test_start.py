@@ -1,6 +1,7 @@
 """`rov-ident init`: from what a bag, a log or a model tells, a configuration with every option."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -203,6 +204,42 @@ def test_types_that_only_a_laboratory_has_are_named(tmp_path):
     assert "republish it as geometry_msgs/TwistStamped" in said
     with pytest.raises(ri.UserError, match="/commanded_thrust may be meant.*JointState"):
         topics.select(bag, ri.load(SHIPPED), ["wrench"])
+
+
+SDF = """<sdf version="1.9"><model name="m"><link name="base_link"><inertial>
+<mass>10</mass><inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.3</izz></inertia></inertial></link>
+<plugin name="gz::sim::systems::Hydrodynamics" filename="gz-sim-hydrodynamics-system">
+<link_name>base_link</link_name><xDotU>{}</xDotU><xU>-1</xU></plugin></model></sdf>"""
+
+
+def test_a_whole_model_takes_no_other_vehicle(tmp_path, capsys):
+    path, out = tmp_path / "x.sdf", str(tmp_path / "c.yaml")
+    path.write_text(SDF.format("-5"))
+    assert main(["init", str(path), "--vehicle", "bluerov2", "--out", out]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "is a whole vehicle, to which vehicle (--vehicle) adds nothing" in said
+    assert main(["init", str(path), "--out", out]) == 0
+    assert "no added mass" not in capsys.readouterr().err
+    path.write_text(SDF.format("0"))
+    assert main(["init", str(path), "--out", out, "--force"]) == 0
+    assert "so none will be estimated" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["robot.urdf", "robot.urdf.xml"])
+@pytest.mark.parametrize("drag", [True, False])
+def test_a_urdf_is_known_by_what_is_in_it(tmp_path, capsys, name, drag):
+    path, out = tmp_path / name, tmp_path / "c.yaml"
+    plugin = '<gazebo><plugin name="gz::sim::systems::Hydrodynamics"><xU>-5</xU></plugin></gazebo>'
+    path.write_text(
+        '<robot name="r"><link name="base_link"><inertial><mass value="9"/>'
+        '<inertia ixx="0.1" iyy="0.2" izz="0.3"/></inertial></link>'
+        f"{plugin if drag else ''}</robot>"
+    )
+    assert main(["init", str(path), "--out", str(out)]) == 0
+    text, said = out.read_text(), capsys.readouterr().err
+    assert "mass: 9.0" in text and ("X_u: -5.0" in text) == drag
+    assert bool(re.search("buoyancy: *# UNKNOWN", text)) != drag
+    assert ("taken as neutral" in said) == drag
 
 
 def test_a_urdf_gives_the_body_and_leaves_the_rest_open(tmp_path, capsys):

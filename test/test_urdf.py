@@ -115,6 +115,39 @@ def test_a_hydrodynamics_plugin_gives_the_coefficients(tmp_path):
     assert any("taken as neutral" in note for note in notes)
 
 
+BLOCK = """
+  <hydrodynamics>
+    <inertial>
+      <mass value="16.61"/><inertia ixx="0.3" iyy="0.2" izz="0.4"/>
+      <center_of_gravity z="0.02"/>
+      <added_mass Xdu="-12.7" Ydv="-10.5" Zdw="-14.57" Kdp="-0.12" Mdq="-0.12" Ndr="0"/>
+    </inertial>
+    <damping>
+      <linear Xu="-28.23" Yv="-18.29" Zw="-23.51" Kp="-0.31" Mq="-0.31" Nr="-0.31"/>
+      <quadratic Xuu="-93.47" Yvv="-74.28" Zww="-168.17" Kpp="-1.55" Mqq="-1.55" Nrr="-1.55"/>
+    </damping>
+    <hydrostatics><buoyancy value="159.91"/><center_of_buoyancy z="-0.01"/></hydrostatics>
+  </hydrodynamics>
+</robot>"""
+
+
+@pytest.mark.parametrize("base", [None, HEAVY])
+def test_its_own_hydrodynamics_are_the_model(tmp_path, base):
+    """Forward-starboard-down, about the origin; sensors and thrusters are still the links'."""
+    path = save(tmp_path / "r.urdf", ROBOT.replace("</robot>", BLOCK))
+    found, notes = import_model(path, config.load(base) if base else None)
+    values = dict(zip(found.model.names, found.model.theta.tolist(), strict=True))
+    assert (values["X_udot"], values["M_qq"], len(values)) == (-12.7, -1.55, 17)
+    body = found.model.body
+    assert (body.mass, body.buoyancy) == (16.61, 159.91)
+    assert body.weight == pytest.approx(16.61 * 9.81)
+    assert (body.cog.tolist(), body.cob.tolist()) == ([0.0, 0.0, 0.02], [0.0, 0.0, -0.01])
+    moved = 16.61 * 0.02**2
+    np.testing.assert_allclose(np.diag(body.inertia), [0.3 - moved, 0.2 - moved, 0.4])
+    np.testing.assert_allclose(found.odometry.position, [0.0, 0.1, 0.2], atol=1e-12)
+    assert any("those of its <hydrodynamics>" in note for note in notes)
+
+
 def test_the_command(tmp_path, capsys):
     path, out = str(save(tmp_path / "r.urdf")), str(tmp_path / "c.yaml")
     assert main(["import-model", path, "--config", str(HEAVY), "--out", out]) == 0

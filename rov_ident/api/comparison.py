@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,20 +26,29 @@ _WITH_INTERVALS = (
     "Results have intervals, parameter files have none: compare result.json of identify, or the "
     "JSON that fit --json writes."
 )
+_BODY = "vehicle."  # how the numbers of the rigid body begin
 _RELATIVE = ("cog_offset.", "buoyancy.")
 _LARGEST_FILE = 100 << 20  # bytes; more than any result has
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Named numbers (n,) with their standard deviations, read from a result."""
+    """Named numbers (n,) with their standard deviations and half of their 95 % intervals, read
+    from a result; of a configuration also what its rigid body is."""
 
     label: str
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Array
     std: Array
-    bags: frozenset[str]  # their sha256
+    half: Array
+    bags: frozenset[str] = frozenset()  # their sha256
+    is_config: bool = False
+
+    def __getitem__(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Values, standard deviations and halves of intervals (n,) of these names."""
+        at = [self.names.index(name) for name in names]
+        return self.values[at], self.std[at], self.half[at]
 
 
 @dataclass(frozen=True)
@@ -47,8 +56,9 @@ class Comparison(Shown):
     """What two results say of the same coefficients: all arrays (n,) in the order of ``names``.
 
     ``deviations`` is the difference over its standard deviation, from the standard deviations of
-    both as if their errors were independent; NaN where neither result has one. ``only_a`` and
-    ``only_b`` are names that one of them lacks.
+    both as if their errors were independent; NaN where neither result has one. ``a_half`` and
+    ``b_half`` are half of their 95 % intervals, as they state them. ``only_a`` and ``only_b`` are
+    names that one of them lacks.
     """
 
     labels: tuple[str, str]
@@ -56,8 +66,10 @@ class Comparison(Shown):
     units: tuple[str, ...]
     a: Array
     a_std: Array
+    a_half: Array
     b: Array
     b_std: Array
+    b_half: Array
     only_a: tuple[str, ...]
     only_b: tuple[str, ...]
     notes: tuple[str, ...] = ()
@@ -71,6 +83,11 @@ class Comparison(Shown):
     def difference_std(self) -> Array:
         """Standard deviation of the difference (n,)."""
         return np.hypot(self.a_std, self.b_std)
+
+    @property
+    def difference_half(self) -> Array:
+        """Half of the 95 % interval of the difference (n,)."""
+        return np.hypot(self.a_half, self.b_half)
 
     @property
     def deviations(self) -> Array:
@@ -87,18 +104,30 @@ class Comparison(Shown):
     def changed(self) -> tuple[str, ...]:
         """The names whose difference is outside its 95 % interval, the surest first."""
         sure = np.nan_to_num(np.abs(self.deviations))
-        return tuple(self.names[i] for i in np.argsort(-sure) if sure[i] > NORMAL)
+        beyond = np.abs(self.difference) > self.difference_half
+        return tuple(self.names[i] for i in np.argsort(-sure) if sure[i] > 0.0 and beyond[i])
 
     @property
     def sentence(self) -> str:
-        """How many coefficients changed, and which one most surely."""
+        """How many coefficients changed, which one most surely, and which only one of them has."""
+        lacking = "".join(
+            f" Only {label} has {', '.join(names)}."
+            for label, names in zip(self.labels, (self.only_a, self.only_b))
+            if names
+        )
+        return self._of_common() + lacking
+
+    def _of_common(self) -> str:
         n, chance = len(self.names), 0.05 * len(self.names)
         if not self.difference_std.any():
-            differ = np.count_nonzero(self.difference)
+            differ = [name for name, by in zip(self.names, self.difference) if by]
+            of_body = [name for name in differ if name.startswith(_BODY)]
+            n -= sum(name.startswith(_BODY) for name in self.names)
+            also = f", and so do {', '.join(of_body)}" if of_body else ""
             return (
-                f"From {self.labels[0]} to {self.labels[1]}, {differ} of {n} coefficients differ; "
-                "neither has intervals, so nothing can be said of whether that is more than "
-                f"chance. {_WITH_INTERVALS}"
+                f"From {self.labels[0]} to {self.labels[1]}, {len(differ) - len(of_body)} of {n} "
+                f"coefficients differ{also}; neither has intervals, so nothing can be said of "
+                f"whether that is more than chance. {_WITH_INTERVALS}"
             )
         text = (
             f"From {self.labels[0]} to {self.labels[1]}, {len(self.changed)} of {n} coefficients "
@@ -121,8 +150,8 @@ class Comparison(Shown):
             [name, *first, *second, unit, percent, off, "changed" if name in self.changed else ""]
             for name, first, second, unit, percent, off in zip(
                 self.names,
-                map(_value_and_interval, self.a, self.a_std),
-                map(_value_and_interval, self.b, self.b_std),
+                map(_value_and_interval, self.a, self.a_half),
+                map(_value_and_interval, self.b, self.b_half),
                 self.units,
                 percents,
                 offs,
@@ -140,17 +169,20 @@ class Comparison(Shown):
         from rov_ident.reports import plots
 
         percent = 100.0 / np.maximum(np.abs(np.where(self.a == 0.0, self.b, self.a)), 1e-12)
-        columns = zip(self.labels, (self.a, self.b), (self.a_std, self.b_std))
+        columns = zip(self.labels, (self.a, self.b), (self.a_half, self.b_half))
         rows = {
-            label: (percent * (value - self.a), percent * NORMAL * np.nan_to_num(std))
-            for label, value, std in columns
+            label: (percent * (value - self.a), percent * np.nan_to_num(half))
+            for label, value, half in columns
         }
         label = f"difference from {self.labels[0]} [%], with 95 % intervals"
         return plots.intervals(self.names, rows, label)
 
     def to_json(self) -> str:
         """Both values, their difference, and which changed."""
-        keys = ("a", "a_std", "b", "b_std", "difference", "difference_std", "deviations")
+        keys = (
+            "a", "a_std", "a_half", "b", "b_std", "b_half",
+            "difference", "difference_std", "difference_half", "deviations",
+        )  # fmt: skip
         columns = zip(*(getattr(self, key).tolist() for key in keys))
         entries: dict[str, dict[str, Any]] = {}
         for name, unit, values in zip(self.names, self.units, columns):
@@ -162,8 +194,8 @@ class Comparison(Shown):
         return as_json(document)
 
 
-def _value_and_interval(value: float, std: float) -> tuple[str, str]:
-    return (f"{value:.5g}", "") if std == 0.0 else estimate(value, NORMAL * std)
+def _value_and_interval(value: float, half: float) -> tuple[str, str]:
+    return (f"{value:.5g}", "") if half == 0.0 else estimate(value, half)
 
 
 def compare(
@@ -178,7 +210,7 @@ def compare(
         A Fit, an Explanation, an Identification, a Config, or the path of the JSON of ``fit``,
         ``explain``, ``nomoto`` or ``forces``, of the folder that ``identify`` wrote, or of a
         parameter file (YAML). Values of a configuration have no uncertainty: they are compared as
-        they are.
+        they are. Of two configurations, mass, weight, buoyancy, centres and inertia are, too.
 
     Returns
     -------
@@ -191,14 +223,18 @@ def compare(
         If a file cannot be read, holds no estimates, or the two have no coefficient in common.
     """
     one, two = _estimates(a), _estimates(b)
-    names = tuple(name for name in one.names if name in two.names)
+    # No result has the rigid body, which a fit takes as it is.
+    shared = ("",) if one.is_config and two.is_config else tuple("XYZKMN")
+    mine, other = (
+        [n for n in e.names if not e.is_config or n.startswith(shared)] for e in (one, two)
+    )
+    names = tuple(name for name in mine if name in other)
     if not names:
         raise UserError(f"{one.label} and {two.label} have no coefficient in common")
-    first, second = (np.array([e.names.index(n) for n in names]) for e in (one, two))
-    units = tuple(one.units[i] for i in first)
-    for name, unit, i in zip(names, units, second, strict=True):
-        if unit != two.units[i]:
-            raise UserError(f"{name} is in {unit} in {one.label}, in {two.units[i]} in {two.label}")
+    units, of_two = (tuple(e.units[e.names.index(n)] for n in names) for e in (one, two))
+    for name, unit, there in zip(names, units, of_two, strict=True):
+        if unit != there:
+            raise UserError(f"{name} is in {unit} in {one.label}, in {there} in {two.label}")
     same_data = (
         "both are made from the same data: their errors go together, and the standard deviation of "
         "the difference is an upper bound of it"
@@ -211,10 +247,8 @@ def compare(
         )
     labels = (one.label, two.label) if one.label != two.label else ("a", "b")
     return Comparison(
-        labels, names, units,
-        one.values[first], one.std[first], two.values[second], two.std[second],
-        tuple(n for n in one.names if n not in names),
-        tuple(n for n in two.names if n not in names),
+        labels, names, units, *one[names], *two[names],
+        tuple(n for n in mine if n not in names), tuple(n for n in other if n not in names),
         tuple(notes),
     )  # fmt: skip
 
@@ -239,9 +273,20 @@ def _estimates(source: Any) -> Estimates:
 
 
 def _numbers_of_config(config: Config, label: str) -> Estimates:
-    model = config.model
-    units = tuple(c.unit for c in model.coefficients)
-    return Estimates(label, model.names, units, model.theta, 0.0 * model.theta, frozenset())
+    model, body = config.model, config.model.body
+    entries = [
+        (c.name, c.unit, value) for c, value in zip(model.coefficients, model.theta.tolist())
+    ]
+    for key, unit in (("mass", "kg"), ("weight", "N"), ("buoyancy", "N")):
+        entries.append((f"{_BODY}{key}", unit, getattr(body, key)))
+    for key in ("cog", "cob"):
+        entries += [(f"{_BODY}{key}.{axis}", "m", x) for axis, x in zip("xyz", getattr(body, key))]
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        name = f"{_BODY}inertia.{'xyz'[i]}{'xyz'[j]}"
+        entries.append((name, "kg m2", body.inertia[i, j]))
+    names, units, values = zip(*entries)
+    none = np.zeros(len(names))
+    return Estimates(label, names, units, np.array(values), none, none, is_config=True)
 
 
 def _numbers_of_json(document: Any, label: str) -> Estimates:
@@ -251,22 +296,33 @@ def _numbers_of_json(document: Any, label: str) -> Estimates:
     """
     if isinstance(document, Mapping) and isinstance(document.get("fit"), Mapping):
         document = document["fit"]  # of identify
-    found: dict[str, tuple[str, float, float]] = {}
+    found: dict[str, tuple[str, float, float, float]] = {}
     entry: Any
     for name, entry in _entries(document):
         value, std, unit = entry.get("value", entry.get("to")), entry.get("std"), entry.get("unit")
         numeric = all(isinstance(x, int | float) and math.isfinite(x) for x in (value, std))
         if not (numeric and isinstance(unit, str) and float(std) >= 0.0):
             raise UserError(f"{label}: {name} has no value, std and unit as results have them")
-        found[name] = (unit, float(value), float(std))
+        found[name] = (unit, float(value), float(std), _half_of(entry, float(std)))
     if not found:
         raise UserError(
             f"{label} holds no estimates: give the JSON of fit, explain, identify, nomoto or forces"
         )
-    units, values, std = zip(*found.values(), strict=True)
+    units, values, std, half = zip(*found.values(), strict=True)
     bags = _mappings(_mapping(document.get("provenance")).get("bags"))
     hashes = frozenset(str(bag["sha256"]) for bag in bags if "sha256" in bag)
-    return Estimates(label, tuple(found), units, np.array(values), np.array(std), hashes)
+    return Estimates(
+        label, tuple(found), units, np.array(values), np.array(std), np.array(half), hashes
+    )
+
+
+def _half_of(entry: Mapping[str, Any], std: float) -> float:
+    """Half of the 95 % interval that a result states: of few data more than NORMAL of ``std``."""
+    low, high = (entry.get(key) for key in ("lower", "upper"))
+    if not (isinstance(low, int | float) and isinstance(high, int | float)):
+        return NORMAL * std
+    half = 0.5 * (float(high) - float(low))
+    return half if math.isfinite(half) and half >= 0.0 else NORMAL * std
 
 
 def _mapping(x: Any) -> Mapping[str, Any]:

@@ -3,11 +3,14 @@
 import contextlib
 import dataclasses
 import itertools
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from rov_ident.api.reading import File, Files, axes, existing, load, once, read, same_data, several
 from rov_ident.config import Config
@@ -128,6 +131,10 @@ def fit(
         )
     if wrong := [name for name, is_ignored in ignored.items() if is_ignored]:
         raise UserError(f"{wrong[0]} has no meaning with the estimator {estimator}")
+    if not (isinstance(jobs, int) and jobs >= 1):
+        raise UserError(f"jobs is {jobs!r}, but must be a whole number from 1 on")
+    if not 0.0 <= reference < math.inf:
+        raise UserError(f"reference is {reference:g} s, but must not be negative")
     given = load(config, f"{estimator}_node" if live else "")
     table: dict[str, Any] = {}
     if prior_from is not None:
@@ -351,8 +358,9 @@ def plan(
         If a bag cannot be read, or no manoeuvre is safe within these limits.
     """
     given, say = load(config), progress or silent
-    if len(tank) != 3:
-        raise UserError(f"tank is {tank}, but must be three lengths, such as (6, 6, 2)")
+    numeric = all(isinstance(side, int | float | np.number) and side > 0 for side in tank)
+    if len(tank) != 3 or not numeric:
+        raise UserError(f"tank is {tank!r}, but must be three lengths [m], such as (6, 6, 2)")
     limits = Limits(tuple(tank), thrust)
     known = (
         contextlib.nullcontext() if bag is None else archive.opened(several(bag), given, say=say)

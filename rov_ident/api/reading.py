@@ -1,7 +1,7 @@
 """What the functions of this room are given: files, configurations, channels; and reading them."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +29,11 @@ Files = File | Sequence[File]
 
 def several(files: Files) -> list[Path]:
     """The paths of one file or of several, each as :func:`existing` gives it."""
-    one = isinstance(files, str | os.PathLike)
-    return [existing(files)] if one else [existing(file) for file in files]  # type: ignore[arg-type, union-attr]
+    if isinstance(files, str | os.PathLike):
+        return [existing(files)]
+    if not isinstance(files, Iterable):
+        raise UserError(f"{files!r} is no path, nor several: give the files to read")
+    return [existing(file) for file in files]
 
 
 def once(paths: Sequence[Path]) -> tuple[list[Path], tuple[str, ...]]:
@@ -55,6 +58,8 @@ def same_data(path: Path, others: Sequence[Path]) -> Path | None:
 
 def existing(file: File) -> Path:
     """The path, with the name of its folder for `.`; UserError where there is nothing."""
+    if not isinstance(file, str | os.PathLike):
+        raise UserError(f"{file!r} is no path: give the file to read")
     path = Path(file)
     if not path.exists():
         raise UserError(f"{path} cannot be read (No such file or directory): check the path")

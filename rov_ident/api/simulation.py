@@ -165,6 +165,8 @@ def simulate(
         raise UserError("give either a bag or a manoeuvre to simulate")
     if not 0.0 < duration < math.inf:
         raise UserError(f"duration is {duration:g} s, but must be positive")
+    if not (isinstance(seed, int | np.integer) and seed >= 0):
+        raise UserError(f"seed is {seed!r}, but must be a whole number from 0 on")
     if progress:
         progress("simulating")
     if manoeuvre is not None:

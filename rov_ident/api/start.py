@@ -10,7 +10,7 @@ import numpy as np
 from rov_ident import config as configuration
 from rov_ident.api.reading import File
 from rov_ident.config.writing import annotated
-from rov_ident.consumer.formats import import_model
+from rov_ident.consumer.formats import holds_hydrodynamics, import_model, is_urdf
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import VEHICLES, shipped, write_file
 from rov_ident.core.frames import FLIP_BODY
@@ -137,13 +137,23 @@ def init(
 
 
 def _add_model(path: Path, found: _Found, vehicle: str) -> None:
-    known = not vehicle and path.suffix.lower() != ".urdf"
-    base = None if known else configuration.load(shipped(f"config/{vehicle or VEHICLES[0]}.yaml"))
+    urdf = is_urdf(path)
+    if vehicle and not urdf:
+        raise UserError(
+            f"{path} is a whole vehicle, to which vehicle (--vehicle) adds nothing: leave it out"
+        )
+    whole = not vehicle and (not urdf or holds_hydrodynamics(path))
+    base = None if whole else configuration.load(shipped(f"config/{vehicle or VEHICLES[0]}.yaml"))
     config, notes = import_model(path, base)
     found.parameters = configuration.to_parameters(config)
     found.remarks = dict.fromkeys(("vehicle.mass", "vehicle.inertia", "vehicle.cog"), path.name)
     if base is None or vehicle:
         found.notes += notes
+        if not any(c.is_added_mass for c in config.model.coefficients):
+            found.notes.append(
+                f"{path.name} has no added mass (0 counts as none), so none will be estimated: add "
+                "X_udot, Y_vdot, Z_wdot, K_pdot, M_qdot and N_rdot to the coefficients"
+            )
     else:  # a URDF holds no hydrodynamics
         assumed, read = configuration.to_parameters(base), found.parameters
         found.parameters = {k: v for k, v in read.items() if v != assumed.get(k)}

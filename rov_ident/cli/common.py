@@ -148,6 +148,13 @@ def box(text: str) -> tuple[float, ...]:
     return sides
 
 
+def folder(text: str) -> Path:
+    """A folder to write in; an empty name, of a variable that is not set, is not this one."""
+    if not text:
+        raise argparse.ArgumentTypeError("an empty name is no folder: use . for this one")
+    return Path(text)
+
+
 @contextlib.contextmanager
 def progress(options: argparse.Namespace) -> "Iterator[Progress]":
     """A line and a bar on standard error; nothing with --quiet, or where nobody looks."""

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, command, progress, say, show
+from rov_ident.cli.common import OUT, Commands, command, folder, progress, say, show
 
 
 def add(commands: Commands) -> None:
@@ -12,7 +12,7 @@ def add(commands: Commands) -> None:
     files = "findings.json report.html extended.yaml"
     explain = command(commands, "explain", text, _explain, "bags --config", files)
     explain.add_argument(
-        "--out", required=True, type=Path, metavar="DIR",
+        "--out", required=True, type=folder, metavar="DIR",
         help="folder for findings.json, report.html and extended.yaml",
     )  # fmt: skip
     explain.add_argument(

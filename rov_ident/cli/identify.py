@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from rov_ident.cli.common import OUT, Commands, command, progress, show
+from rov_ident.cli.common import OUT, Commands, command, folder, progress, show
 
 
 def add(commands: Commands) -> None:
@@ -11,7 +11,7 @@ def add(commands: Commands) -> None:
     files = "report.html extended.yaml result.json"
     identify = command(commands, "identify", text, _identify, "bags --config", files)
     identify.add_argument(
-        "--out", required=True, type=Path, metavar="DIR",
+        "--out", required=True, type=folder, metavar="DIR",
         help="folder for report.html, extended.yaml and result.json",
     )  # fmt: skip
     identify.add_argument(

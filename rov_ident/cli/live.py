@@ -3,9 +3,8 @@
 import argparse
 import json
 import re
-from pathlib import Path
 
-from rov_ident.cli.common import ERR, OUT, Commands, command, port, positive
+from rov_ident.cli.common import ERR, OUT, Commands, command, folder, port, positive
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
 
@@ -32,7 +31,7 @@ def add(commands: Commands) -> None:
     )
     layouts.add_argument("--namespace", default="", help="of the nodes (none)")
     layouts.add_argument(
-        "--out", required=True, type=Path, metavar="DIR",
+        "--out", required=True, type=folder, metavar="DIR",
         help="folder for foxglove.json and plotjuggler.xml",
     )  # fmt: skip
 

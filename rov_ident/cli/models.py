@@ -16,7 +16,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     export.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write")
 
-    text = "a configuration from a Gazebo model, auv_controllers' parameters or a URDF"
+    text = "a configuration from a Gazebo model, auv_controllers' <hydrodynamics> or a URDF"
     model = command(commands, "import-model", text, _import_model, "--json")
     model.add_argument("file", type=Path, metavar="FILE", help="SDFormat, YAML or URDF")
     model.add_argument(

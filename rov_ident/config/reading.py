@@ -59,6 +59,8 @@ def load(
     """
     if isinstance(path, Config):
         return path
+    if not isinstance(path, str | os.PathLike):
+        raise UserError(f"{path!r} is no configuration: give a Config or the path of a file")
     path = Path(path)
     try:
         section = _section(parse_file(path), node)

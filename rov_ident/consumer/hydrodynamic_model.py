@@ -51,7 +51,7 @@ class HydrodynamicModel:
     Raises
     ------
     UserError
-        If ``hold_after`` is not positive, or the parameter file is wrong.
+        If ``hold_after`` is not positive, the parameter file wrong, or an attitude zero.
     """
 
     def __init__(self, config: str | os.PathLike[str] | Config, hold_after: float = 2.0) -> None:
@@ -175,6 +175,11 @@ class HydrodynamicModel:
 
 def _down(attitude: Array) -> Array:
     attitude = np.asarray(attitude, dtype=float)
+    if not 0.0 < np.linalg.norm(attitude) < np.inf:  # an IMU without orientation sends zeros
+        raise UserError(
+            f"the attitude is {attitude.tolist()}, but must be a quaternion w x y z or down in "
+            "body axes, of any length but zero"
+        )
     is_down = len(attitude) != 4
     down: Array = attitude if is_down else gravity_direction(quaternion_normalise(attitude))
     return down / np.linalg.norm(down)  # it may be given as gravity [m/s2]

@@ -18,7 +18,7 @@ Values = Mapping[str, Value]
 
 LAYOUTS: dict[str, dict[str, str]] = {
     "none": {},
-    # Its model has SNAME signs, each kind in the order X Y Z K M N: formats/auv_controllers.py.
+    # Of versions before 0.1.0. SNAME signs, each kind in the order X Y Z K M N.
     "auv_controllers": {
         name: f"hydrodynamics.{parameter}[{i}]"
         for parameter, names in auv_controllers.PARAMETERS.items()
@@ -26,6 +26,13 @@ LAYOUTS: dict[str, dict[str, str]] = {
     },
 }
 """Controllers whose parameters are known, by name: the place of each coefficient."""
+
+LAYOUT_NOTES = {
+    "auv_controllers": "layout auv_controllers reaches versions of auv_controllers before 0.1.0 "
+    "only: later ones have no hydrodynamics parameters, but read <hydrodynamics> of the robot "
+    "description when they start (rov-ident export --format auv_controllers writes it)"
+}
+"""What to say of a layout when it is used."""
 
 _PLACE = re.compile(r"(?P<sign>-?)(?P<parameter>[A-Za-z_][\w./]*)(\[(?P<index>\d{1,3})\])?")
 

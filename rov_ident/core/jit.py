@@ -23,9 +23,11 @@ that makes the machine code, and the place of the package: numba keeps kernels b
 source, so a copy elsewhere would find the mark of a :class:`Compiler`, but no kernels of its own.
 """
 
+import atexit
 import contextlib
 import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -48,7 +50,10 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def _cache_folder() -> Path:
-    """A writable folder for these exact kernels; ``ROV_IDENT_CACHE`` overrides its root."""
+    """A writable folder for these exact kernels; ``ROV_IDENT_CACHE`` overrides its root.
+
+    Where there can be none, one for this process alone, and a sentence on standard error.
+    """
     digest = hashlib.sha256(str(_PACKAGE.absolute()).encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -68,7 +73,21 @@ def _cache_folder() -> Path:
     except OSError:
         pass
     # Compiled code is run as it is found: never from a folder that others could have made.
-    return Path(tempfile.mkdtemp(prefix="rov_ident-"))
+    own = Path(tempfile.mkdtemp(prefix="rov_ident-"))
+    atexit.register(_remove, own, os.getpid())
+    if sys.stderr is not None:
+        print(
+            f"{folder} is not yours to write in, so compiled code is not kept and every start "
+            "compiles anew: set ROV_IDENT_CACHE to a folder of your own",
+            file=sys.stderr,
+        )
+    return own
+
+
+def _remove(folder: Path, owner: int) -> None:
+    """At exit; a forked process leaves it to the one that made it."""
+    if os.getpid() == owner:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 # A folder given by NUMBA_CACHE_DIR is used as it is. We do not set that variable for ourselves:

@@ -309,7 +309,7 @@ class Search:
         fits.pop(name, None)  # two families share some coefficients
         fits |= self.patterns.fits(rest)
         given = (*HULL_DAMPING, "thrust_advance")
-        if name in EFFECTS and EFFECTS[name].place == "wrench" and name not in given:
+        if name in EFFECTS and EFFECTS[name].place in ("wrench", "input") and name not in given:
             interplay = self.patterns.interplay(rest)
             fits |= {} if interplay is None else {INTERPLAY_NAME: interplay}
         return fits

@@ -113,6 +113,8 @@ def import_csv(
         log.data[name] = np.radians(log.data[name])
     log.check_angles()
     notes = log.prepare(prepare) if prepare else []
+    if log.left_out:
+        notes.insert(0, f"columns left out (--map names them): {', '.join(log.left_out)}")
     if given := [
         name for name in _WRENCH if log.headings[name] == "0" != (columns or {}).get(name)
     ]:
@@ -260,6 +262,7 @@ class _Log:
     headings: dict[str, str]  # name: heading in the file
     places: list[tuple[Path, int]]  # of each row: file, line
     more: dict[str, Array]  # further columns by heading: (n,), NaN where empty
+    left_out: tuple[str, ...]  # headings of which nothing is made
 
     @classmethod
     def read(
@@ -270,12 +273,15 @@ class _Log:
         tables: list[dict[str, Array]] = []
         places: list[tuple[Path, int]] = []
         headings: dict[str, str] = {}
+        left_out: dict[str, None] = {}
         for path in paths:
             table = read_csv(path)
             found = _headings(path, table.cells, columns)
             if tables and found.keys() != headings.keys():
                 raise UserError(f"{path} has other columns than {paths[0]}: import them apart.")
             headings = found
+            used = {*found.values(), *more}
+            left_out |= dict.fromkeys(name for name in table.cells if name not in used)
             if missing := [name for name in more if name not in table.cells]:
                 raise UserError(
                     f"{path} has no column `{missing[0]}`: it has {', '.join(table.cells)}."
@@ -294,7 +300,8 @@ class _Log:
             files = " ".join(map(str, paths))
             raise UserError(f"{files}: {len(places)} rows are too few for a log.")
         data = {name: np.concatenate([part[name] for part in tables]) for name in tables[0]}
-        return cls(data, headings, places, {name: data.pop(name) for name in more})
+        further = {name: data.pop(name) for name in more}
+        return cls(data, headings, places, further, tuple(left_out))
 
     def prepare(self, how: Prepare) -> list[str]:
         """Change the columns, leave rows out; what was done, in words."""
@@ -327,6 +334,12 @@ class _Log:
         steps = np.diff(time)
         if (bad := np.flatnonzero(steps <= 0.0)).size:
             row = int(bad[0]) + 1
+            if steps[bad[0]] == 0.0:
+                raise UserError(
+                    f"{self.place(row)}: {heading} is {time[row]:.12g} as in the row before, but "
+                    "time must increase: remove rows that are there twice, or write stamps with "
+                    "more digits."
+                )
             raise UserError(
                 f"{self.place(row)}: {heading} goes from {time[row - 1]:g} to {time[row]:g}, but "
                 "time must increase: sort the rows, or import files of separate dives apart."

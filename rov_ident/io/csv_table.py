@@ -51,20 +51,29 @@ class CsvTable:
 def read_csv(path: Path) -> CsvTable:
     """A file of comma-separated columns under one line of headings; `#` begins a comment.
 
+    Where numbers follow at once, the last comment above them is the line of headings, as numpy
+    writes it.
+
     Raises UserError if it cannot be read, or is no such file.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
     header: list[str] = []
+    comment: list[str] = []  # the last one above the headings
     try:
         data = read_input(path, _LARGEST)
         # utf-8-sig: spreadsheets begin their files with a byte order mark.
         text = io.StringIO(data.decode("utf-8-sig"), newline="")
         reader = csv.reader(text, skipinitialspace=True)
         for cells in reader:
-            if not any(cell.strip() for cell in cells) or cells[0].startswith("#"):
+            if not any(cell.strip() for cell in cells):
                 continue
             cells = [cell.strip() for cell in cells]
+            if cells[0].startswith("#"):
+                comment = [cells[0].lstrip("# "), *cells[1:]] if not header else []
+                continue
+            if not header and len(comment) == len(cells) and all(map(_is_number, cells)):
+                header = comment
             if not header:
                 header = cells
                 if len(cells) == 1 and (other := {";", "\t"} & set(cells[0])):
@@ -92,3 +101,11 @@ def read_csv(path: Path) -> CsvTable:
         raise UserError(f"{path} has two columns `{min(twice)}`: rename one of them")
     columns = {name: tuple(row[i] for row in rows) for i, name in enumerate(header) if name}
     return CsvTable(path, columns, tuple(lines), hashlib.sha256(data).hexdigest())
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

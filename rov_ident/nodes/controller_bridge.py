@@ -88,6 +88,8 @@ class ControllerBridge(GuardedNode):
         given = (self._settings[name] for name in ("parameter", "mapping", "layout"))
         self._targets = bridge.targets(self._config, *given)
         self._names = list(dict.fromkeys(target.parameter for target in self._targets))
+        if note := bridge.LAYOUT_NOTES.get(self._settings["layout"]):
+            self.get_logger().warning(note)
 
         self._lock = threading.Lock()  # around what several callbacks share
         self._model = HydrodynamicModel(self._config, self._settings["hold_after"])

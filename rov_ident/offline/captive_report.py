@@ -10,16 +10,19 @@ from rov_ident.reports import html as report
 from rov_ident.reports import plots
 from rov_ident.reports.table import estimate
 
+_LISTED = 8  # structures below the pictures, or so many that the chosen one is among them
+
 
 def page(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> str:
     sections = [headline(fits).html()]
     sections += [report.bullets(notes)] if notes else []
     for axis, f in fits.items():
         unit = "N" if axis in "XYZ" else "N m"
-        tried = [[" ".join(c.terms), f"{c.cv_rmse:.4g}"] for c in f.candidates[:8]]
         sizes: Array = np.array([len(c.terms) for c in f.candidates], dtype=np.float64)
         errors: Array = np.array([c.cv_rmse for c in f.candidates], dtype=np.float64)
         chosen = [set(c.terms) for c in f.candidates].index(set(f.names))
+        listed = f.candidates[: max(_LISTED, chosen + 1)]
+        tried = [[" ".join(c.terms), f"{c.cv_rmse:.4g}"] for c in listed]
         sections += [
             report.heading(f"{axis}: R2 {f.r2:.4f}, residual {f.rmse:.3g} {unit}"),
             report.panels(

@@ -669,6 +669,7 @@ def to_json(
         "not_understood": list(not_understood),
         "coriolis_taken_off": coriolis_taken_off,
         "notes": list(notes),
+        "provenance": next(iter(fits.values())).provenance,  # all axes are of one table
     }
     return as_json(document)
 

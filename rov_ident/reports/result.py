@@ -100,7 +100,7 @@ class Shown(ABC):
     def _write_plot(self, path: Path) -> None:
         buffer = BytesIO()
         self.plot().savefig(buffer, format=path.suffix[1:], dpi=110)
-        path.write_bytes(buffer.getvalue())
+        write_file(path, buffer.getvalue())
 
     def __str__(self) -> str:
         return str(self.table())
@@ -143,6 +143,9 @@ class Result:
         return self.values + self.quantile * self.std
 
     def value(self, name: str) -> float:
+        """One number by its name. Raises UserError if the result has none of that name."""
+        if name not in self.names:
+            raise UserError(f"there is no {name!r} in this result: use {', '.join(self.names)}")
         return float(self.values[self.names.index(name)])
 
     def entries(self) -> dict[str, dict[str, Any]]:

@@ -74,7 +74,7 @@ def fit(
         model = equation_error(used, model, method)
     errors = [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
     measured = np.concatenate(errors)
-    notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted)]
+    notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted, nonlinear)]
     if model.order == 2 and "T1" not in model.names:
         notes.append("T1 and T2 are complex: only T1T2 and T1_plus_T2 are given")
     return dataclasses.replace(
@@ -85,9 +85,9 @@ def fit(
     )
 
 
-def _remarks(model: Nomoto, errors: Sequence[Array], fitted: float) -> list[str]:
+def _remarks(model: Nomoto, errors: Sequence[Array], fitted: float, nonlinear: bool) -> list[str]:
     """What the errors of the simulated heading, run by run, say against the model; ``fitted`` is
-    the RMSE of output error [rad]."""
+    the RMSE of output error [rad], ``nonlinear`` whether the cubic term was asked for."""
     seen = [error[~np.isnan(error)] for error in errors]
     off = rmse(np.concatenate(seen))
     if off > _BIASED * fitted:
@@ -99,11 +99,14 @@ def _remarks(model: Nomoto, errors: Sequence[Array], fitted: float) -> list[str]
     alike = sum(e[1:] @ e[:-1] for e in seen) / (sum(e @ e for e in seen) + 1e-300)
     if alike < max(_COLOURED, 3.0 / np.sqrt(sum(map(len, seen)))):
         return []
+    untried = ["--order 2"] if model.order == 1 and not model.cross_validation else []
+    untried += [] if nonlinear else ["--nonlinear"]
+    advice = f"try {' and '.join(untried)}, and check" if untried else "check"
     return [
         f"the error of the simulated heading is no white noise (correlation {alike:.2f} between "
         "neighbours): K and T are those of the best model of this structure, and the vehicle's may "
-        "lie outside their intervals; try --order 2 and --nonlinear, and check that the rudder "
-        "angle is measured rather than commanded, and that both columns have one clock"
+        f"lie outside their intervals; {advice} that the rudder angle is measured rather than "
+        "commanded, and that both columns have one clock"
     ]
 
 

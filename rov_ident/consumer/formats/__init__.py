@@ -10,10 +10,11 @@ from rov_ident.core.files import read_input
 
 WRITERS = {"auv_controllers": auv_controllers, "gazebo": gazebo, "mss": mss}
 READERS = {"auv_controllers": auv_controllers, "gazebo": gazebo}
+"""Those with a ``read`` of their own; a URDF needs what else is known as well."""
 
 _LARGEST = 1 << 24  # bytes; a model without meshes has a thousandth
 
-__all__ = ["READERS", "WRITERS", "export", "import_model"]
+__all__ = ["READERS", "WRITERS", "export", "holds_hydrodynamics", "import_model", "is_urdf"]
 
 
 def export(config: Config, name: str) -> Written:
@@ -30,20 +31,41 @@ def import_model(path: str | Path, base: Config | None = None) -> tuple[Config, 
     Raises UserError if the file cannot be read, or what it says is not a vehicle.
     """
     path = Path(path)
-    try:
-        text = read_input(path, _LARGEST).decode()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file: {error}") from error
-    is_xml, is_urdf = text.lstrip().startswith("<"), "<robot" in text
-    if base is not None and not (is_xml and is_urdf):
+    text = _text(path)
+    if base is not None and not _is_urdf(text):
         raise UserError(f"{path} is no URDF: --config adds to a URDF alone")
     try:
-        if is_xml and is_urdf:
+        if _is_urdf(text):
             parameters, notes = urdf.read(text, base)
         else:
+            is_xml = text.lstrip().startswith("<")
             parameters, notes = READERS["gazebo" if is_xml else "auv_controllers"].read(text)
         return from_parameters(parameters), notes
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def is_urdf(path: Path) -> bool:
+    """Whether the file is a URDF, which need not be a whole vehicle. Raises UserError as above."""
+    return _is_urdf(_text(path))
+
+
+def holds_hydrodynamics(path: Path) -> bool:
+    """Whether a URDF says the coefficients. Raises UserError as above."""
+    try:
+        return urdf.holds_hydrodynamics(_text(path))
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_input(path, _LARGEST).decode()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not a text file: {error}") from error
+
+
+def _is_urdf(text: str) -> bool:
+    return text.lstrip().startswith("<") and "<robot" in text

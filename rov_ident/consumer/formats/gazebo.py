@@ -149,19 +149,23 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
     link = links[name]
     gravity = float(np.linalg.norm(_numbers(root, "world/gravity", [0.0, 0.0, -GRAVITY])))
     mass = _numbers(link, "inertial/mass")[0]
-    pose = _numbers(link, "inertial/pose", [0.0] * 6)
-    turn = quaternion_to_matrix(quaternion_from_euler(*pose[3:]))
+    cog, turn = _pose(link.find("inertial"), name)
     tensor = np.zeros((3, 3))
     for tag, (i, j) in INERTIA.items():
         default = None if i == j else [0.0]
         tensor[i, j] = tensor[j, i] = _numbers(link, f"inertial/inertia/{tag}", default)[0]
     tensor = (turn @ tensor @ turn.T) * np.outer(FLIP_BODY, FLIP_BODY)
 
-    volume, centre = _displaced(link)
+    volume, centre, others = _displaced(link, name)
     if not volume:
         notes.append(
             "no collision box, sphere or cylinder tells the buoyancy: the vehicle is taken as "
             "neutral, with the centre of buoyancy at the body origin"
+        )
+    elif others:
+        notes.append(
+            f"the volume of {', '.join(others)} is left out of the buoyancy: it is no box, sphere "
+            "or cylinder; set vehicle.buoyancy and vehicle.cob"
         )
     density = _numbers(root, ".//uniform_fluid_density", [DENSITY])[0]
     coefficients = damping(plugin, notes)
@@ -169,9 +173,7 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
         coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
     coefficients |= _fluid_added_mass(link)
     buoyancy = density * gravity * volume if volume else mass * gravity
-    body = RigidBody(
-        mass, mass * gravity, buoyancy, FLIP_BODY * pose[:3], FLIP_BODY * centre, tensor
-    )
+    body = RigidBody(mass, mass * gravity, buoyancy, FLIP_BODY * cog, FLIP_BODY * centre, tensor)
     vehicle = vehicle_section(model.get("name") or "vehicle", body)
     parameters = {"vehicle": vehicle, "coefficients": coefficients}
     current = _numbers(plugin, "default_current", [0.0, 0.0, 0.0])
@@ -224,15 +226,52 @@ def _fluid_added_mass(link: ET.Element) -> dict[str, float]:
     return found
 
 
-def _displaced(link: ET.Element) -> tuple[float, np.ndarray]:
-    """Volume [m3] and its centre (3,) [m] of the collision shapes, forward-left-up."""
-    volume, moment = 0.0, np.zeros(3)
+def _displaced(link: ET.Element, name: str) -> tuple[float, np.ndarray, list[str]]:
+    """Volume [m3] and its centre (3,) [m] of the collision shapes, forward-left-up; and the names
+    of those whose volume is not known here."""
+    volume, moment, others = 0.0, np.zeros(3), []
     for collision in link.findall("collision"):
-        kinds = [kind for kind in collision.findall("geometry/*") if kind.tag in _VOLUMES]
+        shapes = collision.findall("geometry/*")
+        kinds = [kind for kind in shapes if kind.tag in _VOLUMES]
+        if not kinds and any(shape.tag not in _FLAT for shape in shapes):
+            others.append(f"the collision {collision.get('name', '')} ({shapes[0].tag})")
         shape = sum(_VOLUMES[kind.tag](kind) for kind in kinds[:1])
         volume += shape
-        moment += shape * np.array(_numbers(collision, "pose", [0.0] * 6)[:3])
-    return volume, moment / volume if volume else moment
+        moment += shape * _pose(collision, name)[0]
+    return volume, moment / volume if volume else moment, others
+
+
+def _pose(parent: ET.Element | None, link: str) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) and axes (3, 3) of the ``<pose>`` of something in a link, in the link's frame.
+
+    Raises UserError where it is in another frame, or in a notation that SDFormat does not have.
+    """
+    element = None if parent is None else parent.find("pose")
+    if parent is None or element is None:
+        return np.zeros(3), np.eye(3)
+    frame = element.get("relative_to", "")
+    if frame not in ("", "__default__", link):
+        raise UserError(
+            f"a <pose> of {link!r} is relative to {frame!r}, but is read in the frame of its link "
+            "alone: write it so"
+        )
+    notation = element.get("rotation_format", "euler_rpy")
+    if notation == "quat_xyzw":
+        x, y, z, *turned = _numbers(parent, "pose", [0.0] * 7)
+        length = float(np.linalg.norm(turned))
+        if not length:
+            raise UserError(f"a <pose> of {link!r} has a quaternion of length 0")
+        axes = quaternion_to_matrix(np.array([turned[3], *turned[:3]]) / length)
+        return np.array([x, y, z]), axes
+    if notation != "euler_rpy":
+        raise UserError(f"<pose rotation_format={notation!r}> must be euler_rpy or quat_xyzw")
+    x, y, z, *angles = _numbers(parent, "pose", [0.0] * 6)
+    if element.get("degrees", "").strip() in ("true", "1"):
+        angles = np.radians(angles).tolist()
+    return np.array([x, y, z]), quaternion_to_matrix(quaternion_from_euler(*angles))
+
+
+_FLAT = ("empty", "plane")  # shapes without a volume
 
 
 _VOLUMES: dict[str, Callable[[ET.Element], float]] = {

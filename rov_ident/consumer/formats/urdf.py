@@ -2,7 +2,8 @@
 
 Axes are forward-left-up (REP-103); the body origin is that of `base_link`, or else of the root.
 Links are one rigid body, joints that move at their zero. Buoyancy, and without the hydrodynamics
-plugin the coefficients, come from another configuration.
+plugin the coefficients, come from another configuration. A ``<hydrodynamics>`` of auv_controllers
+has all of these, and is taken instead.
 """
 
 import re
@@ -14,6 +15,7 @@ import numpy as np
 
 from rov_ident.config import Config, to_parameters
 from rov_ident.config.writing import vehicle_section
+from rov_ident.consumer.formats import auv_controllers
 from rov_ident.consumer.formats.base import INERTIA, Read, plain, xml_root
 from rov_ident.consumer.formats.gazebo import damping
 from rov_ident.core.errors import UserError
@@ -51,23 +53,70 @@ def read(text: str, base: Config | None = None) -> Read:
 
     Raises UserError if it is no URDF, has no mass, or nothing says the coefficients.
     """
-    if "${" in text or "<xacro:" in text:
-        raise UserError("is a xacro file: expand it first, with `xacro FILE > robot.urdf`")
-    robot = xml_root(text, "URDF")
+    robot = _robot(text)
     joints = [_joint(element) for element in robot.findall("joint")]
     links = {link.get("name", ""): link for link in robot.findall("link")}
-    places = _link_poses(list(links), joints)
+    block = robot.find("hydrodynamics")
+    # What `export` writes to be included in a robot has no links, so nothing sits anywhere.
+    places = _link_poses(list(links), joints) if links or block is None else {}
     notes: list[str] = []
+    parameters: dict[str, Any] = to_parameters(base) if base else {}
+    if block is not None:
+        body, coefficients = auv_controllers.model_of(block)
+        if links:
+            notes.append(
+                "mass, inertia, centres, buoyancy and coefficients are those of its "
+                "<hydrodynamics>, whatever its links, plugins and --config say"
+            )
+        parameters["coefficients"] = coefficients
+    else:
+        body, coefficients = _of_the_tree(robot, links, joints, places, base, notes)
+        if coefficients:
+            parameters["coefficients"] = coefficients
+    name = base.name if base else robot.get("name") or "vehicle"
+    parameters["vehicle"] = vehicle_section(name, body)
+    if links:
+        _mount(parameters, places, notes)
+        _thrusters(parameters, joints, places, notes)
+    return Read(parameters, tuple(notes))
+
+
+def holds_hydrodynamics(text: str) -> bool:
+    """Whether the robot has coefficients, in whichever way. Raises UserError as :func:`read`."""
+    robot = _robot(text)
+    plugins = _plugins(robot)[:1]
+    return robot.find("hydrodynamics") is not None or any(damping(p, []) for p in plugins)
+
+
+def _robot(text: str) -> ET.Element:
+    if "${" in text or "<xacro:" in text:
+        raise UserError("is a xacro file: expand it first, with `xacro FILE > robot.urdf`")
+    return xml_root(text, "URDF")
+
+
+def _plugins(robot: ET.Element) -> list[ET.Element]:
+    """Those of Gazebo that give the hull its forces."""
+    named = ((p, p.get("name", "") + p.get("filename", "")) for p in robot.iter("plugin"))
+    return [plugin for plugin, name in named if "hydrodynamics" in name.lower()]
+
+
+def _of_the_tree(
+    robot: ET.Element,
+    links: Mapping[str, ET.Element],
+    joints: list[_Joint],
+    places: Mapping[str, _Place],
+    base: Config | None,
+    notes: list[str],
+) -> tuple[RigidBody, dict[str, float]]:
+    """The links as one body, and the coefficients of the hydrodynamics plugin, if any."""
     mass, cog, inertia = _rigid_body(links, places)
     if moving := [j.name for j in joints if j.kind != "fixed" and not _THRUSTER.search(j.name)]:
         notes.append(f"joints that move are taken at their zero: {', '.join(moving)}")
 
-    named = ((p, p.get("name", "") + p.get("filename", "")) for p in robot.iter("plugin"))
-    plugins = (plugin for plugin, name in named if "hydrodynamics" in name.lower())
-    coefficients = next((damping(plugin, notes) for plugin in plugins), {})
+    plugins = _plugins(robot)
+    coefficients = damping(plugins[0], notes) if plugins else {}
     if not coefficients and base is None:
         raise UserError("holds no hydrodynamics: give --config with the coefficients to start from")
-    parameters: dict[str, Any] = to_parameters(base) if base else {}
     gravity = base.gravity if base else GRAVITY
     lift, cob = 0.0, FLIP_BODY * cog
     if base:
@@ -76,15 +125,8 @@ def read(text: str, base: Config | None = None) -> Read:
         notes.append("net buoyancy and centre of buoyancy are those of the configuration")
     else:
         notes.append("it says nothing of buoyancy: taken as neutral, about the centre of gravity")
-    name = base.name if base else robot.get("name") or "vehicle"
     weight, tensor = mass * gravity, np.outer(FLIP_BODY, FLIP_BODY) * inertia
-    rigid_body = RigidBody(mass, weight, weight + lift, FLIP_BODY * cog, cob, tensor)
-    parameters["vehicle"] = vehicle_section(name, rigid_body)
-    if coefficients:
-        parameters["coefficients"] = coefficients
-    _mount(parameters, places, notes)
-    _thrusters(parameters, joints, places, notes)
-    return Read(parameters, tuple(notes))
+    return RigidBody(mass, weight, weight + lift, FLIP_BODY * cog, cob, tensor), coefficients
 
 
 def _joint(element: ET.Element) -> _Joint:
