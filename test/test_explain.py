@@ -366,6 +366,18 @@ def test_a_start_that_went_astray_is_as_measured_again(fitted):
     assert again.rss < start.rss + 10.0
 
 
+def test_a_window_that_tumbles_from_where_a_poor_model_began_is_begun_as_measured():
+    """The true current was refused for it: it lost a window in which the motion is unstable."""
+    trial = Trial("medium", "ocean_current", 0, "11")
+    case = bag(trial, 144712691518876, [0.267]).case
+    streams = streams_of(case)
+    search = Search(streams, case.config, split(streams.duration)[0])
+    start = search.start()
+    current = {("ocean_current", n): v for n, v in case.effects["ocean_current"].items()}
+    found = refit(start.hypothesis.having(current), start.linearisation)
+    assert found.rss < 0.7 * start.rss
+
+
 def test_a_failure_at_the_first_moment_is_a_gain(fitted):
     search, start = fitted
 

@@ -118,10 +118,15 @@ class Linearisation:
 
     @property
     def rss(self) -> float:
-        """Squared residuals; an outlier counts as the least residual that is one, or a fit could
-        improve by losing a window."""
-        out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0)
-        return float(self._squares.sum() + _OUTLIER**2 * out)
+        """Squared residuals, those of all windows."""
+        return float(self.of_windows.sum())
+
+    @property
+    def of_windows(self) -> Array:
+        """Squared residuals (W,); an outlier counts as the least residual that is one, or a fit
+        could improve by losing a window."""
+        out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0, axis=1)
+        return self._squares + _OUTLIER**2 * np.add.reduceat(out, self._rows)
 
     @property
     def first(self) -> Indices:

@@ -210,6 +210,8 @@ def refit(
     begin = min(filter(None, begins), key=lambda x: x.rss, default=None)
     if begin is None:
         return None
+    if begin.rss > start.rss:
+        begin = _measured_where_better(begin)
     fitted = _gauss_newton(begin, iterations)
     return _with_noise(fitted) if update_noise else fitted
 
@@ -271,6 +273,19 @@ def _without_strays(problem: WindowedProblem, starts: Array, noise: Array) -> Ar
     measured = problem.measured_starts()
     far: Array = np.max(np.abs(starts - measured) / noise, axis=1, keepdims=True)
     return np.where(far > _STRAY, measured, starts) if far.max() > _STRAY else starts
+
+
+def _measured_where_better(begin: Linearisation) -> Linearisation:
+    """The same from measured initial velocities in the windows that these simulate better: those
+    that suit a poor model can make a better one tumble."""
+    problem, h = begin.problem, begin.hypothesis
+    measured = linearise(problem, h, problem.measured_starts(), begin.noise)
+    if measured is None:
+        return begin
+    better = measured.of_windows < begin.of_windows
+    starts = np.where(better[:, None], measured.starts, begin.starts)
+    mixed = linearise(problem, h, starts, begin.noise) if better.any() else None
+    return begin if mixed is None or mixed.rss > begin.rss else mixed
 
 
 def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
