@@ -488,12 +488,14 @@ def test_a_thrust_scale_is_tried_whatever_its_score(begun, monkeypatch):
     assert "thrust_scale" in tried and "effect 8" not in tried
 
 
-def test_thrust_of_other_axes_is_a_rival_of_drag_and_of_nothing_else(begun, monkeypatch):
+def test_thrust_of_other_axes_is_a_rival_of_drag_and_thrust_and_not_of_what_every_hull_has(
+    begun, monkeypatch
+):
     there, start = begun
     monkeypatch.setattr(there.patterns, "interplay", lambda rest: rest)
-    for name in ("oblique_damping", "crossflow", "tether_drag"):
+    for name in ("oblique_damping", "crossflow", "tether_drag", "thruster_deadband"):
         assert INTERPLAY_NAME in there._rivals(start, name)
-    for name in ("quadratic_damping", "thruster_lag", "thrust_advance"):
+    for name in ("quadratic_damping", "velocity_scale", "thrust_advance"):
         assert INTERPLAY_NAME not in there._rivals(start, name)
     assert search.INTERPLAY is patterns.INTERPLAY
 

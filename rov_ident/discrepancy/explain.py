@@ -179,7 +179,7 @@ def explain(
     retuned, model, residual = _searched(search, start, say)
     say("judging on held-out data", 0.9)
     judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors)
-    _judge_effects(search, judge, retuned, model)
+    _judge_effects(search, judge, retuned, model, data)
     _add_term(search, judge, retuned, model)
     of_sensors = list(data.findings)
     if search.config is not config:
@@ -273,6 +273,11 @@ class _Data:
     may_drift: bool
 
     @property
+    def records(self) -> repetition.Records:
+        """Which part of the time is which bag."""
+        return repetition.Records(self.streams, self.bags, joined(self.bags)[1])
+
+    @property
     def validated(self) -> bool:
         """Whether another bag is judged."""
         return self.recorded.judged is not self.recorded.streams
@@ -356,7 +361,7 @@ def _in_each_record(
 ) -> tuple[list[Finding], _Shared]:
     """The findings with what each record says of them, and the model without what belongs to each
     record, unless that surely predicts worse; ``last`` is the model fitted to all of the data."""
-    records = repetition.Records(data.streams, data.bags, joined(data.bags)[1])
+    records = data.records
     alone = repetition.alone(records, last)
     found, own = repetition.in_each(search, records, last, found, alone)
     final = model.final.hypothesis
@@ -521,7 +526,9 @@ def _searched(
     return path[0], _Model(final, trials), residuals(final, trials)
 
 
-def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> None:
+def _judge_effects(
+    search: Search, judge: Judge, retuned: Fitted, model: _Model, data: _Data
+) -> None:
     """Turn the effects of a model into findings, and take those of no practical weight out of it.
     Two effects that do the same on the held-out data gain nothing beside each other, and all
     together: the slightest leaves, and the rest is judged anew."""
@@ -533,6 +540,7 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
         ]
         slight = [f for f in found if not is_practical(f.gain)]
         slight = [f for f in slight if not _supports_another(search, judge, model, f.effect)]
+        slight = [f for f in slight if not _gains_in_each(search, judge, model, data, f)]
         if len(slight) < 2:
             break
         least = min(slight, key=lambda f: f.gain.percent)
@@ -548,6 +556,22 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
             model.final = retuned
         else:
             model.final = refit(kept, model.final.linearisation) or retuned
+
+
+def _gains_in_each(
+    search: Search, judge: Judge, model: _Model, data: _Data, found: Finding
+) -> bool:
+    """Whether an effect gains where each of several records has values of its own: of currents
+    that turned, the average may be worth nothing."""
+    if len(data.bags) < 2 or data.validated:
+        return False
+    records, final = data.records, model.final
+    keys = search.keys_of(final, found.effect)
+    there = repetition.alone(records, final, data.to_fit)
+    judged, own = own_parameters.parted(there, final.hypothesis, keys)
+    after = _Shared(judged, judged, records, own).with_own(judge.problem, judged)
+    rest = model.trials[found.effect].rest
+    return is_practical(judge.gain(rest.hypothesis, after, axes=found.axes))
 
 
 def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> None:

@@ -271,14 +271,11 @@ def _pieces(t: Array, width: float) -> list[slice]:
 
 
 def _smoothed(x: Array, width: float, order: int = 0) -> Array:
-    """Columns x (N, k) through a Gaussian filter of a width in steps, or their derivative; what
-    grows steadily goes on beyond the ends."""
+    """Columns x (N, k) through a Gaussian filter of a width in steps, or their derivative."""
     from scipy.ndimage import gaussian_filter1d  # here, as all of it: fits do not need 30 MB
 
-    n = min(len(x) - 1, int(np.ceil(_REACH * width)))
-    longer = np.pad(x, ((n, n), (0, 0)), mode="reflect", reflect_type="odd")
-    out: Array = gaussian_filter1d(longer, width, axis=0, order=order, truncate=_REACH)
-    return out[n : n + len(x)]
+    out: Array = gaussian_filter1d(x, width, axis=0, order=order, truncate=_REACH)
+    return out
 
 
 def _attitude(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:
