@@ -488,9 +488,7 @@ def test_a_thrust_scale_is_tried_whatever_its_score(begun, monkeypatch):
     assert "thrust_scale" in tried and "effect 8" not in tried
 
 
-def test_thrust_of_other_axes_is_a_rival_of_drag_and_thrust_and_not_of_what_every_hull_has(
-    begun, monkeypatch
-):
+def test_thrust_of_other_axes_is_a_rival_of_drag_and_of_thrust(begun, monkeypatch):
     there, start = begun
     monkeypatch.setattr(there.patterns, "interplay", lambda rest: rest)
     for name in ("oblique_damping", "crossflow", "tether_drag", "thruster_deadband"):

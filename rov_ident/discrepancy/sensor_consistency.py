@@ -250,16 +250,16 @@ def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | Non
     (N, 3), whose integral drifts. The velocity sensor stands in for either where it is missing."""
     t, width = streams.t, _STEADY if inertial is None else _DRIFT
     inertial = np.zeros_like(measured) if inertial is None else inertial
-    if streams.has_pose:
-        drifted = streams.position - integral(t, inertial)
-    else:
-        drifted = np.einsum("kij,kj->ki", r, measured) - inertial
+    in_world = np.einsum("kij,kj->ki", r, measured)
     order, step = int(streams.has_pose), float(np.median(np.diff(t)))
-    out = inertial.copy()
+    out = np.empty_like(measured)
     for piece in _pieces(t, width):
+        own = inertial[piece] - inertial[piece][0]  # what it drifted by before is nothing here
+        way = streams.position[piece] - integral(t[piece], own)
+        drifted = way if streams.has_pose else in_world[piece] - own
         even = t[piece][0] + step * np.arange(1 + round((t[piece][-1] - t[piece][0]) / step))
-        rows = _smoothed(interpolated(t[piece], drifted[piece], even), width / step, order)
-        out[piece] += interpolated(even, rows / step**order, t[piece])
+        rows = _smoothed(interpolated(t[piece], drifted, even), width / step, order)
+        out[piece] = own + interpolated(even, rows / step**order, t[piece])
     return out
 
 
