@@ -282,14 +282,17 @@ def _attitude(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:
     """Attitudes (M, 4): short term from the gyro (M, 3), long term as measured (complementary
     filter). A bias of the gyro would tilt them all: it is estimated first, from the odometry's
     ``rate`` (M, 3), then, finer, from the tilt itself."""
-    true = gyro - np.median(gyro - rate, axis=0)
-    for _ in range(2):
-        q = measured.copy()
-        _filter_attitude(q, t, true)
-        a, b = q[:, 1:], measured[:, 1:]
-        tilt = 2.0 * (q[:, :1] * b - measured[:, :1] * a - np.cross(a, b))
-        true = true + tilt.mean(axis=0) / _ATTITUDE_TIME
-    return q
+    out = measured.copy()
+    for piece in _pieces(t, _DRIFT):
+        true = gyro[piece] - np.median(gyro[piece] - rate[piece], axis=0)
+        for _ in range(2):
+            q = measured[piece].copy()
+            _filter_attitude(q, t[piece], true)
+            a, b = q[:, 1:], measured[piece, 1:]
+            tilt = 2.0 * (q[:, :1] * b - measured[piece, :1] * a - np.cross(a, b))
+            true = true + tilt.mean(axis=0) / _ATTITUDE_TIME
+        out[piece] = q
+    return out
 
 
 @kernel
@@ -344,7 +347,9 @@ def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
 
     steps = np.diff(x, axis=0, prepend=x[:1])
     steps[gap] = 0.0
-    out: Array = lfilter([1.0], [1.0, gain - 1.0], steps, axis=0)
+    out = np.empty_like(steps)
+    for a, b in itertools.pairwise([*np.flatnonzero(gap).tolist(), len(x)]):
+        out[a:b] = lfilter([1.0], [1.0, gain - 1.0], steps[a:b], axis=0)
     return out
 
 
