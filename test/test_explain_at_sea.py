@@ -332,6 +332,24 @@ def test_what_is_found_beside_a_refuted_correction_is_not_sure():
     assert left.sensors.keys() == {"velocity_latency"} == left.unsure
 
 
+@pytest.mark.parametrize("seed", [0, 1, *more(*range(2, 8))])
+def test_a_pause_of_one_sensor_is_no_bias_of_the_other(seed):
+    """The attitude in a pause was interpolated, and what gravity is off by it passed for one."""
+    _, streams, config = streams_of("clean", "six-axis", seed, 90.0)
+    draw = np.random.default_rng(seed)
+    begins, lasts = draw.uniform(10.0, 80.0, 4), draw.uniform(1.0, 7.0, 4)
+    for clock, *others in (
+        ("t", "position", "orientation", "nu"),
+        ("imu_t", "gyro", "specific_force"),
+    ):
+        t = getattr(streams, clock)
+        since = t[:, None] - begins
+        there = ~((since > 0.0) & (since < lasts)).any(axis=1)
+        paused = {name: getattr(streams, name)[there] for name in (clock, *others)}
+        found, _ = sensors_of(dataclasses.replace(streams, **paused), config)
+        assert "imu_bias" not in found, clock
+
+
 def test_without_pose_and_imu_no_sensor_is_judged():
     streams, _ = turning()
     assert sensors_of(streams, a_configuration())[0] == {}

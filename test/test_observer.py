@@ -8,7 +8,7 @@ import pytest
 import textbook
 
 from rov_ident.core.jit import record
-from rov_ident.core.runge_kutta import NODES, runge_kutta
+from rov_ident.core.runge_kutta import NODES, linear_step, runge_kutta
 from rov_ident.estimation import observer
 from rov_ident.model.equations import momentum_columns
 
@@ -27,6 +27,21 @@ def test_the_runge_kutta_step_is_the_textbooks():
     x = np.array([0.7, -0.3])
     wanted = textbook.runge_kutta(lambda t, y: np.array([y[1], t - np.sin(y[0])]), 0.0, x, 0.1)
     np.testing.assert_allclose(pendulum(x, 0.1), wanted, rtol=1e-14)
+
+
+@numba.njit(cache=True)
+def small_change(jacobian):
+    work, transition, held = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    linear_step(jacobian, work, transition, held)
+    return transition, held
+
+
+def test_a_small_change_moves_as_the_step_moves_a_linear_motion():
+    draw = np.random.default_rng(4)
+    jacobian, x, push = draw.normal(size=(6, 6)), draw.normal(size=6), draw.normal(size=6)
+    wanted = textbook.runge_kutta(lambda t, y: jacobian @ y / 0.1 + push, 0.0, x, 0.1)
+    transition, held = small_change(jacobian)
+    np.testing.assert_allclose(transition @ x + 0.1 * held @ push, wanted, rtol=1e-12)
 
 
 @numba.njit(cache=True)

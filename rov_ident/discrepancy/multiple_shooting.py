@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.jit import copy, floats, inner, record, released
-from rov_ident.core.runge_kutta import NODES, runge_kutta
+from rov_ident.core.runge_kutta import NODES, linear_step, multiply, runge_kutta
 from rov_ident.effects import Acting, act, add_surroundings, memory, surrounds
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import (
@@ -198,7 +198,7 @@ _SCRATCH = record(
         *floats((6, _LANES), "nearby nearby_h"),
         ("nearby_mass", "f8", (6, 6, _LANES)),
         ("nearby_extended", "f8", (EXTENDED_SIZE, _LANES)),
-        *floats((6, 6), "by_velocity jacobian square"),
+        *floats((6, 6), "by_velocity jacobian work held"),
         ("current", CURRENT),
     ]
 )
@@ -262,34 +262,11 @@ def _differentiate(
 
 
 @inner
-def _times(a, b, scale, out):
-    """out = scale a @ b, all (6, 6): quicker than BLAS by what a call of it costs."""
-    for i in range(6):
-        for j in range(6):
-            out[i, j] = 0.0
-        for k in range(6):
-            for j in range(6):
-                out[i, j] += scale * a[i, k] * b[k, j]
-
-
-@inner
 def _advance(inverse, dt, s, phi, gamma):
-    """How a change of nu and of the wrench reaches the end of a step, phi and gamma (6, 6): as
-    Runge and Kutta's step of fourth order has it, which moves nu. One of second order is far off
-    where drag stops a motion within a step or two, and grows where the motion does not."""
-    _times(inverse, s.by_velocity, dt, s.jacobian)
-    _times(s.jacobian, s.jacobian, 1.0, s.square)
-    for i in range(6):
-        for j in range(6):
-            gamma[i, j] = s.jacobian[i, j] / 24.0 + (1.0 / 6.0 if i == j else 0.0)
-    _times(s.square, gamma, 1.0, phi)
-    for i in range(6):
-        for j in range(6):
-            s.square[i, j] = phi[i, j] + 0.5 * s.jacobian[i, j] + (1.0 if i == j else 0.0)
-    _times(s.jacobian, s.square, 1.0, phi)
-    for i in range(6):
-        phi[i, i] += 1.0
-    _times(s.square, inverse, dt, gamma)
+    """How a change of nu and of the wrench reaches the end of a step, phi and gamma (6, 6)."""
+    multiply(inverse, s.by_velocity, dt, s.jacobian)
+    linear_step(s.jacobian, s.work, phi, s.held)
+    multiply(s.held, inverse, dt, gamma)
 
 
 @released

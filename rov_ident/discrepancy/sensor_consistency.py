@@ -133,7 +133,7 @@ def comparisons(
     if inertial is not None:
         down = inertial.rotation[:, 2]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
-        inside = (streams.t >= streams.imu_t[0]) & (streams.t <= streams.imu_t[-1])
+        inside = _read(streams.imu_t, streams.t)
         t = streams.t[inside]
         y = (np.einsum("kij,kj->ki", r, here.linear) - inertial.velocity)[inside]
         columns = [
@@ -167,6 +167,14 @@ def comparisons(
         for name, t, y, columns in made
         if len(t) > FEWEST
     ]
+
+
+def _read(t: Array, at: Array) -> NDArray[np.bool_]:
+    """Which instants ``at`` (M,) lie between messages, of times t (N,), of a sensor that goes on:
+    what is interpolated across a pause was not measured."""
+    after = np.searchsorted(t, at)
+    gap = np.diff(t, prepend=-np.inf, append=np.inf)
+    return (gap[after] <= _MAX_GAP) | np.isin(at, t)
 
 
 def _has_imu(streams: Streams) -> bool:
@@ -231,7 +239,8 @@ class _DeadReckoning:
     def __init__(self, streams: Streams, config: Config, imu: Reading, rate: Array) -> None:
         self._t, self._at = streams.imu_t, streams.t
         q = orientation_at(streams, streams.imu_t)
-        self.rotation = quaternion_to_matrix(_attitude(q, streams.imu_t, imu.gyro, rate))
+        known = _read(streams.t, streams.imu_t)
+        self.rotation = quaternion_to_matrix(_attitude(q, known, streams.imu_t, imu.gyro, rate))
         lever, force = np.array(config.imu.position), imu.specific_force
         if lever.any():
             turn = np.gradient(imu.gyro, streams.imu_t, axis=0)
@@ -278,32 +287,37 @@ def _smoothed(x: Array, width: float, order: int = 0) -> Array:
     return out
 
 
-def _attitude(measured: Array, t: Array, gyro: Array, rate: Array) -> Array:
+def _attitude(
+    measured: Array, known: NDArray[np.bool_], t: Array, gyro: Array, rate: Array
+) -> Array:
     """Attitudes (M, 4): short term from the gyro (M, 3), long term as measured (complementary
-    filter). A bias of the gyro would tilt them all: it is estimated first, from the odometry's
-    ``rate`` (M, 3), then, finer, from the tilt itself."""
+    filter) where they are ``known`` (M,): not while the odometry pauses. A bias of the gyro would
+    tilt them all: it is estimated first, from the odometry's ``rate`` (M, 3), then, finer, from the
+    tilt itself."""
     out = measured.copy()
     for piece in _pieces(t, _DRIFT):
-        true = gyro[piece] - np.median(gyro[piece] - rate[piece], axis=0)
+        there = known[piece] if known[piece].any() else ~known[piece]
+        true = gyro[piece] - np.median((gyro[piece] - rate[piece])[there], axis=0)
         for _ in range(2):
             q = measured[piece].copy()
-            _filter_attitude(q, t[piece], true)
+            _filter_attitude(q, there, t[piece], true)
             a, b = q[:, 1:], measured[piece, 1:]
             tilt = 2.0 * (q[:, :1] * b - measured[piece, :1] * a - np.cross(a, b))
-            true = true + tilt.mean(axis=0) / _ATTITUDE_TIME
+            true = true + tilt[there].mean(axis=0) / _ATTITUDE_TIME
         out[piece] = q
     return out
 
 
 @kernel
-def _filter_attitude(q, t, rate):
-    """Attitudes q (M, 4) become those of the gyro's rate (M, 3), drawn to the given ones slowly."""
+def _filter_attitude(q, known, t, rate):
+    """Attitudes q (M, 4) become those of the gyro's rate (M, 3), drawn slowly to the given ones
+    where these are ``known`` (M,), from the first of which they begin anew."""
     for i in range(1, len(t)):
         dt = t[i] - t[i - 1]
-        if dt > _MAX_GAP:
+        if dt > _MAX_GAP or (known[i] and not known[i - 1]):
             continue
         ahead = turned(q[i - 1], 0.5 * (rate[i - 1] + rate[i]) * dt)
-        gain = dt / (_ATTITUDE_TIME + dt)
+        gain = dt / (_ATTITUDE_TIME + dt) if known[i] else 0.0
         size = 0.0
         for j in range(4):
             q[i, j] = ahead[j] + gain * (q[i, j] - ahead[j])

@@ -12,7 +12,7 @@ with the regressor Y of ``tau = known + Y theta``. A measurement corrects nu, P 
 """
 
 from rov_ident.core.jit import floats, inlined, reordered
-from rov_ident.core.runge_kutta import NODES, runge_kutta
+from rov_ident.core.runge_kutta import NODES, linear_step, multiply, runge_kutta
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import columns, extend_inputs, generalized_force
 
@@ -31,7 +31,7 @@ OBSERVER = [
     *floats((6,), "force slope guide nu_dot end middle middle_nu_dot"),
     # of the mass matrix, zero for components that are guided; d nu_dot / d nu; Phi; Gamma, from a
     # wrench in the step to the velocity at its end
-    *floats((6, 6), "inverse jacobian square transition into product"),
+    *floats((6, 6), "inverse jacobian held transition into product"),
 ]
 """Fields of the work space. The caller sets mass, one_mass, inverse, force, slope and guide, and
 the inputs by :func:`take_inputs`."""
@@ -93,32 +93,8 @@ def linearised_step(structure, theta, one_theta, nu, late, dt, s):
             for j in range(6):
                 total -= s.inverse[i, j] * (s.h[j, 1 + k] - s.h[j, 0])
             s.jacobian[i, k] = total * (dt / _SHIFT)
-    _product(s.jacobian, s.jacobian, s.square)
-    for i in range(6):
-        for j in range(6):
-            s.into[i, j] = s.jacobian[i, j] / 24.0 + (1.0 / 6.0 if i == j else 0.0)
-    _product(s.square, s.into, s.transition)
-    for i in range(6):
-        for j in range(6):
-            unit = 1.0 if i == j else 0.0
-            s.square[i, j] = unit + 0.5 * s.jacobian[i, j] + s.transition[i, j]
-    _product(s.jacobian, s.square, s.transition)
-    for i in range(6):
-        s.transition[i, i] += 1.0
-        for j in range(6):
-            s.square[i, j] *= dt
-    _product(s.square, s.inverse, s.into)
-
-
-@inlined
-def _product(a, b, out):
-    """out = a @ b, all (6, 6)."""
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += a[i, k] * b[k, j]
-            out[i, j] = total
+    linear_step(s.jacobian, s.product, s.transition, s.held)
+    multiply(s.held, s.inverse, dt, s.into)
 
 
 @inlined
