@@ -137,8 +137,10 @@ def despike(past, here, after, last, variance, usual, floor, share, exact, rates
         spread = max(np.sqrt(usual[i]), floor[i])
         near = GATE * max(spread, share * min(abs(before), abs(after[i])))
         returns = min(abs(after[i] - before), abs(last[i] - before)) <= near
-        two = i < rates and abs(last[i] - before) <= near
-        two = two and min(there, abs(last[i] - after[i])) > 2.0 * near
+        again = 3.0 * near  # what has inertia turns on meanwhile: three intervals
+        two = i < rates and abs(last[i] - before) <= again
+        two = two and min(there, abs(last[i] - after[i])) > 2.0 * again
+        returns = returns or two
         past[0, i], past[1, i] = past[1, i], came
         # between two levels, or beyond the new one by less than the step: controllers overshoot
         passes = back <= abs(after[i] - before)
@@ -153,9 +155,9 @@ def despike(past, here, after, last, variance, usual, floor, share, exact, rates
                 variance[i] = 0.5 * (there * there + back * back)
             continue
         usual[i] += _MEMORY * (min(distance, GATE * spread) ** 2 - usual[i])
-        moves = abs(before - earlier)
-        if (came - before) * (after[i] - came) > 0.0:
-            moves = max(moves, abs(last[i] - after[i]))
+        moves, move_on = abs(before - earlier), abs(last[i] - after[i])
+        on_a_way = (came - before) * (after[i] - came) > 0.0
+        moves = max(moves, move_on) if on_a_way else min(moves, move_on)
         near = max(GATE * spread, _CALM * moves)
         if is_command and back < near < there and after[i] == last[i]:
             near = GATE * exact[i]
