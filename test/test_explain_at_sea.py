@@ -20,7 +20,10 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
     velocity_of_arm,
 )
+from rov_ident.core.linalg import interpolated
+from rov_ident.core.messages import ODOMETRY
 from rov_ident.discrepancy import (
+    clock_errors,
     patterns,
     rates_and_attitude,
     search,
@@ -31,11 +34,12 @@ from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import split
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import Fitted
+from rov_ident.discrepancy.results import Finding, Gain
 from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
-from rov_ident.sampling.raw_streams import Streams, gather
+from rov_ident.sampling.raw_streams import Streams, gather, orientation_at
 
 
 def streams_of(case, driving, seed, seconds=60.0, draw=None):
@@ -360,6 +364,52 @@ def test_without_pose_and_imu_no_sensor_is_judged():
 
 def sensors_of(streams, config):
     return sensor_consistency.search(streams, config, split(streams.duration)[0])
+
+
+@pytest.mark.parametrize("driving", ["pilot", "six-axis"])
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+def test_clocks_that_are_off_make_nothing_sure(driving, seed):
+    _, streams, config = streams_of("clean", driving, seed, 120.0)
+    assert clock_errors.of([streams], config) == clock_errors.ClockErrors(0.0, 0.0)
+    gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
+    drag, lag, turned = (
+        Finding(name, ("X",), {}, None, gain, True, None, (), "")
+        for name in ("quadratic_damping", "thruster_lag", "sensor_misalignment")
+    )
+    by = np.random.default_rng(seed).uniform(0.02, 0.06)
+    wrench = dataclasses.replace(streams, demand_t=streams.demand_t + by)
+    clocks = clock_errors.of([streams, wrench], config)
+    assert clocks.ahead == pytest.approx(by, abs=0.01) and not clocks.behind
+    assert [clocks.beside(f).separable for f in (drag, lag, turned)] == [False, False, True]
+    assert "ahead of the wrench" in clocks.notes[0]
+    since = streams.t - by
+    attitude = orientation_at(streams, since)
+    rates = interpolated(streams.t, streams.nu[:, 3:], since)
+    nu = np.hstack([streams.nu[:, :3], rates])
+    late = dataclasses.replace(streams, orientation=attitude, nu=nu)
+    clocks = clock_errors.of([late], config)
+    assert clocks.behind == pytest.approx(by, rel=0.1) and not clocks.ahead
+    assert [clocks.beside(f).separable for f in (drag, lag, turned)] == [True, False, True]
+    assert "behind the IMU" in clocks.notes[0]
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+def test_lone_velocities_that_jump_are_left_out(seed):
+    dive = dive_of("clean", "pilot", seed, 60.0)
+    config = configuration.from_parameters(dive.parameters)
+    messages = at_sea.messages_of(dive, config)
+    before = gather(messages, config)
+    assert not any("jumps there" in note for note in before.notes)
+    draw = np.random.default_rng(seed)
+    odometry = [i for i, (role, _) in enumerate(messages) if role == ODOMETRY]
+    false = sorted(draw.choice(odometry[5:-5:4], 8, replace=False).tolist())
+    for i in false:
+        role, message = messages[i]
+        wrong = message.linear + draw.choice([-1.0, 1.0], 3) * draw.uniform(0.7, 1.5, 3)
+        messages[i] = role, message._replace(linear=wrong)
+    after = gather(messages, config)
+    assert "left out: odom: velocity jumps there and back (8)" in after.notes
+    assert len(after.t) == len(before.t) - 8
 
 
 def test_a_clock_of_the_imu_is_no_latency_of_the_velocities(monkeypatch):

@@ -27,7 +27,7 @@ from rov_ident.experiment.design import Limits, Proposal
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS
-from rov_ident.offline import archive, batch_fit
+from rov_ident.offline import archive, batch_fit, delays
 from rov_ident.offline.batch_fit import KINDS, Settings
 from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
@@ -273,7 +273,7 @@ def explain(
     read_bags = [_streams(path, given, say) for path in paths]
     judge = None if other is None else _streams(other, given, say)
     for streams, _ in read_bags:
-        seen = messages_alone.samples_of(streams)
+        seen = delays.samples_of(streams)
         messages_alone.refuse_reversed(messages_alone.of_dynamics(seen, given))
     found = explain_streams(
         [streams for streams, _ in read_bags], given, judge[0] if judge else None, say

@@ -14,6 +14,7 @@ from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import (
+    clock_errors,
     empirical_term,
     extension,
     own_parameters,
@@ -63,6 +64,7 @@ _SLIGHT = 0.1  # of the same: 99 % of its power are explained
 _NEAR_NOISE = 3.0  # times what noise makes of a prediction: coefficients are not exact, either
 _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
 _LIKE_ITS_MASS = ("added_mass_coupling", "coriolis", "battery_sag")  # ... of a payload
+_OF_A_DIVE = ("ocean_current", HEADING)  # not the vehicle's
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
@@ -82,6 +84,10 @@ _OWN_DELAYS = (
 _OWN_VALUES = (
     "each record has {} of its own: the extended configuration has none, and is judged here with "
     "what each record has"
+)
+_OF_THIS_DIVE = (
+    "{} may belong to this dive alone: take it out of the extended configuration to simulate "
+    "another, or explain several dives together"
 )
 _ONE_VALUE = "the records differ in {}: the extended configuration has one value for all"
 _FILTERED = (
@@ -223,7 +229,10 @@ def explain(
     notes += [_OWN_HEADINGS] if any(data.headings) else []
     notes += [_OWN_DELAYS] if data.delays else []
     notes += shared.notes
+    passing = [name for name in _OF_A_DIVE if name in best.effects]
+    notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
     notes += [_FILTERED] if data.late else []
+    notes += data.clocks.notes
     notes += [_NO_TORQUE] if data.streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
@@ -255,8 +264,8 @@ class _Data:
     fit in the spans ``to_fit``, and those ``judged`` in the spans ``to_judge``; the latter as
     ``recorded``. ``headings`` and ``delays`` that were taken off each bag; the ``choice`` of sensor
     effects, their ``findings``, and those of practical weight, ``sensors``, which were taken off.
-    Whether a filter makes velocities ``late``, and whether the heading ``may_drift`` where a gyro
-    was taken for biased."""
+    Whether a filter makes velocities ``late``, whether the heading ``may_drift`` where a gyro was
+    taken for biased, and the errors of the ``clocks``."""
 
     bags: Sequence[Streams]
     streams: Streams
@@ -271,6 +280,7 @@ class _Data:
     sensors: Sensors
     late: bool
     may_drift: bool
+    clocks: clock_errors.ClockErrors
 
     @property
     def records(self) -> repetition.Records:
@@ -286,6 +296,7 @@ class _Data:
 def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None) -> _Data:
     rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
     bags = [r.streams for r in rates]
+    clocks = clock_errors.of(bags, config)
     if validate is not None:
         validate = rates_and_attitude.agreed(validate, config).streams
     with_others = [*bags, *([] if validate is None else [validate])]
@@ -327,6 +338,7 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
         sensors,
         any(r.late for r in rates),
         any(r.may_drift for r in rates),
+        clocks,
     )
 
 
@@ -413,6 +425,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
     if data.may_drift:
         found = list(map(unsure, found))
     found = [unsure(f) if _is_between_readings(f, data.streams) else f for f in found]
+    found = list(map(data.clocks.beside, found))
     found = _beside_a_payload(found)
     return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
 

@@ -12,17 +12,14 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix, turns
-from rov_ident.core.linalg import integral, interpolated, scaled_inverse, scaled_solve
+from rov_ident.core.linalg import integral
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
-from rov_ident.model.scales import authority
-from rov_ident.offline.batch_fit import AT_REST
-from rov_ident.offline.filtered_regression import filtered_rows, regression
-from rov_ident.offline.least_squares import PERIOD
+from rov_ident.offline import delays
+from rov_ident.offline.delays import Delay
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams
-from rov_ident.sampling.sample import SAMPLE
 from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
@@ -30,10 +27,7 @@ _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) 
 _DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
 _SURELY = 5.0  # standard deviations: these are of the noise alone, and clean dives reach 4.5
 _FIRST_ORDER = 1.0  # s; a longer delay is beyond the manoeuvres about which it is linear
-_CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
-_FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes, ...
-_FEWEST_TIMED = 100  # ... and fewer than these nothing of delays
-_FEWEST_ROWS = 20  # of filtered wrench and motion; about as many as there are coefficients
+_FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes
 _UPWARD = 0.9  # g; mean specific force upward; a sign or an axis that is wrong gives 0.7 or less
 _SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
 _REVERSED = -0.3  # correlation of two measurements of one thing; below it the sign is wrong
@@ -100,8 +94,8 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         text += "check vehicle.frame (frd: z down, flu: z up), vehicle.cob and vehicle.cog"
         remarks.append(Remark("vehicle.frame", BAD, text))
     r = quaternion_to_matrix(streams.orientation)
-    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
     if len(streams.imu_t) > _FEWEST_IMU:
+        mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
         attitude = r[np.clip(np.searchsorted(streams.t, streams.imu_t), 0, len(r) - 1)]
         force = np.einsum("kij,jl,kl->ki", attitude, mounting, streams.specific_force)
         mean = np.median(force, axis=0)
@@ -113,8 +107,7 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
             text += f"{-config.gravity:.1f}: check the frame id of the IMU, frames.body and "
             text += "imu.rotation"
         remarks.append(Remark("imu axes", level, text))
-        gyro = interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
-        rate = streams.nu[:, 3:]
+        gyro, rate = delays.gyro_at(streams, config), streams.nu[:, 3:]
         remarks.append(_agreement("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
     step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
     remarks += _rates_and_turns(streams, step)
@@ -123,10 +116,9 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
         told, axes = way[step:] - way[:-step], ("north", "east", "down")
         remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
-    if len(streams.imu_t) > _FEWEST_TIMED:
-        known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
-        lag = _lag(streams.t[known], gyro[known], rate[known])
-        remarks.append(_delay_remark("odometry behind the IMU", *lag))
+    late = delays.odometry_behind_imu(streams, config)
+    if late is not None:
+        remarks.append(_delay_remark("odometry behind the IMU", late))
     return remarks
 
 
@@ -184,21 +176,11 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     """
     if samples["inputs"].any():
         return []  # fins and propellers drive it, too: the wrench alone does not say where it goes
-    task = regression(config, _CORNER)
-    still = samples.copy()
-    for name in ("nu", "down", "down_slope"):
-        still[name] = 0.0
-    phi = filtered_rows(task, samples, PERIOD)
-    wrench = filtered_rows(task, still, PERIOD)[:, :, -1]
-    if len(phi) < _FEWEST_ROWS or len(phi) != len(wrench):
+    rows = delays.filtered(samples, config)
+    if rows is None or (is_without_velocity(samples) and not rows.driven.any()):
         return []
-    size = np.sqrt(np.mean(wrench**2, axis=0))
-    if is_without_velocity(samples):  # forces drive what is simulated itself
-        size[:3] = 0.0
-        if not np.any(size > AT_REST * authority(config.dynamics)):
-            return []
-    driven = size > AT_REST * authority(config.dynamics)
-    subject, moved = "wrench against motion", wrench - phi[:, :, -1]
+    wrench, driven, size = rows.wrench, rows.driven, np.sqrt(np.mean(rows.wrench**2, axis=0))
+    subject, moved = "wrench against motion", wrench - rows.phi[:, :, -1]
     if not driven.any():
         return [Remark(subject, BAD, "no axis is driven: nothing can be identified")]
     if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
@@ -213,9 +195,9 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         "the vehicle goes where it is pushed",
         -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
-    late = _delay_remark("motion behind the wrench", *_wrench_lag(driven, phi, wrench))
-    half = len(phi) // 2
-    halves = [_wrench_lag(driven, phi[part], wrench[part]) for part in np.s_[:half, half:]]
+    late = _delay_remark("motion behind the wrench", delays.motion_behind_wrench(rows))
+    half = len(wrench) // 2
+    halves = [delays.motion_behind_wrench(rows.part(part)) for part in np.s_[:half, half:]]
     return [push, late, *_drift_remark(*halves)]
 
 
@@ -227,78 +209,25 @@ def _correlation(a: Array, b: Array) -> float:
     return max(about_zero, float(np.corrcoef(a, b)[0, 1]))
 
 
-def samples_of(streams: Streams) -> NDArray[np.void]:
-    """Samples (N,) of SAMPLE at the odometry messages, as far as :func:`of_dynamics` needs them."""
-    samples = np.zeros(len(streams.t), dtype=SAMPLE)
-    dt = np.diff(streams.t, prepend=streams.t[0])
-    impulse = np.concatenate(
-        [np.zeros((1, 6)), np.cumsum(np.diff(streams.demand_t)[:, None] * streams.demand[:-1], 0)]
-    )
-    at = interpolated(streams.demand_t, impulse, streams.t)
-    samples["t"], samples["dt"], samples["nu"] = streams.t, dt, streams.nu
-    samples["restart"] = (dt <= 0.0) | (dt > LONGEST_INTERVAL)
-    samples["wrench"][1:] = np.diff(at, axis=0) / np.maximum(dt[1:, None], 1e-9)
-    if len(streams.inputs_t):
-        samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, streams.t)
-    samples["down"] = quaternion_to_matrix(streams.orientation)[:, 2]
-    samples["down_slope"][1:] = np.diff(samples["down"], axis=0) / np.maximum(dt[1:, None], 1e-9)
-    return samples
-
-
-def _delay_remark(subject: str, lag: float, std: float) -> Remark:
-    text = f"{1e3 * lag:.1f} ± {1e3 * NORMAL * std:.1f} ms (95 %)"
-    if not np.isfinite(lag):
+def _delay_remark(subject: str, late: Delay) -> Remark:
+    text = f"{1e3 * late.value:.1f} ± {1e3 * NORMAL * late.std:.1f} ms (95 %)"
+    if not np.isfinite(late.value):
         return Remark(subject, WARNING, "cannot be told: nothing moves")
-    if abs(lag) > _FIRST_ORDER:
+    if abs(late.value) > _FIRST_ORDER:
         return Remark(subject, WARNING, "cannot be told: the one does not follow the other")
-    if abs(lag) > max(_DELAY, 3.0 * std):
+    if abs(late.value) > max(_DELAY, 3.0 * late.std):
         more = ", or let explain look for thruster lag and delay" if "wrench" in subject else ""
         return Remark(subject, WARNING, f"{text}: check the time stamps{more}")
     return Remark(subject, GOOD, text)
 
 
-def _drift_remark(first: tuple[float, float], last: tuple[float, float]) -> list[Remark]:
-    """That a delay, with its error, differs between the halves of the record; else nothing."""
-    moved, std = last[0] - first[0], float(np.hypot(first[1], last[1]))
+def _drift_remark(first: Delay, last: Delay) -> list[Remark]:
+    """That a delay differs between the halves of the record; else nothing."""
+    moved, std = last.value - first.value, float(np.hypot(first.std, last.std))
     if not max(_DELAY, _SURELY * std) < abs(moved) < _FIRST_ORDER:
         return []
     text = (
-        f"{1e3 * first[0]:.0f} ms in the first half, {1e3 * last[0]:.0f} ms in the second: do the "
-        "clocks that stamp them run apart, or did something change?"
+        f"{1e3 * first.value:.0f} ms in the first half, {1e3 * last.value:.0f} ms in the second: "
+        "do the clocks that stamp them run apart, or did something change?"
     )
     return [Remark("motion behind the wrench, by halves", WARNING, text)]
-
-
-def _lag(t: Array, early: Array, late: Array) -> tuple[float, float]:
-    """By how much ``late`` (k, n) follows ``early`` [s], to first order, and its error."""
-    slope = np.gradient(early, t, axis=0)
-    power = float(np.sum(slope**2))
-    if power < 1e-6 * len(t):
-        return np.nan, np.nan
-    off = late - early
-    off = off - off.mean(axis=0)
-    lag = -float(np.sum(off * slope)) / power
-    left = off + lag * slope
-    return lag, float(np.sqrt(np.mean(left**2) / power))
-
-
-def _wrench_lag(driven: Array, phi: Array, wrench: Array) -> tuple[float, float]:
-    """Delay between wrench and motion, the coefficients refitted along with it; rows phi (K, 6, n +
-    1) = [Phi y], filtered wrench (K, 6). tau(t - d) is tau - d tau': the wrench's derivative is one
-    more column, and the delay its factor."""
-    slope = np.gradient(wrench, PERIOD, axis=0)
-    table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)[1:-1]
-    n = table.shape[2] - 1
-    if not driven.any() or len(table) < 5 * n:
-        return np.nan, np.nan
-    weight = np.where(driven, 1.0 / np.maximum(np.mean(wrench**2, axis=0), 1e-12), 0.0)
-    prior = np.append(np.ones(n - 1), 0.0)
-    for _ in range(3):
-        a = np.einsum("kai,a,kaj->ij", table, weight, table)
-        normal = a[:n, :n] + np.diag(prior)
-        x = scaled_solve(normal, a[:n, n])
-        left = table[:, :, n] - table[:, :, :n] @ x
-        weight = np.where(driven, 1.0 / np.maximum(np.mean(left**2, axis=0), 1e-12), 0.0)
-    # rows closer than the filter's memory repeat each other
-    variance = scaled_inverse(normal)[-1, -1] * 2.0 / (_CORNER * PERIOD)
-    return float(x[-1]), float(np.sqrt(variance))

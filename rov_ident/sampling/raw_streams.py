@@ -16,14 +16,16 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, to_core
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
-from rov_ident.core.noise import second_differences
+from rov_ident.core.noise import robust_std, second_differences
 from rov_ident.model.coefficients import AXES, INPUTS, VELOCITIES
+from rov_ident.model.scales import authority
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
 _USUAL = 2.0  # a choice: times what 99 % of the messages keep to
+_SPIKE = 10.0  # standard deviations of what velocities change by: no noise reaches that
 # of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
 # a tenth as noisy; without noise the sum of true velocities is a fifth of it off
 _RECKONED = 0.1
@@ -113,7 +115,8 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
     """
     taken, counts = _accepted(messages, config)
     imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
-    odometry = _while_commanded(taken[ODOMETRY], [t for t, _ in wrench], config.timeout, counts)
+    odometry = _without_spikes(taken[ODOMETRY], config, counts)
+    odometry = _while_commanded(odometry, [t for t, _ in wrench], config.timeout, counts)
     for name, found in (("odometry", odometry), ("wrench", wrench)):
         if len(found) < 2:
             raise UserError(f"the bag holds no usable {name} messages")
@@ -251,6 +254,28 @@ def _despiked(
     outliers = {i for indices in lone for i in indices}
     counts[f"{role}: outlier"] += len(outliers)
     return [taken[i] for i in range(len(taken)) if i not in outliers]
+
+
+def _without_spikes(
+    odometry: list[tuple[float, Any]], config: Config, counts: Counter[str]
+) -> list[tuple[float, Any]]:
+    """The messages without those whose linear velocity jumps there and back: by more than noise,
+    and by more than the working wrench moves the vehicle from one message to the next."""
+    if len(odometry) < 3:
+        return odometry
+    t = np.array([t for t, _ in odometry])
+    v = np.array([m.linear for _, m in odometry])
+    there, back = v[1:-1] - v[:-2], v[1:-1] - v[2:]
+    off = np.where(there * back > 0.0, np.minimum(np.abs(there), np.abs(back)), 0.0)
+    agility = authority(config.dynamics)[:3] / np.diag(config.dynamics.mass_matrix)[:3]
+    moved = np.maximum(np.diff(t)[:-1], np.diff(t)[1:])[:, None] * agility
+    spike = (off > np.maximum(_SPIKE * robust_std(there), moved)).any(axis=1)
+    counts["odom: velocity jumps there and back"] += int(spike.sum())
+    return [
+        odometry[0],
+        *(m for m, drop in zip(odometry[1:-1], spike, strict=True) if not drop),
+        odometry[-1],
+    ]
 
 
 def _continuous(q: Array) -> Array:

@@ -1,0 +1,78 @@
+"""What the clocks of wrench, odometry and IMU do to each other, and what is not sure beside it.
+
+A delay of thrust moves the motion behind the wrench. No cause moves it ahead: then stamps are
+wrong, and any effect that looks like earlier thrust (the forces of added mass do) is made of that.
+And a late attitude is behind the thrust like late thrust, but behind the gyro, too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rov_ident.config import Config
+from rov_ident.discrepancy.findings import unsure
+from rov_ident.discrepancy.results import Finding
+from rov_ident.discrepancy.search import LATE_THRUST
+from rov_ident.effects import EFFECTS
+from rov_ident.offline import delays
+from rov_ident.sampling.raw_streams import Streams
+
+_AHEAD = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
+# 45 simulated dives with exact stamps, while 15 ms of a wrong clock made 17
+_SURELY = 5.0  # standard deviations: these are of the noise alone
+
+
+@dataclass(frozen=True)
+class ClockErrors:
+    """The longest times [s] by which the motion is ahead of the wrench, and the odometry's attitude
+    and rates behind the gyro; zero where they surely are not."""
+
+    ahead: float
+    behind: float
+
+    @property
+    def notes(self) -> list[str]:
+        """What is wrong, in words."""
+        told = []
+        if self.ahead:
+            told.append(
+                f"the motion is {1e3 * self.ahead:.0f} ms ahead of the wrench, as nothing that "
+                "thrusts can be: correct the time stamps; no cause is sure beside that"
+            )
+        if self.behind:
+            told.append(
+                f"attitude and angular velocities of the odometry are {1e3 * self.behind:.0f} ms "
+                "behind the IMU: correct the time stamps; whether thrust is late is not sure"
+            )
+        return told
+
+    def beside(self, found: Finding) -> Finding:
+        """The finding, not sure where wrong stamps may have made it."""
+        made = self.ahead and not EFFECTS[found.effect].of_sensors
+        late = self.behind and found.effect in LATE_THRUST
+        return unsure(found) if made or late else found
+
+
+def of(bags: Sequence[Streams], config: Config) -> ClockErrors:
+    """The errors of the clocks of some bags, the worst of each kind."""
+    return ClockErrors(
+        max(_ahead(bag, config) for bag in bags), max(_behind(bag, config) for bag in bags)
+    )
+
+
+def _ahead(streams: Streams, config: Config) -> float:
+    if len(streams.inputs_t):
+        return 0.0  # fins and propellers drive it, too: the wrench alone does not say when
+    rows = delays.filtered(delays.samples_of(streams), config)
+    late = delays.NO_DELAY if rows is None else delays.motion_behind_wrench(rows)
+    return -late.value if late.value < -max(_AHEAD, _SURELY * late.std) else 0.0
+
+
+def _behind(streams: Streams, config: Config) -> float:
+    """The gyro's stamp may be anywhere in the interval that it reads."""
+    late = delays.odometry_behind_imu(streams, config)
+    if late is None:
+        return 0.0
+    half = 0.5 * float(np.median(np.diff(streams.imu_t)))
+    return late.value if late.value > max(half, _SURELY * late.std) else 0.0

@@ -1,0 +1,136 @@
+"""By how much the motion is behind the wrench, and the odometry behind the IMU.
+
+Both are told without a simulation: the gyro reads what the odometry's attitude and rates follow,
+and filtered wrench and motion are one regression, with the delay as one more coefficient.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
+from rov_ident.core.messages import Array
+from rov_ident.model.scales import authority
+from rov_ident.offline.batch_fit import AT_REST
+from rov_ident.offline.filtered_regression import filtered_rows, regression
+from rov_ident.offline.least_squares import PERIOD
+from rov_ident.sampling.queues import LONGEST_INTERVAL
+from rov_ident.sampling.raw_streams import Streams
+from rov_ident.sampling.sample import SAMPLE
+from rov_ident.sampling.without_velocity import is_without_velocity
+
+_CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
+_FEWEST_TIMED = 100  # messages of the IMU; fewer say nothing of delays
+_FEWEST_ROWS = 20  # of filtered wrench and motion; about as many as there are coefficients
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay [s] and its standard deviation; NaN where nothing moves."""
+
+    value: float
+    std: float
+
+
+NO_DELAY = Delay(np.nan, np.nan)
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """Filtered wrench (K, 6), motion ``phi`` (K, 6, n + 1) = [Phi y] of the same regression, and
+    which axes are ``driven`` (6,)."""
+
+    phi: Array
+    wrench: Array
+    driven: NDArray[np.bool_]
+
+    def part(self, which: slice) -> "Filtered":
+        """The same of some rows."""
+        return Filtered(self.phi[which], self.wrench[which], self.driven)
+
+
+def gyro_at(streams: Streams, config: Config) -> Array:
+    """Rates (N, 3) of the gyro in body axes at the times of the odometry."""
+    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    return interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
+
+
+def odometry_behind_imu(streams: Streams, config: Config) -> Delay | None:
+    """Of the odometry's angular velocities; None without an IMU."""
+    if len(streams.imu_t) <= _FEWEST_TIMED:
+        return None
+    known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
+    gyro, rate = gyro_at(streams, config)[known], streams.nu[known, 3:]
+    return _lag(streams.t[known], gyro, rate)
+
+
+def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
+    """Wrench and motion of samples (k,) of SAMPLE, filtered alike; None where there are too few."""
+    task = regression(config, _CORNER)
+    still = samples.copy()
+    for name in ("nu", "down", "down_slope"):
+        still[name] = 0.0
+    phi = filtered_rows(task, samples, PERIOD)
+    wrench = filtered_rows(task, still, PERIOD)[:, :, -1]
+    if len(phi) < _FEWEST_ROWS or len(phi) != len(wrench):
+        return None
+    size = np.sqrt(np.mean(wrench**2, axis=0))
+    if is_without_velocity(samples):  # forces drive what is simulated itself
+        size[:3] = 0.0
+    return Filtered(phi, wrench, size > AT_REST * authority(config.dynamics))
+
+
+def samples_of(streams: Streams) -> NDArray[np.void]:
+    """Samples (N,) of SAMPLE at the odometry messages, as far as :func:`filtered` needs them."""
+    samples = np.zeros(len(streams.t), dtype=SAMPLE)
+    dt = np.diff(streams.t, prepend=streams.t[0])
+    impulse = np.concatenate(
+        [np.zeros((1, 6)), np.cumsum(np.diff(streams.demand_t)[:, None] * streams.demand[:-1], 0)]
+    )
+    at = interpolated(streams.demand_t, impulse, streams.t)
+    samples["t"], samples["dt"], samples["nu"] = streams.t, dt, streams.nu
+    samples["restart"] = (dt <= 0.0) | (dt > LONGEST_INTERVAL)
+    samples["wrench"][1:] = np.diff(at, axis=0) / np.maximum(dt[1:, None], 1e-9)
+    if len(streams.inputs_t):
+        samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, streams.t)
+    samples["down"] = quaternion_to_matrix(streams.orientation)[:, 2]
+    samples["down_slope"][1:] = np.diff(samples["down"], axis=0) / np.maximum(dt[1:, None], 1e-9)
+    return samples
+
+
+def _lag(t: Array, early: Array, late: Array) -> Delay:
+    """By how much ``late`` (k, n) follows ``early`` [s], to first order."""
+    slope = np.gradient(early, t, axis=0)
+    power = float(np.sum(slope**2))
+    if power < 1e-6 * len(t):
+        return NO_DELAY
+    off = late - early
+    off = off - off.mean(axis=0)
+    lag = -float(np.sum(off * slope)) / power
+    left = off + lag * slope
+    return Delay(lag, float(np.sqrt(np.mean(left**2) / power)))
+
+
+def motion_behind_wrench(rows: Filtered) -> Delay:
+    """The coefficients are refitted along with it: tau(t - d) is tau - d tau', so the derivative of
+    the wrench is one more column, and the delay its factor."""
+    phi, wrench, driven = rows.phi, rows.wrench, rows.driven
+    slope = np.gradient(wrench, PERIOD, axis=0)
+    table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)[1:-1]
+    n = table.shape[2] - 1
+    if not driven.any() or len(table) < 5 * n:
+        return NO_DELAY
+    weight = np.where(driven, 1.0 / np.maximum(np.mean(wrench**2, axis=0), 1e-12), 0.0)
+    prior = np.append(np.ones(n - 1), 0.0)
+    for _ in range(3):
+        a = np.einsum("kai,a,kaj->ij", table, weight, table)
+        normal = a[:n, :n] + np.diag(prior)
+        x = scaled_solve(normal, a[:n, n])
+        left = table[:, :, n] - table[:, :, :n] @ x
+        weight = np.where(driven, 1.0 / np.maximum(np.mean(left**2, axis=0), 1e-12), 0.0)
+    # rows closer than the filter's memory repeat each other
+    variance = scaled_inverse(normal)[-1, -1] * 2.0 / (_CORNER * PERIOD)
+    return Delay(float(x[-1]), float(np.sqrt(variance)))
