@@ -82,7 +82,10 @@ def report(heavy):
     return OnlineEstimator(heavy, "rls").report()
 
 
-def fill(store, report, names=("/rls_node", "/ukf_node"), seconds=60, seed=0):
+def fill(
+    store, report, names=("/rls_node", "/ukf_node"), seconds=60, seed=0,
+    vehicle="the_inspection_vehicle_with_the_longest_name_of_all_of_them",
+):  # fmt: skip
     """What nodes would publish in so many seconds of convergence."""
     random = np.random.default_rng(seed)
     n = len(report.names)
@@ -99,7 +102,7 @@ def fill(store, report, names=("/rls_node", "/ukf_node"), seconds=60, seed=0):
                 report, stamp=stamp, values=values, std=std, states=states,
                 lower=values - 1.96 * std, upper=values + 1.96 * std, excitation=excitation,
             )  # fmt: skip
-            store.take_report(name, "heavy", said)
+            store.take_report(name, vehicle, said)
             for j in range(4):
                 residual = random.standard_normal(6) * [3, 3, 5, 0.3, 0.2, 0.4]
                 store.take_residual(name, stamp + j * 50_000_000, residual)
@@ -108,7 +111,7 @@ def fill(store, report, names=("/rls_node", "/ukf_node"), seconds=60, seed=0):
         inputs = {"odom rate": "20.0 Hz", "imu rate": "100.0 Hz", "wrench rate": "50.0 Hz"}
         store.take_status(name, "inputs", Status(0, "all messages are used", inputs))
         store.take_status(name, "estimation", Status(0, f"{n} of {n} have converged", {}))
-    suspicion = {"score": "210", "price": "31", "share": "0.83", "alternatives": "lift coupled"}
+    suspicion = {"score": "210", "penalty": "31", "share": "0.83", "alternatives": "lift coupled"}
     store.take_status(
         names[0],
         "model",
@@ -416,6 +419,20 @@ async def _in_a_browser(report):
             "document.querySelector('[data-coefficient=X_u] .row').innerText.replace('−', '-')"
         )
         assert float(shown.split()[0]) == pytest.approx(value, rel=5e-3)
+        # Read aloud, a name is apart from its unit, and a state is a word.
+        card = "document.querySelector('[data-coefficient=X_u]')"
+        assert await page.evaluate(f"{card}.querySelector('h3').textContent") == "X_u N s/m"
+        spoken = await page.evaluate(f"{card}.querySelector('.state').getAttribute('aria-label')")
+        assert spoken == "converged"
+        # Numbers are written without powers of ten where they need none, and nothing is minus zero.
+        for expression, text in (
+            ("interval(70)", "140"), ("interval(3)", "5.9"), ("interval(1e9)", "2.0e9"),
+            ("written(-1e-9, 0.01)", "0.000"), ("written(-0.2, 0.01)", "−0.200"),
+        ):  # fmt: skip
+            assert await page.evaluate(expression) == text
+        assert "chance reaches 31" in await page.evaluate(
+            "document.querySelector('.note').textContent"
+        )
         # Under the pointer is the value of that time.
         box = await page.evaluate(
             "JSON.parse(JSON.stringify(document.querySelector('[data-coefficient=X_u] svg')"
@@ -466,6 +483,7 @@ async def _in_a_browser(report):
         # The other vehicle, on a click.
         await page.evaluate("document.querySelectorAll('nav button')[1].click()")
         await page.until("document.querySelectorAll('.tile').length == 1")
+        assert await page.evaluate("document.activeElement.textContent") == "/rov2"
         # A page of elsewhere gets nothing, whatever it tries.
         other = url.replace("127.0.0.1", "localhost")
         tried = await page.evaluate(

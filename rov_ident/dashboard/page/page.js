@@ -43,7 +43,7 @@ const namespaceOf = (name) => name.slice(0, name.lastIndexOf("/")) || "/";
 const shortName = (name) => name.slice(name.lastIndexOf("/") + 1).replace(/_node$/, "");
 const colour = (index) => `var(--colour-${index % 4})`;
 const dashed = (index) => index % 2 ? "dashed" : "";  // or one curve would hide the other
-const signed = (text) => text.replace("-", "−");
+const signed = (text) => text.replace(/^-(?=[0.]+$)/, "").replace("-", "−");  // nothing is minus zero
 
 function written(value, std) {         // two digits of the standard deviation decide
   if (value === null || value === undefined) return "–";
@@ -54,7 +54,8 @@ function written(value, std) {         // two digits of the standard deviation d
 }
 
 function interval(std) {
-  return std > 0 ? signed((1.96 * std).toPrecision(2).replace(/e\+?/, "e")) : "0";
+  const text = std > 0 ? (1.96 * std).toPrecision(2) : "0";
+  return text.includes("e+") && std < 1e6 ? String(Number(text)) : signed(text.replace("e+", "e"));
 }
 
 function duration(seconds) {
@@ -224,11 +225,11 @@ function buildHealth(main, names) {
       const model = of.model;
       note.hidden = !(model && model.level > 0);
       if (!note.hidden) {
-        const [score, price, share] = ["score", "price", "share"].map((key) => model.values[key]);
+        const [score, penalty, share] = ["score", "penalty", "share"].map((key) => model.values[key]);
         const rivals = model.values.alternatives;
         note.replaceChildren();
         element(note, "strong", "", `${shortName(name)}: ${model.message}`);
-        element(note, "p", "soft", `score ${score} (chance reaches ${price}), ` +
+        element(note, "p", "soft", `score ${score} (chance reaches ${penalty}), ` +
           `${(100 * share).toFixed(0)} % of the error` +
           (rivals ? `; or: ${rivals.split(" ").join(", ")}` : "") +
           ". A hint: `rov-ident explain` on a recording is the proof.");
@@ -268,13 +269,15 @@ function buildCoefficients(main, names, coefficients) {
   for (const coefficient of coefficients) {
     const card = element(grid, "div", "card");
     card.dataset.coefficient = coefficient;
-    const title = element(card, "h3", "", coefficient);
+    const title = element(card, "h3", "", `${coefficient} `);
     const unit = element(title, "span", "soft");
     const picture = new Picture(card, names, `${coefficient} over time`, 118);
     const rows = names.map((_, index) => {
       const row = element(card, "div", "row");
       keyOf(element(row, "span"), index, "");
-      return { row, value: element(row, "span"), state: element(row, "span", "state") };
+      const cells = { row, value: element(row, "span"), state: element(row, "span", "state") };
+      cells.state.setAttribute("role", "img");  // a sign, whose word is read aloud
+      return cells;
     });
     updates.push((start, end) => {
       let low = Infinity, high = -Infinity;
@@ -287,9 +290,10 @@ function buildCoefficients(main, names, coefficients) {
         const at = cursor === null ? null : nearest(state.history, end - cursor);
         const [v, s] = at ? [at[1][i], at[2][i]] : [state.values[i], state.std[i]];
         value.textContent = `${written(v, s)} ± ${interval(s)}`;
-        const [sign, level] = STATES[state.gone ? "stale" : state.states[i]];
+        const word = state.gone ? "stale" : state.states[i], [sign, level] = STATES[word];
         words.className = `state levels-${level}`;
         words.textContent = at ? `${duration(end - at[0])} ago` : sign;
+        words.setAttribute("aria-label", at ? words.textContent : word);
         words.title = state.messages[i];
         const points = state.history.filter(([t]) => t >= start).map(([t, values, std]) =>
           [t, values[i], values[i] - 1.96 * std[i], values[i] + 1.96 * std[i]]);
@@ -326,7 +330,7 @@ function buildResiduals(main, names) {
   const grid = element(main, "div", "grid six");
   AXES.forEach((axis, k) => {
     const card = element(grid, "div", "card");
-    const title = element(card, "h3", "", axis);
+    const title = element(card, "h3", "", `${axis} `);
     element(title, "span", "soft", k < 3 ? "N" : "N m");
     const picture = new Picture(card, names, `residual ${axis} over time`, 104);
     const rows = names.map((_, index) => {
@@ -494,6 +498,7 @@ function build(namespaces, names, coefficients) {
       location.hash = encodeURIComponent(namespace);
       built = "";
       refresh();
+      nav.querySelector("[aria-pressed=true]").focus();  // the button pressed is another element now
     });
   }
   if (!names.length) {
