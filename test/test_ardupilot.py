@@ -221,7 +221,7 @@ def test_the_command(tmp_path, dive, capsys):
     assert '"odometry": ' in result.read_text()
     assert "odometry" in capsys.readouterr().err
     assert main(["import", path, "--out", out]) == 2
-    assert "--config names the parameter file" in capsys.readouterr().err
+    assert "--config names the parameter file whose" in capsys.readouterr().err
     assert main(["import", path, path, "--config", "c", "--out", out]) == 2
     assert "one by one" in capsys.readouterr().err
 
@@ -309,27 +309,40 @@ def test_a_log_of_zero_quaternions_is_refused(tmp_path, dive):
 
 # ------------------------------------------------------------------ PX4
 
-ULOG = {  # of each topic: its fields, and their layout behind the time
-    "vehicle_local_position": ("float vx;float vy;float vz;float x;float y;float z;"
-                               "bool v_xy_valid;", "6f?"),
-    "vehicle_attitude": ("float[4] q;", "4f"),
+ULOG = {  # of each topic: its fields, and their layout behind the time, as PX4 1.15 writes them
+    "vehicle_local_position": (
+        "uint64_t timestamp_sample;float x;float y;float z;float[2] delta_xy;float delta_z;"
+        "float vx;float vy;float vz;bool xy_valid;bool z_valid;bool v_xy_valid;bool v_z_valid;"
+        "uint8_t xy_reset_counter;uint8_t z_reset_counter;uint8_t vxy_reset_counter;"
+        "uint8_t vz_reset_counter;", "Q9f4?4B"),
+    "vehicle_attitude": ("uint64_t timestamp_sample;float[4] q;", "Q4f"),
     "sensor_combined": ("float[3] gyro_rad;float[3] accelerometer_m_s2;", "6f"),
-    "actuator_motors": ("float[12] control;", "12f"),
+    "actuator_motors": ("uint64_t timestamp_sample;float[12] control;uint16_t reversible_flags;",
+                        "Q12fH"),
     "battery_status": ("float voltage_v;", "f"),
     "vehicle_status": ("uint8_t arming_state;", "B"),
 }  # fmt: skip
+LATE = 2000  # us; EKF2 publishes after the sample that it is about
 
 
-def ulog(path, dive, parameters):
-    """A log as PX4's logger writes it (docs.px4.io, "ULog File Format")."""
+def ulog(
+    path, dive, parameters, command=lambda pulses: (pulses - 1500) / 400.0, reversible=0xFF,
+    place=lambda k: ((0.0, 0.0, 0.0), (0, 0, 0, 0)), without=(), tail=b"",
+):  # fmt: skip
+    """A log as PX4's logger writes it (docs.px4.io, "ULog File Format").
+
+    ``place``: of the k-th position, what its resets have added, and their counters.
+    """
     data = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0))
+    number = {(name, 0): k for k, name in enumerate(ULOG)} | {("battery_status", 1): len(ULOG)}
 
     def add(kind, content):
         data.extend(struct.pack("<Hc", len(content), kind) + content)
 
-    def say(topic, t, *values):
+    def say(topic, t, *values, instance=0):
         layout = struct.Struct("<HQ" + ULOG[topic][1])
-        add(b"D", layout.pack([*ULOG].index(topic), t, *values))
+        if topic not in without:
+            add(b"D", layout.pack(number[topic, instance], t, *values))
 
     for name, (fields, _) in ULOG.items():
         add(b"F", f"{name}:uint64_t timestamp;{fields}".encode())
@@ -337,20 +350,25 @@ def ulog(path, dive, parameters):
         whole = isinstance(value, int)
         key = f"{'int32_t' if whole else 'float'} {name}".encode()
         add(b"P", bytes([len(key)]) + key + struct.pack("<i" if whole else "<f", value))
-    for number, name in enumerate(ULOG):
-        add(b"A", struct.pack("<BH", 0, number) + name.encode())
-    say("battery_status", 0, VOLTAGE)
+    for (name, instance), k in number.items():
+        add(b"A", struct.pack("<BH", instance, k) + name.encode())
+    say("battery_status", 0, 0.0)  # the first has no battery
+    say("battery_status", 0, VOLTAGE, instance=1)
     say("vehicle_status", 0, 2)
+    positions = 0
     for t, role, m in dive:
         if role == WRENCH:
-            say("actuator_motors", t, *((m - 1500) / 400.0), *[np.nan] * 4)
+            say("actuator_motors", t, t, *command(m), *[np.nan] * 4, reversible)
         elif role == IMU:
             say("sensor_combined", t, *m.angular_velocity, *m.linear_acceleration)
         else:
+            shift, counters = place(positions)
+            positions += 1
             v = quaternion_to_matrix(m.orientation) @ m.linear
-            say("vehicle_attitude", t, *m.orientation)
-            say("vehicle_local_position", t, *v, *m.position, True)
-    path.write_bytes(bytes(data))
+            say("vehicle_attitude", t + LATE, t, *m.orientation)
+            say("vehicle_local_position", t + LATE, t, *(m.position + shift), *shift, *v,
+                True, True, True, True, *counters)  # fmt: skip
+    path.write_bytes(bytes(data) + tail)
     return path
 
 
@@ -376,6 +394,92 @@ def test_a_log_of_px4(tmp_path, dive):
     turned = ulog(tmp_path / "turned.ulg", dive, rotors(turned=(0,)))
     report = import_log(turned, tmp_path / "turned.mcap", configured(**GEOMETRY))
     assert any("thruster 1 pushes the other way" in note for note in report.notes)
+
+
+def outputs(low=1000, high=2000, reverse=0):
+    """PX4's parameters of eight motors on outputs 8 to 1."""
+    found = {"PWM_MAIN_REV": reverse}
+    for k in range(1, 9):
+        found |= {
+            f"PWM_MAIN_FUNC{k}": 109 - k, f"PWM_MAIN_MIN{k}": low, f"PWM_MAIN_MAX{k}": high,
+        }  # fmt: skip
+    return found
+
+
+def imported(tmp_path, path):
+    report = import_log(path, tmp_path / f"{path.stem}.mcap", configured(**GEOMETRY))
+    return report, estimate(tmp_path / f"{path.stem}.mcap", config.load(HEAVY))
+
+
+@pytest.mark.parametrize("case", ["range", "curve", "one way", "reversed"])
+def test_pulses_are_those_of_px4s_mixer(tmp_path, dive, case):
+    """1000 to 2000 us as PX4 has it unless told; THR_MDL_FAC; motors of one way; PWM_MAIN_REV."""
+    parameters, options = rotors() | outputs(), {}
+
+    def half(pulses):
+        return (pulses - 1500) / 500.0
+
+    options["command"] = half
+    if case == "curve":
+        parameters["THR_MDL_FAC"] = 0.3
+        options["command"] = lambda pulses: (
+            np.sign(half(pulses)) * (0.3 * half(pulses) ** 2 + 0.7 * np.abs(half(pulses)))
+        )
+    elif case == "one way":
+        options["command"] = lambda pulses: 0.5 * (half(pulses) + 1.0)
+        options["reversible"] = 0
+    elif case == "reversed":  # output 8, which is motor 1: its propeller is the other way round
+        parameters = rotors(turned=(0,)) | outputs(reverse=0x80)
+        options["command"] = lambda pulses: half(pulses) * [-1, *[1] * 7]
+    path = ulog(tmp_path / "log.ulg", dive, parameters, **options)
+    report, found = imported(tmp_path, path)
+    assert report.notes == (
+        f"battery from {VOLTAGE} to {VOLTAGE} V, as measured",
+        "100 % of the log is armed; the rest is left out",
+    )
+    assert_close(found, expected(tmp_path / "direct.mcap", dive), 1e-3)
+
+
+def test_a_motor_without_an_output_is_said(tmp_path, dive):
+    report, _ = imported(tmp_path, ulog(tmp_path / "log.ulg", dive, rotors()))
+    assert "no PWM outputs of the motors" in report.notes[0]
+
+
+def test_positions_that_px4_sets_anew(tmp_path, dive):
+    """They go on from where they were, and a velocity that jumps is said."""
+
+    def place(k):
+        again = int(k >= 40)
+        return (3.0 * again, -2.0 * again, 0.5 * again), (again, again, again, 0)
+
+    path = ulog(tmp_path / "log.ulg", dive, rotors() | outputs(1100, 1900), place=place)
+    report, _ = imported(tmp_path, path)
+    assert "EKF2 set its velocity anew 1 times: it jumps there without a force" in report.notes
+    read = [m.position for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    true = [m.position for _, role, m in dive if role == ODOMETRY]
+    np.testing.assert_allclose(read, true, atol=1e-5)
+
+
+def test_dropouts_and_a_cut_of_a_log_of_px4(tmp_path, dive):
+    dropout = struct.pack("<HcH", 2, b"O", 1500)
+    path = ulog(tmp_path / "log.ulg", dive, rotors() | outputs(), tail=dropout)
+    report, _ = imported(tmp_path, path)
+    assert "the logger lost 1.5 s in 1 dropouts" in report.notes
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    report, _ = imported(tmp_path, path)
+    assert 4.0 < report.duration < 6.0
+
+
+def test_what_a_log_of_px4_lacks_is_named_as_px4_does(tmp_path, dive):
+    for topic, words in (
+        ("vehicle_local_position", "no valid velocity of EKF2"),
+        ("actuator_motors", r"actuator_motors.*SDLOG_PROFILE"),
+        ("vehicle_attitude", "vehicle_attitude"),
+        ("sensor_combined", "sensor_combined"),
+    ):
+        path = ulog(tmp_path / "log.ulg", dive, rotors(), without=(topic,))
+        with pytest.raises(UserError, match=words):
+            import_log(path, tmp_path / "out.mcap", configured(**GEOMETRY))
 
 
 def test_what_is_no_log_of_px4(tmp_path):

@@ -163,6 +163,7 @@ def _add_model(path: Path, found: _Found, vehicle: str) -> None:
 
 def _add_log(path: Path, found: _Found, vehicle: str) -> None:
     log = read_log(path)
+    found.notes += log.notes
     frame = int(log.parameters.get("FRAME_CONFIG", -1))
     if not vehicle and frame in _OF_FRAME:
         found.start_from(_OF_FRAME[frame])

@@ -22,7 +22,7 @@ def add(commands: common.Commands) -> None:
         help="CSV files, or one .BIN or .tlog of ArduSub, one .ulg of PX4",
     )
     import_.add_argument(
-        "--config", type=Path, help="of a .BIN or .tlog: its `thrusters` turn pulses into a wrench"
+        "--config", type=Path, help="for a log of an autopilot: its `thrusters` give the wrench"
     )
     import_.add_argument("--out", required=True, type=Path, metavar="BAG", help="bag to write")
     common.columns_option(import_, "u=surge_speed; w=0 is a constant")
@@ -86,12 +86,12 @@ def _import_ardupilot(options: argparse.Namespace, tell: "Progress") -> tuple[An
     from rov_ident.io.ardupilot_log import import_log
 
     if len(options.log) > 1:
-        raise UserError("import ArduSub's logs one by one: each has a clock of its own")
+        raise UserError("import logs of an autopilot one by one: each has a clock of its own")
     log = options.log[0]
     if not options.config:
         raise UserError(
-            f"{log.name} holds pulse widths: --config names the parameter file whose thrusters "
-            "turn them into a wrench"
+            f"{log.name} holds commands of thrusters: --config names the parameter file whose "
+            "thrusters turn them into a wrench"
         )
     config = configuration.load(options.config)
     for option in ("degrees", "polarity", "despike", "depth", "smooth", "cut", "cut_idle"):
@@ -108,7 +108,7 @@ def _import_csv(options: argparse.Namespace, tell: "Progress") -> tuple[Any, str
     from rov_ident.sampling.preprocess import Preparation
 
     if options.config:
-        raise UserError("--config is for ArduSub's logs: a CSV holds the wrench itself")
+        raise UserError("--config is for logs of an autopilot: a CSV holds the wrench itself")
     tell("reading")
     report = import_csv(
         options.log,

@@ -117,6 +117,16 @@ class Log:
         self.armed = _Track()  # 1 or 0, until the next; empty where the log does not say
         self.parameters: dict[str, float] = {}  # of the autopilot
         self.signal = PWM  # what the outputs are
+        self.reversed: set[int] = set()  # motors whose pulses PX4 reverses, from 0
+        self.notes: list[str] = []
+        self.words = {  # what a log must hold, and what to do where it does not
+            "motion": "velocity of an EKF (XKF1 or LOCAL_POSITION_NED)",
+            "outputs": "thruster output (RCOU or SERVO_OUTPUT_RAW)",
+            "attitude": "attitude (XKQ, ATT or ATTITUDE)",
+            "rates": "angular rates (IMU, RAW_IMU or ATTITUDE)",
+            "advice": "log it (LOG_BITMASK, or the stream rates of telemetry), and give the EKF a "
+            "source of velocity",
+        }
 
     def is_armed(self, t: int) -> bool:
         """Whether the vehicle is, at t [us]; so it is taken to be where the log does not say."""
@@ -135,9 +145,14 @@ class Log:
         rotors = int(self.parameters.get("CA_ROTOR_COUNT", 0))
         if rotors:
             get = self.parameters.get
+            sides = [-1.0 if i in self.reversed else 1.0 for i in range(rotors)]
             return {
-                key: [get(f"CA_ROTOR{i}_{kind}{x}", 0.0) for i in range(rotors) for x in "XYZ"]
-                for key, kind in (("position", "P"), ("direction", "A"))
+                "position": [get(f"CA_ROTOR{i}_P{x}", 0.0) for i in range(rotors) for x in "XYZ"],
+                "direction": [
+                    sides[i] * get(f"CA_ROTOR{i}_A{x}", 0.0) + 0.0
+                    for i in range(rotors)
+                    for x in "XYZ"
+                ],
             }
         frame = FRAMES.get(int(self.parameters.get("FRAME_CONFIG", -1)))
         if frame is None:
@@ -159,10 +174,10 @@ def import_log(
     path: str | Path, out: str | Path, config: Config,
     progress: Callable[[float], None] | None = None,
 ) -> LogReport:  # fmt: skip
-    """Write an ArduSub log as a bag of `odom`, `imu/data` and `thruster_wrench`.
+    """Write a log of ArduSub or PX4 as a bag of `odom`, `imu/data` and `thruster_wrench`.
 
     Args:
-        path: a dataflash log (`.BIN`, also as text, `.log`) or a telemetry log (`.tlog`).
+        path: a dataflash log (`.BIN`, also as text, `.log`), a telemetry log (`.tlog`) or a ULog.
         out: the bag, see `BagWriter`.
         config: its `thrusters` make the wrench.
         progress: called with the share that has been read.
@@ -172,19 +187,17 @@ def import_log(
     path = Path(path)
     check(config.thrusters, PWM)
     log = read_log(path, progress or (lambda share: None))
-    notes: list[str] = []
+    notes = log.notes
     thrusters = _as_autopilot_has_them(config.thrusters, log, notes)
     allocator = Allocator(thrusters, log.signal)
     for name, track in (
-        ("velocity of an EKF (XKF1 or LOCAL_POSITION_NED)", log.motion),
-        ("thruster output (RCOU or SERVO_OUTPUT_RAW)", log.outputs),
-        ("attitude (XKQ, ATT or ATTITUDE)", log.attitude or log.angles),
+        ("motion", log.motion),
+        ("outputs", log.outputs),
+        ("attitude", log.attitude or log.angles),
+        ("rates", log.imu if len(log.imu) >= 2 else log.rates),
     ):
         if len(track) < 2:
-            raise UserError(
-                f"{path} holds no {name}: log it (LOG_BITMASK, or the stream rates of telemetry), "
-                "and give the EKF a source of velocity"
-            )
+            raise UserError(f"{path} holds no {log.words[name]}: {log.words['advice']}")
     messages = [*_wrenches(log, allocator, config.thrusters.voltage, notes), *_inertial(log)]
     with np.errstate(all="ignore"):  # a quaternion of zeros: left out below
         odometry = list(_odometry(log, notes))
@@ -299,8 +312,6 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
         times, quaternions = log.angles.t, quaternion_from_euler(*np.array(log.angles.rows).T)
         notes.append("no quaternion of the EKF: the attitude is the autopilot's angles")
     rates = log.imu if len(log.imu) >= 2 else log.rates
-    if len(rates) < 2:
-        raise UserError("the log holds no angular rates: log the IMU (IMU, RAW_IMU or ATTITUDE)")
     rate_t, rate = np.array(rates.t, dtype=float), np.array(rates.rows)[:, :3]
     lost = 0
     for t, row in zip(log.motion.t, log.motion.rows, strict=True):
