@@ -434,7 +434,7 @@ def test_bad_metadata(tmp_path):
     metadata = path / "metadata.yaml"
     text = metadata.read_text()
     metadata.write_text(text.replace("compression_mode: ''", "compression_mode: FILE"))
-    with pytest.raises(UserError, match="compressed by rosbag2"):
+    with pytest.raises(UserError, match="rosbags-convert --src .*dive --dst NEW"):
         Bag(path)
     metadata.write_text(text.replace("dive_0.mcap", "dive_1.mcap"))
     with pytest.raises(UserError, match=r"dive_1\.mcap cannot be read"):

@@ -79,9 +79,10 @@ class Fitted:
 
     @cached_property
     def noise_squares(self) -> Array:
-        """Squared residuals (draws,) that noise of the wrench's reading makes; none where each draw
-        makes more than there are: a model that nearly tumbles makes any amount of so little noise
-        that it is none of the vehicle's."""
+        """Squared residuals (draws,) that noise of the wrench's reading makes.
+
+        Zeros where every draw makes more than there are: the model is then close to unstable and
+        amplifies the noise far beyond what the vehicle does."""
         problem = self.linearisation.problem
         if not problem.reading_std.any():
             return np.zeros(DRAWS)

@@ -287,8 +287,8 @@ def _files_of_directory(path: Path) -> list[Path]:
         files = [_file_of_bag(path, name) for name in names]
         if compression in ("file", "message"):
             raise UserError(
-                f"{path} is compressed by rosbag2 ({compression} mode): convert it with "
-                "`ros2 bag convert` to MCAP without compression_mode."
+                f"{path} is compressed by rosbag2 ({compression} mode): unpack it with "
+                f"`rosbags-convert --src {path} --dst NEW`, and give NEW"
             )
     else:  # its writer was killed
         patterns = ("*.mcap", "*.db3", "*.bag")
