@@ -179,11 +179,11 @@ def consistency_of(
 ) -> Consistency:
     """Judge an estimate.
 
-    ``values`` (n,) are not yet drawn to what is physically possible; ``std`` (n,) are their
-    standard deviations, None where bounds have held them. ``unexplained`` (6,) is the
-    force that lasts a second and that the model does not have, relative to the working wrench; NaN
-    where it is not known. ``lasting`` (6,), of RLS, UKF and ML, is the power of
-    innovations added up over a second in motion: 1 is expected, NaN where it is not known.
+    ``values`` (n,) are what the data ask for, not yet drawn to what is possible; ``std`` (n,) are
+    their standard deviations, None for least squares, which asks for nothing but the prior.
+    ``unexplained`` (6,) is the force that lasts a second and that the model does not have, relative
+    to the working wrench; NaN where it is not known. ``lasting`` (6,), of RLS, UKF and ML, is the
+    power of innovations added up over a second in motion: 1 is expected, NaN where it is not known.
     ``sensors`` are test ratios of the odometry's parts against the IMU.
     """
     tests = []

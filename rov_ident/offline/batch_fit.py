@@ -75,6 +75,7 @@ class Settings:
 class _Stage(NamedTuple):
     names: tuple[str, ...]
     values: Array
+    asked: Array  # as values, but beyond their bounds where the data would go there
     covariance: Array
     states: dict[str, State]
     more: dict[str, Any]
@@ -118,7 +119,7 @@ def fit_batch(
     effects = kind == "ml" and not settings.stages
     config = config.with_nuisance if effects else config
     prior = prior_of(config, effects)
-    values, covariance = prior.mean.copy(), np.diag(prior.std**2)
+    values, asked, covariance = prior.mean.copy(), prior.mean.copy(), np.diag(prior.std**2)
     states = dict.fromkeys(prior.names, State.HELD)
     unexplained, lasting = np.full((2, 6), np.nan)
     now, parts = config, []
@@ -131,7 +132,7 @@ def fit_batch(
         if found is None:
             continue
         at = np.array([prior.names.index(name) for name in found.names])
-        values[at] = found.values
+        values[at], asked[at] = found.values, found.asked
         states.update(found.states)
         covariance[np.ix_(at, at)] = found.covariance
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
@@ -145,7 +146,8 @@ def fit_batch(
     sensors: dict[str, float] = {}
     for bag in judged.bags:
         sensors |= {p: max(r, sensors.get(p, 0.0)) for p, r in bag.contradictions.items()}
-    consistency = consistency_of(config, prior, values, unexplained, lasting, sensors)
+    std = np.sqrt(np.diag(covariance)) if kind == "ml" else None
+    consistency = consistency_of(config, prior, asked, unexplained, lasting, sensors, std)
     consistency = replace(consistency, asks=kind == "ml")
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
     if unmeasured:
@@ -288,7 +290,7 @@ def _stage(
             "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
         }
     }
-    noise = None
+    noise, asked = None, found
     unexplained, lasting = np.full((2, 6), np.nan)
     if kind == "ml":
         if before is not None:
@@ -311,6 +313,7 @@ def _stage(
         )
         names = prior.names
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
+        asked = likelihood.asked
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         unexplained[:2] = np.nan if unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
@@ -355,7 +358,9 @@ def _stage(
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
     if free[0] and not any(archive.each(_has_surge_thrust)):
         notes += _scale_notes(config, names, covariance)
-    return _Stage(names, values, covariance + of_scales, states, more, unexplained, lasting, noise)
+    return _Stage(
+        names, values, asked, covariance + of_scales, states, more, unexplained, lasting, noise
+    )
 
 
 def _has_surge_thrust(samples: Samples) -> bool:

@@ -319,7 +319,8 @@ def noise_cost(
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n).
+    """The maximum: values (n,) of the estimated coefficients, their covariance (n, n), and what the
+    data ``asked`` (n,) for, which may be beyond the bounds (of the quadratic there).
 
     ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
     ``lasting`` (6,) is the power of innovations added up over a second in motion: 1 is expected,
@@ -330,6 +331,7 @@ class Likelihood:
     """
 
     values: Array
+    asked: Array
     covariance: Array
     bound: Array
     noise: Noise
@@ -433,8 +435,13 @@ def maximise(
     seconds, power = np.sum(each(whiteness, *last), 0)
     known = seconds > JUDGED_TIME
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
+    slope, curvature = slope_of(theta, at)
+    asked, ours = theta.copy(), np.ix_(~held, ~held)
+    asked[~held] += inverse_of(curvature[ours]) @ slope[~held]
     bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
-    return Likelihood(theta, covariance, bound, noise, at, lasting, held, noisy, steps, converged)
+    return Likelihood(
+        theta, asked, covariance, bound, noise, at, lasting, held, noisy, steps, converged
+    )
 
 
 def _with_consider_parameters(
