@@ -24,6 +24,7 @@ from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.batch_fit import fit_batch
+from rov_ident.offline.delays import Delay
 from rov_ident.sampling.records import read_record
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -441,7 +442,6 @@ def test_moments_of_inertia_that_no_body_has(heavy, zz, possible):
 
 def test_a_delay_beyond_what_is_linear_is_not_told():
     """Of a gyro in degrees it was -2.3e23 ms."""
-    assert _delay_remark("motion behind the wrench", -0.3, 0.01).text.startswith("-300.0 ")
-    assert _delay_remark("motion behind the wrench", -2.3e20, 1e19).text.startswith(
-        "cannot be told"
-    )
+    assert _delay_remark("motion behind the wrench", Delay(-0.3, 0.01)).text.startswith("-300.0 ")
+    remark = _delay_remark("motion behind the wrench", Delay(-2.3e20, 1e19))
+    assert remark.text.startswith("cannot be told")

@@ -982,7 +982,7 @@ def textbook_despiking(x, floor, share, exact):
             continue
         usual += 0.02 * (min(nearest, 5.0 * spread) ** 2 - usual)
         rises = (came - before) * (after - came) > 0.0
-        moves = max(abs(before - x[k - 2]), abs(last - after) if rises else 0.0)
+        moves = (max if rises else min)(abs(before - x[k - 2]), abs(last - after))
         near = max(5.0 * spread, 3.0 * moves)
         near = 5.0 * exact if back < near < there and after == last else near
         if min(nearest, abs(raw[k - 2] - came)) > near:
@@ -1010,6 +1010,43 @@ def test_despiking_is_the_rule_of_the_textbook(seed):
     right = np.abs(found - steps(600)) < 20.0
     assert np.mean(right[wild]) > 0.85, "most outliers are gone"
     assert np.mean(found[~wild] == x[~wild]) > 0.97, "and little else is changed"
+
+
+def despiked(x, floor, rates, is_command):
+    """Values and variances of one number x (n,) of all messages, and which were outliers."""
+    found, variance = x.copy(), np.zeros(len(x))
+    out = np.zeros(len(x), bool)
+    past, usual = np.array([[x[0]], [x[1]], [x[0]], [x[1]]]), np.zeros(1)
+    for k in range(2, len(x) - 2):
+        out[k] = despike(
+            past, found[k : k + 1], x[k + 1 : k + 2], x[k + 2 : k + 3], variance[k : k + 1], usual,
+            np.array([floor]), 0.03 * is_command, np.array([0.01]), rates, is_command,
+        )  # fmt: skip
+    return found, variance, out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_wrong_rates_in_a_turn(seed):
+    """The vehicle turns on by more than the noise until the right rate comes again."""
+    rng = np.random.default_rng(seed)
+    right = np.sin(4.0 * np.arange(0.0, 20.0, 0.01)) + 0.003 * rng.standard_normal(2000)
+    first = rng.choice(np.arange(60, 1990, 10), 40, replace=False)
+    wrong = np.concatenate([first, first + 1])
+    x = right.copy()
+    x[wrong] += np.tile(rng.choice([-1.0, 1.0], 40) * rng.uniform(1.0, 2.0, 40), 2)
+    x[first] += rng.uniform(-0.1, 0.1, 40)
+    assert not despiked(right, 0.003, 1, False)[2].any()
+    assert set(np.flatnonzero(despiked(x, 0.003, 1, False)[2])) == set(wrong)
+
+
+def test_two_outliers_at_a_step_are_not_believed():
+    """The one looks like its beginning, the other like the overshoot of a controller."""
+    rng = np.random.default_rng(0)
+    x = np.repeat([-38.5, 38.0], 100) + 0.4 * rng.standard_normal(200)
+    assert not despiked(x, 0.25, 0, True)[1].any()
+    x[99:101] = -18.7, 87.1
+    found, variance, _ = despiked(x, 0.25, 0, True)
+    assert found[100] != 87.1 or variance[100] > 50.0**2
 
 
 FLOATS = st.floats(allow_nan=True, allow_infinity=True, width=64)
