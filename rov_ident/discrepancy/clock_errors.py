@@ -20,6 +20,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 _AHEAD = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
 # 45 simulated dives with exact stamps, while 15 ms of a wrong clock made 17
+_FIRST_ORDER = 1.0  # s; what is further is beyond the manoeuvres about which a delay is linear
 _SURELY = 5.0  # standard deviations: these are of the noise alone
 
 
@@ -66,7 +67,8 @@ def _ahead(streams: Streams, config: Config) -> float:
         return 0.0  # fins and propellers drive it, too: the wrench alone does not say when
     rows = delays.filtered(delays.samples_of(streams), config)
     late = delays.NO_DELAY if rows is None else delays.motion_behind_wrench(rows)
-    return -late.value if late.value < -max(_AHEAD, _SURELY * late.std) else 0.0
+    ahead = -late.value
+    return ahead if max(_AHEAD, _SURELY * late.std) < ahead < _FIRST_ORDER else 0.0
 
 
 def _behind(streams: Streams, config: Config) -> float:
@@ -75,4 +77,4 @@ def _behind(streams: Streams, config: Config) -> float:
     if late is None:
         return 0.0
     half = 0.5 * float(np.median(np.diff(streams.imu_t)))
-    return late.value if late.value > max(half, _SURELY * late.std) else 0.0
+    return late.value if max(half, _SURELY * late.std) < late.value < _FIRST_ORDER else 0.0

@@ -125,8 +125,8 @@ def despike(past, here, after, last, variance, usual, floor, share, exact, rates
     nearest neighbour and are brought up to date; ``floor`` (n,), and ``share`` of the number
     itself, is always usual. ``variance`` (n,) is left with the mean square of what may be wrong.
 
-    The first ``rates`` numbers have inertia: two in a row that are alike are outliers, too, if what
-    was before comes again.
+    The first ``rates`` numbers have inertia: two in a row are outliers, too, if what was before
+    comes again.
     """
     found = False
     for i in range(len(here)):

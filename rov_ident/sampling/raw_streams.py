@@ -269,7 +269,8 @@ def _without_spikes(
     off = np.where(there * back > 0.0, np.minimum(np.abs(there), np.abs(back)), 0.0)
     agility = authority(config.dynamics)[:3] / np.diag(config.dynamics.mass_matrix)[:3]
     moved = np.maximum(np.diff(t)[:-1], np.diff(t)[1:])[:, None] * agility
-    spike = np.max(off / np.maximum(_SPIKE * robust_std(there), moved), axis=1) > 1.0
+    usual = np.maximum(_SPIKE * robust_std(there), moved)
+    spike = np.max(off / np.maximum(usual, 1e-9), axis=1) > 1.0
     counts["odom: velocity jumps there and back"] += int(spike.sum())
     return [
         odometry[0],
