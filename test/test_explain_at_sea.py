@@ -350,8 +350,9 @@ def test_a_pause_of_one_sensor_is_no_bias_of_the_other(seed):
         since = t[:, None] - begins
         there = ~((since > 0.0) & (since < lasts)).any(axis=1)
         paused = {name: getattr(streams, name)[there] for name in (clock, *others)}
-        found, _ = sensors_of(dataclasses.replace(streams, **paused), config)
-        assert "imu_bias" not in found, clock
+        with_pauses = dataclasses.replace(streams, **paused)
+        assert "imu_bias" not in sensors_of(with_pauses, config)[0], clock
+        assert clock_errors.of([with_pauses], config) == clock_errors.ClockErrors(0.0, 0.0), clock
 
 
 def test_without_pose_and_imu_no_sensor_is_judged():

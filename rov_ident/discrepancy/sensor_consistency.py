@@ -41,7 +41,7 @@ from rov_ident.discrepancy.windowed_problem import within
 from rov_ident.effects import EFFECTS, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array, Indices
-from rov_ident.sampling.raw_streams import Streams, orientation_at
+from rov_ident.sampling.raw_streams import Streams, measured_at, orientation_at
 
 # Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
 # which the white noise is nothing, about a factor of three apart.
@@ -133,7 +133,7 @@ def comparisons(
     if inertial is not None:
         down = inertial.rotation[:, 2]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
-        inside = _read(streams.imu_t, streams.t)
+        inside = measured_at(streams.imu_t, streams.t)
         t = streams.t[inside]
         y = (np.einsum("kij,kj->ki", r, here.linear) - inertial.velocity)[inside]
         columns = [
@@ -167,14 +167,6 @@ def comparisons(
         for name, t, y, columns in made
         if len(t) > FEWEST
     ]
-
-
-def _read(t: Array, at: Array) -> NDArray[np.bool_]:
-    """Which instants ``at`` (M,) lie between messages, of times t (N,), of a sensor that goes on:
-    what is interpolated across a pause was not measured."""
-    after = np.searchsorted(t, at)
-    gap = np.diff(t, prepend=-np.inf, append=np.inf)
-    return (gap[after] <= _MAX_GAP) | np.isin(at, t)
 
 
 def _has_imu(streams: Streams) -> bool:
@@ -239,7 +231,7 @@ class _DeadReckoning:
     def __init__(self, streams: Streams, config: Config, imu: Reading, rate: Array) -> None:
         self._t, self._at = streams.imu_t, streams.t
         q = orientation_at(streams, streams.imu_t)
-        known = _read(streams.t, streams.imu_t)
+        known = measured_at(streams.t, streams.imu_t)
         self.rotation = quaternion_to_matrix(_attitude(q, known, streams.imu_t, imu.gyro, rate))
         lever, force = np.array(config.imu.position), imu.specific_force
         if lever.any():

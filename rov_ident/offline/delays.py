@@ -18,7 +18,7 @@ from rov_ident.offline.batch_fit import AT_REST
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.sampling.queues import LONGEST_INTERVAL
-from rov_ident.sampling.raw_streams import Streams
+from rov_ident.sampling.raw_streams import Streams, measured_at
 from rov_ident.sampling.sample import SAMPLE
 from rov_ident.sampling.without_velocity import is_without_velocity
 
@@ -62,9 +62,8 @@ def odometry_behind_imu(streams: Streams, config: Config) -> Delay | None:
     """Of the odometry's angular velocities; None without an IMU."""
     if len(streams.imu_t) <= _FEWEST_TIMED:
         return None
-    known = (streams.t > streams.imu_t[0]) & (streams.t < streams.imu_t[-1])
-    gyro, rate = gyro_at(streams, config)[known], streams.nu[known, 3:]
-    return _lag(streams.t[known], gyro, rate)
+    known = measured_at(streams.imu_t, streams.t)
+    return _lag(streams.t, gyro_at(streams, config), streams.nu[:, 3:], known)
 
 
 def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
@@ -101,13 +100,14 @@ def samples_of(streams: Streams) -> NDArray[np.void]:
     return samples
 
 
-def _lag(t: Array, early: Array, late: Array) -> Delay:
-    """By how much ``late`` (k, n) follows ``early`` [s], to first order."""
-    slope = np.gradient(early, t, axis=0)
+def _lag(t: Array, early: Array, late: Array, known: NDArray[np.bool_]) -> Delay:
+    """By how much ``late`` (k, n) follows ``early`` [s] where both are ``known`` (k,), to first
+    order."""
+    slope = np.gradient(early, t, axis=0)[known]
     power = float(np.sum(slope**2))
     if power < 1e-6 * len(t):
         return NO_DELAY
-    off = late - early
+    off = (late - early)[known]
     off = off - off.mean(axis=0)
     lag = -float(np.sum(off * slope)) / power
     left = off + lag * slope

@@ -22,6 +22,7 @@ from rov_ident.model.scales import authority
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
+from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
 _USUAL = 2.0  # a choice: times what 99 % of the messages keep to
@@ -285,6 +286,13 @@ def _continuous(q: Array) -> Array:
     flips = np.sum(q[1:] * q[:-1], axis=1) < 0.0
     sign = np.where(np.cumsum(np.concatenate([[0], flips])) % 2, -1.0, 1.0)
     return q * sign[:, None]
+
+
+def measured_at(t: Array, at: Array) -> NDArray[np.bool_]:
+    """Which instants ``at`` (M,) lie between messages, of times t (N,), of a sensor that goes on:
+    what is interpolated across a pause was not measured."""
+    gap = np.diff(t, prepend=-np.inf, append=np.inf)
+    return (gap[np.searchsorted(t, at)] <= LONGEST_INTERVAL) | np.isin(at, t)
 
 
 def orientation_at(streams: Streams, t: Array) -> Array:
