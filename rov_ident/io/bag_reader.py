@@ -301,9 +301,14 @@ def _files_of_directory(path: Path) -> list[Path]:
 
 def _file_of_bag(folder: Path, name: str) -> Path:
     """A file of the bag; what points out of its folder is another's file."""
-    file = folder / name
+    file, metadata = folder / name, folder / "metadata.yaml"
     if not file.resolve().is_relative_to(folder.resolve()):
-        raise UserError(f"{folder / 'metadata.yaml'} names {name}, which is outside the bag.")
+        raise UserError(f"{metadata} names {name}, which is outside the bag.")
+    if not file.exists():
+        raise UserError(
+            f"{file} cannot be read: it is not there, though {metadata} names it. Copy it, too, or "
+            "remove metadata.yaml to have the other files read."
+        )
     return file
 
 
@@ -317,8 +322,8 @@ def _natural_order(path: Path) -> list[tuple[int, str]]:
 def _kind(path: Path) -> type[_File] | type[OtherFile]:
     with open_input(path) as stream:
         head = stream.read(16)
-    if not head:
-        raise UserError(f"{path} is empty: record the bag anew.")
+    if not head:  # what a power cut leaves of a file that was just begun
+        return _File
     for magic, kind in _KINDS.items():
         if head.startswith(magic):
             return kind
@@ -329,6 +334,8 @@ def _index(path: Path) -> _File | OtherFile:
     kind = _kind(path)
     if issubclass(kind, OtherFile):
         return kind(path)
+    if path.stat().st_size == 0:
+        return _File(path, lost_bytes=1)
     with open_input(path) as stream:
         return _index_by_summary(path, stream) or _index_by_walking(path, stream)
 
