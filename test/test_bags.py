@@ -522,6 +522,41 @@ def test_topics_in_a_namespace_by_name_and_by_type(tmp_path):
     assert found["imu"] == "/rov/imu/data"
 
 
+def test_of_two_vehicles_the_one_whose_odometry_is_named(tmp_path):
+    """And of two IMUs the vehicle's own; what else could have been chosen is said."""
+    bag = bag_of(
+        tmp_path,
+        odom=["/rov1/odom", "/rov2/odom"],
+        imu=["/rov1/imu/data", "/rov2/imu/data"],
+        wrench=["/rov1/thruster_wrench", "/rov2/thruster_wrench"],
+    )
+    for name in ("/rov1", "/rov2"):
+        found = chosen(bag, odom=f"{name}/odom")
+        assert found["imu"] == f"{name}/imu/data"
+        assert found["wrench"] == f"{name}/thruster_wrench"
+    usual = SimpleNamespace(**vars(topics.USUAL) | {"topics": Topics(odom="/rov2/odom")})
+    assert topics.doubts(bag, found, usual) == [
+        "dive.mcap: imu is /rov2/imu/data; topics.imu chooses another of its type: /rov1/imu/data",
+        "dive.mcap: wrench is /rov2/thruster_wrench; topics.wrench chooses another of its type: "
+        "/rov1/thruster_wrench",
+    ]
+
+
+@pytest.mark.parametrize("ahead", [0.5, -3.0, 1.7e9])
+def test_topics_of_different_clocks_are_named(tmp_path, ahead):
+    at, off = 10**12, round(ahead * 1e9)
+    rows = [
+        ("/odom", cdr.ODOMETRY_TYPE, at, cdr.encode(odometry(at))),
+        ("/thruster_wrench", cdr.WRENCH_TYPE, at + 1, cdr.encode(wrench(at + off))),
+    ]
+    bag = Bag(write(tmp_path / "dive.mcap", rows))
+    said = topics.doubts(bag, chosen(bag), topics.USUAL)
+    assert bool(said) == (abs(ahead) > 1.0)
+    if said:
+        order = "after" if ahead > 0 else "before"
+        assert f"/thruster_wrench is stamped {abs(ahead):.3g} s {order} /odom" in said[0]
+
+
 def test_imu_may_be_absent(tmp_path):
     assert "imu" not in chosen(bag_of(tmp_path, odom=["/odom"], wrench=["/w"]))
 

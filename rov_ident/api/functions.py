@@ -294,8 +294,8 @@ def _streams(path: Path, config: Config, say: Progress) -> tuple[Streams, dict[s
     refuse_without_velocity(bag, chosen, config)
 
     streams = gather(topics.messages(bag, chosen, config, say=say), config)
-    if bag.damage:
-        streams = dataclasses.replace(streams, notes=(*streams.notes, bag.damage))
+    notes = [*topics.doubts(bag, chosen, config), *streams.notes, *filter(None, [bag.damage])]
+    streams = dataclasses.replace(streams, notes=tuple(notes))
     return streams, {"name": bag.path.name, "sha256": bag.sha256}
 
 

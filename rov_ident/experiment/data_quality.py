@@ -184,7 +184,9 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
         raise UserError(f"{path.name} lasts {streams.duration:.1f} s: nothing can be said of it")
     notes = [Remark("messages", WARNING, note) for note in record.notes]
     frames = inputs.first_frames(bag, topics, config)
-    remarks = [*of_messages(streams, config), *notes, *_excitation_remarks(streams, config)]
+    told = ", ".join(f"{role} is {topic}" for role, topic in topics.items())
+    remarks = [Remark("topics", GOOD, told), *of_messages(streams, config), *notes]
+    remarks += _excitation_remarks(streams, config)
     remarks += _mounting_remarks(inputs.mounting(bag, frames), config)
     remarks += _inertia_remarks(config)
     failed = (test for test in tests_of(streams, config) if not test.passed)

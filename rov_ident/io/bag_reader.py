@@ -209,12 +209,29 @@ class Bag:
         yield from pending
 
 
-def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) -> str | None:
-    """Which topic plays a ``role``, as `odom`, that is called ``name`` and of ``type_name``.
+def candidates(bag: Bag, role: str, name: str, type_name: str, beside: str = "") -> list[str]:
+    """The topics that may play a ``role``, as `odom`, that is called ``name`` and of ``type_name``.
 
-    An ``override`` (if not empty) wins; else the topic of that name in whatever namespace; else the
-    only topic of the type. Topics without messages do not count. None: there is none, and need not
-    be.
+    Those of that name in whatever namespace; else of a usual name; else all of the type. Where
+    these are several, the one alone that shares the first name of ``beside``, the odometry's topic:
+    a bag may hold two vehicles. Topics without messages do not count.
+    """
+    typed = [t for t, (kind, count) in bag.topics.items() if kind == type_name and count]
+    usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
+    tiers = [[topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual]
+    found = next(filter(None, tiers), typed)
+    if len(found) > 1:  # mavros has vision_pose/pose beside local_position/pose
+        own = [topic for topic in found if topic.split("/")[1:2] == beside.split("/")[1:2]]
+        closer = ([topic for topic in tier if topic in found] for tier in tiers)
+        found = next((some for some in (*closer, own) if len(some) == 1), found)
+    return found
+
+
+def select_topic(
+    bag: Bag, role: str, name: str, type_name: str, override: str, beside: str = ""
+) -> str | None:
+    """Which topic plays a ``role``: an ``override`` (if not empty), else the only one of
+    :func:`candidates`. None: there is none, and need not be.
 
     Raises UserError: the role is missing, ambiguous or taken by a topic of another type.
     """
@@ -227,21 +244,15 @@ def select_topic(bag: Bag, role: str, name: str, type_name: str, override: str) 
         if filled[topic] != type_name:
             raise UserError(f"{topic} in {bag.path} is {filled[topic]}, but {role} is {type_name}.")
         return topic
-    named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
-    typed = [topic for topic in filled if filled[topic] == type_name]
-    usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
-    tiers = [[topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual]
-    candidates = next(filter(None, tiers), typed)
-    if len(candidates) > 1:  # mavros has vision_pose/pose beside local_position/pose
-        closer = ([topic for topic in tier if topic in candidates] for tier in tiers)
-        candidates = next((found for found in closer if len(found) == 1), candidates)
-    if len(candidates) == 1:
-        return candidates[0]
-    if candidates:
+    found = candidates(bag, role, name, type_name, beside)
+    if len(found) == 1:
+        return found[0]
+    if found:
         raise UserError(
-            f"{bag.path} has several topics that may be {role}: {', '.join(candidates)}; "
-            f"name the one to use, as in topics.{role}: {candidates[0]}."
+            f"{bag.path} has several topics that may be {role}: {', '.join(found)}; "
+            f"name the one to use, as in topics.{role}: {found[0]}."
         )
+    named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
     if named:
         raise UserError(
             f"{named[0]} in {bag.path} is {filled[named[0]]}, but {role} must be {type_name}."

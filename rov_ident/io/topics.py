@@ -11,6 +11,8 @@ along the shortest rotation.
 from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from itertools import islice
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -58,6 +60,10 @@ _FOREIGN = {  # what such topics and types are called, and what they could be
         "sensor_msgs/JointState (a force for each thruster) or geometry_msgs/WrenchStamped",
     ),
 }
+
+ONE_CLOCK = 1.0
+"""s; topics that come together and are stamped further apart are of two clocks: no driver takes so
+long, and the sampler waits no longer for a late topic."""
 
 USUAL: Any = SimpleNamespace(
     inputs=Inputs(), topics=schema.Topics(), frames=schema.Frames(), thrusters=schema.Thrusters()
@@ -210,17 +216,59 @@ def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, s
     Raises UserError if a role is missing, ambiguous or of another type than ``inputs`` says.
     """
     wanted = vars(config.topics)
-    chosen = {}
+    chosen: dict[str, str] = {}
     for role, (name, type_name) in sources(config.inputs).items():
         if roles and role not in roles:
             continue
+        beside = chosen.get(ODOMETRY, wanted[ODOMETRY])
         try:
-            topic = select_topic(bag, role, name, _full_name(type_name), wanted[role])
+            topic = select_topic(bag, role, name, _full_name(type_name), wanted[role], beside)
         except UserError as error:
             raise UserError(f"{error}{_other_type(bag, role, type_name, wanted[role])}") from error
         if topic:
             chosen[role] = topic
     return chosen
+
+
+def doubts(bag: Bag, topics: Mapping[str, str], config: Config) -> list[str]:
+    """Notes on a choice of :func:`select` that could be another, and on topics whose stamps are of
+    different clocks."""
+    notes = []
+    for role, topic in topics.items():
+        kind = bag.topics[topic].type_name
+        others = [t for t, i in bag.topics.items() if i.type_name == kind and i.message_count]
+        others = [other for other in others if other not in topics.values()]
+        if others and not vars(config.topics)[role]:
+            more = " ..." if len(others) > _NAMED else ""
+            notes.append(
+                f"{role} is {topic}; topics.{role} chooses another of its type: "
+                f"{', '.join(others[:_NAMED])}{more}"
+            )
+    behind = {role: _behind_arrival(bag, role, topic, config) for role, topic in topics.items()}
+    for role, seconds in behind.items():
+        apart = seconds - behind[ODOMETRY]
+        if abs(apart) > ONE_CLOCK:
+            notes.append(
+                f"{topics[role]} is stamped {abs(apart):.3g} s {'before' if apart > 0 else 'after'}"
+                f" {topics[ODOMETRY]}, though they were recorded at the same time: have one clock "
+                "stamp both (beside a simulator: use_sim_time, of the recorder, too)"
+            )
+    return [f"{bag.path.name}: {note}" for note in notes]
+
+
+def _behind_arrival(bag: Bag, role: str, topic: str, config: Config) -> float:
+    """How long [s] the first messages were stamped before they were recorded; 0 of those that are
+    stamped on arrival, NaN where nothing tells."""
+    if role == BATTERY:
+        return np.nan
+    if role == WRENCH and config.inputs.wrench not in _STAMPED:
+        return 0.0
+    decode = cdr.decode_joints if role == DRIVE else cdr.DECODERS[bag.topics[topic].type_name]
+    ages = []
+    for raw in islice(bag.iter_raw([topic]), _FIRST):
+        with suppress(ValueError):
+            ages.append((raw.log_time - decode(raw.data).stamp) * 1e-9)
+    return float(np.median(ages)) if ages else np.nan
 
 
 def _other_type(bag: Bag, role: str, type_name: str, wanted: str) -> str:
@@ -336,15 +384,18 @@ def survey(bag: Bag) -> tuple[dict[str, Seen], list[str]]:
                 of_kind = [t for t in of_kind if "thrust" in t or "pwm" in t or "rc" in t]
             if not of_kind or not any(bag.topics[t].message_count for t in of_kind):
                 continue
-            try:
-                called = name or sources(Inputs(**typed))[role].topic
-                topic = select_topic(bag, role, called, _full_name(kind), "")
-            except UserError as error:
-                topic = max(of_kind, key=lambda t: bag.topics[t].message_count)
-                notes.append(f"{role}: {topic} is taken, the one with most messages. {error}")
-            if topic:
-                found[role] = _source_of(bag, topic, kind)
-                return
+            called = name or sources(Inputs(**typed))[role].topic
+            beside = found[ODOMETRY].topic if ODOMETRY in found else ""
+            several = candidates(bag, role, called, _full_name(kind), beside)
+            several = [topic for topic in several if topic in of_kind]
+            topic = max(several, key=lambda t: bag.topics[t].message_count)
+            if len(several) > 1:
+                notes.append(
+                    f"{role}: of {', '.join(several)} the one with most messages is taken, "
+                    f"{topic}: correct topics.{role} if another is meant"
+                )
+            found[role] = _source_of(bag, topic, kind)
+            return
 
     look(ODOMETRY, schema.ODOMETRY_TYPES)
     look(IMU, ("sensor_msgs/Imu",), ROLE_NAMES[IMU])
@@ -387,36 +438,53 @@ def mounting(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Array]:
     ``frames`` as `first_frames` gives them. The body frame is that of the odometry (its child), or
     `base_link`; the tree has its axes forward, left, up.
     """
-    if "/tf_static" not in bag.topics:
-        return {}
-    from rosbags.typesys import Stores, get_typestore
+    parents = _tree(bag)
 
-    store = get_typestore(Stores.ROS2_JAZZY)
-    parents: dict[str, tuple[str, Array, Array]] = {}  # frame: (parent, origin, w x y z)
-    for raw in bag.iter_raw(["/tf_static"]):
-        for each in store.deserialize_cdr(raw.data, raw.type_name).transforms:
-            p, q = each.transform.translation, each.transform.rotation
-            place = np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z])
-            parents[each.child_frame_id] = (each.header.frame_id, *place)
-
-    def placed(frame: str, body: str) -> tuple[Array, Array] | None:
-        """Origin and attitude of a frame in the body's; None where no chain leads there."""
+    def below_root(frame: str) -> tuple[str, Array, Array]:
+        """The frame from which the tree hangs; origin and attitude of a frame in it."""
         origin, attitude = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-        for _ in range(len(parents) + 1):
-            if frame == body:
-                return origin, attitude
+        for _ in parents:  # more steps than these lead round a loop
             if frame not in parents:
-                return None
+                break
             frame, p, q = parents[frame]
             origin = p + quaternion_to_matrix(q) @ origin
             attitude = quaternion_multiply(q, attitude)
-        return None
+        return frame, origin, attitude
+
+    def placed(frame: str, body: str) -> tuple[Array, Array] | None:
+        """Origin and attitude of a frame in the body's; None where the tree does not join them."""
+        (root, origin, attitude), (other, p, q) = below_root(frame), below_root(body)
+        if root != other or root in parents:
+            return None
+        back = q * [1.0, -1.0, -1.0, -1.0]
+        return quaternion_to_matrix(back) @ (origin - p), quaternion_multiply(back, attitude)
 
     motion, child = frames.get(ODOMETRY, ("", ""))
     found: dict[str, Array] = {}
+    if not parents:
+        return found
     if IMU in frames and (at := placed(frames[IMU][0], child or "base_link")):
         found["imu.position"] = FLIP_BODY * at[0]
         found["imu.rotation"] = FLIP_BODY * quaternion_to_euler(at[1])
     if motion and not child and (at := placed(motion, "base_link")):
         found["odometry.position"] = FLIP_BODY * at[0]
     return found
+
+
+def _tree(bag: Bag) -> dict[str, tuple[str, Array, Array]]:
+    """By frame of `/tf_static`: the parent, and origin and attitude (w x y z) in it; without what
+    cannot be read, or is no transform."""
+    parents = {}
+    if bag.topics.get("/tf_static", ("",))[0] == "tf2_msgs/msg/TFMessage":
+        from rosbags.typesys import Stores, get_typestore
+
+        store = get_typestore(Stores.ROS2_JAZZY)
+        for raw in bag.iter_raw(["/tf_static"]):
+            with suppress(Exception):  # whatever the bytes make of the library
+                for each in store.deserialize_cdr(raw.data, raw.type_name).transforms:
+                    p, q = each.transform.translation, each.transform.rotation
+                    origin = np.array([p.x, p.y, p.z])
+                    attitude = quaternion_normalise([q.w, q.x, q.y, q.z])
+                    if np.isfinite([*origin, *attitude]).all():
+                        parents[each.child_frame_id] = each.header.frame_id, origin, attitude
+    return parents

@@ -72,7 +72,8 @@ def read_record(
     parts.append(sampler.flush())
     samples = after_reset(joined(parts))
     counts = sampler.counts + unusable
-    notes = [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
+    notes = inputs.doubts(bag, topics, config)
+    notes += [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
     notes += [] if measured else [f"{bag.path.name}: {IMPOSSIBLE}"]
     notes += _input_notes(config, samples)
