@@ -209,6 +209,19 @@ def test_pauses_and_slow_topics_are_noticed(checked):
     assert "least" in of(found, "odometry").text
 
 
+def test_a_bag_of_two_dives_has_no_wrong_signs(checked):
+    """Across an hour between them the vehicle was turned and moved by hand."""
+
+    def change(role, m):
+        t = (m.stamp - sensors.START) * 1e-9
+        return m if t < 10.0 else None if t < 14.0 else m._replace(stamp=m.stamp + 3_600 * 10**9)
+
+    found = checked(change)
+    assert {r.level for r in found.remarks if r.level == BAD} == set(), found.sentence
+    assert "lost to pauses" in of(found, "odometry").text
+    assert of(found, "topics").text == "odom is /odom, imu is /imu/data, wrench is /thruster_wrench"
+
+
 def test_what_is_not_driven_is_said(heavy, tmp_path):
     run = sensors.dive(heavy, "rest", 20.0, seed=1)
     write_messages(tmp_path / "rest.mcap", run.messages)

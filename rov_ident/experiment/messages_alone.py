@@ -109,12 +109,12 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         remarks.append(Remark("imu axes", level, text))
         gyro, rate = delays.gyro_at(streams, config), streams.nu[:, 3:]
         remarks.append(_agreement("gyro against odometry", gyro, rate, MOTIONS[3:], _ANGULAR_LEAST))
-    step = max(1, round(1.0 / float(np.median(np.diff(streams.t)))))  # a second: noise is small
-    remarks += _rates_and_turns(streams, step)
-    if streams.has_pose and streams.nu[:, :3].any():
-        moved = streams.position[step:] - streams.position[:-step]
+    first, last = _seconds(streams.t)
+    remarks += _rates_and_turns(streams, first, last)
+    if len(first) and streams.has_pose and streams.nu[:, :3].any():
+        moved = streams.position[last] - streams.position[first]
         way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
-        told, axes = way[step:] - way[:-step], ("north", "east", "down")
+        told, axes = way[last] - way[first], ("north", "east", "down")
         remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
     late = delays.odometry_behind_imu(streams, config)
     if late is not None:
@@ -122,12 +122,24 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
     return remarks
 
 
-def _rates_and_turns(streams: Streams, step: int) -> list[Remark]:
-    """Whether the odometry's angular velocities are as large as the turns of its attitude, of which
-    one is over ``step`` messages."""
+def _seconds(t: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last message, (k,) each, of all that are a second apart, so that noise is small;
+    none across a pause, of whose motion nothing is known."""
+    usual = float(np.median(np.diff(t)))
+    step = max(1, round(1.0 / usual))
+    pauses = np.cumsum(np.diff(t, prepend=t[0]) > max(LONGEST_INTERVAL, 2.0 * usual))
+    first = np.flatnonzero(pauses[step:] == pauses[:-step])
+    return first, first + step
+
+
+def _rates_and_turns(
+    streams: Streams, first: NDArray[np.intp], last: NDArray[np.intp]
+) -> list[Remark]:
+    """Whether the odometry's angular velocities are as large as the turns of its attitude, each
+    from a ``first`` message to a ``last`` one."""
     way = integral(streams.t, streams.nu[:, 3:])
     turned = np.vstack([np.zeros(3), np.cumsum(turns(streams.orientation), axis=0)])
-    rates, real = (x[step:] - x[:-step] for x in (way, turned))
+    rates, real = (x[last] - x[first] for x in (way, turned))
     power = np.sum(real**2, axis=0)
     turns_much = power > _MOVES**2 * len(real)
     share = np.sum(rates * real, axis=0) / np.maximum(power, 1e-300)
