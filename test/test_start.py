@@ -62,9 +62,11 @@ def test_what_is_unknown_is_refused_until_it_is_given(tmp_path, capsys):
     assert "20 Hz in demo.mcap, frame odom_ned" in (tmp_path / "c.yaml").read_text()
 
 
-@pytest.fixture
-def mavros(tmp_path):
-    """A bag as mavros publishes it, with a tilted IMU 0.1 m ahead and 0.2 m up."""
+LEVEL, LEFT = (1.0, 0.0, 0.0, 0.0), (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # w x y z
+
+
+def tree_of(*transforms):
+    """The bytes of a message of these (parent, child, xyz, wxyz)."""
     store = get_typestore(Stores.ROS2_JAZZY)
     T = store.types
     stamp = T["builtin_interfaces/msg/Time"](0, 0)
@@ -75,15 +77,19 @@ def mavros(tmp_path):
         header = T["std_msgs/msg/Header"](stamp, parent)
         return T["geometry_msgs/msg/TransformStamped"](header, child, inner)
 
-    half = np.sqrt(0.5)
-    tree = T["tf2_msgs/msg/TFMessage"]([
-        transform("base_link", "mount", (0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
-        transform("mount", "imu_link", (0.0, 0.0, 0.2), (half, 0.0, 0.0, half)),
-    ])  # fmt: skip
+    message = T["tf2_msgs/msg/TFMessage"]([transform(*each) for each in transforms])
+    return bytes(store.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
+
+
+@pytest.fixture
+def mavros(tmp_path):
+    """A bag as mavros publishes it, with a tilted IMU 0.1 m ahead and 0.2 m up."""
+    data = tree_of(
+        ("base_link", "mount", (0.1, 0.0, 0.0), LEVEL), ("mount", "imu_link", (0.0, 0.0, 0.2), LEFT)
+    )
     path, zero = tmp_path / "mavros.mcap", np.zeros(3)
     unit = np.array([1.0, 0.0, 0.0, 0.0])
     with BagWriter(path) as bag:
-        data = bytes(store.serialize_cdr(tree, "tf2_msgs/msg/TFMessage"))
         bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, data)
         for k in range(20):
             t = 1_000_000_000 + 50_000_000 * k
@@ -108,6 +114,37 @@ def test_a_bag_of_mavros_by_its_usual_names(tmp_path, mavros, capsys):
     said = capsys.readouterr().err
     assert "nothing that can be wrench" in said and "as it is" not in said
     assert f"It can be used, with other records than {mavros.name};" in said
+
+
+LOOP = [("mount", "imu_link", (0.1, 0, 0), LEVEL), ("imu_link", "mount", (0.1, 0, 0), LEVEL)]
+
+
+@pytest.mark.parametrize(
+    "transforms, position, yaw",
+    [
+        ([("imu_link", "base_link", (0.0, 0.2, 0.0), LEFT)], [-0.2, 0.0, 0.0], np.pi / 2),
+        (
+            [("hull", "base_link", (0.1, 0, 0), LEFT), ("hull", "imu_link", (0.3, 0, 0), LEVEL)],
+            [0.0, 0.2, 0.0], np.pi / 2,
+        ),
+        (LOOP, None, 0.0),
+        ([("base_link", "imu_link", (np.nan, 0.0, 0.0), LEVEL)], None, 0.0),
+        ([("base_link", "imu_link", (0.1, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))], None, 0.0),
+        (b"\0\1\0\0\xff\xff\xff\xff", None, 0.0),
+    ],
+    ids=["upward", "by a common parent", "a loop", "not finite", "no rotation", "garbage"],
+)  # fmt: skip
+def test_mounting_by_any_tree(tmp_path, transforms, position, yaw):
+    """As tf2 finds it, up the tree and down; what is no transform is passed over."""
+    data = transforms if isinstance(transforms, bytes) else tree_of(*transforms)
+    with BagWriter(tmp_path / "tree.mcap") as bag:
+        bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, data)
+    frames = {ODOMETRY: ("map", "base_link"), IMU: ("imu_link", "")}
+    found = topics.mounting(Bag(tmp_path / "tree.mcap"), frames)
+    assert bool(found) == (position is not None)
+    if found:
+        np.testing.assert_allclose(found["imu.position"], position, atol=1e-9)
+        np.testing.assert_allclose(found["imu.rotation"], [0.0, 0.0, yaw], atol=1e-9)
 
 
 def test_check_compares_the_mounting_with_the_tree(tmp_path, mavros, short_dive):

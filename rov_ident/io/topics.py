@@ -25,19 +25,22 @@ from rov_ident.core.frames import (
     from_core,
     quaternion_between,
     quaternion_multiply,
+    quaternion_normalise,
     quaternion_to_euler,
     quaternion_to_matrix,
 )
 from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
 from rov_ident.core.progress import Progress, silent
 from rov_ident.io import cdr
-from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, select_topic
+from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, candidates, select_topic
 from rov_ident.model.thruster_allocation import Allocator, knows
 
 ODOMETRY, IMU, WRENCH, POSE, BATTERY = "odom", "imu", "wrench", "pose", "battery"
 _JOINTS = "sensor_msgs/JointState"
 
 _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
+_NAMED = 5  # topics; of arrays of numbers a bag may have dozens
+_FIRST = 200  # messages that tell how late a topic is: some seconds
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
 _HELD = 1000  # poses and twists that wait for each other
 _NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
