@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import WrenchStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
@@ -247,6 +248,22 @@ def test_wrench_alone(live, heavy):
     np.testing.assert_array_equal(report.values, heavy.model.theta)
 
 
+def test_clocks_that_differ_are_named(live, short_dive):
+    """Without that all messages are good, and none can be used; a second publisher is named."""
+    vehicle = live()
+    other = vehicle.node.create_publisher(WrenchStamped, "thruster_wrench", 10)
+
+    def drive():
+        for _, role, message in short_dive[:200]:
+            hour = 3_600 * 10**9 if role == "wrench" else 0
+            vehicle.publish(role, cdr.encode(message._replace(stamp=message.stamp + hour)))
+        return "/thruster_wrench is stamped after /odom" in vehicle.words()
+
+    vehicle.until(drive)
+    vehicle.until(lambda: "/thruster_wrench has 2 publishers" in vehicle.words())
+    assert other.get_subscription_count() == 1
+
+
 def test_services_and_parameters(live, heavy, short_dive, tmp_path):
     saved = tmp_path / "saved.yaml"
     vehicle = live(f"save_path:={saved}", "timeout:=300")
@@ -329,6 +346,7 @@ def test_a_node_outlives_its_callbacks(live, short_dive, tmp_path):
         ("mass: ", "mass: -", "vehicle.mass is -"),
         ("cog: [0.0, 0.0, 0.0]", "cog: [0, 0.0, 0.0]", "written alike"),
         ("coefficients:", "coefficients", "not valid YAML"),
+        ("/**:", "/my_node:", "has no section for /rls_node"),
         *more(("mass: ", "mass: []  # ", "vehicle.mass is []")),
         *more(("X_uu: ", "X_ux: ", "coefficients.X_ux")),
     ],

@@ -326,3 +326,19 @@ def test_drivers_of_any_quality(domain):
         vehicle.close()
         status, said = end_node(process)
     assert status == 0, said
+
+
+def test_an_imu_that_cannot_be_received_is_named(domain):
+    """Its driver is best effort, as most are, and reliable messages were requested."""
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import Imu
+
+    process = start_node("rls", HEAVY, "qos.reliability:=reliable")
+    vehicle = Vehicle(roles=("odom", "wrench"))
+    vehicle.node.create_publisher(Imu, "imu/data", qos_profile_sensor_data)
+    try:
+        vehicle.until(lambda: "on /imu/data, though it has a publisher" in vehicle.words())
+    finally:
+        vehicle.close()
+        status, said = end_node(process)
+    assert status == 0, said

@@ -14,7 +14,7 @@ from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH
 from rov_ident.core.states import Level, State
 from rov_ident.estimation.checkpoint import Keeper
 from rov_ident.estimation.online import OnlineEstimator
-from rov_ident.io.topics import BATTERY, Reader
+from rov_ident.io.topics import BATTERY, ONE_CLOCK, Reader
 from rov_ident.nodes.common import GuardedNode
 from rov_ident.nodes.conversions import to_status
 from rov_ident.sampling.validation import describe
@@ -112,28 +112,50 @@ class Diagnostics:
     def _input_faults(self) -> list[str]:
         """What keeps the inputs from being used, in words."""
         complaints = []
-        for role, (name, _) in self._inputs.sources.items():
+        for role in self._inputs.sources:
             if self._lockstep or not self._inputs.is_missing(role, self._online.config.timeout):
                 continue
-            topic = self._node.resolve_topic_name(name)
+            topic = self._topic(role)
             if self._inputs.received[role]:
                 complaints.append(f"no more messages on {topic}: its driver has stopped")
-            elif role == IMU:
-                continue  # it may well have none
             elif self._node.count_publishers(topic):
                 complaints.append(
                     f"no message received on {topic}, though it has a publisher: it is silent, "
                     "or of another type, or its quality of service does not match qos.reliability"
                 )
-            else:
+            elif role != IMU:  # it may well have none
                 complaints.append(f"no message received on {topic}: remap it or start the driver")
+        complaints += self._clock_faults()
         counts = self._online.counts + self._reader.counts + self._node.faults + self._inputs.lost
         refused = counts - self._counts
         complaints += describe(
             {k: n for k, n in refused.items() if k not in _NO_WARNING and n > _CHANCE.get(k, 0)}
         )
         self._counts = counts
+        for role, subscription in self._inputs.subscriptions.items() if complaints else ():
+            if (number := subscription.get_publisher_count()) > 1:
+                complaints.append(f"{self._topic(role)} has {number} publishers: let one publish")
         return complaints
+
+    def _clock_faults(self) -> list[str]:
+        """Topics that come in together, but are stamped by different clocks."""
+        stamps = {
+            role: stamp
+            for role, stamp in self._online.sampler.validation.stamps.items()
+            if self._inputs.silence[role] < ONE_CLOCK and not self._lockstep
+        }
+        complaints = []
+        for role, stamp in stamps.items():
+            apart = (stamp - stamps.get(ODOMETRY, stamp)) * 1e-9
+            if abs(apart) > ONE_CLOCK:
+                topic, odometry = (self._topic(each) for each in (role, ODOMETRY))
+                order = "before" if apart < 0.0 else "after"
+                words = f"{topic} is stamped {order} {odometry} ({abs(apart):.3g} s)"
+                complaints.append(f"{words}: have one clock stamp both")
+        return complaints
+
+    def _topic(self, role: str) -> str:
+        return str(self._node.resolve_topic_name(self._inputs.sources[role][0]))
 
     def _input_status(self, complaints: list[str], period: float) -> DiagnosticStatus:
         values = {}

@@ -1,7 +1,9 @@
 """The configuration as ROS 2 parameters: declared, described, changed while running."""
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
@@ -40,6 +42,12 @@ def declare(node: Node, own: Iterable[str]) -> Config:
         if name not in own
     }
     if not any(name.startswith(("vehicle", "coefficients")) for name in given):
+        for option, path in pairwise(sys.argv):
+            if option == "--params-file":
+                raise UserError(
+                    f"{path} has no section for {node.get_fully_qualified_name()}: call its "
+                    "section /**:, which is for every node"
+                )
         raise UserError(
             "no configuration was given: add --ros-args --params-file FILE "
             "(`rov-ident init --out FILE` writes one)"

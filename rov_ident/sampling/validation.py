@@ -56,6 +56,11 @@ class Validation:
         """In which a topic's vectors are; empty before its first message."""
         return self._frame_ids.get(role, ("",))[-1]
 
+    @property
+    def stamps(self) -> Mapping[str, int]:
+        """The stamp [ns] of the last message that was taken of each topic."""
+        return self._last_stamp
+
     def judge(self, role: str, message: Message) -> str:
         """Why a message is refused, after counting it; empty if it is taken.
 
