@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pty
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -180,6 +181,46 @@ def test_curves_are_read_out_and_zoomed_together(tmp_path):
     path.write_text(html.page("curves", "", [html.panels(panels, "")], ""))
     assert path.stat().st_size < 5e6
     asyncio.run(_zoom(path))
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_charts_begin_with_the_limits_that_are_drawn(tmp_path):
+    """A simulation that diverges leaves the measurement to be seen, and errors begin at zero."""
+    t = np.linspace(0.0, 60.0, 600)
+    run, error = {"retuned": np.exp(t / 5.0)}, {"retuned": 0.1 + 1e-3 * np.sin(t)}
+    axes = "", "time [s]", "u [m/s]"
+    panels = [
+        plots.zoomable(plots.curves(t, run, *axes, measured=np.sin(t)), "run"),
+        plots.zoomable(plots.curves(t, error, *axes, marker="o"), "error"),
+    ]
+    path = tmp_path / "page.html"
+    path.write_text(html.page("curves", "", [html.panels(panels, "")], ""))
+
+    async def written():
+        async with chromium() as browser:
+            await browser.send("Page.addScriptToEvaluateOnNewDocument", source=KEEP_WHAT_IS_WRITTEN)
+            await browser.open(path.as_uri())
+            return await browser.until("written.filter(t => t == 'time [s]').length > 1 && written")
+
+    told = asyncio.run(written())
+    assert not [text for text in told if "000" in text]
+    assert "0.02" in told
+
+
+def test_no_curve_leads_across_a_pause():
+    """Nor is an error lost between two pauses: it is a point."""
+    t = np.concatenate([np.arange(0.0, 10.0, 0.1), [20.0], np.arange(3600.0, 3610.0, 0.1)])
+    drawn = plots.curves(t, {"retuned": np.sin(t)}, "u", "time [s]", "u [m/s]", measured=np.cos(t))
+    for line in drawn.axes[0].get_lines():
+        x, y = line.get_data()
+        broken = np.isnan(y)
+        np.testing.assert_allclose(x[broken], [14.95, 1810.0])
+        np.testing.assert_array_equal(x[~broken], t)
+    error = np.where(t == 20.0, 0.1, np.nan)
+    drawn = plots.curves(t, {"retuned": error}, "u", "time [s]", "error", marker="o")
+    (chart,) = json.loads(re.search(r"'curves'>(.*)</script>", plots.zoomable(drawn))[1])
+    assert [line["marked"] for line in chart["lines"]] == [True]
+    assert 0.1 in chart["lines"][0]["y"]
 
 
 def _long_names():

@@ -368,8 +368,9 @@ def _departures(explanation: Explanation, shown: Mapping[str, Array]) -> list[st
         unit, slots = UNITS[c], 0.5 * (edges[1:] + edges[:-1])
         by_time = {label: binned(t, e[:, i], edges) for label, e in errors.items()}
         figure = plots.curves(
-            slots, by_time, MOTIONS[c], "time [s]", f"RMS error [{unit}]", shaded=explanation.held
-        )
+            slots, by_time, MOTIONS[c], "time [s]", f"RMS error [{unit}]",
+            shaded=explanation.held, marker="o",
+        )  # fmt: skip
         over_time.append(plots.zoomable(figure, f"time-{c}-"))
         slots, by_speed = _by_speed(explanation, shown, i)
         figure = plots.curves(

@@ -19,14 +19,19 @@
     const stroke = ({ colour, alpha }) => () => faint(resolved(host, colour), alpha);
     const value = (u, v) => (v == null ? "–" : +v.toPrecision(4));
     const axis = { stroke: ink, grid: { stroke: () => faint(ink(), 0.12), width: 1 }, ticks: { show: false }, font: "11px system-ui" };
-    const whole = (u) => u.scales.x.min <= x[0] && u.scales.x.max >= x[1];
+    const [first, last] = [data[0][0], data[0].at(-1)];
+    let whole = true;   // not zoomed: with the limits of the drawn picture; uPlot asks for x first
+    const width = (u, low, high) => {
+      whole = low == null || (low <= Math.max(first, x[0]) && high >= Math.min(last, x[1]));
+      return whole ? x : [Math.max(low, x[0]), Math.min(high, x[1])];
+    };
     const edge = lines.length + 1;   // the first series of a band
     const options = {
       title, width: host.clientWidth, height: 230,
       cursor: { sync: { key: x.join(), scales: ["x", null] }, drag: { x: true, y: false } },
       scales: {
-        x: { time: false, range: (u, low, high) => (low == null ? x : [Math.max(low, x[0]), Math.min(high, x[1])]) },
-        y: { range: (u, low, high) => (whole(u) || low == null ? y : uPlot.rangeNum(low, high, 0.1, true)) },
+        x: { time: false, range: width },
+        y: { range: (u, low, high) => (whole || low == null ? y : uPlot.rangeNum(low, high, 0.1, true)) },
       },
       axes: [
         { ...axis, size: 22, label: "time [s]", labelSize: 16, labelFont: "11px system-ui" },
@@ -35,7 +40,7 @@
       series: [
         { label: "t", value: (u, v) => (v == null ? "–" : `${v.toFixed(2)} s`) },
         ...lines.map((l) => ({
-          label: l.label, stroke: stroke(l), width: l.width, dash: l.dash, value, points: { show: false },
+          label: l.label, stroke: stroke(l), width: l.width, dash: l.dash, value, points: { show: l.marked, size: 4 },
           ...(l.step ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}),
         })),
         ...bands.flatMap(() => [0, 1].map(() => ({ label: "", class: "edge", points: { show: false } }))),

@@ -54,6 +54,7 @@ LIMIT = 1.0  # a simulated curve may leave the measured range by so many ranges,
 _APART = ((None, None), (4.0, 2.0), (1.0, 2.0))
 """Dashes by which curves that lie on each other are told apart."""
 
+_PAUSE = 10.0  # usual steps, after which a curve breaks: nothing was measured there
 MEASURED = "measured"
 MODELS: Mapping[str, tuple[str, tuple[float, ...]]] = {
     "as configured": (COLOURS[1], (3.0, 1.2)),
@@ -176,13 +177,17 @@ def draw_curves(
     shaded: Sequence[tuple[float, float]] = (),
     marker: str = "",
 ) -> None:
-    """A curve (k,) over x (k,) for each of MODELS, held-out spans shaded. Without ``measured`` the
-    curves are errors, from zero."""
+    """A curve (k,) over x (k,) for each of MODELS, broken at pauses, held-out spans shaded. Without
+    ``measured`` the curves are errors, from zero."""
+    steps = np.diff(x)
+    pauses = 1 + np.flatnonzero(steps > _PAUSE * (np.median(steps) if len(steps) else 1.0))
+    at = np.insert(x, pauses, 0.5 * (x[pauses - 1] + x[pauses]))
     for begin, end in shaded:
         if end > x[0] and begin < x[-1]:
             ax.axvspan(max(begin, x[0]), min(end, x[-1]), color=INK, alpha=0.08, lw=0)
     if measured is not None:
-        ax.plot(x, measured, color=INK, lw=3.2, alpha=0.35, label=MEASURED)
+        behind = np.insert(measured, pauses, np.nan)
+        ax.plot(at, behind, color=INK, lw=3.2, alpha=0.35, label=MEASURED)
     if measured is not None and np.isfinite(measured).any():
         low, high = np.nanmin(measured), np.nanmax(measured)
         reach = LIMIT * (high - low)
@@ -193,7 +198,7 @@ def draw_curves(
     for label, y in models.items():
         colour, dashes = MODELS[label]
         line: dict[str, Any] = {"color": colour, "dashes": dashes or (None, None), "lw": 1.3}
-        ax.plot(x, y, marker=marker, ms=2.5, label=label, **line)
+        ax.plot(at, np.insert(y, pauses, np.nan), marker=marker, ms=2.5, label=label, **line)
     if measured is None:
         ax.set_ylim(bottom=0.0)
     if not marker and len(x) and x[0] < x[-1]:
@@ -459,6 +464,7 @@ def _chart(ax: Axes) -> dict[str, Any]:
             "x": _numbers(x), "y": _numbers(y), "label": label.lstrip("_"),
             "width": line.get_linewidth(), "dash": [3.0 * d for d in dashes],
             "step": "steps" in line.get_drawstyle(),
+            "marked": line.get_marker() not in ("", "None"),
             "colour": _named(str(line.get_color())), "alpha": line.get_alpha() or 1.0,
         })  # fmt: skip
     for band in ax.collections:
