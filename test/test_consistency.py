@@ -273,3 +273,19 @@ def test_nothing_has_converged_where_nothing_was_judged(heavy, short_dive, tmp_p
     fit = ri.fit(tmp_path / "short.mcap", heavy, kind)
     assert not fit.consistency.judged and "too little motion" in fit.doubt
     assert State.CONVERGED not in fit.states
+
+
+def test_a_fit_to_part_of_the_commands_says_so(tmp_path):
+    """Nothing that the innovations show says that the wrench is late: inertia would be too large,
+    and sure."""
+    _, parameters, messages = dive("", "six-axis", 3)
+    commands = itertools.count()
+    rare = [m for m in messages if m[1] != "wrench" or next(commands) % 5 == 0]
+    file = tmp_path / "vehicle.yaml"
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+    for name, part in (("all", messages), ("rare", rare)):
+        write_messages(tmp_path / f"{name}.mcap", part)
+        found = ri.fit(tmp_path / f"{name}.mcap", file, "rls").consistency
+        assert "motion ahead of the wrench" in [test.name for test in found.tests]
+        assert found.consistent == (name == "all"), found.sentence
+    assert "record each command" in found.sentence

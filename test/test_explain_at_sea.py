@@ -394,6 +394,21 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
     assert "behind the IMU" in clocks.notes[0]
 
 
+@pytest.mark.parametrize("driving", ["pilot", "six-axis"])
+@pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
+def test_commands_that_were_not_recorded(driving, seed):
+    """A controller at 50 Hz, of whose commands one in five is published: what is held is late."""
+    _, streams, config = streams_of("clean", driving, seed, 120.0)
+    (test,) = clock_errors.tests_of(streams, config)
+    assert test.passed
+    tenth = slice(int(np.random.default_rng(seed).integers(5)), None, 5)
+    thinned = dataclasses.replace(
+        streams, demand_t=streams.demand_t[tenth], demand=streams.demand[tenth]
+    )
+    (test,) = clock_errors.tests_of(thinned, config)
+    assert not test.passed and test.value == pytest.approx(0.04, abs=0.01)
+
+
 @pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
 def test_lone_velocities_that_jump_are_left_out(seed):
     dive = dive_of("clean", "pilot", seed, 60.0)

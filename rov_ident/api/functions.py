@@ -18,6 +18,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
+from rov_ident.discrepancy import clock_errors
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import Test
 from rov_ident.estimation.online import ESTIMATORS
@@ -160,7 +161,7 @@ def fit(
             _refuse_unusable(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
-        found = found.with_tests(_velocity_sensor_tests([bag.path for bag in many.bags], given))
+        found = found.with_tests(_message_tests([bag.path for bag in many.bags], given))
         if table:
             found = _with_table_notes(found, given, table)
         found = dataclasses.replace(found, notes=(*repeated, *found.notes))
@@ -178,15 +179,16 @@ def fit(
         return dataclasses.replace(found, more=found.more | more, judged=curves(*runs))
 
 
-def _velocity_sensor_tests(paths: Sequence[Path], config: Config) -> list[Test]:
-    """Tests of the velocity sensor on the first messages of each bag: the worst result of each."""
+def _message_tests(paths: Sequence[Path], config: Config) -> list[Test]:
+    """Tests of sensors and clocks on the first messages of each bag: the worst result of each."""
     worst: dict[str, Test] = {}
     for path in paths:
         bag = Bag(path)
         chosen = topics.select(bag, config)
         if has_velocity(bag, chosen, config):
             first = itertools.islice(topics.messages(bag, chosen, config), _COMPARED)
-            for test in tests_of(gather(first, config), config):
+            streams = gather(first, config)
+            for test in (*tests_of(streams, config), *clock_errors.tests_of(streams, config)):
                 before = worst.get(test.name, test)
                 worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
     return list(worst.values())

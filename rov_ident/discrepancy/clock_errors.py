@@ -15,13 +15,9 @@ from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.results import Finding
 from rov_ident.discrepancy.search import LATE_THRUST
 from rov_ident.effects import EFFECTS
+from rov_ident.estimation.consistency import Test
 from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams
-
-_AHEAD = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
-# 45 simulated dives with exact stamps, while 15 ms of a wrong clock made 17
-_FIRST_ORDER = 1.0  # s; what is further is beyond the manoeuvres about which a delay is linear
-_SURELY = 5.0  # standard deviations: these are of the noise alone
 
 
 @dataclass(frozen=True)
@@ -37,10 +33,7 @@ class ClockErrors:
         """What is wrong, in words."""
         told = []
         if self.ahead:
-            told.append(
-                f"the motion is {1e3 * self.ahead:.0f} ms ahead of the wrench, as nothing that "
-                "thrusts can be: correct the time stamps; no cause is sure beside that"
-            )
+            told.append(f"{delays.ahead_of_wrench(self.ahead)}; no cause is sure beside that")
         if self.behind:
             told.append(
                 f"attitude and angular velocities of the odometry are {1e3 * self.behind:.0f} ms "
@@ -62,13 +55,19 @@ def of(bags: Sequence[Streams], config: Config) -> ClockErrors:
     )
 
 
-def _ahead(streams: Streams, config: Config) -> float:
-    if len(streams.inputs_t):
-        return 0.0  # fins and propellers drive it, too: the wrench alone does not say when
-    rows = delays.filtered(delays.samples_of(streams), config)
+def tests_of(streams: Streams, config: Config) -> list[Test]:
+    """Whether the motion is ahead of the wrench: what a fit asks that learns from both. Nothing
+    where nothing moves, or fins and propellers drive it, too: the wrench alone says not when."""
+    rows = None if len(streams.inputs_t) else delays.filtered(delays.samples_of(streams), config)
     late = delays.NO_DELAY if rows is None else delays.motion_behind_wrench(rows)
-    ahead = -late.value
-    return ahead if max(_AHEAD, _SURELY * late.std) < ahead < _FIRST_ORDER else 0.0
+    if not np.isfinite(late.value):
+        return []
+    ahead, limit = late.ahead
+    return [Test("motion ahead of the wrench", ahead, limit, delays.ahead_of_wrench(ahead))]
+
+
+def _ahead(streams: Streams, config: Config) -> float:
+    return max((t.value for t in tests_of(streams, config) if not t.passed), default=0.0)
 
 
 def _behind(streams: Streams, config: Config) -> float:
@@ -77,4 +76,5 @@ def _behind(streams: Streams, config: Config) -> float:
     if late is None:
         return 0.0
     half = 0.5 * float(np.median(np.diff(streams.imu_t)))
-    return late.value if max(half, _SURELY * late.std) < late.value < _FIRST_ORDER else 0.0
+    surely = max(half, delays.SURELY * late.std)
+    return late.value if surely < late.value < delays.FIRST_ORDER else 0.0

@@ -16,7 +16,7 @@ from rov_ident.core.linalg import integral
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.offline import delays
-from rov_ident.offline.delays import Delay
+from rov_ident.offline.delays import Delay, ahead_of_wrench
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams
@@ -25,8 +25,6 @@ from rov_ident.sampling.without_velocity import is_without_velocity
 GOOD, WARNING, BAD = "good", "warning", "bad"
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
 _DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
-_SURELY = 5.0  # standard deviations: these are of the noise alone, and clean dives reach 4.5
-_FIRST_ORDER = 1.0  # s; a longer delay is beyond the manoeuvres about which it is linear
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes
 _UPWARD = 0.9  # g; mean specific force upward; a sign or an axis that is wrong gives 0.7 or less
 _SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
@@ -225,10 +223,13 @@ def _delay_remark(subject: str, late: Delay) -> Remark:
     text = f"{1e3 * late.value:.1f} ± {1e3 * NORMAL * late.std:.1f} ms (95 %)"
     if not np.isfinite(late.value):
         return Remark(subject, WARNING, "cannot be told: nothing moves")
-    if abs(late.value) > _FIRST_ORDER:
+    if abs(late.value) > delays.FIRST_ORDER:
         return Remark(subject, WARNING, "cannot be told: the one does not follow the other")
+    of_wrench, (ahead, most) = "wrench" in subject, late.ahead
+    if of_wrench and ahead > most:
+        return Remark(subject, WARNING, f"{text}: {ahead_of_wrench(ahead)}")
     if abs(late.value) > max(_DELAY, 3.0 * late.std):
-        more = ", or let explain look for thruster lag and delay" if "wrench" in subject else ""
+        more = ", or let explain look for thruster lag and delay" if of_wrench else ""
         return Remark(subject, WARNING, f"{text}: check the time stamps{more}")
     return Remark(subject, GOOD, text)
 
@@ -236,7 +237,7 @@ def _delay_remark(subject: str, late: Delay) -> Remark:
 def _drift_remark(first: Delay, last: Delay) -> list[Remark]:
     """That a delay differs between the halves of the record; else nothing."""
     moved, std = last.value - first.value, float(np.hypot(first.std, last.std))
-    if not max(_DELAY, _SURELY * std) < abs(moved) < _FIRST_ORDER:
+    if not max(_DELAY, delays.SURELY * std) < abs(moved) < delays.FIRST_ORDER:
         return []
     text = (
         f"{1e3 * first.value:.0f} ms in the first half, {1e3 * last.value:.0f} ms in the second: "
