@@ -146,8 +146,8 @@ def test_the_reference_follows_outliers_and_what_does_not_move(heavy):
 
 
 @numba.njit(cache=True)
-def inverted(mass, lightest, inverse):
-    invert_mass(ukf.LANES, mass, lightest, inverse)
+def inverted(mass, lightest, turns, inverse):
+    invert_mass(ukf.LANES, mass, lightest, turns, inverse)
 
 
 def test_mass_matrices_are_made_positive_definite(heavy):
@@ -161,7 +161,7 @@ def test_mass_matrices_are_made_positive_definite(heavy):
     assert np.sum(indefinite) >= 3 and not indefinite[0]
     lanes = np.ascontiguousarray(mass.transpose(1, 2, 0))
     inverse = np.zeros_like(lanes)
-    inverted(lanes, ukf.problem(heavy).lightest, inverse)
+    inverted(lanes, ukf.problem(heavy).lightest, 1.0, inverse)
     for k, before in enumerate(mass):
         expected = before + textbook.ballast(before, body)
         np.testing.assert_allclose(lanes[:, :, k], expected, rtol=1e-9, atol=1e-9)
@@ -169,6 +169,12 @@ def test_mass_matrices_are_made_positive_definite(heavy):
         wanted = np.tril(np.linalg.inv(expected))
         np.testing.assert_allclose(np.tril(inverse[:, :, k]), wanted, rtol=1e-7, atol=1e-9)
     assert np.array_equal(lanes[:, :, 0], mass[0])
+    again = np.zeros_like(lanes)
+    inverted(lanes, ukf.problem(heavy).lightest, 0.0, again)
+    for k in range(ukf.LANES):
+        linear = np.tril(np.linalg.inv(lanes[:3, :3, k]))
+        np.testing.assert_allclose(np.tril(again[:3, :3, k]), linear, rtol=1e-7, atol=1e-9)
+    assert not again[3:].any(), "forces turn a vehicle that turns as measured"
 
 
 def test_a_prior_wide_enough_for_negative_mass(heavy, noisy):

@@ -58,6 +58,7 @@ from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
 from rov_ident.sampling.raw_streams import Streams, joined
+from rov_ident.sampling.sample import NO_MOMENT
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
@@ -70,10 +71,6 @@ _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 CUT_SHORT = (
     "the search was cut short after as much simulation as it may take: not all further effects, or "
     "rivals of those found, were tried; a configuration that fits better (rov-ident fit) helps"
-)
-_NO_TORQUE = (
-    "the wrench of these bags never holds a moment: how the vehicle turns is taken from the "
-    "measurement, not simulated, and nothing is said about it"
 )
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"
@@ -233,7 +230,7 @@ def explain(
     notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
     notes += [_FILTERED] if data.late else []
     notes += data.clocks.notes
-    notes += [_NO_TORQUE] if data.streams.guided.any() else []
+    notes += [NO_MOMENT] if data.streams.guided.any() else []
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
     findings = Findings(

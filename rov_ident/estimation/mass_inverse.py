@@ -66,7 +66,7 @@ def _inverse(a, least):
 
 
 @inlined
-def invert_mass(lanes, m, lightest, inverse):
+def invert_mass(lanes, m, lightest, turns, inverse):
     """Lower half of the inverses (6, 6, lanes) of symmetric m (6, 6, lanes) = [[A, B'], [B, D]].
 
     In 3 x 3 blocks, with V = A^-1 B', the Schur complement S = D - B V and U = V S^-1::
@@ -76,19 +76,22 @@ def invert_mass(lanes, m, lightest, inverse):
     The pivots of A and S are those of m. Where one is less than ``lightest`` (6,), m has no inertia
     left in some direction, as the outer points of a wide prior may have: m gets so much more on its
     diagonal that it has (as in Gill, Murray and Wright 1981, sec. 4.4.2.2).
+
+    ``turns`` is 1.0, or 0.0 where forces turn nothing, as rotation is guided: A^-1, and zeros.
     """
     none = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     first = lightest[0], lightest[1], lightest[2]
     last = lightest[3], lightest[4], lightest[5]
     for k in range(lanes):
-        b = _block(m, 3, 0, k)
+        b = _plus(none, turns, _block(m, 3, 0, k), unit)
         a, more = _inverse(_block(m, 0, 0, k), first)
         v = _plus(none, 1.0, a, b)
         s, yet_more = _inverse(_plus(_block(m, 3, 3, k), -1.0, b, _transposed(v)), last)
         u = _plus(none, 1.0, v, s)
         _put(inverse, 0, 0, k, 1.0, _plus(a, 1.0, u, v))
         _put(inverse, 3, 0, k, -1.0, _transposed(u))
-        _put(inverse, 3, 3, k, 1.0, s)
+        _put(inverse, 3, 3, k, turns, s)
         m[0, 0, k], m[1, 1, k], m[2, 2, k] = (
             m[0, 0, k] + more[0], m[1, 1, k] + more[1], m[2, 2, k] + more[2],
         )  # fmt: skip

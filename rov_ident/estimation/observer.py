@@ -56,6 +56,14 @@ def take_inputs(structure, inputs, s):
 
 
 @inlined
+def take_guide(s):
+    """Take off the force what guided components add to the other equations of motion."""
+    for i in range(6):
+        for j in range(6):
+            s.force[i] -= s.one_mass[i, j, 0] * s.guide[j]
+
+
+@inlined
 def linearised_step(structure, theta, one_theta, nu, late, dt, s):
     """One step from nu (6,), beginning ``late`` seconds after mid-interval, and its linearisation.
 

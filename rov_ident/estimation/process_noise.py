@@ -47,6 +47,12 @@ def process(config: Config) -> NDArray[np.void]:
 
 
 @inlined
+def is_guided(sample):
+    """Whether nothing is known of the moments: the vehicle then turns as measured."""
+    return sample.wrench_doubt[3] == np.inf
+
+
+@inlined
 def wrench_noise(constants, sample, out):
     """out (6,): variance density [N2 s, (N m)2 s] of the wrench; an error lasts as long as it.
 
@@ -56,14 +62,15 @@ def wrench_noise(constants, sample, out):
 
     Returns whether some of the wrench is in doubt: then the noise levels are not updated.
     """
-    lasting, doubtful = max(constants.lasting, sample.hold), False
+    lasting, doubtful, guided = max(constants.lasting, sample.hold), False, is_guided(sample)
     for i in range(6):
+        doubt = 0.0 if guided and i >= 3 else sample.wrench_doubt[i]
         known = constants.relative * sample.wrench[i] ** 2 + constants.least[i]
         x, y, z = constants.restoring[i]
         a = y * sample.down[2] - z * sample.down[1]
         b = z * sample.down[0] - x * sample.down[2]
         c = x * sample.down[1] - y * sample.down[0]
         tilted = sample.tilt * (a * a + b * b + c * c)
-        out[i] = lasting * (known + sample.wrench_doubt[i]) + tilted
-        doubtful |= sample.wrench_doubt[i] > 0.0
+        out[i] = lasting * (known + doubt) + tilted
+        doubtful |= doubt > 0.0
     return doubtful

@@ -38,11 +38,18 @@ class ReferenceUkf:
         if info["reason"] == ukf.RESTARTED:
             self._restart()
             return
+        x, p = self.filter.x, self.filter.P
+        free = self._free = np.isfinite(row["wrench_doubt"])
+        self._guide = np.where(free, 0.0, (row["nu"] - x[:6]) / row["dt"])
+        guided = np.flatnonzero(~free)
+        p[guided] = p[:, guided] = 0.0
+        p[guided, guided] = ukf.KNOWN
         self.filter.Q = self._noise(before.monitor["density"])
         self.filter.predict(dt=row["dt"])
         z, r = row["odometry"].copy(), row["odometry_variance"].copy()
         if np.isfinite(row["gyro"]).all():
             z[3:], r[3:] = row["gyro"], row["gyro_variance"]
+        z[guided] = np.nan
         gate = self.config.ukf.gate**2
         for part in (slice(0, 3), slice(3, 6)):
             if not np.isfinite(z[part] + r[part]).all() or info["nis"][part].max() > gate:
@@ -57,7 +64,10 @@ class ReferenceUkf:
         mass = self.model.with_theta(theta).mass_matrix
         mass = mass + raised(mass, self.task.lightest)
         force = force_of_one(self.model.structure, mass, theta, nu, self._row["inputs"][0])
-        return np.linalg.solve(mass, tau - force - self.model.restoring_force(down))
+        left = tau - force - self.model.restoring_force(down) - mass @ self._guide
+        nu_dot, free = self._guide.copy(), self._free
+        nu_dot[free] = np.linalg.solve(mass[np.ix_(free, free)], left[free])
+        return nu_dot
 
     def _restart(self) -> None:
         """Begin from the measured velocity; the coefficients stay."""
@@ -88,10 +98,12 @@ class ReferenceUkf:
         return np.concatenate([nu, x[6:]])
 
     def _inverse_mass(self) -> Array:
-        """(6, 6), at the estimate."""
+        """(6, 6), at the estimate; zeros where forces move nothing."""
         mass = self.model.with_theta(self._theta(self.filter.x[6:])).mass_matrix
-        inverse = np.linalg.inv(mass + raised(mass, self.task.lightest))
-        return np.asarray(inverse, dtype=np.float64)
+        mass, inverse = mass + raised(mass, self.task.lightest), np.zeros((6, 6))
+        free = np.ix_(self._free, self._free)
+        inverse[free] = np.linalg.inv(mass[free])
+        return inverse
 
     def _noise(self, density: Array) -> Array:
         """Q (6 + n, 6 + n) of the unknown forces, and ``density`` (6,) of unknown acceleration."""
@@ -99,12 +111,12 @@ class ReferenceUkf:
         inverse = self._inverse_mass()
         strength = (wrench.relative_std * row["wrench"]) ** 2 + np.square(wrench.floor_std)
         lasting = max(wrench.correlation_time, row["hold"])
-        strength = lasting * (strength + row["wrench_doubt"])
+        strength = lasting * (strength + np.where(self._free, row["wrench_doubt"], 0.0))
         turned = np.cross(self.model.body.restoring, row["down"])
         strength += row["tilt"] * np.square(turned).sum(axis=1)
         forces = (inverse * strength) @ inverse.T
         q = np.zeros_like(self.filter.P)
-        q[:6, :6] = (forces + np.diag(density)) * row["dt"]
+        q[:6, :6] = (forces + np.diag(density * self._free)) * row["dt"]
         return q
 
     def _update(self, z: Array, r: Array, monitor: NDArray[np.void]) -> None:

@@ -65,10 +65,11 @@ from rov_ident.estimation.observer import (
     drive_of,
     force_of,
     linearised_step,
+    take_guide,
     take_inputs,
 )
 from rov_ident.estimation.physical import Estimate, calibrated
-from rov_ident.estimation.process_noise import wrench_noise
+from rov_ident.estimation.process_noise import is_guided, wrench_noise
 from rov_ident.estimation.shared import (
     FASTEST,
     LAG,
@@ -124,6 +125,7 @@ _SETTINGS = record(
 _SCALARS = record(
     [
         *floats((), "t since_update since_walk"),
+        ("guided", "?"),  # the vehicle turns as measured
         ("rho", "f8"),  # thrust scale over its prior mean, of the observer
         ("peak", "f8", (6,)),  # squared velocities, their peaks of late
         ("free", "i8"),  # so many of the first columns take rows
@@ -389,6 +391,9 @@ def _steps(task, state, work, samples, sides, infos):
             info.reason = NOT_FINITE
             continue
         c.t = sample.t
+        if c.guided != is_guided(sample):
+            c.guided = is_guided(sample)
+            _take_over(task, state, work)
         info.reason = USED
         if sample.restart or not c.started or not sample.dt > 0.0:
             info.reason = RESTARTED
@@ -481,9 +486,9 @@ def _take_over(task, state, work):
         for j in range(6):
             s.one_mass[i, j, 0] = task.rigid_body[i, j]
     add_added_mass(task.structure, work.one_theta, s.one_mass)
-    invert_mass(1, s.one_mass, task.lightest, s.lower_inverse)
+    turns = 0.0 if state.scalars[0].guided else 1.0
+    invert_mass(1, s.one_mass, task.lightest, turns, s.lower_inverse)
     for i in range(6):
-        s.guide[i] = 0.0
         for j in range(6):
             s.inverse[i, j] = s.lower_inverse[max(i, j), min(i, j), 0]
             for k in range(LANES):
@@ -498,7 +503,16 @@ def _predict(task, state, work, sample, side):
     n = len(work.scale)
     force_of(sample, s.wrench, task.restoring, s.force, s.slope)
     take_inputs(task.structure, sample.inputs[0], s)
-    doubtful = wrench_noise(task.process[0], sample, s.middle)
+    doubtful, guided = wrench_noise(task.process[0], sample, s.middle), is_guided(sample)
+    for i in range(6):
+        s.guide[i] = 0.0
+        if guided and i >= 3:
+            s.guide[i] = (sample.nu[i] - nu[i]) / sample.dt
+            for a in range(n):
+                sensitivity[i, a] = 0.0
+            for j in range(6):
+                p[i, j] = p[j, i] = 0.0
+    take_guide(s)
     for i in range(6):
         for j in range(i + 1):
             total = 0.0
@@ -506,6 +520,8 @@ def _predict(task, state, work, sample, side):
                 total += inverse[i, a] * inverse[j, a] * s.middle[a]
             noise[i, j] = total
             noise[j, i] = total
+        if guided and i >= 3:
+            continue
         state.monitor[i].since += sample.dt
         noise[i, i] += state.monitor[i].density
         state.monitor[i].acting = 0.0 if doubtful else noise[i, i]
@@ -613,6 +629,8 @@ def _update(task, state, work, sample, side, info):
     measure(sample, z, r)
     for i in range(6):
         moving |= work.moving[i] != 0
+        if is_guided(sample) and i >= 3:
+            z[i] = np.nan
         if np.isnan(z[i]):
             continue
         # less what the parameters of effects, as they are, add to the measurement

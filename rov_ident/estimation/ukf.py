@@ -47,7 +47,7 @@ from rov_ident.estimation.innovation_monitor import (
 from rov_ident.estimation.mass_inverse import invert_mass
 from rov_ident.estimation.observer import force_of
 from rov_ident.estimation.physical import Estimate, calibrated
-from rov_ident.estimation.process_noise import wrench_noise
+from rov_ident.estimation.process_noise import is_guided, wrench_noise
 from rov_ident.estimation.shared import (
     FASTEST,
     LAG,
@@ -81,6 +81,7 @@ REASONS = (
 REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 
 LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
+KNOWN = 1e-12  # (rad/s)2; of a rate that is guided: as good as none, for the root to exist
 _PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
 _ROOM = 1.5  # for innovation_monitor.watch ("Constants of the process noise" in docs/accuracy.md)
 
@@ -173,7 +174,8 @@ _SCRATCH = record(
         ("centre_inverse", "f8", (6, 6)),
         # nu of the centre point, mean minus centre; wrench minus restoring in mid-interval, and its
         # slope; variance density of the wrench; nu as measured, its variance
-        *floats((6,), "centre shift force slope strength z r"),
+        # nu_dot of components that are guided, zero for the others
+        *floats((6,), "centre shift force slope strength z r guide"),
         # of the estimate, for the residual
         *floats((6,), "wrench"),
         *floats((6, 1), "one_nu one_h"),
@@ -243,6 +245,7 @@ def _steps(task, state, work, samples, sides, infos):
                 state.monitor[i].nis = 1.0
             info.reason = RESTARTED
         else:
+            _guide(state.x, work, sample)
             _take_root(work, info)
             _predict(task, state.x, work, sample, side)
             if not _collect(task, state, work, sample):
@@ -277,6 +280,18 @@ def _restart(state, p, sample):
 
 
 @inlined
+def _guide(x, work, sample):
+    """Where nothing is known of the moments, rates are as good as known, and go as measured."""
+    for i in range(6):
+        work.scratch[0].guide[i] = 0.0
+        if is_guided(sample) and i >= 3:
+            work.scratch[0].guide[i] = (sample.nu[i] - x[i]) / sample.dt
+            for j in range(len(x)):
+                work.p[i, j] = work.p[j, i] = 0.0
+            work.p[i, i] = KNOWN
+
+
+@inlined
 def _take_root(work, out):
     """work.root of work.p, which is repaired where rounding has made a direction negative."""
     p, size = work.p, len(work.p)
@@ -304,7 +319,8 @@ def _predict(task, x, work, sample, side):
     dt = sample.dt / steps
     for sign in range(2):
         for first in range(0, columns, LANES):
-            _spread(task, x, work, first, spread if sign == 0 else -spread)
+            turns = 0.0 if is_guided(sample) else 1.0
+            _spread(task, x, work, first, spread if sign == 0 else -spread, turns)
             _add_effect_wrench(task, work, side)
             for k in range(steps):
                 _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt)
@@ -320,7 +336,7 @@ def _predict(task, x, work, sample, side):
 
 
 @reordered
-def _spread(task, x, work, first, spread):
+def _spread(task, x, work, first, spread, turns):
     """Sigma points x + spread * column: their velocities, coefficients, mass matrices."""
     s, theta, structure = work.scratch[0], work.theta, task.structure
     for i in range(6):
@@ -341,16 +357,19 @@ def _spread(task, x, work, first, spread):
             s.mass[i, j, k] = task.rigid_body[i, j]
             s.mass[j, i, k] = task.rigid_body[i, j]
     add_added_mass(structure, theta, s.mass)
-    invert_mass(LANES, s.mass, task.lightest, s.inverse)
+    invert_mass(LANES, s.mass, task.lightest, turns, s.inverse)
 
 
 @inlined
 def _add_effect_wrench(task, work, side):
-    """What the parameters of effects add to the wrench on the sigma points."""
+    """What parameters of effects, and guided rates, add to the wrench on the sigma points."""
     s, first = work.scratch[0], len(task.theta) - side.shape[1]
     for i in range(6):
         for k in range(LANES):
             s.push[i, k] = 0.0
+        for j in range(3, 6):
+            for k in range(LANES):
+                s.push[i, k] -= s.mass[i, j, k] * s.guide[j]
         for j in range(side.shape[1]):
             for k in range(LANES):
                 s.push[i, k] += side[i, j] * (work.theta[first + j, k] - side[12, j])
@@ -377,7 +396,7 @@ def _propagate(structure, work, late, dt):
             )  # fmt: skip
             nu_dot = symmetric_product(s.inverse, rest, k)
             for i in range(6):
-                s.nu_dot[i, k] = nu_dot[i]
+                s.nu_dot[i, k] = nu_dot[i] + s.guide[i]
         for i in range(6):
             runge_kutta(stage, dt, nu[i], s.nu_dot[i], reached[i], s.total[i])
     for i in range(6):
@@ -394,7 +413,7 @@ def _collect(task, state, work, sample):
     s, c = work.scratch[0], task.settings[0]
     x, p, root, plus, minus = state.x, work.p, work.root, work.moved[0], work.moved[1]
     size, columns = p.shape
-    doubtful = wrench_noise(task.process[0], sample, s.strength)
+    doubtful, guided = wrench_noise(task.process[0], sample, s.strength), is_guided(sample)
     speed = 0.0
     for i in range(6):
         total = 0.0
@@ -412,7 +431,7 @@ def _collect(task, state, work, sample):
             total = 0.0
             for k in range(columns):
                 total += plus[i, k] * plus[j, k] + minus[i, k] * minus[j, k]
-            noise = state.monitor[i].density if i == j else 0.0
+            noise = state.monitor[i].density if i == j and not (guided and i >= 3) else 0.0
             for a in range(6):
                 noise += s.centre_inverse[i, a] * s.centre_inverse[j, a] * s.strength[a]
             # the last one stays: of the axis itself
@@ -449,8 +468,11 @@ def _update(task, state, work, sample, side, out):
         noisy |= work.noisy[i]
         for j in range(side.shape[1]):
             z[i] += side[6 + i, j] * side[12, j]
-        state.monitor[i].since += sample.dt
         moving |= sample.moving[i] != 0
+        if is_guided(sample) and i >= 3:
+            z[i] = np.nan
+        else:
+            state.monitor[i].since += sample.dt
     for first in (0, 3):
         if not np.isfinite(z[first] + z[first + 1] + z[first + 2]):
             continue

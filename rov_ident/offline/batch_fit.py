@@ -38,7 +38,7 @@ from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
-from rov_ident.sampling.sample import parts
+from rov_ident.sampling.sample import free_axes, parts
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
@@ -257,6 +257,7 @@ def _stage(
         if held := [n for n in names if n not in known]:
             notes.append(f"{name}: {', '.join(held)} held, {reason}")
             names, config = known, replace(config, estimate=known)
+    free &= np.any(archive.each(free_axes), axis=0)
     prior = prior_of(config, effects=True)
     coefficients = prior_of(config)
     precision = 1.0 if settings.prior else _NO_PRIOR

@@ -34,7 +34,7 @@ from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.filtered_regression import Regression, filtered_rows, regression
 from rov_ident.sampling.records import HORIZON, predicted
-from rov_ident.sampling.sample import parts
+from rov_ident.sampling.sample import free_axes, parts
 
 PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
 _LAG = 2.0  # s; window over the correlation of the residuals
@@ -174,6 +174,8 @@ def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array]
         simulated["nu"][:, :3] -= samples["water"]
         z = filtered_rows(batch.task, simulated, PERIOD)
         z[:, :, -1] = phi[:, :, -1]
+    unknown = ~free_axes(samples)
+    z[:, unknown] = phi[:, unknown] = 0.0
     good = np.isfinite(z).all(axis=(1, 2))
     return phi[good], z[good]
 

@@ -57,6 +57,7 @@ from rov_ident.estimation.observer import (
     drive_of,
     force_of,
     linearised_step,
+    take_guide,
     take_inputs,
 )
 from rov_ident.estimation.shared import (
@@ -72,7 +73,7 @@ from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.sampling.kinematic_filter import SUREST
-from rov_ident.sampling.sample import NO_SIDES, parts
+from rov_ident.sampling.sample import NO_SIDES, free_axes, parts
 from rov_ident.sampling.wrench_scatter import SHARE
 
 T = TypeVar("T")
@@ -114,7 +115,8 @@ class Noise:
     def process(self, samples: Samples) -> Array:
         """Density (k, 6) of the wrench's error."""
         lasting = np.maximum(self.correlation_time, samples["hold"])[:, None]
-        variance = (self.relative * samples["wrench"]) ** 2 + samples["wrench_doubt"]
+        doubt = np.where(np.isfinite(samples["wrench_doubt"]), samples["wrench_doubt"], 0.0)
+        variance = (self.relative * samples["wrench"]) ** 2 + doubt
         # |r x down|^2, of a unit vector
         along = (samples["down"] @ self.restoring.T) ** 2
         turned = np.maximum(np.sum(self.restoring**2, axis=1) - along, 0.0)
@@ -175,9 +177,11 @@ def one_pass(
 
     ``estimated`` (n,) are indices into theta, behind which come the values (p,) of parameters of
     ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
-    measurement. ``out`` (3, k, 6), unless it is empty, is filled with :class:`Innovations`.
+    measurement, and those of which no wrench is known. ``out`` (3, k, 6), unless it is empty, is
+    filled with :class:`Innovations`.
     """
-    free = np.ones(6, dtype=bool) if free is None else free
+    known = free_axes(samples)
+    free = known if free is None else free & known
     samples, sides = parts(samples)
     if not len(effects):
         sides = NO_SIDES
@@ -583,9 +587,7 @@ def _predict(eq, sample, side, process, x, p, sensitivity, scale, work):
     wrench_of(eq.one_theta, sample, side, s.wrench)
     force_of(sample, s.wrench, eq.restoring, s.force, s.slope)
     take_inputs(eq.structure, sample.inputs[0], s)
-    for i in range(6):
-        for j in range(6):
-            s.force[i] -= eq.mass[i, j] * s.guide[j]
+    take_guide(s)
     steps = steps_of(sample.dt)
     dt = sample.dt / steps
     for step in range(steps):

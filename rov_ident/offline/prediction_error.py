@@ -14,6 +14,7 @@ from rov_ident.effects import EFFECTS, Acting, compiled
 from rov_ident.model.equations import Model
 from rov_ident.offline.archive import Archive, Bag, Samples
 from rov_ident.sampling.records import HORIZON, measured_motion, predicted
+from rov_ident.sampling.sample import free_axes
 
 _POINTS = 1500  # of a curve in a picture
 _DRAWS = 8  # the RMS over them is known to 25 %
@@ -55,6 +56,7 @@ def _simulated(
     told, keep = samples["measured"], slice(None, None, max(1, len(samples) // _POINTS))
     with np.errstate(invalid="ignore"):
         squares = np.sum((simulated - motion)[told] ** 2, axis=0)
+    squares[~free_axes(samples)] = np.nan
     return squares, int(told.sum()), (samples["t"][keep], motion[keep], simulated[keep])
 
 

@@ -40,10 +40,15 @@ class _Command(NamedTuple):
 
 
 class ActingWrench:
-    """Takes commands from their queue and says what acts in each interval."""
+    """Takes commands from their queue and says what acts in each interval.
+
+    ``has_moment``: whether any held a moment so far. Thrusters hardly push without some: until then
+    none was recorded, and what turns the vehicle is unknown.
+    """
 
     def __init__(self, config: Config) -> None:
         self._noise = ReadingNoise()
+        self.has_moment = False
         self.configure(config)
         self.clear()
 
@@ -135,6 +140,7 @@ class ActingWrench:
         if at > end or (at == end and held is not None):
             return None
         wrench, _, doubt = despiker.judge(WRENCH, queue)
+        self.has_moment = self.has_moment or bool(wrench[3:].any())
         self._noise.take(at, queue.popleft().values)
         self._estimated.clear()
         if last > -np.inf:

@@ -17,7 +17,7 @@ from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import INPUTS
 from rov_ident.model.equations import Model
-from rov_ident.sampling.sample import after_reset, joined, stretches
+from rov_ident.sampling.sample import NO_MOMENT, after_reset, free_axes, joined, stretches
 from rov_ident.sampling.sampler import Sampler
 from rov_ident.sampling.validation import describe
 from rov_ident.sampling.without_velocity import IMPOSSIBLE, has_velocity, is_without_velocity
@@ -76,6 +76,7 @@ def read_record(
     notes += [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
     notes += [bag.damage] if bag.damage else []
     notes += [] if measured else [f"{bag.path.name}: {IMPOSSIBLE}"]
+    notes += [] if free_axes(samples).all() else [f"{bag.path.name}: {NO_MOMENT}"]
     notes += _input_notes(config, samples)
     if len(samples) < 2:
         raise UserError(
@@ -113,11 +114,13 @@ def predicted(
 
     An infinite horizon is one run. Every window starts from the measured state at its first sample;
     so does every stretch after a gap. Components not marked in ``free`` (6,) follow the
-    measurement. Infinite where the simulation diverges. ``effects`` on the wrench and the current
-    act along the simulated motion, in place of what the samples say they did along the measured
-    one.
+    measurement, and those of which no wrench is known. Infinite where the simulation diverges.
+    ``effects`` on the wrench and the current act along the simulated motion, in place of what the
+    samples say they did along the measured one.
     """
-    out = np.empty((len(samples), 6))
+    out, known = np.empty((len(samples), 6)), free_axes(samples)
+    if not known.all():
+        free = known if free is None else free & known
     for first, end in stretches(samples):
         part = samples[first:end]
         thrust = part["wrench"] - part["surroundings"]

@@ -13,6 +13,11 @@ from rov_ident.model.coefficients import INPUTS
 
 NO_SIDES = np.zeros((1, 13, 0))
 
+NO_MOMENT = (
+    "the wrench never holds a moment: how the vehicle turns is taken from the measurement, not "
+    "simulated, and nothing is said about it"
+)
+
 SAMPLE = record(
     [
         ("t", "f8"),  # s since the first message
@@ -30,7 +35,9 @@ SAMPLE = record(
         ("tilt", "f8"),  # rad2 s: variance density of an error of down that lasts a second
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
-        ("wrench_doubt", "f8", (6,)),  # N2, (N m)2: what of it may be an outlier, mean over dt
+        # N2, (N m)2: what of it may be an outlier, mean over dt; infinite, of all moments: none was
+        # ever recorded
+        ("wrench_doubt", "f8", (6,)),
         # fins and shafts: mean over dt, and at t; zeros where none is configured
         ("inputs", "f8", (2, len(INPUTS))),
         # N2 s, (N m)2 s: variance density of what looks like noise of the wrench's reading; 0 where
@@ -60,6 +67,12 @@ def after_reset(samples: NDArray[np.void]) -> NDArray[np.void]:
     """Samples (k,) of SAMPLE from the last one on that makes all before it invalid (``anew``)."""
     anew = np.flatnonzero(samples["anew"])
     return samples[anew[-1] :] if len(anew) else samples
+
+
+def free_axes(samples: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Axes (6,) along which samples (k,) tell what moves the vehicle (:data:`NO_MOMENT`)."""
+    known: NDArray[np.bool_] = np.isfinite(samples["wrench_doubt"]).any(axis=0)
+    return known
 
 
 def stretches(samples: NDArray[np.void]) -> Iterator[tuple[int, int]]:

@@ -69,6 +69,7 @@ class Sampler:
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
         self._usual = 0.0  # s between samples
+        self._has_moment = False  # of thrusters or fins: see ActingWrench
         self._position = np.zeros(3)  # m: the last that was measured
         self.configure(config)
 
@@ -249,6 +250,9 @@ class Sampler:
             self.counts[f"sample: no {why}"] += 1
             self._previous = math.nan
             return None
+        self._has_moment |= self._acting.has_moment or bool(sample["inputs"][0, :, :3].any())
+        if not self._has_moment:
+            sample["wrench_doubt"][0, 3:] = np.inf
         self._acting.surround(sample)
         if self._jacobians is not None:
             self._jacobians.extend(sample, sides, self.kinematic_filter.acceleration)
