@@ -39,6 +39,7 @@ from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams, gather, orientation_at
 
 
@@ -399,13 +400,13 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
 def test_commands_that_were_not_recorded(driving, seed):
     """A controller at 50 Hz, of whose commands one in five is published: what is held is late."""
     _, streams, config = streams_of("clean", driving, seed, 120.0)
-    (test,) = clock_errors.tests_of(streams, config)
+    (test,) = delays.tests_of(streams, config)
     assert test.passed
     tenth = slice(int(np.random.default_rng(seed).integers(5)), None, 5)
     thinned = dataclasses.replace(
         streams, demand_t=streams.demand_t[tenth], demand=streams.demand[tenth]
     )
-    (test,) = clock_errors.tests_of(thinned, config)
+    (test,) = delays.tests_of(thinned, config)
     assert not test.passed and test.value == pytest.approx(0.04, abs=0.01)
 
 

@@ -18,7 +18,6 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.discrepancy import clock_errors
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import Test
 from rov_ident.estimation.online import ESTIMATORS
@@ -188,7 +187,7 @@ def _message_tests(paths: Sequence[Path], config: Config) -> list[Test]:
         if has_velocity(bag, chosen, config):
             first = itertools.islice(topics.messages(bag, chosen, config), _COMPARED)
             streams = gather(first, config)
-            for test in (*tests_of(streams, config), *clock_errors.tests_of(streams, config)):
+            for test in (*tests_of(streams, config), *delays.tests_of(streams, config)):
                 before = worst.get(test.name, test)
                 worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
     return list(worst.values())

@@ -15,7 +15,6 @@ from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.results import Finding
 from rov_ident.discrepancy.search import LATE_THRUST
 from rov_ident.effects import EFFECTS
-from rov_ident.estimation.consistency import Test
 from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams
 
@@ -55,19 +54,8 @@ def of(bags: Sequence[Streams], config: Config) -> ClockErrors:
     )
 
 
-def tests_of(streams: Streams, config: Config) -> list[Test]:
-    """Whether the motion is ahead of the wrench: what a fit asks that learns from both. Nothing
-    where nothing moves, or fins and propellers drive it, too: the wrench alone says not when."""
-    rows = None if len(streams.inputs_t) else delays.filtered(delays.samples_of(streams), config)
-    late = delays.NO_DELAY if rows is None else delays.motion_behind_wrench(rows)
-    if not np.isfinite(late.value):
-        return []
-    ahead, limit = late.ahead
-    return [Test("motion ahead of the wrench", ahead, limit, delays.ahead_of_wrench(ahead))]
-
-
 def _ahead(streams: Streams, config: Config) -> float:
-    return max((t.value for t in tests_of(streams, config) if not t.passed), default=0.0)
+    return max((t.value for t in delays.tests_of(streams, config) if not t.passed), default=0.0)
 
 
 def _behind(streams: Streams, config: Config) -> float:

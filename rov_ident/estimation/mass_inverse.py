@@ -4,12 +4,12 @@ from rov_ident.core.jit import inlined
 
 
 @inlined
-def _block(m, i, j, k):
-    """The 3 x 3 block at i, j of m (6, 6, lanes) in lane k, as a tuple of rows."""
+def _block(m, i, j, k, f):
+    """f times the 3 x 3 block at i, j of m (6, 6, lanes) in lane k, as a tuple of rows."""
     return (
-        (m[i, j, k], m[i, j + 1, k], m[i, j + 2, k]),
-        (m[i + 1, j, k], m[i + 1, j + 1, k], m[i + 1, j + 2, k]),
-        (m[i + 2, j, k], m[i + 2, j + 1, k], m[i + 2, j + 2, k]),
+        (f * m[i, j, k], f * m[i, j + 1, k], f * m[i, j + 2, k]),
+        (f * m[i + 1, j, k], f * m[i + 1, j + 1, k], f * m[i + 1, j + 2, k]),
+        (f * m[i + 2, j, k], f * m[i + 2, j + 1, k], f * m[i + 2, j + 2, k]),
     )
 
 
@@ -80,14 +80,13 @@ def invert_mass(lanes, m, lightest, turns, inverse):
     ``turns`` is 1.0, or 0.0 where forces turn nothing, as rotation is guided: A^-1, and zeros.
     """
     none = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     first = lightest[0], lightest[1], lightest[2]
     last = lightest[3], lightest[4], lightest[5]
     for k in range(lanes):
-        b = _plus(none, turns, _block(m, 3, 0, k), unit)
-        a, more = _inverse(_block(m, 0, 0, k), first)
+        b = _block(m, 3, 0, k, turns)
+        a, more = _inverse(_block(m, 0, 0, k, 1.0), first)
         v = _plus(none, 1.0, a, b)
-        s, yet_more = _inverse(_plus(_block(m, 3, 3, k), -1.0, b, _transposed(v)), last)
+        s, yet_more = _inverse(_plus(_block(m, 3, 3, k, 1.0), -1.0, b, _transposed(v)), last)
         u = _plus(none, 1.0, v, s)
         _put(inverse, 0, 0, k, 1.0, _plus(a, 1.0, u, v))
         _put(inverse, 3, 0, k, -1.0, _transposed(u))

@@ -13,6 +13,7 @@ from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
 from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
+from rov_ident.estimation.consistency import Test
 from rov_ident.model.scales import authority
 from rov_ident.offline.batch_fit import AT_REST
 from rov_ident.offline.filtered_regression import filtered_rows, regression
@@ -153,3 +154,14 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
     # rows closer than the filter's memory repeat each other
     variance = scaled_inverse(normal)[-1, -1] * 2.0 / (_CORNER * PERIOD)
     return Delay(float(x[-1]), float(np.sqrt(variance)))
+
+
+def tests_of(streams: Streams, config: Config) -> list[Test]:
+    """Whether the motion is ahead of the wrench: what a fit asks that learns from both. Nothing
+    where nothing moves, or fins and propellers drive it, too: the wrench alone says not when."""
+    rows = None if len(streams.inputs_t) else filtered(samples_of(streams), config)
+    late = NO_DELAY if rows is None else motion_behind_wrench(rows)
+    if not np.isfinite(late.value):
+        return []
+    ahead, limit = late.ahead
+    return [Test("motion ahead of the wrench", ahead, limit, ahead_of_wrench(ahead))]
