@@ -13,7 +13,7 @@ from rov_ident import config as configuration
 from rov_ident.config.prior import prior_of
 from rov_ident.estimation import reference_ukf, ukf
 from rov_ident.estimation.innovation_monitor import NIS_TIME
-from rov_ident.estimation.mass_inverse import invert_mass
+from rov_ident.estimation.mass_inverse import invert_mass, invert_translation
 from rov_ident.estimation.physical import is_passive, physical
 from rov_ident.estimation.reference_ukf import ReferenceUkf
 from rov_ident.sampling.sample import SAMPLE
@@ -147,7 +147,10 @@ def test_the_reference_follows_outliers_and_what_does_not_move(heavy):
 
 @numba.njit(cache=True)
 def inverted(mass, lightest, turns, inverse):
-    invert_mass(ukf.LANES, mass, lightest, turns, inverse)
+    if turns:
+        invert_mass(ukf.LANES, mass, lightest, inverse)
+    else:
+        invert_translation(ukf.LANES, mass, lightest, inverse)
 
 
 def test_mass_matrices_are_made_positive_definite(heavy):
@@ -161,7 +164,7 @@ def test_mass_matrices_are_made_positive_definite(heavy):
     assert np.sum(indefinite) >= 3 and not indefinite[0]
     lanes = np.ascontiguousarray(mass.transpose(1, 2, 0))
     inverse = np.zeros_like(lanes)
-    inverted(lanes, ukf.problem(heavy).lightest, 1.0, inverse)
+    inverted(lanes, ukf.problem(heavy).lightest, True, inverse)
     for k, before in enumerate(mass):
         expected = before + textbook.ballast(before, body)
         np.testing.assert_allclose(lanes[:, :, k], expected, rtol=1e-9, atol=1e-9)
@@ -170,7 +173,7 @@ def test_mass_matrices_are_made_positive_definite(heavy):
         np.testing.assert_allclose(np.tril(inverse[:, :, k]), wanted, rtol=1e-7, atol=1e-9)
     assert np.array_equal(lanes[:, :, 0], mass[0])
     again = np.zeros_like(lanes)
-    inverted(lanes, ukf.problem(heavy).lightest, 0.0, again)
+    inverted(lanes, ukf.problem(heavy).lightest, False, again)
     for k in range(ukf.LANES):
         linear = np.tril(np.linalg.inv(lanes[:3, :3, k]))
         np.testing.assert_allclose(np.tril(again[:3, :3, k]), linear, rtol=1e-7, atol=1e-9)

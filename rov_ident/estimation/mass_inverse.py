@@ -4,12 +4,12 @@ from rov_ident.core.jit import inlined
 
 
 @inlined
-def _block(m, i, j, k, f):
-    """f times the 3 x 3 block at i, j of m (6, 6, lanes) in lane k, as a tuple of rows."""
+def _block(m, i, j, k):
+    """The 3 x 3 block at i, j of m (6, 6, lanes) in lane k, as a tuple of rows."""
     return (
-        (f * m[i, j, k], f * m[i, j + 1, k], f * m[i, j + 2, k]),
-        (f * m[i + 1, j, k], f * m[i + 1, j + 1, k], f * m[i + 1, j + 2, k]),
-        (f * m[i + 2, j, k], f * m[i + 2, j + 1, k], f * m[i + 2, j + 2, k]),
+        (m[i, j, k], m[i, j + 1, k], m[i, j + 2, k]),
+        (m[i + 1, j, k], m[i + 1, j + 1, k], m[i + 1, j + 2, k]),
+        (m[i + 2, j, k], m[i + 2, j + 1, k], m[i + 2, j + 2, k]),
     )
 
 
@@ -66,7 +66,7 @@ def _inverse(a, least):
 
 
 @inlined
-def invert_mass(lanes, m, lightest, turns, inverse):
+def invert_mass(lanes, m, lightest, inverse):
     """Lower half of the inverses (6, 6, lanes) of symmetric m (6, 6, lanes) = [[A, B'], [B, D]].
 
     In 3 x 3 blocks, with V = A^-1 B', the Schur complement S = D - B V and U = V S^-1::
@@ -76,24 +76,37 @@ def invert_mass(lanes, m, lightest, turns, inverse):
     The pivots of A and S are those of m. Where one is less than ``lightest`` (6,), m has no inertia
     left in some direction, as the outer points of a wide prior may have: m gets so much more on its
     diagonal that it has (as in Gill, Murray and Wright 1981, sec. 4.4.2.2).
-
-    ``turns`` is 1.0, or 0.0 where forces turn nothing, as rotation is guided: A^-1, and zeros.
     """
     none = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     first = lightest[0], lightest[1], lightest[2]
     last = lightest[3], lightest[4], lightest[5]
     for k in range(lanes):
-        b = _block(m, 3, 0, k, turns)
-        a, more = _inverse(_block(m, 0, 0, k, 1.0), first)
+        b = _block(m, 3, 0, k)
+        a, more = _inverse(_block(m, 0, 0, k), first)
         v = _plus(none, 1.0, a, b)
-        s, yet_more = _inverse(_plus(_block(m, 3, 3, k, 1.0), -1.0, b, _transposed(v)), last)
+        s, yet_more = _inverse(_plus(_block(m, 3, 3, k), -1.0, b, _transposed(v)), last)
         u = _plus(none, 1.0, v, s)
         _put(inverse, 0, 0, k, 1.0, _plus(a, 1.0, u, v))
         _put(inverse, 3, 0, k, -1.0, _transposed(u))
-        _put(inverse, 3, 3, k, turns, s)
+        _put(inverse, 3, 3, k, 1.0, s)
         m[0, 0, k], m[1, 1, k], m[2, 2, k] = (
             m[0, 0, k] + more[0], m[1, 1, k] + more[1], m[2, 2, k] + more[2],
         )  # fmt: skip
         m[3, 3, k], m[4, 4, k], m[5, 5, k] = (
             m[3, 3, k] + yet_more[0], m[4, 4, k] + yet_more[1], m[5, 5, k] + yet_more[2],
+        )  # fmt: skip
+
+
+@inlined
+def invert_translation(lanes, m, lightest, inverse):
+    """The same for a vehicle that turns as measured: A^-1, and zeros, as forces turn nothing."""
+    none = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    least = lightest[0], lightest[1], lightest[2]
+    for k in range(lanes):
+        a, more = _inverse(_block(m, 0, 0, k), least)
+        _put(inverse, 0, 0, k, 1.0, a)
+        _put(inverse, 3, 0, k, 1.0, none)
+        _put(inverse, 3, 3, k, 1.0, none)
+        m[0, 0, k], m[1, 1, k], m[2, 2, k] = (
+            m[0, 0, k] + more[0], m[1, 1, k] + more[1], m[2, 2, k] + more[2],
         )  # fmt: skip

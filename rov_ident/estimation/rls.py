@@ -55,7 +55,7 @@ from rov_ident.estimation.innovation_monitor import (
     lost,
     watch,
 )
-from rov_ident.estimation.mass_inverse import invert_mass
+from rov_ident.estimation.mass_inverse import invert_mass, invert_translation
 from rov_ident.estimation.observer import (
     LANES,
     OBSERVER,
@@ -486,8 +486,10 @@ def _take_over(task, state, work):
         for j in range(6):
             s.one_mass[i, j, 0] = task.rigid_body[i, j]
     add_added_mass(task.structure, work.one_theta, s.one_mass)
-    turns = 0.0 if state.scalars[0].guided else 1.0
-    invert_mass(1, s.one_mass, task.lightest, turns, s.lower_inverse)
+    if state.scalars[0].guided:
+        invert_translation(1, s.one_mass, task.lightest, s.lower_inverse)
+    else:
+        invert_mass(1, s.one_mass, task.lightest, s.lower_inverse)
     for i in range(6):
         for j in range(6):
             s.inverse[i, j] = s.lower_inverse[max(i, j), min(i, j), 0]

@@ -44,7 +44,7 @@ from rov_ident.estimation.innovation_monitor import (
     lost,
     watch,
 )
-from rov_ident.estimation.mass_inverse import invert_mass
+from rov_ident.estimation.mass_inverse import invert_mass, invert_translation
 from rov_ident.estimation.observer import force_of
 from rov_ident.estimation.physical import Estimate, calibrated
 from rov_ident.estimation.process_noise import is_guided, wrench_noise
@@ -315,15 +315,18 @@ def _predict(task, x, work, sample, side):
     s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
     force_of(sample, sample.wrench, task.restoring, s.force, s.slope)
     extend_inputs(LANES, task.structure, sample.inputs[0], s.extended)
-    steps = steps_of(sample.dt)
+    steps, guided = steps_of(sample.dt), is_guided(sample)
     dt = sample.dt / steps
     for sign in range(2):
         for first in range(0, columns, LANES):
-            turns = 0.0 if is_guided(sample) else 1.0
-            _spread(task, x, work, first, spread if sign == 0 else -spread, turns)
-            _add_effect_wrench(task, work, side)
+            _spread(task, x, work, first, spread if sign == 0 else -spread)
+            if guided:
+                invert_translation(LANES, s.mass, task.lightest, s.inverse)
+            else:
+                invert_mass(LANES, s.mass, task.lightest, s.inverse)
+            _add_effect_wrench(task, work, side, guided)
             for k in range(steps):
-                _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt)
+                _propagate(task.structure, work, k * dt - 0.5 * sample.dt, dt, guided)
             for i in range(6):
                 row = work.moved[sign, i, first : first + LANES]
                 for k in range(LANES):
@@ -336,7 +339,7 @@ def _predict(task, x, work, sample, side):
 
 
 @reordered
-def _spread(task, x, work, first, spread, turns):
+def _spread(task, x, work, first, spread):
     """Sigma points x + spread * column: their velocities, coefficients, mass matrices."""
     s, theta, structure = work.scratch[0], work.theta, task.structure
     for i in range(6):
@@ -357,17 +360,16 @@ def _spread(task, x, work, first, spread, turns):
             s.mass[i, j, k] = task.rigid_body[i, j]
             s.mass[j, i, k] = task.rigid_body[i, j]
     add_added_mass(structure, theta, s.mass)
-    invert_mass(LANES, s.mass, task.lightest, turns, s.inverse)
 
 
 @inlined
-def _add_effect_wrench(task, work, side):
+def _add_effect_wrench(task, work, side, guided):
     """What parameters of effects, and guided rates, add to the wrench on the sigma points."""
     s, first = work.scratch[0], len(task.theta) - side.shape[1]
     for i in range(6):
         for k in range(LANES):
             s.push[i, k] = 0.0
-        for j in range(3, 6):
+        for j in range(3, 6 if guided else 3):
             for k in range(LANES):
                 s.push[i, k] -= s.mass[i, j, k] * s.guide[j]
         for j in range(side.shape[1]):
@@ -376,7 +378,7 @@ def _add_effect_wrench(task, work, side):
 
 
 @reordered
-def _propagate(structure, work, late, dt):
+def _propagate(structure, work, late, dt, guided):
     """One Runge-Kutta step of the sigma points, beginning ``late`` seconds after mid-interval."""
     s = work.scratch[0]
     nu, reached, h, force, slope, push = s.nu, s.stage, s.h, s.force, s.slope, s.push
@@ -396,7 +398,10 @@ def _propagate(structure, work, late, dt):
             )  # fmt: skip
             nu_dot = symmetric_product(s.inverse, rest, k)
             for i in range(6):
-                s.nu_dot[i, k] = nu_dot[i] + s.guide[i]
+                s.nu_dot[i, k] = nu_dot[i]
+        for i in range(3, 6 if guided else 3):
+            for k in range(LANES):
+                s.nu_dot[i, k] = s.guide[i]
         for i in range(6):
             runge_kutta(stage, dt, nu[i], s.nu_dot[i], reached[i], s.total[i])
     for i in range(6):
