@@ -28,8 +28,8 @@ from rov_ident.sampling.records import (
     numbers,
     predicted,
     score,
+    simulated_axes,
 )
-from rov_ident.sampling.sample import free_axes
 from rov_ident.simulation.virtual_sensors import Dive, Suite, dive, measure, odometry_of
 from rov_ident.steering import autopilot
 
@@ -180,8 +180,7 @@ def simulate(
     assert bag is not None
     record = read(bag, given, progress)
     samples, model, effects = record.samples, given.dynamics, compiled(given.effects)
-    known = free_axes(samples)
-    free = free if known.all() else known if free is None else free & known
+    free = simulated_axes(samples, free)
     nu, restarted = (predicted(model, samples, h, free, effects) for h in (math.inf, HORIZON))
     if not np.isfinite(nu).all():
         raise UserError(

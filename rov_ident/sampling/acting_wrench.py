@@ -42,8 +42,9 @@ class _Command(NamedTuple):
 class ActingWrench:
     """Takes commands from their queue and says what acts in each interval.
 
-    ``has_moment``: whether any held a moment so far. Thrusters hardly push without some: until then
-    none was recorded, and what turns the vehicle is unknown.
+    ``has_moment``: whether any held a moment so far, or, as the sampler says, fins were turned.
+    Thrusters hardly push without some moment: until then none was recorded, and what turns the
+    vehicle is unknown.
     """
 
     def __init__(self, config: Config) -> None:

@@ -103,6 +103,14 @@ def _input_notes(config: Config, samples: NDArray[np.void]) -> list[str]:
     return said
 
 
+def simulated_axes(
+    samples: NDArray[np.void], free: NDArray[np.bool_] | None
+) -> NDArray[np.bool_] | None:
+    """Of the axes ``free`` (6,), None being all, those along which a wrench is known."""
+    known = free_axes(samples)
+    return free if known.all() else known if free is None else free & known
+
+
 def predicted(
     model: Model,
     samples: NDArray[np.void],
@@ -118,9 +126,7 @@ def predicted(
     ``effects`` on the wrench and the current act along the simulated motion, in place of what the
     samples say they did along the measured one.
     """
-    out, known = np.empty((len(samples), 6)), free_axes(samples)
-    if not known.all():
-        free = known if free is None else free & known
+    out, free = np.empty((len(samples), 6)), simulated_axes(samples, free)
     for first, end in stretches(samples):
         part = samples[first:end]
         thrust = part["wrench"] - part["surroundings"]

@@ -69,7 +69,6 @@ class Sampler:
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
         self._usual = 0.0  # s between samples
-        self._has_moment = False  # of thrusters or fins: see ActingWrench
         self._position = np.zeros(3)  # m: the last that was measured
         self.configure(config)
 
@@ -250,8 +249,8 @@ class Sampler:
             self.counts[f"sample: no {why}"] += 1
             self._previous = math.nan
             return None
-        self._has_moment |= self._acting.has_moment or bool(sample["inputs"][0, :, :3].any())
-        if not self._has_moment:
+        self._acting.has_moment |= bool(sample["inputs"][0, :, :3].any())
+        if not self._acting.has_moment:
             sample["wrench_doubt"][0, 3:] = np.inf
         self._acting.surround(sample)
         if self._jacobians is not None:
