@@ -73,6 +73,7 @@ def test_what_turns_it_is_unknown(dive, kind, seed):
     if kind != "ukf" and fit.consistency.consistent:
         known = [found[n][1] < 0.15 * abs(vehicle.theta[n]) for n in MOVING]
         assert sum(known) >= len(MOVING) - 3, {n: found[n] for n in MOVING}
+    assert not any("righting arm" in advice for advice in fit.advice)
     assert np.isnan(fit.rmse[3:]).all() and np.isfinite(fit.rmse[:3]).all()
 
 

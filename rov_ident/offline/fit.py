@@ -128,7 +128,8 @@ class Fit(Shown, Result):
         if abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
             advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
         of_arm = min(righting_arm_share(self.given), self.given.wrench.scale_std) * scale
-        if of_arm**2 > _MOST * self.covariance[i, i]:
+        turned = np.isfinite(self.rmse[3:]).any()  # by moments that are known: else no arm tells
+        if turned and of_arm**2 > _MOST * self.covariance[i, i]:
             advice.append(
                 "Measure the righting arm (docs/live.md): what is not known of it "
                 "(vehicle.cob_std) makes most of the intervals of thrust and coefficients."
