@@ -84,6 +84,20 @@ def test_least_squares_does_not_take_it_for_zero(dive):
     assert {n: found[n] for n in TURNING} == pytest.approx({n: fit.given.value(n) for n in TURNING})
 
 
+def test_records_with_moments_and_without(dive, tmp_path):
+    """Together: what turns the vehicle is learnt, and judged, where it is known."""
+    vehicle, bag, file = dive(0)
+    whole = tmp_path / "whole.mcap"
+    write_messages(whole, drawn(0)[2])
+    for kind in ("rls", "ls"):
+        fit = ri.fit([bag, whole], file, kind)
+        assert np.isfinite(fit.rmse).all()
+        found = dict(zip(fit.names, zip(fit.values, fit.std, fit.states), strict=True))
+        assert [n for n in ("K_pdot", "M_qdot", "N_rdot") if found[n][2] is State.HELD] == []
+        off = {n: (found[n][0] - vehicle.theta[n]) / found[n][1] for n in sea.NOMINAL}
+        assert max(map(abs, off.values())) < 3.5, off
+
+
 def test_until_a_moment_is_heard(dive):
     """Most dives begin with some seconds in which no thruster turns."""
     vehicle, bag, file = dive(0, since=20.0)

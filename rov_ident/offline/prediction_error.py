@@ -50,14 +50,14 @@ def open_loop(archive: Archive, config: Config, free: NDArray[np.bool_] | None =
 
 def _simulated(
     samples: Samples, model: Model, effects: Acting, free: NDArray[np.bool_] | None
-) -> tuple[Array, int, tuple[Array, Array, Array]]:
-    """Of a bag the sum (6,) of squared errors over so many samples, and what is drawn."""
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Of a bag the sums (6,) of squared errors, over so many samples (6,), and what is drawn."""
     motion, simulated = measured_motion(samples), predicted(model, samples, HORIZON, free, effects)
     told, keep = samples["measured"], slice(None, None, max(1, len(samples) // _POINTS))
     with np.errstate(invalid="ignore"):
         squares = np.sum((simulated - motion)[told] ** 2, axis=0)
-    squares[~free_axes(samples)] = np.nan
-    return squares, int(told.sum()), (samples["t"][keep], motion[keep], simulated[keep])
+    known, drawn = free_axes(samples), (samples["t"][keep], motion[keep], simulated[keep])
+    return known * squares, known * told.sum(), drawn
 
 
 def curves(bags: Sequence[Bag], before: OpenLoop, after: OpenLoop) -> tuple[Curves, ...]:
@@ -111,11 +111,13 @@ def _is_read(name: str) -> bool:
 
 def _departures(
     samples: Samples, fitted: tuple[Model, Acting], drawn: Sequence[tuple[Model, Acting]]
-) -> tuple[Array, int]:
-    """Sums (6,) over samples and draws of the squared differences to the fitted simulation."""
+) -> tuple[Array, Array]:
+    """Sums (6,) over samples and draws of the squared differences to the fitted simulation, and how
+    many (6,) these are."""
     around = predicted(fitted[0], samples, HORIZON, effects=fitted[1])
     total = np.zeros(6)
     with np.errstate(invalid="ignore"):
         for model, effects in drawn:
             total += np.sum((predicted(model, samples, HORIZON, effects=effects) - around) ** 2, 0)
-    return total, len(samples) * len(drawn)
+    known = free_axes(samples)
+    return known * total, known * len(samples) * len(drawn)
