@@ -56,7 +56,8 @@ def _simulated(
     told, keep = samples["measured"], slice(None, None, max(1, len(samples) // _POINTS))
     with np.errstate(invalid="ignore"):
         squares = np.sum((simulated - motion)[told] ** 2, axis=0)
-    known, drawn = free_axes(samples), (samples["t"][keep], motion[keep], simulated[keep])
+    known = free_axes(samples).astype(np.float64)
+    drawn = samples["t"][keep], motion[keep], simulated[keep]
     return known * squares, known * told.sum(), drawn
 
 
@@ -119,5 +120,5 @@ def _departures(
     with np.errstate(invalid="ignore"):
         for model, effects in drawn:
             total += np.sum((predicted(model, samples, HORIZON, effects=effects) - around) ** 2, 0)
-    known = free_axes(samples)
+    known = free_axes(samples).astype(np.float64)
     return known * total, known * len(samples) * len(drawn)
