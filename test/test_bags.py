@@ -542,6 +542,19 @@ def test_of_two_vehicles_the_one_whose_odometry_is_named(tmp_path):
     ]
 
 
+def test_numbers_of_one_vehicle_beside_the_thrust_of_another(tmp_path):
+    """Arrays that are not of thrusters are passed over, whoever publishes them."""
+    at, numbers = 10**12, "std_msgs/msg/Float64MultiArray"
+    array = b"\0\1\0\0" + bytes(12)  # no dimension, no offset, no number
+    rows = [
+        ("/rov1/odom", cdr.ODOMETRY_TYPE, at, cdr.encode(odometry(at))),
+        ("/rov1/gains", numbers, at, array),
+        ("/rov2/thrust", numbers, at, array),
+    ]
+    seen, _ = topics.survey(Bag(write(tmp_path / "dive.mcap", rows)))
+    assert seen["wrench"].topic == "/rov2/thrust"
+
+
 @pytest.mark.parametrize("ahead", [0.5, -3.0, 1.7e9])
 def test_topics_of_different_clocks_are_named(tmp_path, ahead):
     at, off = 10**12, round(ahead * 1e9)

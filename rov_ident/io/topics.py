@@ -390,7 +390,7 @@ def survey(bag: Bag) -> tuple[dict[str, Seen], list[str]]:
             called = name or sources(Inputs(**typed))[role].topic
             beside = found[ODOMETRY].topic if ODOMETRY in found else ""
             several = candidates(bag, role, called, _full_name(kind), beside)
-            several = [topic for topic in several if topic in of_kind]
+            several = [topic for topic in several if topic in of_kind] or of_kind
             topic = max(several, key=lambda t: bag.topics[t].message_count)
             if len(several) > 1:
                 notes.append(
