@@ -15,6 +15,7 @@ from rov_ident.config.prior import prior_of
 from rov_ident.core.messages import Wrench
 from rov_ident.core.states import State
 from rov_ident.io.write_messages import write_messages
+from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.records import read_record
 from rov_ident.sampling.sample import NO_MOMENT, free_axes
 
@@ -32,11 +33,16 @@ def drawn(seed, duration=90.0):
     return vehicle, {"/**": {"ros__parameters": told}}, messages
 
 
-def without_moments(messages, since=np.inf):
-    """The messages, without the moments of the wrench; from ``since`` [s] on with them."""
+def without_moments(messages, since=np.inf, rounding=0.0):
+    """The messages, without the moments of the wrench; from ``since`` [s] on with them.
+
+    ``rounding``: of the largest force [N], is left of a moment [N m], as an allocation leaves it.
+    """
+    rng = np.random.default_rng(0)
     for arrival, role, message in messages:
         if isinstance(message, Wrench) and message.stamp < sea.EPOCH + 1e9 * since:
-            message = message._replace(torque=np.zeros(3))
+            left = rounding * np.abs(message.force).max() * rng.integers(-2, 3, 3)
+            message = message._replace(torque=left)
         yield arrival, role, message
 
 
@@ -111,6 +117,18 @@ def test_until_a_moment_is_heard(dive):
     found = dict(zip(fit.names, zip(fit.values, fit.std), strict=True))
     off = {n: (found[n][0] - vehicle.theta[n]) / found[n][1] for n in sea.NOMINAL}
     assert fit.consistency.consistent and max(map(abs, off.values())) < 3.5, off
+
+
+@pytest.mark.parametrize("precision", [np.float64, np.float32])
+def test_rounding_is_no_moment(dive, tmp_path, precision):
+    """Thrusters in pairs leave 1e-16 or 1e-7 of their force; what turns it stays unknown."""
+    _, _, file = dive(0)
+    bag, config = tmp_path / "rounded.mcap", ri.load(file)
+    messages = list(without_moments(drawn(0)[2], rounding=np.finfo(precision).eps))
+    write_messages(bag, messages)
+    assert np.isinf(read_record(bag, config).samples["wrench_doubt"][:, 3:]).all()
+    streams = gather(((role, message) for _, role, message in messages), config)
+    np.testing.assert_array_equal(streams.guided, [False] * 3 + [True] * 3)
 
 
 def test_a_simulation_turns_as_measured(dive):

@@ -23,6 +23,18 @@ from rov_ident.sampling.queues import Waiting
 from rov_ident.sampling.wrench_scatter import ReadingNoise
 
 _ZERO = np.zeros(6)
+# m; a moment of forces at a shorter arm is the rounding of an allocation, in 32 bits, too: no
+# thruster is placed that well
+_ROUNDING_ARM = 1e-6
+
+
+def holds_moment(largest: Array) -> bool:
+    """Whether a wrench whose components (6,) [N, N m] are never larger than these holds a moment.
+
+    Thrusters hardly push without one. A wrench that never holds any was recorded without, and what
+    turns the vehicle is unknown.
+    """
+    return bool(largest[3:].max() > _ROUNDING_ARM * largest[:3].max())
 
 
 class MeanWrench(NamedTuple):
@@ -40,16 +52,11 @@ class _Command(NamedTuple):
 
 
 class ActingWrench:
-    """Takes commands from their queue and says what acts in each interval.
-
-    ``has_moment``: whether any held a moment so far, or, as the sampler says, fins were turned.
-    Thrusters hardly push without some moment: until then none was recorded, and what turns the
-    vehicle is unknown.
-    """
+    """Takes commands from their queue and says what acts in each interval."""
 
     def __init__(self, config: Config) -> None:
         self._noise = ReadingNoise()
-        self.has_moment = False
+        self._largest = np.zeros(6)  # N, N m
         self.configure(config)
         self.clear()
 
@@ -69,6 +76,11 @@ class ActingWrench:
         self._period = CommandPeriod()
         self._last_received = -np.inf  # s
         self._estimated: deque[_Command] = deque()  # of those that were dropped
+
+    @property
+    def has_moment(self) -> bool:
+        """Whether any command held a moment so far."""
+        return holds_moment(self._largest)
 
     @property
     def hold(self) -> float:
@@ -141,7 +153,7 @@ class ActingWrench:
         if at > end or (at == end and held is not None):
             return None
         wrench, _, doubt = despiker.judge(WRENCH, queue)
-        self.has_moment = self.has_moment or bool(wrench[3:].any())
+        np.maximum(self._largest, np.abs(wrench), out=self._largest)
         self._noise.take(at, queue.popleft().values)
         self._estimated.clear()
         if last > -np.inf:

@@ -19,6 +19,7 @@ from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message
 from rov_ident.core.noise import robust_std, second_differences
 from rov_ident.model.coefficients import AXES, INPUTS, VELOCITIES
 from rov_ident.model.scales import authority
+from rov_ident.sampling.acting_wrench import holds_moment
 from rov_ident.sampling.despiking import largest_usual, measured_values
 from rov_ident.sampling.driven import value_of
 from rov_ident.sampling.dropped_commands import SILENCE, completed
@@ -95,13 +96,11 @@ class Streams:
     def guided(self) -> NDArray[np.bool_]:
         """Axes (6,) whose velocity a simulation can only take as measured.
 
-        Thrusters hardly push without some moment: a wrench without any was recorded so, and what
-        turns the vehicle is unknown, unless fins are heard. A velocity that never changes was not
-        measured: a record in the plane holds zeros for the rest.
+        Rates, if neither the wrench holds a moment nor fins are heard. A velocity that never
+        changes was not measured: a record in the plane holds zeros for the rest.
         """
-        unknown: NDArray[np.bool_] = np.repeat(
-            [False, not (self.demand[:, 3:].any() or self.inputs[:, :3].any())], 3
-        )
+        is_turned = holds_moment(np.abs(self.demand).max(axis=0)) or self.inputs[:, :3].any()
+        unknown: NDArray[np.bool_] = np.repeat([False, not is_turned], 3)
         return unknown | (np.nanmax(self.nu, axis=0) == np.nanmin(self.nu, axis=0))
 
     @property

@@ -65,6 +65,7 @@ class Sampler:
         self.kinematic_filter = KinematicFilter(config)
         self._acting = ActingWrench(config)
         self._driven = Driven(config, self.counts)
+        self._has_fins = False  # whether any was turned so far
         self._simulated = None if velocity else SimulatedVelocity(config)
         self.commands: list[tuple[float, Array]] | None = None
         self._previous = math.nan  # s; time of the last sample
@@ -249,8 +250,8 @@ class Sampler:
             self.counts[f"sample: no {why}"] += 1
             self._previous = math.nan
             return None
-        self._acting.has_moment |= bool(sample["inputs"][0, :, :3].any())
-        if not self._acting.has_moment:
+        self._has_fins |= bool(sample["inputs"][0, :, :3].any())
+        if not (self._has_fins or self._acting.has_moment):
             sample["wrench_doubt"][0, 3:] = np.inf
         self._acting.surround(sample)
         if self._jacobians is not None:
