@@ -414,7 +414,8 @@ def test_what_is_promised_is_what_a_fit_then_states(tmp_path):
     n = len(shipped.estimate)
     driven = np.array([p.std for p in proposal.after])
     stated = fit.std[:n] / np.hypot(driven, proposal.of_scales)
-    assert stated.min() > 0.5 and stated.max() < 2.0
+    # damping of zero is at its bound, and half of a normal distribution is narrower
+    assert stated[true.model.theta != 0.0].min() > 0.5 and stated.max() < 2.0
     error = (fit.values[:n] - true.model.theta) / driven
     assert np.sqrt(np.mean(error**2)) < 1.5
     assert "no driving tells" in proposal.sentence
