@@ -21,6 +21,7 @@ from rov_ident.io import topics
 from rov_ident.io.bag_reader import ROLE_NAMES, Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.cdr import ROLE_TYPES, encode
+from rov_ident.simulation import virtual_sensors as sensors
 
 DEMO = ROOT / "bags" / "demo.mcap"
 LOGS = DATA / "ardusub"
@@ -147,14 +148,15 @@ def test_mounting_by_any_tree(tmp_path, transforms, position, yaw):
         np.testing.assert_allclose(found["imu.rotation"], [0.0, 0.0, yaw], atol=1e-9)
 
 
-def test_check_compares_the_mounting_with_the_tree(tmp_path, mavros, short_dive):
-    """Of the file that init made of it, and of one that knows nothing of the IMU's place."""
-    bag, out = tmp_path / "dive.mcap", tmp_path / "c.yaml"
-    assert main(["init", str(mavros), "--vehicle", "bluerov2_heavy", "--out", str(out)]) == 0
+@pytest.fixture
+def mounted(tmp_path, mavros, heavy):
+    """A dive with that IMU, the tree in its bag; and the vehicle with the IMU in its place."""
     (tree,) = Bag(mavros).iter_raw(["/tf_static"])
-    with BagWriter(bag) as writer:
+    imu = dataclasses.replace(heavy.imu, position=(0.1, 0.0, -0.2), rotation=(0.0, 0.0, -np.pi / 2))
+    known = dataclasses.replace(heavy, imu=imu)
+    with BagWriter(tmp_path / "dive.mcap") as writer:
         writer.write("/tf_static", tree.type_name, 1, tree.data)
-        for arrival, role, message in short_dive:
+        for arrival, role, message in sensors.dive(known, duration=10.0, seed=1).messages:
             message = to_core(message)
             if role == ODOMETRY:
                 message = message._replace(frame_id="map", child_frame_id="base_link")
@@ -163,15 +165,41 @@ def test_check_compares_the_mounting_with_the_tree(tmp_path, mavros, short_dive)
             message = from_core(message)
             name = f"/{ROLE_NAMES[role]}"
             writer.write(name, ROLE_TYPES[role], arrival, encode(message))
-    shipped, made = ri.load(SHIPPED), ri.load(out)
-    same = dataclasses.replace(made.imu, rotation=(np.pi, np.pi, np.pi / 2))  # by other angles
+    return tmp_path / "dive.mcap", known
+
+
+def test_check_compares_the_mounting_with_the_tree(mounted, heavy):
+    """Of files with the IMU in its place, by other angles, too, elsewhere, and nowhere."""
+    bag, known = mounted
+    same = dataclasses.replace(known.imu, rotation=(np.pi, np.pi, np.pi / 2))
+    elsewhere = dataclasses.replace(known.imu, position=(0.1, 0.0, 0.2), rotation=(0.0, 0.0, 0.1))
     wrong = {"imu.position", "imu.rotation"}
-    for imu, expected in ((shipped.imu, wrong), (made.imu, set()), (same, set())):
-        found = ri.check(bag, dataclasses.replace(shipped, imu=imu))
+    for imu, expected in ((known.imu, set()), (same, set()), (elsewhere, wrong)):
+        found = ri.check(bag, dataclasses.replace(heavy, imu=imu))
         said = {r.subject: r.text for r in found.remarks if "/tf_static" in r.text}
         assert said.keys() == expected
         if expected:
             assert said["imu.position"].startswith("[0.1, 0.0, -0.2] by /tf_static")
+    found = ri.check(bag, heavy)
+    said = [r.text for r in found.remarks if "/tf_static" in r.text]
+    assert len(said) == 2 and all("as the configuration has none" in text for text in said)
+    assert not [r.text for r in found.remarks if r.level != "good" and "imu" in r.text.lower()]
+
+
+@pytest.mark.parametrize("estimator", ["rls", "ml"])
+def test_a_fit_takes_the_mounting_from_the_tree(mounted, heavy, tmp_path, estimator):
+    """As if the configuration had it; what it saves has it."""
+    bag, known = mounted
+    told, silent = ri.fit(bag, known, estimator), ri.fit(bag, heavy, estimator)
+    np.testing.assert_allclose(silent.values, told.values, rtol=1e-5, atol=1e-8)
+    assert [n for n in silent.notes if n.startswith("imu.position is [0.1, 0.0, -0.2]")]
+    assert not [n for n in told.notes if "/tf_static" in n]
+    silent.save(tmp_path / "fitted.yaml")
+    saved = ri.load(tmp_path / "fitted.yaml")
+    np.testing.assert_allclose(saved.imu.position, [0.1, 0.0, -0.2], atol=1e-9)
+    nowhere = dataclasses.replace(heavy.imu, position=(1e-9, 0.0, 0.0))
+    unturned = ri.read(bag, dataclasses.replace(heavy, imu=nowhere)).samples["nu"]
+    assert np.abs(unturned - ri.read(bag, heavy).samples["nu"]).max() > 0.01
 
 
 def test_a_borrowed_mass_is_not_trusted(tmp_path, capsys):

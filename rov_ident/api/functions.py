@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rov_ident.api.reading import File, Files, axes, existing, load, once, read, same_data, several
+from rov_ident.api.reading import (
+    File,
+    Files,
+    axes,
+    existing,
+    load,
+    mounted,
+    once,
+    read,
+    same_data,
+    several,
+)
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
@@ -140,6 +151,7 @@ def fit(
     if prior_from is not None:
         given, table = with_prior(given, Path(prior_from))
     (paths, repeated), say = once(several(bags)), progress or silent
+    given, placed = mounted(given, paths)
     groups = [channels] if isinstance(channels, str) else channels or ()
     stages = tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
     settings = Settings(stages, prior, weighted, process)
@@ -163,7 +175,7 @@ def fit(
         found = found.with_tests(_message_tests([bag.path for bag in many.bags], given))
         if table:
             found = _with_table_notes(found, given, table)
-        found = dataclasses.replace(found, notes=(*repeated, *found.notes))
+        found = dataclasses.replace(found, notes=(*repeated, *placed, *found.notes))
         if validate is None:
             return found
         other = existing(validate)
@@ -271,6 +283,7 @@ def explain(
     other = None if validate is None else existing(validate)
     if other and (same := same_data(other, paths)):
         raise UserError(f"{other} is what is searched ({same}): validate on a bag of another dive")
+    given, placed = mounted(given, paths)
     read_bags = [_streams(path, given, say) for path in paths]
     judge = None if other is None else _streams(other, given, say)
     for streams, _ in read_bags:
@@ -284,7 +297,8 @@ def explain(
     made |= {"bags": [source for _, source in read_bags]}
     made |= {"validate": judge[1]} if judge else {}
     findings = found.findings
-    findings = dataclasses.replace(findings, provenance=made, notes=(*repeated, *findings.notes))
+    notes = (*repeated, *placed, *findings.notes)
+    findings = dataclasses.replace(findings, provenance=made, notes=notes)
     return dataclasses.replace(found, findings=findings)
 
 
@@ -362,9 +376,8 @@ def plan(
     numeric = all(isinstance(side, int | float | np.number) and side > 0 for side in tank)
     if len(tank) != 3 or not numeric:
         raise UserError(f"tank is {tank!r}, but must be three lengths [m], such as (6, 6, 2)")
-    limits = Limits(tuple(tank), thrust)
-    known = (
-        contextlib.nullcontext() if bag is None else archive.opened(several(bag), given, say=say)
-    )
+    limits, paths = Limits(tuple(tank), thrust), [] if bag is None else several(bag)
+    given, _ = mounted(given, paths)
+    known = archive.opened(paths, given, say=say) if paths else contextlib.nullcontext()
     with known as bags:
         return design.propose(given, bags, duration, limits, say)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rov_ident.api.functions import check, explain, plan
 from rov_ident.api.functions import fit as fit_bags
-from rov_ident.api.reading import File, Files, load, several
+from rov_ident.api.reading import File, Files, load, mounted, several
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -248,8 +248,8 @@ def identify(
     UserError
         If a bag cannot be read, or no dive is fit for identification: why, and what to fly instead.
     """
-    say, given = progress or silent, load(config)
-    paths = several(dives)
+    say, paths = progress or silent, several(dives)
+    given, placed = mounted(load(config), paths)
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}
     for path in paths:
@@ -285,7 +285,7 @@ def identify(
         why.append(f"no next manoeuvre: {error}")
     checks = tuple(found for path, found in checked)
     name = judge.name if judge else ""
-    notes = (*why, *(explanation.findings.notes if explanation else ()))
+    notes = (*placed, *why, *(explanation.findings.notes if explanation else ()))
     return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
+from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
 from rov_ident.sampling.records import Record, read_record
@@ -112,7 +114,15 @@ def read(bag: File, config: File | Config, progress: Progress | None = None) -> 
     UserError
         If the bag cannot be read, lacks a topic or yields no sample.
     """
-    return read_record(existing(bag), load(config), progress or silent)
+    path = existing(bag)
+    given, notes = mounted(load(config), [path])
+    record = read_record(path, given, progress or silent)
+    return replace(record, notes=(*notes, *record.notes))
+
+
+def mounted(config: Config, paths: Iterable[Path]) -> tuple[Config, tuple[str, ...]]:
+    """The configuration with sensors where the bags say, if it does not (`topics.mounted`)."""
+    return topics.mounted(config, map(Bag, paths))
 
 
 def axes(channels: str) -> NDArray[np.bool_]:

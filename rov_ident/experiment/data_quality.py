@@ -174,6 +174,7 @@ class Check(Shown):
 
 def check(path: Path, config: Config, say: Progress = silent) -> Check:
     """Look at a bag; UserError if it cannot be read, or lacks the messages that are needed."""
+    config, placed = inputs.mounted(config, [Bag(path)])
     record = read_record(path, config, say)
     say("looking at its messages")
     bag, unmeasured = Bag(path), is_without_velocity(record.samples)
@@ -187,6 +188,7 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
     told = ", ".join(f"{role} is {topic}" for role, topic in topics.items())
     remarks = [Remark("topics", GOOD, told), *of_messages(streams, config), *notes]
     remarks += _excitation_remarks(streams, config)
+    remarks += [Remark("mounting", GOOD, note) for note in placed]
     remarks += _mounting_remarks(inputs.mounting(bag, frames), config)
     remarks += _inertia_remarks(config)
     failed = (test for test in tests_of(streams, config) if not test.passed)

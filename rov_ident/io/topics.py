@@ -10,8 +10,9 @@ along the shortest rotation.
 
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -42,6 +43,8 @@ _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msg
 _NAMED = 5  # topics; of arrays of numbers a bag may have dozens
 _FIRST = 200  # messages that tell how late a topic is: some seconds
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
+_STATIC = "/tf_static"
+_NOWHERE = 1e-6  # m, rad: what is left of zero by rounding
 _HELD = 1000  # poses and twists that wait for each other
 _NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
 _FRAME = "base_link"  # of a wrench that comes without a frame: the axes are those of frames.body
@@ -433,6 +436,27 @@ def first_frames(bag: Bag, chosen: Mapping[str, str], config: Config) -> dict[st
     return found
 
 
+def mounted(config: Config, bags: Iterable[Bag]) -> tuple[Config, tuple[str, ...]]:
+    """The configuration with sensors that it leaves at the body's origin, unturned, where the first
+    bag with a `/tf_static` says that they are; and a note on each that was moved."""
+    bag = next((bag for bag in bags if _STATIC in bag.topics), None)
+    if bag is None:
+        return config, ()
+    notes = []
+    for key, vector in mounting(bag, first_frames(bag, select(bag, config), config)).items():
+        section, name = key.split(".")
+        settings = getattr(config, section)
+        if not np.any(getattr(settings, name)) and np.abs(vector).max() > _NOWHERE:
+            moved = replace(settings, **{name: tuple(vector.tolist())})
+            config = replace(config, **{section: moved})
+            told = [round(float(x), 3) + 0.0 for x in vector]
+            notes.append(
+                f"{key} is {told} (forward, starboard, down) by {_STATIC} of {bag.path.name}, as "
+                "the configuration has none"
+            )
+    return config, tuple(notes)
+
+
 def mounting(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Array]:
     """Where `/tf_static` says that the sensors are, (3,) each, forward-starboard-down in the body
     frame: `imu.position` [m], `imu.rotation` [rad], `odometry.position` [m]; what it does not say
@@ -478,11 +502,11 @@ def _tree(bag: Bag) -> dict[str, tuple[str, Array, Array]]:
     """By frame of `/tf_static`: the parent, and origin and attitude (w x y z) in it; without what
     cannot be read, or is no transform."""
     parents = {}
-    if bag.topics.get("/tf_static", ("",))[0] == "tf2_msgs/msg/TFMessage":
+    if bag.topics.get(_STATIC, ("",))[0] == "tf2_msgs/msg/TFMessage":
         from rosbags.typesys import Stores, get_typestore
 
         store = get_typestore(Stores.ROS2_JAZZY)
-        for raw in bag.iter_raw(["/tf_static"]):
+        for raw in bag.iter_raw([_STATIC]):
             with suppress(Exception):  # whatever the bytes make of the library
                 for each in store.deserialize_cdr(raw.data, raw.type_name).transforms:
                     p, q = each.transform.translation, each.transform.rotation
