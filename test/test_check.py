@@ -456,6 +456,7 @@ def test_moments_of_inertia_that_no_body_has(heavy, zz, possible):
 
 def test_a_delay_beyond_what_is_linear_is_not_told():
     """Of a gyro in degrees it was -2.3e23 ms."""
-    assert _delay_remark("motion behind the wrench", Delay(-0.3, 0.01)).text.startswith("-300.0 ")
-    remark = _delay_remark("motion behind the wrench", Delay(-2.3e20, 1e19))
+    subject = "motion behind the wrench"
+    assert _delay_remark(subject, Delay(-0.3, 0.01), "").text.startswith("-300.0 ")
+    remark = _delay_remark(subject, Delay(-2.3e20, 1e19), "")
     assert remark.text.startswith("cannot be told")

@@ -29,6 +29,7 @@ from rov_ident.discrepancy import (
     search,
     sensor_choice,
     sensor_consistency,
+    velocity_sensor,
 )
 from rov_ident.discrepancy.explain import explain
 from rov_ident.discrepancy.held_out import split
@@ -378,7 +379,7 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
         Finding(name, ("X",), {}, None, gain, True, None, (), "")
         for name in ("quadratic_damping", "thruster_lag", "sensor_misalignment")
     )
-    by = np.random.default_rng(seed).uniform(0.02, 0.06)
+    by = np.random.default_rng(seed).uniform(0.025, 0.06)
     wrench = dataclasses.replace(streams, demand_t=streams.demand_t + by)
     clocks = clock_errors.of([streams, wrench], config)
     assert clocks.ahead == pytest.approx(by, abs=0.01) and not clocks.behind
@@ -393,6 +394,8 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
     assert clocks.behind == pytest.approx(by, rel=0.1) and not clocks.ahead
     assert [clocks.beside(f).separable for f in (drag, lag, turned)] == [True, False, True]
     assert "behind the IMU" in clocks.notes[0]
+    assert velocity_sensor.tests_of(late, config) == []  # no factor of the velocities
+    assert [t.passed for t in velocity_sensor.tests_of(streams, config)] == [True, True]
 
 
 @pytest.mark.parametrize("driving", ["pilot", "six-axis"])

@@ -8,8 +8,6 @@ And a late attitude is behind the thrust like late thrust, but behind the gyro, 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from rov_ident.config import Config
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.results import Finding
@@ -34,10 +32,7 @@ class ClockErrors:
         if self.ahead:
             told.append(f"{delays.ahead_of_wrench(self.ahead)}; no cause is sure beside that")
         if self.behind:
-            told.append(
-                f"attitude and angular velocities of the odometry are {1e3 * self.behind:.0f} ms "
-                "behind the IMU: correct the time stamps; whether thrust is late is not sure"
-            )
+            told.append(f"{delays.behind_imu(self.behind)}; whether thrust is late is not sure")
         return told
 
     def beside(self, found: Finding) -> Finding:
@@ -50,19 +45,10 @@ class ClockErrors:
 def of(bags: Sequence[Streams], config: Config) -> ClockErrors:
     """The errors of the clocks of some bags, the worst of each kind."""
     return ClockErrors(
-        max(_ahead(bag, config) for bag in bags), max(_behind(bag, config) for bag in bags)
+        max(_ahead(bag, config) for bag in bags),
+        max(delays.surely_behind_imu(bag, config) for bag in bags),
     )
 
 
 def _ahead(streams: Streams, config: Config) -> float:
     return max((t.value for t in delays.tests_of(streams, config) if not t.passed), default=0.0)
-
-
-def _behind(streams: Streams, config: Config) -> float:
-    """The gyro's stamp may be anywhere in the interval that it reads."""
-    late = delays.odometry_behind_imu(streams, config)
-    if late is None:
-        return 0.0
-    half = 0.5 * float(np.median(np.diff(streams.imu_t)))
-    surely = max(half, delays.SURELY * late.std)
-    return late.value if surely < late.value < delays.FIRST_ORDER else 0.0

@@ -16,7 +16,7 @@ from rov_ident.core.linalg import integral
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.offline import delays
-from rov_ident.offline.delays import Delay, ahead_of_wrench
+from rov_ident.offline.delays import Delay
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams
@@ -24,7 +24,6 @@ from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
-_DELAY = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes
 _UPWARD = 0.9  # g; mean specific force upward; a sign or an axis that is wrong gives 0.7 or less
 _SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
@@ -116,7 +115,9 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
     late = delays.odometry_behind_imu(streams, config)
     if late is not None:
-        remarks.append(_delay_remark("odometry behind the IMU", late))
+        behind = delays.surely_behind_imu(streams, config)
+        wrong = delays.behind_imu(behind) if behind else ""
+        remarks.append(_delay_remark("odometry behind the IMU", late, wrong))
     return remarks
 
 
@@ -205,10 +206,13 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         "the vehicle goes where it is pushed",
         -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
-    late = _delay_remark("motion behind the wrench", delays.motion_behind_wrench(rows))
+    late = delays.motion_behind_wrench(rows)
+    ahead, most = late.ahead
+    wrong = delays.ahead_of_wrench(ahead) if ahead > most else ""
     half = len(wrench) // 2
     halves = [delays.motion_behind_wrench(rows.part(part)) for part in np.s_[:half, half:]]
-    return [push, late, *_drift_remark(*halves)]
+    told = _delay_remark("motion behind the wrench", late, wrong)
+    return [push, told, *_drift_remark(*halves)]
 
 
 def _correlation(a: Array, b: Array) -> float:
@@ -219,17 +223,17 @@ def _correlation(a: Array, b: Array) -> float:
     return max(about_zero, float(np.corrcoef(a, b)[0, 1]))
 
 
-def _delay_remark(subject: str, late: Delay) -> Remark:
+def _delay_remark(subject: str, late: Delay, wrong: str) -> Remark:
+    """A delay; ``wrong`` says what it means where it surely is one of the stamps, else is empty."""
     text = f"{1e3 * late.value:.1f} ± {1e3 * NORMAL * late.std:.1f} ms (95 %)"
     if not np.isfinite(late.value):
         return Remark(subject, WARNING, "cannot be told: nothing moves")
     if abs(late.value) > delays.FIRST_ORDER:
         return Remark(subject, WARNING, "cannot be told: the one does not follow the other")
-    of_wrench, (ahead, most) = "wrench" in subject, late.ahead
-    if of_wrench and ahead > most:
-        return Remark(subject, WARNING, f"{text}: {ahead_of_wrench(ahead)}")
-    if abs(late.value) > max(_DELAY, 3.0 * late.std):
-        more = ", or let explain look for thruster lag and delay" if of_wrench else ""
+    if wrong:
+        return Remark(subject, WARNING, f"{text}: {wrong}")
+    if abs(late.value) > max(delays.MATTERS, 3.0 * late.std):
+        more = ", or let explain look for thruster lag and delay" if "wrench" in subject else ""
         return Remark(subject, WARNING, f"{text}: check the time stamps{more}")
     return Remark(subject, GOOD, text)
 
@@ -237,7 +241,7 @@ def _delay_remark(subject: str, late: Delay) -> Remark:
 def _drift_remark(first: Delay, last: Delay) -> list[Remark]:
     """That a delay differs between the halves of the record; else nothing."""
     moved, std = last.value - first.value, float(np.hypot(first.std, last.std))
-    if not max(_DELAY, delays.SURELY * std) < abs(moved) < delays.FIRST_ORDER:
+    if not max(delays.MATTERS, delays.SURELY * std) < abs(moved) < delays.FIRST_ORDER:
         return []
     text = (
         f"{1e3 * first.value:.0f} ms in the first half, {1e3 * last.value:.0f} ms in the second: "

@@ -26,6 +26,7 @@ from rov_ident.sampling.without_velocity import is_without_velocity
 _CORNER = 6.0  # rad/s; of the filter on wrench and motion: above the motion, below the noise
 _FEWEST_TIMED = 100  # messages of the IMU; fewer say nothing of delays
 FIRST_ORDER = 1.0  # s; what is further is beyond the manoeuvres about which a delay is linear
+MATTERS = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
 SURELY = 5.0  # standard deviations: these are of the noise alone, and clean dives reach 4.5
 _AHEAD = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
 # 45 simulated dives with exact stamps, while 15 ms of a wrong clock made 17
@@ -84,6 +85,24 @@ def odometry_behind_imu(streams: Streams, config: Config) -> Delay | None:
         return None
     known = measured_at(streams.imu_t, streams.t)
     return _lag(streams.t, gyro_at(streams, config), streams.nu[:, 3:], known)
+
+
+def surely_behind_imu(streams: Streams, config: Config) -> float:
+    """By how much [s] attitude and rates of the odometry are behind the gyro, 0 where they surely
+    are not: the gyro's stamp may be anywhere in the interval that it reads."""
+    late = odometry_behind_imu(streams, config)
+    if late is None:
+        return 0.0
+    half = 0.5 * float(np.median(np.diff(streams.imu_t)))
+    return late.value if max(half, SURELY * late.std) < late.value < FIRST_ORDER else 0.0
+
+
+def behind_imu(behind: float) -> str:
+    """What it means that the odometry is so long [s] behind."""
+    return (
+        f"attitude and angular velocities of the odometry are {1e3 * behind:.0f} ms behind the "
+        "IMU: correct the time stamps"
+    )
 
 
 def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
