@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.effects import EFFECTS, parameter
+from rov_ident.model.coefficients import DIAGONAL
 from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.model.scales import WORKING_SPEED, authority
 
@@ -79,6 +80,12 @@ ONE_AXIS = 1.0 / 3.0
 """of the standard deviation of the thrust's scale: how far the thrust of one axis may be off by
 itself, 5 % by default. Hull and wakes take that from the thrusters of one axis and not of another
 ("thrust deduction": Faltinsen 1990, Sea Loads on Ships and Offshore Structures, ch. 8)."""
+STAMPS = 0.001
+"""s; to which a driver's stamps are good: its process waits as long for its turn."""
+_TO_AND_FRO = 2.0  # rad/s; of a motion to and fro in three seconds, as steps and pilots make
+_TIMES = ("thruster_lag", "time_constant"), ("velocity_latency", "delay")
+_COB, _ARM = 0.005, 0.15  # m, as of the centre of gravity; of the arm, as of the thrust: a drawing
+# has it from volumes and weights of parts, and files of one vehicle differ by far more
 _FIRST_LAG = 0.4  # prior standard deviations ("Times" in docs/live.md)
 
 
@@ -149,7 +156,7 @@ def rigid_body_covariance(
     """
     known, body = config.vehicle_uncertainty, config.model.body
     masses, moments = _own_inertia(body)
-    if scaled := _with_thrust(names, values):
+    if scaled := _with_thrust(body, names, values):
         # relative to the inertia that the file gives and that does not change with the mass
         of_mass = {n: v - moments.get(n, 0.0) for n, v in scaled.items()}
     else:
@@ -171,12 +178,15 @@ def scale_covariance(
     the centre of gravity, as a heel at rest tells how far it is to one side in shares of the arm.
     The thrust of each other axis may be off by itself. And a velocity sensor that reads too much
     makes the same forces belong to velocities and accelerations that are as much smaller.
+
+    And stamps that are off: see :func:`_of_stamps`.
     """
-    masses, moments = _own_inertia(config.model.body)
+    body = config.model.body
+    masses, moments = _own_inertia(body)
     own = masses | moments
     of_all = dict(zip(names, values.tolist(), strict=True))
-    scaled = {n: v - own.get(n, 0.0) for n, v in _with_thrust(names, values).items()}
-    sources = []
+    scaled = {n: v - own.get(n, 0.0) for n, v in _with_thrust(body, names, values).items()}
+    sources = _of_stamps(config, names)
     if scaled:
         by_axis = ONE_AXIS * config.wrench.scale_std
         # no more than is supposed of the scale: a body without an arm tells nothing of it
@@ -191,10 +201,40 @@ def scale_covariance(
     return _consider_covariance(sources, names, gain)
 
 
+def _of_stamps(config: Config, names: tuple[str, ...]) -> list[dict[str, float]]:
+    """What it does to added mass and damping that linear velocities, or rates, are stamped late by
+    a standard deviation. Nothing where the file knows all times.
+
+    With ``M nu_dot + D nu + K x = tau``, a wrench that is d early is ``tau - d tau'``, in a motion
+    to and fro at w: ``(M - d D) nu_dot + (D + d (w^2 M - K)) nu + K x``. A lag and a delay of the
+    velocities take that up only where they stay positive.
+    """
+    if not any(f"{effect}.{own}" in names for effect, own in _TIMES):
+        return []
+    model = config.dynamics
+    of_mass, sources = authority(model) / WORKING_SPEED, []
+    stiffness = np.zeros(6)
+    stiffness[3:5] = model.body.weight * model.body.righting_arm
+    of_damping = np.hypot(_TO_AND_FRO**2 * np.diag(model.mass_matrix), stiffness)
+    changes = {
+        "added_mass": of_mass, "linear": of_damping, "quadratic": of_damping / WORKING_SPEED
+    }  # fmt: skip
+    for kind, change in changes.items():
+        moved = dict(zip(DIAGONAL[kind], (STAMPS * change).tolist(), strict=True))
+        for rows in ("XYZ", "KMN"):
+            sources.append({name: x for name, x in moved.items() if name[0] in rows})
+    return sources
+
+
+def cob_std(config: Config) -> float:
+    """The standard deviation [m] of the height of the centre of buoyancy."""
+    stated = config.vehicle_uncertainty.cob_std
+    return max(_COB, _ARM * abs(config.model.body.righting_arm)) if stated is None else stated
+
+
 def righting_arm_share(config: Config) -> float:
     """The standard deviation of the righting arm, relative to it."""
-    arm = abs(config.model.body.righting_arm)
-    return config.vehicle_uncertainty.cob_std / max(arm, 1e-9)
+    return cob_std(config) / max(abs(config.model.body.righting_arm), 1e-9)
 
 
 def _off_centre(config: Config, values: Mapping[str, float]) -> dict[str, float]:
@@ -221,12 +261,16 @@ def _own_inertia(body: RigidBody) -> tuple[dict[str, float], dict[str, float]]:
     )
 
 
-def _with_thrust(names: tuple[str, ...], values: Array) -> dict[str, float]:
-    """What is proportional to the thrust in the same motion, if its scale is estimated."""
+def _with_thrust(body: RigidBody, names: tuple[str, ...], values: Array) -> dict[str, float]:
+    """What is proportional to the thrust in the same motion, if its scale is estimated. Of a lost
+    buoyancy it is what weight and buoyancy leave together."""
     if THRUST_SCALE not in names:
         return {}
-    of_all = zip(names, values.tolist(), strict=True)
-    return {n: v for n, v in of_all if n == THRUST_SCALE or moves_with_thrust(n)}
+    of_all = dict(zip(names, values.tolist(), strict=True))
+    scaled = {n: v for n, v in of_all.items() if n == THRUST_SCALE or moves_with_thrust(n)}
+    if _BUOYANCY in scaled:
+        scaled[_BUOYANCY] += body.weight - body.buoyancy
+    return scaled
 
 
 def _consider_covariance(
@@ -246,14 +290,14 @@ def gain_of(covariance: Array, std: Array) -> Array:
     return np.eye(len(std)) - covariance / std**2
 
 
-THRUST_SCALE = "thrust_scale.scale"
+THRUST_SCALE, _BUOYANCY = "thrust_scale.scale", "buoyancy.delta"
 _COG_OFFSET = ("cog_offset.dx", "cog_offset.dy", "cog_offset.dz")
 
 
 def moves_with_thrust(name: str) -> bool:
     """Whether it must be k times as large where the thrust is, for the same motion: a force, or
     the coefficient of one."""
-    return "." not in name or name == "buoyancy.delta"
+    return "." not in name or name == _BUOYANCY
 
 
 def theta_of(config: Config) -> Array:

@@ -83,9 +83,11 @@ class VehicleUncertainty:
     )
     buoyancy_std: float = not_negative(0.02, "of the buoyancy, relative to the weight")
     cog_std: float = not_negative(0.005, "of the centre of gravity, each component", "m")
-    cob_std: float = not_negative(
-        0.005, "of the height of the centre of buoyancy; it widens the thrust scale", "m"
-    )
+    cob_std: float = option(
+        None, "of the height of the centre of buoyancy; it widens the thrust scale; left out: "
+        "0.005, or 0.15 of the righting arm where that is more", "m", lower=0.0,
+        computed=True,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import stdtrit
 
-from rov_ident.config.prior import ONE_AXIS, scale_covariance
+from rov_ident.config.prior import ONE_AXIS, cob_std, scale_covariance
 from rov_ident.core.linalg import scaled_inverse, scaled_solve
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
@@ -164,7 +164,7 @@ class Fitted:
         stronger = thrust[:, :, None] * config.wrench.scale_std
         axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]
         errors = [
-            problem.raising(body)[:, :, None] * known.cob_std,
+            problem.raising(body)[:, :, None] * cob_std(config),
             problem.of_rigid_body(body, self.linearisation.motion) * own,
             ONE_AXIS * stronger * np.eye(6)[:, axes],
         ]

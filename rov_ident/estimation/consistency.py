@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config
-from rov_ident.config.prior import Prior
+from rov_ident.config.prior import STAMPS, Prior
 from rov_ident.core.linalg import widened
 from rov_ident.core.messages import Array
 from rov_ident.core.states import IDENTIFIABLE, State
@@ -28,7 +28,6 @@ _WHITENESS = "whiteness: "
 SUPPOSED = 2.8
 """Standard deviations: of nine suppositions one seems, or is, further off in 5 % of dives."""
 _SELDOM = 1.645  # normal deviate that 5 % exceed, as of SUPPOSED
-_STAMPS = 0.001  # s to which a driver's stamps are good: its process waits as long for its turn
 _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
 _BY_CHANCE = 1.25  # of summed white innovations over what is expected, in one dive of a thousand
@@ -238,7 +237,7 @@ def consistency_of(
         )  # fmt: skip
     if std is not None:
         upper = np.where(prior.negative, np.minimum(prior.upper, 0.0), prior.upper)
-        by_clocks = np.array([_STAMPS if unit == "s" else 0.0 for unit in prior.units])
+        by_clocks = np.array([STAMPS if unit == "s" else 0.0 for unit in prior.units])
         beyond = np.maximum(prior.lower - values, values - upper) / np.hypot(std, by_clocks)
         for i in np.flatnonzero(beyond > 0.0).tolist():
             name = prior.names[i]
