@@ -20,7 +20,7 @@ from rov_ident.core.frames import (
     quaternion_to_matrix,
     velocity_of_arm,
 )
-from rov_ident.core.linalg import interpolated
+from rov_ident.core.linalg import integral, interpolated
 from rov_ident.core.messages import ODOMETRY
 from rov_ident.discrepancy import (
     clock_errors,
@@ -396,6 +396,11 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
     assert "behind the IMU" in clocks.notes[0]
     assert velocity_sensor.tests_of(late, config) == []  # no factor of the velocities
     assert [t.passed for t in velocity_sensor.tests_of(streams, config)] == [True, True]
+    # nor is one judged by a position that is the sum of those velocities
+    over_ground = np.einsum("kij,kj->ki", quaternion_to_matrix(streams.orientation), nu[:, :3])
+    reckoned = dataclasses.replace(streams, position=integral(streams.t, over_ground))
+    tests = velocity_sensor.tests_of(reckoned, config)
+    assert [test.name for test in tests] == ["velocity sensor: sensor_misalignment"]
 
 
 @pytest.mark.parametrize("driving", ["pilot", "six-axis"])
