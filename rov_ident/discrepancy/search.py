@@ -42,7 +42,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
 
-LIKELIEST = (*HULL_DAMPING, "thrust_scale")  # thrust is never just as configured
+LIKELIEST = (*HULL_DAMPING, "thrust_scale", "ocean_current")  # of the vehicle, thrust and water
 INTERPLAY_NAME = f"{UNKNOWN} {INTERPLAY}"  # it makes a name unsure, and is none itself
 LATE_THRUST = ("thruster_lag", "actuation_delay")  # what every thruster has a little of
 
