@@ -134,6 +134,32 @@ def test_the_data_choose_the_order(order, lags):
     assert (second < 0.5 * first) == (order == 2)
 
 
+def test_the_second_order_must_be_worth_its_parameters():
+    """Of a first-order vehicle: the error of this run is less by more than a standard error."""
+    run = simulated(0.4, 5.0, 0.1, noise=1e-3, seed=0, duration=60.0)
+    assert nomoto.fit([every(run, 0.2)], "auto").order == 1
+
+
+def test_the_second_order_is_not_chosen_for_a_response_slower_than_the_run():
+    """Of this first-order vehicle it predicts the parts left out better, with K = 0.046 for 0.3."""
+    run = every(simulated(0.3, 4.0, np.radians(20.0), duration=20.0), 0.1)
+    noise = 0.002 * np.random.default_rng(14).normal(size=len(run.t))
+    assert nomoto.fit([replace(run, heading=run.heading + noise)], "auto").order == 1
+
+
+def test_a_response_slower_than_the_run_is_said():
+    slow = every(simulated(0.3, 400.0, 0.1, duration=40.0), 0.2)
+    assert any("slower than the longest run (40 s)" in note for note in nomoto.fit([slow]).notes)
+
+
+def test_a_heading_that_answers_late_is_said():
+    """An all-pass, which a dead time looks like, and no rudder."""
+    run = every(simulated(0.3, 4.0, 0.2, noise=1e-3), 0.1)
+    late = replace(run, heading=np.interp(run.t - 0.6, run.t, run.heading))
+    (note,) = (n for n in nomoto.fit([late], 2).notes if n.startswith("T3 is negative"))
+    assert "answers some 0.6" in note
+
+
 def test_a_cubic_term_that_helps_the_turn_is_not_fitted():
     """Its model would run away as soon as a manoeuvre is faster than those fitted."""
     model = nomoto.fit([every(simulated(0.3, 4.0, 0.1, n3=-5.0), 0.2)], nonlinear=True)
@@ -579,6 +605,9 @@ BAD = {
         lambda p, r: changed(write(p, r), "heading_deg", "heading_rad"), "else wrap it"
     ),
     "time back": (lambda p, r: write(p, r, extra="3,0,0,x\n"), "time must increase"),
+    "milliseconds": (
+        lambda p, r: write(p, replace(r, t=1000.0 * r.t)), "looks like milliseconds: divide"
+    ),
     "no number": (lambda p, r: write(p, r, extra="101,0,hard,x\n"), "`hard` is not a number"),
     "ragged": (lambda p, r: write(p, r, extra="101,0\n"), "2 cells under 4 headings"),
     "too short": (

@@ -64,9 +64,9 @@ class Run:
         """(n, 4), of INPUTS."""
         return np.column_stack([*(self.fins[x] for x in "sra"), self.revolutions])
 
-    def zigzag(self, name: str = "simulated") -> Zigzag:
+    def zigzag(self) -> Zigzag:
         """Heading and rudder."""
-        return Zigzag(name, self.t, self.angles[:, 2], self.fins["r"])
+        return Zigzag("simulated", self.t, self.angles[:, 2], self.fins["r"])
 
 
 def steer(

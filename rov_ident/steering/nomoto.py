@@ -75,8 +75,21 @@ def fit(
     errors = [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
     measured = np.concatenate(errors)
     notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted, nonlinear)]
+    if _outlasts(model, runs):
+        notes.append(
+            f"the response is slower than the longest run ({_longest(runs):.3g} s), which hardly "
+            "tells it from the first state and delta_0: K, T and their intervals may be far off; "
+            + ("try --order 1, or fit" if model.order == 2 else "fit")
+            + " a longer run"
+        )
     if model.order == 2 and "T1" not in model.names:
         notes.append("T1 and T2 are complex: only T1T2 and T1_plus_T2 are given")
+    elif model.order == 2 and model.upper[model.names.index("T3")] < 0.0:
+        late = model.value("T2") - model.value("T3")
+        notes.append(
+            f"T3 is negative: the heading answers some {late:.2g} s late, which no rudder does; T "
+            "contains a dead time, the servo (is the rudder angle the command?) or two clocks"
+        )
     return dataclasses.replace(
         model,
         rmse=rmse(measured),
@@ -117,7 +130,9 @@ def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:
     and predicted by a fit to the rest, which runs through it; not so the first and the last, where
     the course of an unstable vehicle depends on the state rather than the order. The second order
     is chosen if its mean squared error is less by more than one standard error of the difference
-    over the parts (Breiman et al. 1984, sec. 3.4.3).
+    over the parts (Breiman et al. 1984, sec. 3.4.3), which chance exceeds one time in five with
+    four parts, and by more than its two further parameters cost (Schwarz 1978). But not if it alone
+    ends with a response slower than the runs, of which K is what is left over.
     """
     models: dict[int, Nomoto] = {}
     for order in ORDERS:
@@ -129,10 +144,22 @@ def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:
     chosen = min(models)
     if len(models) == 2:
         gain = errors[1] - errors[2]
-        if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)):
-            chosen = 2
+        headings = sum(int(run.known.sum()) for run in runs)
+        price = 2.0 * np.log(headings) / headings * errors[1].mean()
+        sure = gain.mean() > max(gain.std(ddof=1) / np.sqrt(len(gain)), price)
+        chosen = 2 if sure and (_outlasts(models[1], runs) or not _outlasts(models[2], runs)) else 1
     found = {order: float(np.sqrt(error.mean())) for order, error in errors.items()}
     return dataclasses.replace(models[chosen], cross_validation=found)
+
+
+def _longest(runs: Sequence[Zigzag]) -> float:
+    return max(float(np.ptp(run.t)) for run in runs)
+
+
+def _outlasts(model: Nomoto, runs: Sequence[Zigzag]) -> bool:
+    """Whether the slowest response is slower than the longest run: the first state and delta_0 then
+    do what K does."""
+    return _longest(runs) * abs(model.growth) < 1.0
 
 
 def _left_out(runs: Sequence[Zigzag], model: Nomoto) -> Array:

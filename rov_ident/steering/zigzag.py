@@ -18,6 +18,8 @@ _RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
 _TURNED = 2.5 * np.pi  # a heading beyond it counts turns, or is in degrees
 _FAINT = 1.0  # deg; a zigzag whose angles all stay below it is one in radians
+_RARE, _LONG = 5.0, 6 * 3600.0  # s between rows, s in all: zigzags take half an hour at most (ITTC
+# 7.5-04-02-01), but half a minute at 200 Hz has such numbers in milliseconds
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,11 @@ def from_csv(path: Path) -> Zigzag:
         raise UserError(
             f"{path}, line {table.lines[bad[0] + 1]}: t_s goes from {t[bad[0]]:g} to "
             f"{t[bad[0] + 1]:g}, but time must increase: sort the rows"
+        )
+    if (step := (t[-1] - t[0]) / max(len(t) - 1, 1)) >= _RARE and t[-1] - t[0] > _LONG:
+        raise UserError(
+            f"{path}: t_s has rows {step:g} s apart for {(t[-1] - t[0]) / 3600.0:.3g} hours, which "
+            "looks like milliseconds: divide it by 1000, or cut out the zigzag"
         )
     rudder = _angle(table, "rudder", blank=False)
     heading = _angle(table, "heading", blank=True)
