@@ -298,6 +298,8 @@ def test_bad_tables_are_refused_in_a_sentence(case, tmp_path, capsys):
     "arguments, sentence",
     [
         (["--map", "beta_deg=drift"], "has no column `drift` for beta_deg"),
+        (["--map", "X=X [kN]"], "`X [kN]` seems to be in kN, but X is read in SI units"),
+        (["--map", "u=v (km/h)"], "seems to be in km/h, but u is read in SI units"),
         (["--nondimensional", "rho=1000"], "lacks L"),
         (["--nondimensional", "rho=1000,L=-1"], "all positive"),
         (["--out", "c.yaml"], "need --config"),
@@ -305,7 +307,7 @@ def test_bad_tables_are_refused_in_a_sentence(case, tmp_path, capsys):
     ],
 )
 def test_bad_arguments_are_refused(arguments, sentence, tmp_path, capsys):
-    path = write(tmp_path / "t.csv", table())
+    path = write(tmp_path / "t.csv", table(**{"X [kN]": ANGLES, "v (km/h)": ANGLES}))
     assert main(["forces", str(path), *arguments]) == 2
     assert sentence in capsys.readouterr().err
 
@@ -469,7 +471,7 @@ def test_repeated_runs_do_not_vouch_for_one_another():
     assert np.mean(inside) > 0.8
 
 
-@pytest.mark.parametrize("separator", ";\t")
+@pytest.mark.parametrize("separator", ";\t ")
 def test_another_separator_is_named(separator, tmp_path, capsys):
     path = tmp_path / "t.csv"
     path.write_text("u,X\n1,-1\n2,-4\n".replace(",", separator))
@@ -491,3 +493,26 @@ def test_what_spoils_a_table_is_said(change, sentence):
     wrong = -force if change == "resistance" else np.where(np.arange(60) == 7, -3.0 * force, force)
     fits = force_tables.fit(force_tables.ForceTable("wrong", nu, {}, {"X": wrong}))
     assert any(sentence in remark for remark in force_tables.remarks(fits, True))
+
+
+def test_a_force_that_drives_beside_the_way_ahead_is_said():
+    """Lift of the wrong sign: of a table with u and v no drift angle is turned round."""
+    rng = np.random.default_rng(1)
+    nu = np.zeros((60, 6))
+    nu[:, 0], nu[:, 1] = rng.uniform(0.5, 2.0, 60), rng.uniform(-0.5, 0.5, 60)
+    force = 30.0 * nu[:, 0] * nu[:, 1] + 0.1 * rng.standard_normal(60)
+    (remark,) = force_tables.remarks(
+        force_tables.fit(force_tables.ForceTable("resistance", nu, {}, {"Y": force})), True
+    )
+    assert "Y_uv is positive, so Y would drive the vehicle along its own motion" in remark
+
+
+def test_a_table_that_lacks_what_varied_is_said():
+    """Runs at several angles of drift, without the column of the drift."""
+    rng = np.random.default_rng(1)
+    nu = np.zeros((90, 6))
+    nu[:, 0] = np.repeat(np.linspace(0.5, 2.0, 10), 9)
+    drift = np.tile(np.radians(np.linspace(-10.0, 20.0, 9)), 10)
+    force = -30.0 * nu[:, 0] ** 2 * drift * (1.0 + 0.03 * rng.standard_normal(90))
+    fits = force_tables.fit(force_tables.ForceTable("no beta", nu, {}, {"Y": force}))
+    assert any("rows of the same condition differ" in r for r in force_tables.remarks(fits, True))

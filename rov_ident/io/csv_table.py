@@ -76,16 +76,16 @@ def read_csv(path: Path) -> CsvTable:
                 header = comment
             if not header:
                 header = cells
-                if len(cells) == 1 and (other := {";", "\t"} & set(cells[0])):
+                if len(cells) == 1 and (other := [c for c in ";\t " if c in cells[0]]):
                     raise UserError(
-                        f"{path} separates its columns by {min(other)!r}: save it with commas, and "
+                        f"{path} separates its columns by {other[0]!r}: save it with commas, and "
                         "points in its numbers"
                     )
                 continue
             if len(cells) != len(header):
                 raise UserError(
                     f"{path}, line {reader.line_num}: {len(cells)} cells under {len(header)} "
-                    "headings; correct or remove the row"
+                    "headings; correct or remove the row, and write numbers with points"
                 )
             rows.append(cells)
             lines.append(reader.line_num)

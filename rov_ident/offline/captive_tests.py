@@ -56,6 +56,7 @@ _WORTH = 2.0  # standard errors, which chance exceeds one time in forty
 _FAR = 12.0  # median errors: eight standard deviations (0.674 each) of a normal distribution
 _LIGHT = 1e-3  # weight of a structure, the best one's being 1, which changes no standard deviation
 _SLIP = 0.5  # of the force itself: noise in proportion to it is less, a sign or unit more
+_UNLIKE = 0.25  # of the force (RMS); runs of a condition repeat to a few percent, poor ones to ten
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 
 
@@ -96,6 +97,8 @@ class AxisFit(Result):
     """By term that the table moves and the structure lacks: by how much each value (n,) would be
     less per unit of it (the regression of its column on those of the structure)."""
     aliases: Mapping[str, str] = field(default_factory=dict)
+    unlike: float = 0.0
+    """Standard deviation of repeated runs of a condition, over the force (RMS)."""
     measured: Array = field(default_factory=lambda: np.zeros(0))
     fitted: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -177,6 +180,11 @@ class _Reader:
                 raise UserError(
                     f"{table.path} has no column `{heading}` for {name}: it has "
                     f"{', '.join(table.cells)}"
+                )
+            if (unit := _in_other_unit(heading)) and not name.endswith(("_deg", "_rad")):
+                raise UserError(
+                    f"{table.path}: `{heading}` seems to be in {unit}, but {name} is read in SI "
+                    "units: convert the column, and rename it"
                 )
 
     def column(self, name: str, blank: bool = False) -> Array | None:
@@ -267,6 +275,17 @@ _WORDS = {
     **{name: name for name in "uvwpq"},
     **{name.replace("_", " "): names[0] for names in _FIN_COLUMNS.values() for name in names},
 }
+
+
+_OTHER_UNIT = re.compile(
+    r"[(\[](k[tn]s?|knots|km/?h|ft/s|mph|[mc]m/s|[km]n\W?m?|lbf|kgf|deg/s)[)\]]"
+)
+
+
+def _in_other_unit(heading: str) -> str:
+    """The unit in the brackets of a heading such as `X [kN]`, if it is a usual one but not SI."""
+    found = _OTHER_UNIT.search(heading.lower())
+    return heading[slice(*found.span(1))] if found else ""
 
 
 def _guessed_name(heading: str) -> str:
@@ -463,8 +482,10 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
     """The structure of one axis, see the head of this module."""
     states = np.column_stack([nu, *fins.values()])
     _, first, which = np.unique(states.round(9), axis=0, return_index=True, return_inverse=True)
-    conditions = len(first)
-    force = np.bincount(which.ravel(), force) / np.bincount(which.ravel())
+    conditions, repeats, which = len(first), len(force) - len(first), which.ravel()
+    mean = np.bincount(which, force) / np.bincount(which)
+    repeated = math.sqrt(float(np.sum((force - mean[which]) ** 2)) / max(repeats, 1))
+    unlike, force = repeated / max(_rms(force), 1e-300), mean
     nu, fins = nu[first], {letter: angle[first] for letter, angle in fins.items()}
     if conditions < _FEWEST:
         raise UserError(
@@ -511,6 +532,7 @@ def fit_axis(axis: str, nu: Array, fins: Mapping[str, Array], force: Array) -> A
             if name not in terms
         },
         aliases={a: b for a, b in aliases.items() if b in terms},
+        unlike=unlike,
         measured=force,
         fitted=fitted,
     )
@@ -687,13 +709,20 @@ def remarks(fits: Mapping[str, AxisFit], with_config: bool) -> list[str]:
     """What a reader of the coefficients should know."""
     out = []
     for axis, f in fits.items():
-        own = {n for n in f.names if not n.endswith("_0") and parse(n).is_diagonal}
+        velocity = VELOCITIES[AXES.index(axis)]
+        own = {f"{axis}_{of}{velocity}" for of in ("", velocity, "u")} & {*f.names}
         driven = [n for n, low in zip(f.names, f.lower) if n in own and low > 0.0]
         if driven and len(driven) == len(own):
             out.append(
                 f"{driven[0]} is positive, so {axis} would drive the vehicle along its own motion: "
                 "the table must hold the forces on the vehicle, not its resistance, in axes "
                 f"forward, starboard, down; reverse the sign of {axis} if it does not"
+            )
+        if f.unlike > _UNLIKE:
+            out.append(
+                f"{axis}: rows of the same condition differ by {100.0 * f.unlike:.0f} % of the "
+                "force: if that is not noise, something else varies that the table lacks or whose "
+                "heading is not understood, and the values hold for its average: add its column"
             )
         if len(f.names) == len(f.measured) // _ROWS_PER_TERM < len(f.pool):
             out.append(
