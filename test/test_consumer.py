@@ -214,7 +214,20 @@ def test_hold_after(heavy):
         HydrodynamicModel(heavy, hold_after=0.0)
 
 
-@pytest.mark.parametrize("attitude", [[0.0] * 4, [0.0] * 3, [np.nan, 0.0, 0.0, 1.0]])
+def test_a_vector_of_another_shape_is_refused(heavy):
+    hydrodynamics, level = HydrodynamicModel(heavy), [1.0, 0.0, 0.0, 0.0]
+    for ask in (
+        lambda: hydrodynamics.D(np.zeros((1, 6))),
+        lambda: hydrodynamics.C(np.zeros(5)),
+        lambda: hydrodynamics.wrench(np.zeros(6), np.zeros(3), level),
+    ):
+        with pytest.raises(UserError, match=r"nu.* has the shape \(.*\), but must be \(6,\)"):
+            ask()
+
+
+@pytest.mark.parametrize(
+    "attitude", [[0.0] * 4, [0.0] * 3, [np.nan, 0.0, 0.0, 1.0], np.ones(5), np.eye(3)]
+)
 def test_an_attitude_without_a_direction_is_refused(heavy, attitude):
     """Zeros are what an IMU without orientation sends: they made NaN of the thrust."""
     hydrodynamics = HydrodynamicModel(heavy)

@@ -113,6 +113,18 @@ def test_ours_pass_as_well():
         (block("python").replace("position, nu", "nu"), "fails in its wrench (TypeError"),
         (block("python").replace("@kernel", ""), "must have a kernel as its wrench"),
         (block("python").replace('"wrench"', '"thrust"'), "must have one of input, motion, wrench"),
+        (
+            block("python").replace("out[3] +=", "out[3] ="),
+            "must do nothing at its nulls, but its wrench does",
+        ),
+        (block("python").replace("p[0] *", "p[0] / 0.0 *"), "gives numbers that are not finite"),
+        (block("python").replace("out[3] +=", "thrust[0] ="), "fails in its wrench (ValueError"),
+        (
+            block("python").replace("=wrench,", "=None, late=lambda ratio: 0.1,"),
+            "must do nothing at its nulls, but its late does",
+        ),
+        (block("python").replace('"ratio"', '"my ratio"'), "name of its parameter 'my ratio'"),
+        (block("python").replace("0.02),)", "0.02))"), "must have a tuple of EffectParameter"),
         (block("python").replace("0.02),)", "0.02),) * 2"), "a name of its own for each"),
         (
             block("python").replace("=wrench,", "=None, water=lambda ratio: (ratio, 0.0),"),

@@ -51,7 +51,8 @@ class HydrodynamicModel:
     Raises
     ------
     UserError
-        If ``hold_after`` is not positive, the parameter file wrong, or an attitude zero.
+        If ``hold_after`` is not positive, the parameter file wrong, an attitude zero, or a vector
+        not of its shape.
     """
 
     def __init__(self, config: str | os.PathLike[str] | Config, hold_after: float = 2.0) -> None:
@@ -158,11 +159,11 @@ class HydrodynamicModel:
 
     def C(self, nu: Array) -> Array:
         """(6, 6), skew-symmetric."""
-        return self._model.coriolis_matrix(nu)
+        return self._model.coriolis_matrix(_six(nu, "nu"))
 
     def D(self, nu: Array) -> Array:
         """(6, 6), on the left-hand side: ``D nu`` is the drag that thrust must overcome."""
-        return self._model.damping_matrix(nu)
+        return self._model.damping_matrix(_six(nu, "nu"))
 
     def g(self, attitude: Array) -> Array:
         """(6,): the wrench that holds the vehicle still at this attitude."""
@@ -170,12 +171,22 @@ class HydrodynamicModel:
 
     def wrench(self, nu: Array, nu_dot: Array, attitude: Array) -> Array:
         """(6,): ``M nu_dot + C(nu) nu + D(nu) nu + g``, the thrust that this motion takes."""
-        return self._model.wrench(nu, nu_dot, _down(attitude))
+        return self._model.wrench(_six(nu, "nu"), _six(nu_dot, "nu_dot"), _down(attitude))
+
+
+def _six(x: Array, name: str) -> Array:
+    x = np.asarray(x, dtype=float)
+    if x.shape != (6,):
+        raise UserError(f"{name} has the shape {x.shape}, but must be (6,): u v w p q r")
+    return x
 
 
 def _down(attitude: Array) -> Array:
     attitude = np.asarray(attitude, dtype=float)
-    if not 0.0 < np.linalg.norm(attitude) < np.inf:  # an IMU without orientation sends zeros
+    known = attitude.shape in ((3,), (4,))
+    if not (
+        known and 0.0 < np.linalg.norm(attitude) < np.inf
+    ):  # an IMU without orientation sends zeros
         raise UserError(
             f"the attitude is {attitude.tolist()}, but must be a quaternion w x y z or down in "
             "body axes, of any length but zero"

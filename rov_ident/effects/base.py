@@ -39,7 +39,8 @@ An effect says what it does by exactly one of these, each in the file of the eff
     [rad], about world down; its position is in the world.
 """
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -206,6 +207,10 @@ def faults(effect: Any) -> str:
         return f"must have exactly one of {', '.join(_HOOKS)}"
     if bool(effect.sense) != bool(effect.correct):
         return "must have sense and correct, or neither"
+    if not isinstance(effect.parameters, tuple) or not all(
+        isinstance(p, EffectParameter) for p in effect.parameters
+    ):
+        return "must have a tuple of EffectParameter as its parameters"
     if len(effect.parameters) > SIZE:
         return f"has {len(effect.parameters)} parameters, but may have {SIZE} at most"
     if bool(effect.parameters) == bool(effect.coefficients):
@@ -213,6 +218,8 @@ def faults(effect: Any) -> str:
     if len({p.name for p in effect.parameters}) < len(effect.parameters):
         return "must have a name of its own for each parameter"
     for p in effect.parameters:
+        if not re.fullmatch(r"[A-Za-z]\w*", p.name, re.ASCII):
+            return f"needs letters, digits and underscores as the name of its parameter {p.name!r}"
         if not (p.lower <= p.null <= p.upper and p.typical > 0.0):
             return f"needs lower <= null <= upper and typical > 0 of its parameter {p.name}"
     try:
@@ -224,17 +231,25 @@ def faults(effect: Any) -> str:
 
 
 def _fault_of_hooks(effect: Effect) -> str:
-    """What goes wrong when the hooks are called once; empty if nothing.
+    """What goes wrong when the hooks are called at the nulls, where they must do nothing, and at
+    the typical sizes; empty if nothing.
 
     Kernels are called as the Python functions they are: compiled, an index beyond the end of an
     array would read and write other numbers, and nobody would be told.
     """
-    values = {p.name: min(p.null + p.typical, p.upper) for p in effect.parameters}
-    p, six, three = np.zeros(SIZE), np.full(6, 0.1), np.ones(3)
+    nulls = {p.name: p.null for p in effect.parameters}
+    typical = {p.name: min(p.null + p.typical, p.upper) for p in effect.parameters}
+    return _fault_at(effect, nulls, True) or _fault_at(effect, typical, False)
+
+
+def _fault_at(effect: Effect, values: Mapping[str, float], is_null: bool) -> str:
+    p, six, three, eye = np.zeros(SIZE), np.full(6, 0.1), np.ones(3), np.eye(3)
     p[: len(values)] = list(values.values())
+    for given in (p, six, three, eye):
+        given.flags.writeable = False  # no hook may change them: others read them, too
     body = RigidBody(1.0, 10.0, 10.0, np.zeros(3), np.zeros(3), np.eye(3))
     kernels: dict[str, tuple[Any, ...]] = {
-        "wrench": (p, 1.0, three, six, np.eye(3), six.copy(), six.copy()),
+        "wrench": (p, 1.0, three, six, eye, six, six.copy()),
         "act": (p, np.zeros(MEMORY), 1.0, 0.1, six.copy()),
         "steer": (p, np.zeros(STEER_MEMORY), 0.1, np.full((2, len(INPUTS)), 0.1)),
     }
@@ -254,7 +269,12 @@ def _fault_of_hooks(effect: Effect) -> str:
                 if (hook := getattr(effect, name)) is not None:
                     if not hasattr(hook, "py_func"):
                         return f"must have a kernel as its {name} (rov_ident.core.jit.kernel)"
+                    before = arguments[-1].copy()
                     hook.py_func(*arguments)
+                    if not np.isfinite(arguments[-1]).all():
+                        return f"gives numbers that are not finite from its {name}"
+                    if is_null and not np.allclose(arguments[-1], before):
+                        return f"must do nothing at its nulls, but its {name} does"
             for name, (arguments, shape) in functions.items():
                 if (hook := getattr(effect, name)) is not None:
                     found = hook(*arguments, **values)
@@ -262,6 +282,9 @@ def _fault_of_hooks(effect: Effect) -> str:
                         return f"must return a {type(arguments[0]).__name__} from its {name}"
                     if shape is not None and np.shape(found) != shape:
                         return f"must return numbers of the shape {shape} from its {name}"
+                    same = arguments[0] if shape == (4, 3) else 0.0
+                    if is_null and shape is not None and not np.allclose(found, same):
+                        return f"must do nothing at its nulls, but its {name} does"
     except Exception as error:  # it is code of others
         return f"fails in its {name} ({type(error).__name__}: {error})"
     return ""
