@@ -88,6 +88,29 @@ def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
     assert not out.exists()
 
 
+def test_what_is_missing_is_said_before_any_dive_is_read(dives):
+    def progress(*_):
+        raise AssertionError("a dive is read")
+
+    with pytest.raises(ri.UserError, match="no bag was given"):
+        ri.identify([], WRONG, progress=progress)
+    with pytest.raises(ri.UserError, match="gone.mcap cannot be read"):
+        ri.identify(dives / "long.mcap", WRONG, validate="gone.mcap", progress=progress)
+
+
+def test_a_dive_given_twice_counts_once(dives, tmp_path, monkeypatch):
+    """It would be judged by itself, or nothing be left to fit."""
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes((dives / "short.mcap").read_bytes())
+    checked = []
+    monkeypatch.setattr(identification, "check", lambda path, *_, **__: checked.append(path) or (
+        SimpleNamespace(usable=False, why="it is no dive")
+    ))  # fmt: skip
+    with pytest.raises(ri.UserError, match="no dive is fit"):
+        ri.identify([dives / "short.mcap", copy, dives / "long.mcap"], WRONG)
+    assert [path.name for path in checked] == ["short.mcap", "long.mcap"]
+
+
 @pytest.mark.parametrize("agree", [True, False])
 def test_a_fit_that_the_data_contradict_is_doubted_in_the_headline(dives, agree):
     fit = ri.fit(dives / "short.mcap", WRONG, "ls")

@@ -6,6 +6,7 @@ import textbook
 from tiers import more
 
 from rov_ident import config
+from rov_ident.core.errors import UserError
 from rov_ident.core.jit import interpret, stop_interpreting
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.core.states import Level, State
@@ -64,6 +65,23 @@ def publishable(estimator):
 
 
 # ------------------------------------------------------------------ words
+
+
+def test_a_message_put_together_wrongly_is_refused(heavy, messages):
+    """From Python: lists, other shapes and seconds are no bad data; nothing is kept of them."""
+    estimator = OnlineEstimator(heavy, "rls")
+    odometry = next(m for role, m in messages if role == ODOMETRY)
+    for role, message, words in (
+        ("odometry", odometry, "there is no input 'odometry': use one of odom, imu"),
+        (IMU, odometry, "'imu' takes a message Imu, not Odometry"),
+        (ODOMETRY, {"stamp": 1}, "takes a message Odometry, not dict"),
+        (ODOMETRY, odometry._replace(linear=[0.0, 0.0, 0.0]), "linear of an 'odom' must be"),
+        (ODOMETRY, odometry._replace(linear=np.zeros(2)), r"of shape \(3,\)"),
+        (ODOMETRY, odometry._replace(stamp=1.5), "the stamp is 1.5, but must be whole nanosec"),
+    ):
+        with pytest.raises(UserError, match=words):
+            estimator.push(role, message)
+    assert not estimator.counts
 
 
 @pytest.mark.parametrize("kind", KINDS)

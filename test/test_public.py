@@ -306,6 +306,7 @@ def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
         (lambda bag: ri.plan(HEAVY, tank=(6.0, 6.0)), "must be three lengths"),
         (lambda bag: ri.plan(HEAVY, duration=float("nan")), "10 s are the least"),
         (lambda bag: ri.plan(HEAVY, tank="666"), "must be three lengths"),
+        (lambda bag: ri.plan(HEAVY, tank=3.0), "must be three lengths"),
         (lambda bag: ri.plan(HEAVY, tank=(6.0, -6.0, 2.0)), "must be three lengths"),
         (lambda bag: ri.fit(None, HEAVY), "None is no path, nor several"),
         (lambda bag: ri.fit([None], HEAVY), "None is no path"),
@@ -464,6 +465,12 @@ def test_bad_files_are_refused_in_a_sentence(tmp_path, capsys, text):
     bad.write_text(text)
     assert main(["compare", str(good), str(bad)]) == 2
     assert "bad.json" in capsys.readouterr().err.replace("\n", "")
+
+
+@pytest.mark.parametrize("thing", [{"X_u": -10.0}, [1.0, 2.0], None])
+def test_what_is_no_result_is_not_compared(thing):
+    with pytest.raises(ri.UserError, match=f"{type(thing).__name__} is no result: give a Fit"):
+        ri.compare(thing, thing)
 
 
 # ------------------------------------------------------------------ what is written of it

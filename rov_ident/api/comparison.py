@@ -259,6 +259,9 @@ def _estimates(source: Any) -> Estimates:
     if isinstance(source, Shown):
         label = source.estimator if isinstance(source, Result) else type(source).__name__.lower()
         return _numbers_of_json(json.loads(source.to_json()), label)
+    if not isinstance(source, str | os.PathLike):
+        kind = type(source).__name__
+        raise UserError(f"{kind} is no result: give a Fit, a Config or the path of a file of one")
     path, label = Path(source), Path(source).name
     if path.is_dir():  # of identify
         path /= "result.json"

@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -373,10 +373,11 @@ def plan(
         If a bag cannot be read, or no manoeuvre is safe within these limits.
     """
     given, say = load(config), progress or silent
-    numeric = all(isinstance(side, int | float | np.number) and side > 0 for side in tank)
-    if len(tank) != 3 or not numeric:
+    sides = tuple(tank) if isinstance(tank, Iterable) else ()
+    numeric = all(isinstance(side, int | float | np.number) and side > 0 for side in sides)
+    if len(sides) != 3 or not numeric:
         raise UserError(f"tank is {tank!r}, but must be three lengths [m], such as (6, 6, 2)")
-    limits, paths = Limits(tuple(tank), thrust), [] if bag is None else several(bag)
+    limits, paths = Limits(sides, thrust), [] if bag is None else several(bag)
     given, _ = mounted(given, paths)
     known = archive.opened(paths, given, say=say) if paths else contextlib.nullcontext()
     with known as bags:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rov_ident.api.functions import check, explain, plan
 from rov_ident.api.functions import fit as fit_bags
-from rov_ident.api.reading import File, Files, load, mounted, several
+from rov_ident.api.reading import File, Files, existing, load, mounted, once, several
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -248,8 +248,10 @@ def identify(
     UserError
         If a bag cannot be read, or no dive is fit for identification: why, and what to fly instead.
     """
-    say, paths = progress or silent, several(dives)
+    say = progress or silent
+    paths, repeated = once(several(dives))
     given, placed = mounted(load(config), paths)
+    judge = None if validate is None else existing(validate)
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}
     for path in paths:
@@ -261,7 +263,6 @@ def identify(
     if not checked:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
         raise UserError(f"no dive is fit for identification: {reasons}{_first_dive(given, say)}")
-    judge = Path(validate) if validate else None
     if judge is None and len(checked) > 1:
         judge, _ = min(checked, key=lambda pair: pair[1].duration)
     used = [path for path, _ in checked if path != judge]
@@ -285,7 +286,7 @@ def identify(
         why.append(f"no next manoeuvre: {error}")
     checks = tuple(found for path, found in checked)
     name = judge.name if judge else ""
-    notes = (*placed, *why, *(explanation.findings.notes if explanation else ()))
+    notes = (*repeated, *placed, *why, *(explanation.findings.notes if explanation else ()))
     return Identification(fitted, explanation, checks, left_out, name, proposal, judged, notes)
 
 

@@ -35,7 +35,10 @@ def several(files: Files) -> list[Path]:
         return [existing(files)]
     if not isinstance(files, Iterable):
         raise UserError(f"{files!r} is no path, nor several: give the files to read")
-    return [existing(file) for file in files]
+    paths = [existing(file) for file in files]
+    if not paths:
+        raise UserError("no bag was given")
+    return paths
 
 
 def once(paths: Sequence[Path]) -> tuple[list[Path], tuple[str, ...]]:

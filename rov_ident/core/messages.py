@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.core.errors import UserError
+
 Array = NDArray[np.float64]
 
 ODOMETRY, IMU, WRENCH = "odom", "imu", "wrench"  # the roles of the three inputs
@@ -84,6 +86,38 @@ class Commands(NamedTuple):
 
 
 Message = Odometry | Imu | Wrench | Joints
+
+_TAKEN: dict[str, tuple[type[Message], dict[str, int]]] = {
+    ODOMETRY: (
+        Odometry,
+        {"position": 3, "orientation": 4, "linear": 3, "angular": 3, "twist_variance": 6},
+    ),
+    IMU: (
+        Imu,
+        {"orientation": 4, "angular_velocity": 3, "linear_acceleration": 3, "angular_variance": 3,
+         "acceleration_variance": 3},
+    ),
+    WRENCH: (Wrench, {"force": 3, "torque": 3}),
+    DRIVE: (Joints, {}),
+}  # fmt: skip
+
+
+def check_form(role: str, message: Message) -> None:
+    """Refuse what a program has put together wrongly; no message on the wire is so.
+
+    Raises UserError: another role, type or shape, or a stamp that is no whole number.
+    """
+    if role not in _TAKEN:
+        raise UserError(f"there is no input {role!r}: use one of {', '.join(_TAKEN)}")
+    kind, lengths = _TAKEN[role]
+    if not isinstance(message, kind):
+        raise UserError(f"{role!r} takes a message {kind.__name__}, not {type(message).__name__}")
+    if not isinstance(message.stamp, int | np.integer):
+        raise UserError(f"the stamp is {message.stamp!r}, but must be whole nanoseconds")
+    for name, length in lengths.items():
+        if getattr(getattr(message, name), "shape", None) != (length,):
+            raise UserError(f"{name} of an {role!r} must be a numpy array of shape ({length},)")
+
 
 SECOND = 1_000_000_000  # ns
 LAST_STAMP = (2**31 - 1) * SECOND  # ns; the end of ROS time, 32 bits of seconds

@@ -21,7 +21,7 @@ from rov_ident.config.prior import (
     scale_covariance,
 )
 from rov_ident.core.errors import UserError
-from rov_ident.core.messages import Array, Message
+from rov_ident.core.messages import Array, Message, check_form
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.core.whiteness import JUDGED_TIME
@@ -222,7 +222,13 @@ class OnlineEstimator:
         ``role`` is "odom" with an Odometry, "imu" with an Imu, "wrench" with a Wrench; their axes
         follow from their frame ids and the configuration, as under ROS. What is wrong with a
         message is counted, not raised.
+
+        Raises
+        ------
+        UserError
+            If the message is of another type or shape than its role has.
         """
+        check_form(role, message)
         return self.take(self.sampler.push(role, message))
 
     def follow(self, messages: Iterable[tuple[str, Message]]) -> None:

@@ -153,7 +153,7 @@ def _archive(
         else:
             read.append(outcome)
     if not read:
-        raise UserError("; ".join(failures) or "no bag was given")
+        raise UserError("; ".join(failures))
     bags = [bag for bag, _ in read]
     notes = [*failures, *(note for bag in bags for note in bag.notes)]
     return Archive(bags, notes, partial(each, [where for _, where in read]), reread)
