@@ -301,9 +301,7 @@ def sensor_findings(
         rest, _ = sensor_consistency.search(streams, config, fit, others, fixed)
         given = as_headed if name == HEADING and as_headed is not None else judged
         before = sensor_consistency.comparisons(given, config, rest)
-        of = sensor_consistency.common_squares((before, after), held, unit=1, length=CHUNK)
-        of = of[:, :, of[:, 2].any(axis=0)]
-        gain = gain_of(["kinematic"] * of.shape[2], of[:, 0], of[:, 1], of[:, 2].sum(axis=0))
+        gain = kinematic_gain((before, after), held)
         parameters = {
             p.name: Value(found[name][p.name], std[name, p.name], p.unit)
             for p in EFFECTS[name].parameters
@@ -315,3 +313,10 @@ def sensor_findings(
         run = None if sure else EFFECTS[name].manoeuvre
         findings.append(Finding(name, (), parameters, None, gain, sure, run, rivals, words))
     return findings
+
+
+def kinematic_gain(pair: Sequence[Sequence[sensor_consistency.Comparison]], held: Spans) -> Gain:
+    """By how much better sensors agree in the spans ``held`` after a correction than before it."""
+    of = sensor_consistency.common_squares(pair, held, unit=1, length=CHUNK)
+    of = of[:, :, of[:, 2].any(axis=0)]
+    return gain_of(["kinematic"] * of.shape[2], of[:, 0], of[:, 1], of[:, 2].sum(axis=0))

@@ -15,16 +15,8 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.findings import parameters_of, sentence, unsure
-from rov_ident.discrepancy.held_out import (
-    BLOCK,
-    CHUNK,
-    Judge,
-    gain_of,
-    surely_less,
-    thinned,
-    windows,
-)
+from rov_ident.discrepancy.findings import kinematic_gain, parameters_of, sentence, unsure
+from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
 from rov_ident.discrepancy.hypothesis import role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
@@ -191,9 +183,7 @@ def late_finding(
 ) -> Finding:  # fmt: skip
     """Velocities that are late by another delay in each record: what taking that off gains."""
     pair = [sensor_consistency.comparisons(s, config, sensors) for s in (before, after)]
-    of = sensor_consistency.common_squares(pair, held, unit=1, length=CHUNK)
-    of = of[:, :, of[:, 2].any(axis=0)]
-    gain = gain_of(["kinematic"] * of.shape[2], of[:, 0], of[:, 1], of[:, 2].sum(axis=0))
+    gain = kinematic_gain(pair, held)
     most = max(late, key=lambda v: abs(v.value))
     each = tuple({"delay": v} for v in late)
     words = sentence(LATENCY, {"delay": most}, gain)

@@ -427,9 +427,9 @@ def css(colour: str) -> str:
 
 
 @styled
-def to_png(figure: matplotlib.figure.Figure, dpi: int = 110) -> bytes:
+def to_png(figure: matplotlib.figure.Figure) -> bytes:
     buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
     return buffer.getvalue()
 
 
