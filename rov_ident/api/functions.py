@@ -12,18 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rov_ident.api.reading import (
-    File,
-    Files,
-    axes,
-    existing,
-    load,
-    mounted,
-    once,
-    read,
-    same_data,
-    several,
-)
+from rov_ident.api.reading import File, Files, axes, existing, load, once, read, same_data, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
@@ -151,7 +140,7 @@ def fit(
     if prior_from is not None:
         given, table = with_prior(given, Path(prior_from))
     (paths, repeated), say = once(several(bags)), progress or silent
-    given, placed = mounted(given, paths)
+    given, placed = topics.mounted(given, paths)
     groups = [channels] if isinstance(channels, str) else channels or ()
     stages = tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
     settings = Settings(stages, prior, weighted, process)
@@ -283,7 +272,7 @@ def explain(
     other = None if validate is None else existing(validate)
     if other and (same := same_data(other, paths)):
         raise UserError(f"{other} is what is searched ({same}): validate on a bag of another dive")
-    given, placed = mounted(given, paths)
+    given, placed = topics.mounted(given, paths)
     read_bags = [_streams(path, given, say) for path in paths]
     judge = None if other is None else _streams(other, given, say)
     for streams, _ in read_bags:
@@ -378,7 +367,7 @@ def plan(
     if len(sides) != 3 or not numeric:
         raise UserError(f"tank is {tank!r}, but must be three lengths [m], such as (6, 6, 2)")
     limits, paths = Limits(sides, thrust), [] if bag is None else several(bag)
-    given, _ = mounted(given, paths)
+    given, _ = topics.mounted(given, paths)
     known = archive.opened(paths, given, say=say) if paths else contextlib.nullcontext()
     with known as bags:
         return design.propose(given, bags, duration, limits, say)

@@ -11,7 +11,7 @@ import numpy as np
 
 from rov_ident.api.functions import check, explain, plan
 from rov_ident.api.functions import fit as fit_bags
-from rov_ident.api.reading import File, Files, existing, load, mounted, once, several
+from rov_ident.api.reading import File, Files, existing, load, once, several
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -23,6 +23,7 @@ from rov_ident.estimation.consistency import CAUSE
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
+from rov_ident.io import topics
 from rov_ident.offline import archive
 from rov_ident.offline.fit import Fit, rmse_change
 from rov_ident.offline.prediction_error import open_loop
@@ -250,7 +251,7 @@ def identify(
     """
     say = progress or silent
     paths, repeated = once(several(dives))
-    given, placed = mounted(load(config), paths)
+    given, placed = topics.mounted(load(config), paths)
     judge = None if validate is None else existing(validate)
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}

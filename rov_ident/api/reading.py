@@ -118,14 +118,9 @@ def read(bag: File, config: File | Config, progress: Progress | None = None) -> 
         If the bag cannot be read, lacks a topic or yields no sample.
     """
     path = existing(bag)
-    given, notes = mounted(load(config), [path])
+    given, notes = topics.mounted(load(config), [path])
     record = read_record(path, given, progress or silent)
     return replace(record, notes=(*notes, *record.notes))
-
-
-def mounted(config: Config, paths: Iterable[Path]) -> tuple[Config, tuple[str, ...]]:
-    """The configuration with sensors where the bags say, if it does not (`topics.mounted`)."""
-    return topics.mounted(config, map(Bag, paths))
 
 
 def axes(channels: str) -> NDArray[np.bool_]:

@@ -184,9 +184,8 @@ def _six(x: Array, name: str) -> Array:
 def _down(attitude: Array) -> Array:
     attitude = np.asarray(attitude, dtype=float)
     known = attitude.shape in ((3,), (4,))
-    if not (
-        known and 0.0 < np.linalg.norm(attitude) < np.inf
-    ):  # an IMU without orientation sends zeros
+    # an IMU without orientation sends zeros
+    if not (known and 0.0 < np.linalg.norm(attitude) < np.inf):
         raise UserError(
             f"the attitude is {attitude.tolist()}, but must be a quaternion w x y z or down in "
             "body axes, of any length but zero"

@@ -174,7 +174,7 @@ class Check(Shown):
 
 def check(path: Path, config: Config, say: Progress = silent) -> Check:
     """Look at a bag; UserError if it cannot be read, or lacks the messages that are needed."""
-    config, placed = inputs.mounted(config, [Bag(path)])
+    config, placed = inputs.mounted(config, [path])
     record = read_record(path, config, say)
     say("looking at its messages")
     bag, unmeasured = Bag(path), is_without_velocity(record.samples)

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -436,25 +437,33 @@ def first_frames(bag: Bag, chosen: Mapping[str, str], config: Config) -> dict[st
     return found
 
 
-def mounted(config: Config, bags: Iterable[Bag]) -> tuple[Config, tuple[str, ...]]:
+def mounted(config: Config, paths: Iterable[Path]) -> tuple[Config, tuple[str, ...]]:
     """The configuration with sensors that it leaves at the body's origin, unturned, where the first
     bag with a `/tf_static` says that they are; and a note on each that was moved."""
-    bag = next((bag for bag in bags if _STATIC in bag.topics), None)
-    if bag is None:
-        return config, ()
     notes = []
-    for key, vector in mounting(bag, first_frames(bag, select(bag, config), config)).items():
-        section, name = key.split(".")
+    for key, vector, name in _told_of_mounting(config, paths):
+        section, own = key.split(".")
         settings = getattr(config, section)
-        if not np.any(getattr(settings, name)) and np.abs(vector).max() > _NOWHERE:
-            moved = replace(settings, **{name: tuple(vector.tolist())})
+        if not np.any(getattr(settings, own)) and np.abs(vector).max() > _NOWHERE:
+            moved = replace(settings, **{own: tuple(vector.tolist())})
             config = replace(config, **{section: moved})
             told = [round(float(x), 3) + 0.0 for x in vector]
             notes.append(
-                f"{key} is {told} (forward, starboard, down) by {_STATIC} of {bag.path.name}, as "
-                "the configuration has none"
+                f"{key} is {told} (forward, starboard, down) by {_STATIC} of {name}, as the "
+                "configuration has none"
             )
     return config, tuple(notes)
+
+
+def _told_of_mounting(config: Config, paths: Iterable[Path]) -> list[tuple[str, Array, str]]:
+    """What the first bag with a `/tf_static` says, as `mounting` has it, and the bag's name."""
+    for path in paths:
+        with suppress(UserError):  # who reads it says what is wrong with it
+            bag = Bag(path)
+            if _STATIC in bag.topics:
+                frames = first_frames(bag, select(bag, config), config)
+                return [(key, x, path.name) for key, x in mounting(bag, frames).items()]
+    return []
 
 
 def mounting(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Array]:
