@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from concurrent.futures import CancelledError
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ from rov_ident.discrepancy.explain import (
     explain,
 )
 from rov_ident.discrepancy.findings import (
+    is_left,
     possibly_earlier,
     with_parameters,
     without_most_favourable,
@@ -596,3 +598,14 @@ def test_what_may_have_begun_before_the_bag_is_not_told_from_what_lasts():
         # nor where the first window alone, with what its commands found, would have to tell it
         assert possibly_earlier(finding, 5.0).separable == told
         assert not possibly_earlier(finding, 39.5).separable
+
+
+@pytest.mark.parametrize(
+    ("values", "left"), [((0.0, 0.0), False), ((0.0, 0.01), True), ((0.02, 0.0), True)]
+)
+def test_an_effect_that_ends_at_its_null_is_none(values, left):
+    """Of 70 % of a dive a delay was worth its penalty; the fit to all of it made it zero."""
+    keys = [("actuation_delay", "delay"), ("thruster_lag", "time_constant")]
+    last = SimpleNamespace(hypothesis=SimpleNamespace(values=dict(zip(keys, values))))
+    search = SimpleNamespace(keys_of=lambda fitted, name: keys)
+    assert is_left(search, last, "late") is left

@@ -26,6 +26,7 @@ from rov_ident.discrepancy import (
 from rov_ident.discrepancy.findings import (
     changes,
     finding,
+    is_left,
     noise_finding,
     residuals,
     sensor_findings,
@@ -191,7 +192,8 @@ def explain(
     minor = model.minor + [f for f in of_sensors if not is_practical(f.gain)]
     of_sensors = [f for f in of_sensors if is_practical(f.gain)]
     last, notes = _with_all_data(data.streams, model.final)
-    of_dynamics = [with_parameters(search, last, f) for f in model.found]
+    there = [f for f in model.found if is_left(search, last, f.effect)]
+    of_dynamics = [with_parameters(search, last, f) for f in there]
     shared = _Shared(model.final.hypothesis, last.hypothesis)
     if len(bags) > 1:
         say("leaving records out", 0.95)

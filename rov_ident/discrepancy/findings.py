@@ -137,6 +137,12 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
     )
 
 
+def is_left(search: Search, last: Fitted, name: str) -> bool:
+    """Whether anything is left of an effect in the fit to all data: it may end at its null."""
+    keys = [k for k in search.keys_of(last, name) if role_of(k) == "amplitude"]
+    return not keys or any(last.hypothesis.values[k] != bounds(k)[0] for k in keys)
+
+
 def _differs_from_null(fitted: Fitted, keys: Sequence[Key], covariance: Array) -> bool:
     """Whether the amplitudes among parameters surely differ from their nulls together (Wald)."""
     keys = [k for k in keys if role_of(k) == "amplitude"]
