@@ -396,11 +396,14 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
     assert "behind the IMU" in clocks.notes[0]
     assert velocity_sensor.tests_of(late, config) == []  # no factor of the velocities
     assert [t.passed for t in velocity_sensor.tests_of(streams, config)] == [True, True]
-    # nor is one judged by a position that is the sum of those velocities
-    over_ground = np.einsum("kij,kj->ki", quaternion_to_matrix(streams.orientation), nu[:, :3])
-    reckoned = dataclasses.replace(streams, position=integral(streams.t, over_ground))
-    tests = velocity_sensor.tests_of(reckoned, config)
-    assert [test.name for test in tests] == ["velocity sensor: sensor_misalignment"]
+    # by a position that is the sum of those velocities, only one above one is
+    for factor, passes in ((1.0, True), (0.9, True), (1.1, False)):
+        scaled = streams.nu * np.repeat([factor, 1.0], 3)
+        to_world = quaternion_to_matrix(streams.orientation)
+        way = integral(streams.t, np.einsum("kij,kj->ki", to_world, scaled[:, :3]))
+        reckoned = dataclasses.replace(streams, nu=scaled, position=way)
+        tests = {test.name: test.passed for test in velocity_sensor.tests_of(reckoned, config)}
+        assert tests["velocity sensor: velocity_scale"] is passes, factor
 
 
 @pytest.mark.parametrize("driving", ["pilot", "six-axis"])
