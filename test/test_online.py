@@ -1,5 +1,7 @@
 """The estimator that nodes, replay and offline fits share: words, bounds, garbage, reset."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import textbook
@@ -115,6 +117,48 @@ def test_a_recording_is_followed_as_if_pushed(trained, wrong, messages):
     assert ours.covariance.tolist() == theirs.covariance.tolist()
     assert ours.excitation.tolist() == theirs.excitation.tolist()
     assert estimator.counts == trained.counts
+
+
+@pytest.fixture(scope="module")
+def lagging(heavy, wrong):
+    """A file that takes the thrust for undelayed, and messages of a vehicle with a lag of 0.3 s."""
+    lag = {"thruster_lag": {"time_constant": 0.3}}
+    dive = sensors.dive(dataclasses.replace(heavy, effects=lag), "steps", 60.0, seed=5)
+    config = textbook.with_section(wrong, "wrench", lag_std=0.2)
+    return config, [(role, m) for _, role, m in dive.messages]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_learnt_anew_about_another_lag_is_not_forgotten(lagging, kind):
+    """Once a lag is known better, the same messages teach again: nothing is as unknown as before
+    any of them."""
+    config, messages = lagging
+    estimator = OnlineEstimator(config, kind)
+    strong = [estimator.prior.names.index(name) for name in ("X_uu", "Y_vv", "Z_ww", "N_rr")]
+    begun, shares, next_look = seconds(messages[0][1]), [], 0.0
+    for role, message in messages:
+        estimator.push(role, message)
+        if seconds(message) - begun > next_look:
+            next_look += 1.0
+            shares.append((estimator.report().std / estimator.prior.std)[strong].max())
+    known = np.minimum.accumulate(shares)
+    assert known[20] < 0.3  # a third of a dive tells them
+    assert (shares[20:] < 2.0 * known[20]).all(), np.round(shares, 2)
+    report = estimator.report()
+    i = report.names.index("thruster_lag.time_constant")
+    assert abs(report.values[i] - 0.3) < 3.0 * report.std[i] + 0.01
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_learning_anew_does_not_depend_on_how_messages_come(lagging, kind):
+    """One by one or as a recording: the same to the last bit."""
+    config, messages = lagging
+    pushed = fed(OnlineEstimator(config, kind), messages)
+    followed = OnlineEstimator(config, kind)
+    followed.follow(messages)
+    expected = pushed.report()
+    assert followed.report().values.tolist() == expected.values.tolist()
+    assert followed.report().covariance.tolist() == expected.covariance.tolist()
 
 
 def test_stamp_is_the_last_sample_s(trained, messages):

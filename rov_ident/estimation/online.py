@@ -21,6 +21,7 @@ from rov_ident.config.prior import (
     scale_covariance,
 )
 from rov_ident.core.errors import UserError
+from rov_ident.core.jit import interpreting
 from rov_ident.core.messages import Array, Message, check_form
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
 from rov_ident.core.threads import one_blas_thread
@@ -31,6 +32,7 @@ from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
+from rov_ident.estimation.recent_messages import LOOK_BACK, RecentMessages
 from rov_ident.estimation.shared import INFO, informative_axes, noisy_axes, too_noisy
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.sample import after_reset, joined
@@ -155,6 +157,7 @@ class OnlineEstimator:
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
         self.sampler = Sampler(config)
+        self._recent = RecentMessages()
         self.monitor: Monitor | None = None
         self._about: Array  # (k,): values of the parameters of effects that samples are made with
         self._centred: float  # s: since when
@@ -182,7 +185,7 @@ class OnlineEstimator:
         self._firmest = np.full(len(self._about), np.inf)  # std of times, when last learnt anew
         if self.monitor is not None:
             self.monitor.reset()
-        self._origin = self.memory()
+        self._begin_at(self.memory())
 
     def configure(self, config: Config) -> None:
         """Take other settings of the same model and coefficients; what is learnt stays."""
@@ -205,6 +208,8 @@ class OnlineEstimator:
     @enabled.setter
     def enabled(self, value: bool) -> None:
         self._paused = self._paused or not value
+        if value != self._enabled:
+            self._recent.clear()
         self._enabled = value
 
     @property
@@ -229,7 +234,7 @@ class OnlineEstimator:
             If the message is of another type or shape than its role has.
         """
         check_form(role, message)
-        return self.take(self.sampler.push(role, message))
+        return self.take(self._sampled(role, message))
 
     def follow(self, messages: Iterable[tuple[str, Message]]) -> None:
         """:meth:`push` all messages of a recording and :meth:`flush`, with the same result.
@@ -238,7 +243,7 @@ class OnlineEstimator:
         """
         waiting: list[NDArray[np.void]] = []
         for role, message in messages:
-            samples = self.sampler.push(role, message)
+            samples = self._sampled(role, message)
             if not len(samples):
                 continue
             waiting.append(samples)
@@ -248,6 +253,11 @@ class OnlineEstimator:
         if waiting:
             self.take(joined(waiting))
         self.flush()
+
+    def _sampled(self, role: str, message: Message) -> NDArray[np.void]:
+        if self._is_time.any():
+            self._recent.add(role, message)
+        return self.sampler.push(role, message)
 
     def _is_due(self, samples: NDArray[np.void]) -> bool:
         """Whether parameters of effects are to be looked at after samples (k,)."""
@@ -267,6 +277,7 @@ class OnlineEstimator:
         if samples["anew"].any():
             samples = after_reset(samples)
             self._begin_with(self._origin)
+            self._recent.clear()
             if self.monitor is not None:
                 self.monitor.reset()
         if self._paused:
@@ -286,6 +297,7 @@ class OnlineEstimator:
                 self._follow_excitation()
                 if len(self._about):
                     self._recentre()
+            self._recent.forget_before(self.stamp - round(LOOK_BACK * 1e9))
         if self.monitor is not None and self.sampler.commands is not None:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:
@@ -317,6 +329,7 @@ class OnlineEstimator:
     def next_record(self) -> None:
         """Another record follows: inputs begin anew, what is learnt stays."""
         self.sampler, self._settled = Sampler(self.config), math.nan
+        self._recent.clear()
         self._begin_window()
         self._centre(self._effect_values)
 
@@ -331,7 +344,7 @@ class OnlineEstimator:
         But not for changes far below their uncertainty, as samples are right to first order. A time
         is followed once the data know it. After a long step all is learnt anew: information gained
         about another value claims to know what it does not. Each such step needs more information
-        than the one before. ``at_once``: a memory was recalled.
+        than the one before, or two values might take turns. ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         own = slice(len(self.config.estimate), None)
@@ -353,14 +366,36 @@ class OnlineEstimator:
         if outdated.any() and not at_once:
             self._firmest = np.where(outdated, std, self._firmest)
             self._begin_with(self._origin)
+            self._learn_again()
+
+    def _learn_again(self) -> None:
+        """From the recent messages, with the parameters of effects as samples have them now.
+
+        Not while kernels are interpreted, when it would take minutes.
+        """
+        if interpreting():
+            return
+        samples = self._recent.samples(
+            self.config, self._centre_config, self._origin.kinematics, self.sampler.origin,
+            self._last_t,
+        )  # fmt: skip
+        samples = after_reset(samples)
+        while len(samples):
+            count = int(np.sum(samples["t"] < samples["t"][0] + CENTRING_TIME))
+            self._fold(samples[:count])
+            self._window += sum(samples["dt"][:count].tolist())
+            self._follow_excitation()
+            samples = samples[count:]
+        self._centred = self._last_t
 
     def _centre(self, values: Mapping[str, float]) -> None:
         """Have samples made with these values of the parameters of effects, all of them, and of
         coefficients: with these a rigid body is heavier or lighter."""
         self._centred = self._last_t
         self._about = np.array([values[name] for name in self.config.effect_names])
+        self._centre_config = self.config.with_values(values)
         if self.config.effect_names:
-            self.sampler.recentre(self.config.with_values(values))
+            self.sampler.recentre(self._centre_config)
 
     def memory(self) -> Memory:
         """What is learnt so far, for `checkpoint`. The arrays are not to be changed.
@@ -389,13 +424,19 @@ class OnlineEstimator:
         if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
             raise UserError("its numbers are not finite")
         self.reset()
-        self._origin, self._recalled = memory, memory.stamp
+        self._recalled = memory.stamp
+        self._begin_at(memory)
         self._begin_with(memory)
         self.sampler.kinematic_filter.begin_with(memory.kinematics)
         self._paused = True  # whatever has happened in between
         if self.config.estimate_effects:
             self._recentre(at_once=True)
             self._learnt_about = self._about
+
+    def _begin_at(self, memory: Memory) -> None:
+        """What is learnt anew begins with this memory."""
+        self._origin = memory
+        self._recent.clear()
 
     def _begin_with(self, memory: Memory) -> None:
         """Know what is in the memory and nothing else."""

@@ -1,0 +1,54 @@
+"""The messages of late, from which samples are made anew once a lag or a delay is known better.
+
+A sample has the wrench that acts with the lag that was supposed when it was made, and is right for
+another lag to first order only. So what was learnt from samples of a wrong lag is given up, and the
+same messages are learnt from again ("Times" in docs/live.md).
+"""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rov_ident.config import Config
+from rov_ident.core.messages import Message
+from rov_ident.sampling.sample import joined
+from rov_ident.sampling.sampler import Sampler
+
+LOOK_BACK = 120.0
+"""s; a choice: in two minutes a lag becomes known, and to learn from them again takes a second or
+two, in which messages wait."""
+_MOST = 100_000  # messages; were all topics at 200 Hz, two minutes had fewer
+
+
+class RecentMessages:
+    """Roles and messages of the last LOOK_BACK seconds, as they came."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[str, Message]] = deque(maxlen=_MOST)
+
+    def add(self, role: str, message: Message) -> None:
+        self._kept.append((role, message))
+
+    def clear(self) -> None:
+        self._kept.clear()
+
+    def forget_before(self, stamp: int) -> None:
+        """Drop the oldest of them up to the first that is not before ``stamp`` [ns]."""
+        while self._kept and self._kept[0][1].stamp < stamp:
+            self._kept.popleft()
+
+    def samples(
+        self, config: Config, about: Config, kinematics: NDArray[np.void], origin: int | None,
+        last: float,
+    ) -> NDArray[np.void]:  # fmt: skip
+        """Samples (k,) of SAMPLE up to the time ``last`` [s], for the estimation that ``config``
+        asks for, made with the parameters of effects of ``about``. ``kinematics`` is the state of a
+        kinematic filter before the first message, ``origin`` the stamp [ns] of t = 0."""
+        sampler = Sampler(config)
+        sampler.recentre(about)
+        sampler.origin = origin
+        sampler.kinematic_filter.begin_with(kinematics)
+        made = [sampler.push(role, message) for role, message in self._kept]
+        samples = joined([part for part in made if len(part)] or [sampler.flush()])
+        return samples[samples["t"] <= last]
