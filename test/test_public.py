@@ -319,11 +319,33 @@ def test_bags_and_configurations_as_they_come(bag, fit, tmp_path):
         (lambda bag: ri.OnlineEstimator(HEAVY, "ols"), "there is no estimator 'ols'"),
         (lambda bag: ri.compare(HEAVY, bag), "no JSON of a result"),
         (lambda bag: ri.compare(HEAVY, "nowhere.json"), "nowhere.json cannot be read"),
+        (lambda bag: ri.fit(bag, HEAVY, ["ml"]), r"estimator is \['ml'\], but must be a name"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", 3), "channels is 3, but must be text, such as"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", ["surge", 3]), "channels is 3, but must be text"),
+        (lambda bag: ri.fit(bag, HEAVY, "ls", reference="5"), "reference is '5', but must be a n"),
+        (lambda bag: ri.fit(bag, HEAVY, prior_from=3), "3 is no path"),
+        (lambda bag: ri.simulate(HEAVY, manoeuvre="steps", duration="10"), "duration is '10', but"),
+        (lambda bag: ri.simulate(HEAVY, bag=bag, channels=3), "channels is 3, but must be text"),
+        (lambda bag: ri.simulate(HEAVY, manoeuvre=["steps"]), "manoeuvre is .*, but must be text"),
+        (lambda bag: ri.simulate(HEAVY, manoeuvre="rest", sensors={}), "must be a rov_ident.Suite"),
+        (lambda bag: ri.plan(HEAVY, duration="60"), "duration is '60', but must be a number"),
+        (lambda bag: ri.plan(HEAVY, thrust=None), "thrust is None, but must be a number"),
+        (lambda bag: ri.init(3), "3 is no path"),
+        (lambda bag: ri.init(vehicle=["bluerov2"]), "there is no vehicle"),
+        (lambda bag: ri.init().save(None), "path is None, but must be a path"),
+        (lambda bag: ri.OnlineEstimator(HEAVY, ["rls"]), "kind is .*, but must be a name"),
+        (lambda bag: ri.HydrodynamicModel(HEAVY, "2"), "hold_after is '2', but must be a number"),
     ],
 )
 def test_what_the_caller_can_mend_is_a_user_error(bag, call, message):
     with pytest.raises(ri.UserError, match=message):
         call(bag)
+
+
+def test_no_path_is_no_place_for_a_result(fit):
+    for save in (fit.save, fit.save_config):
+        with pytest.raises(ri.UserError, match="path is None, but must be a path"):
+            save(None)
 
 
 def test_a_name_that_a_result_does_not_have_is_refused(fit):

@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from rov_ident.api.reading import File, Files, axes, existing, load, once, read, same_data, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.velocity_sensor import tests_of
@@ -112,6 +113,9 @@ def fit(
         If there is no such estimator or channel, an option has no meaning with the estimator, a bag
         cannot be read, or the data are too few.
     """
+    require(str, "a name", estimator=estimator)
+    require(str | Iterable | None, "text, such as 'surge,yaw', or several", channels=channels)
+    require(Real, "a number", reference=reference)
     live = estimator in ESTIMATORS
     if not live and estimator not in KINDS:
         known = ", ".join((*ESTIMATORS, *KINDS))
@@ -138,7 +142,7 @@ def fit(
     given = load(config, f"{estimator}_node" if live else "")
     table: dict[str, Any] = {}
     if prior_from is not None:
-        given, table = with_prior(given, Path(prior_from))
+        given, table = with_prior(given, existing(prior_from))
     (paths, repeated), say = once(several(bags)), progress or silent
     given, placed = topics.mounted(given, paths)
     groups = [channels] if isinstance(channels, str) else channels or ()
@@ -361,6 +365,7 @@ def plan(
     UserError
         If a bag cannot be read, or no manoeuvre is safe within these limits.
     """
+    require(Real, "a number", duration=duration, thrust=thrust)
     given, say = load(config), progress or silent
     sides = tuple(tank) if isinstance(tank, Iterable) else ()
     numeric = all(isinstance(side, int | float | np.number) and side > 0 for side in sides)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rov_ident import config as configuration
 from rov_ident.config import Config
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.io import topics
@@ -128,6 +128,7 @@ def axes(channels: str) -> NDArray[np.bool_]:
 
     Raises UserError if there is no such channel.
     """
+    require(str, "text, such as 'surge,yaw'", channels=channels)
     wanted = channels.split(",")
     if unknown := sorted(set(wanted) - set(CHANNELS)):
         raise UserError(f"no channel {unknown[0]!r}: use {','.join(CHANNELS)}")

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from rov_ident.api.reading import File, axes, load, read
 from rov_ident.config import Config
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.progress import Progress
 from rov_ident.core.threads import one_blas_thread
@@ -160,6 +161,9 @@ def simulate(
         If not one of bag and manoeuvre is given, the bag cannot be read, there is no such
         manoeuvre, or the simulation diverges.
     """
+    require(Real, "a number", duration=duration)
+    require(str | None, "text", manoeuvre=manoeuvre)
+    require(Suite | None, "a rov_ident.Suite", sensors=sensors)
     given = load(config)
     free = None if channels is None else axes(channels)
     if (bag is None) == (manoeuvre is None):

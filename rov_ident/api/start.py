@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident import config as configuration
-from rov_ident.api.reading import File
+from rov_ident.api.reading import File, existing
 from rov_ident.config.writing import annotated
 from rov_ident.consumer.formats import holds_hydrodynamics, import_model, is_urdf
 from rov_ident.core.errors import UserError
@@ -120,7 +120,7 @@ def init(
     else:
         found.put("vehicle.frame", "frd", "the convention of this package")
     if record is not None:
-        path = Path(record)
+        path = existing(record)
         if progress:
             progress(f"reading {path.name}")
         if path.suffix.lower() in SUFFIXES:

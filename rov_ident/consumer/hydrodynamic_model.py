@@ -6,13 +6,14 @@ No middleware: a message is anything with the fields of diagnostic_msgs/Diagnost
 import math
 import os
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from rov_ident.config import LARGEST, Config, load
 from rov_ident.config.prior import prior_of
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 from rov_ident.core.frames import gravity_direction, quaternion_normalise
 from rov_ident.core.messages import SECOND
 from rov_ident.core.states import Level
@@ -56,6 +57,7 @@ class HydrodynamicModel:
     """
 
     def __init__(self, config: str | os.PathLike[str] | Config, hold_after: float = 2.0) -> None:
+        require(Real, "a number", hold_after=hold_after)
         if not hold_after > 0.0:
             raise UserError(f"hold_after is {hold_after} s, but must be positive")
         config = load(config)

@@ -1,5 +1,7 @@
 """The one family of exceptions for what the user can mend."""
 
+from typing import Any
+
 _LONGEST = 2000  # characters
 
 
@@ -14,3 +16,14 @@ class UserError(Exception):
         if len(sentence) <= _LONGEST:
             return sentence
         return f"{sentence[: _LONGEST - 505]} ... {sentence[-500:]}"
+
+
+def require(kind: Any, words: str, /, **arguments: Any) -> None:
+    """Refuse arguments of a program, given by their names, that are not of a ``kind`` (a class, or
+    several: ``str | None``), which is called ``words``.
+
+    Raises UserError.
+    """
+    for name, value in arguments.items():
+        if not isinstance(value, kind):
+            raise UserError(f"{name} is {value!r}, but must be {words}")

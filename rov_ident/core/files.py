@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO
 
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 
 Place = str | os.PathLike[str]
 
@@ -85,6 +85,7 @@ def write_file(path: Place, content: str | bytes) -> None:
 
     Raises UserError if it cannot be written there.
     """
+    require(str | os.PathLike, "a path", path=path)
     check_output(path)
     try:
         replace_file(path, content.encode() if isinstance(content, str) else content)

@@ -20,7 +20,7 @@ from rov_ident.config.prior import (
     rigid_body_covariance,
     scale_covariance,
 )
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 from rov_ident.core.jit import interpreting
 from rov_ident.core.messages import Array, Message, check_form
 from rov_ident.core.states import CONTRADICTED, Level, State, is_known
@@ -146,6 +146,7 @@ class OnlineEstimator:
     """
 
     def __init__(self, config: str | os.PathLike[str] | Config, kind: Kind) -> None:
+        require(str, "a name", kind=kind)
         config = load(config).with_nuisance
         if kind not in ESTIMATORS:
             raise UserError(f"there is no estimator '{kind}': use {' or '.join(ESTIMATORS)}")

@@ -2,6 +2,7 @@
 which data they come; and what every result of a command can do: table, picture, file, JSON."""
 
 import json
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from rov_ident.core.errors import UserError
+from rov_ident.core.errors import UserError, require
 from rov_ident.core.files import write_file
 from rov_ident.core.messages import Array
 from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate
@@ -77,6 +78,7 @@ class Shown(ABC):
         UserError
             If the ending is none of these, or the file cannot be written.
         """
+        require(str | os.PathLike, "a path", path=path)
         path = Path(path)
         writers = self._writers()
         if path.suffix not in writers:
