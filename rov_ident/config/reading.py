@@ -30,7 +30,7 @@ from rov_ident.config.schema import (
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FLIP_BODY
 from rov_ident.core.yaml_file import parse_file
-from rov_ident.effects import EFFECTS, estimable
+from rov_ident.effects import EFFECTS, Values, estimable
 from rov_ident.effects.base import EffectParameter
 from rov_ident.model import thruster_allocation as thrusters
 from rov_ident.model.coefficients import catalogue, parse
@@ -291,7 +291,7 @@ def _model(vehicle: Vehicle, coefficients: Mapping[str, float], gravity: float) 
 
 
 def estimated(
-    model: Model, effects: Mapping[str, Mapping[str, float]], names: Names, inputs: Inputs
+    model: Model, effects: Values, names: Names, inputs: Inputs
 ) -> tuple[Names, tuple[tuple[str, str], ...]]:
     """What to estimate, in the order of the model and of the effects; no names given: all, but for
     coefficients whose input no joint gives."""

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FrameDefaults
-from rov_ident.effects import EFFECTS, rigid_body
+from rov_ident.effects import EFFECTS, Values, rigid_body
 from rov_ident.model import thruster_allocation as thrusters
 from rov_ident.model.coefficients import INPUTS, Coefficient
 from rov_ident.model.equations import GRAVITY, Model
@@ -439,7 +439,7 @@ class Config:
         "the rudder's name in joint_states (sensor_msgs/JointState, position in rad); empty: the "
         "rudder is on the topic rudder (std_msgs/Float64, rad), stamped on arrival",
     )
-    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    effects: Values = field(default_factory=dict)
     estimate_effects: tuple[tuple[str, str], ...] = ()
 
     @property

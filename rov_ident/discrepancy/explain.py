@@ -53,7 +53,7 @@ from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, Values
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
@@ -97,7 +97,6 @@ _ONLY_FITTED = (
     "part that the search fitted"
 )
 
-Sensors = Mapping[str, Mapping[str, float]]
 Progress = Callable[[str, float], None]
 
 
@@ -276,7 +275,7 @@ class _Data:
     delays: Sequence[Value]
     choice: sensor_choice.Choice
     findings: Sequence[Finding]
-    sensors: Sensors
+    sensors: Values
     late: bool
     may_drift: bool
     clocks: clock_errors.ClockErrors

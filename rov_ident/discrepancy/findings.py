@@ -34,7 +34,7 @@ from rov_ident.discrepancy.sensor_choice import (
     with_noise,
 )
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, Values
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
@@ -286,7 +286,7 @@ def sensor_findings(
     streams: Streams,
     judged: Streams,
     config: Config,
-    found: Mapping[str, Mapping[str, float]],
+    found: Values,
     std: Mapping[Key, float],
     fit: Spans,
     held: Spans,

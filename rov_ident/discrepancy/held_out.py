@@ -2,7 +2,7 @@
 with it and without."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rov_ident.discrepancy.reading_noise import draws
 from rov_ident.discrepancy.results import Gain, Together
 from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
-from rov_ident.effects import sense
+from rov_ident.effects import Values, sense
 from rov_ident.effects.base import Reading
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
@@ -79,9 +79,7 @@ def thinned(spans: Spans) -> Spans:
 class Judge:
     """Open-loop simulation on data that no fit has seen."""
 
-    def __init__(
-        self, problem: WindowedProblem, sensors: Mapping[str, Mapping[str, float]] | None = None
-    ) -> None:
+    def __init__(self, problem: WindowedProblem, sensors: Values | None = None) -> None:
         """``sensors``: the effects that were taken off the data, which are judged as recorded."""
         self.problem, self._sensors = problem, sensors or {}
         self._guided, self.free = problem.guided, ~problem.guided  # axes (6,)

@@ -8,7 +8,7 @@ differs, and does not predict other records, belongs to each record (`own_parame
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import PENALTY
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.effects import Values
 from rov_ident.model.equations import Array
 from rov_ident.sampling.raw_streams import Streams
 
@@ -179,7 +180,7 @@ def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], lis
 
 def late_finding(
     before: Streams, after: Streams, config: Config, held: Spans,
-    sensors: Mapping[str, Mapping[str, float]], late: Sequence[Value],
+    sensors: Values, late: Sequence[Value],
 ) -> Finding:  # fmt: skip
     """Velocities that are late by another delay in each record: what taking that off gains."""
     pair = [sensor_consistency.comparisons(s, config, sensors) for s in (before, after)]

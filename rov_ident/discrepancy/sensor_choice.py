@@ -24,7 +24,7 @@ from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import VERY_STRONG, mean_inflation
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, Values
 from rov_ident.effects.base import a_reading
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
@@ -44,9 +44,6 @@ _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
 
-Sensors = dict[str, dict[str, float]]
-
-
 @dataclass(frozen=True)
 class Choice:
     """The sensor effects that are believed, the standard deviations of their parameters, those that
@@ -54,7 +51,7 @@ class Choice:
     are parameters that were held at their null, ``unsure`` effects that something without a name
     may be behind."""
 
-    sensors: Sensors
+    sensors: Values
     std: Mapping[Key, float]
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     fixed: frozenset[Key] = frozenset()
@@ -76,7 +73,7 @@ class Data:
         found, std = sensor_consistency.search(self.streams, self.config, self.spans, names, fixed)
         return Choice(found, std, fixed=fixed)
 
-    def dynamics(self, sensors: Sensors, axes: str = AXES) -> Array | None:
+    def dynamics(self, sensors: Values, axes: str = AXES) -> Array | None:
         """Squared errors (C, free axes) of held-out data as recorded, summed over chunks, of the
         model fitted to corrected data, on those of the ``axes`` that are simulated; None where it
         cannot be. A current is allowed for: what turns the velocities turns it, too, and a model
@@ -94,7 +91,7 @@ class Data:
         use = [i for i in np.flatnonzero(~streams.guided) if AXES[i] in axes]
         return judge.summed(fitted.hypothesis)[:, use] if use else None
 
-    def agreement(self, of: Sequence[Sensors]) -> list[Array]:
+    def agreement(self, of: Sequence[Values]) -> list[Array]:
         """Squared innovations (C, comparisons) of corrections, in the units of the first."""
         all_found = [sensor_consistency.comparisons(self.judged, self.config, s) for s in of]
         sums = sensor_consistency.common_squares(all_found, self.held)

@@ -14,7 +14,7 @@ effects are linear to first order, and the fit is repeated about its own result.
 
 import dataclasses
 import itertools
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -38,7 +38,7 @@ from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, Rows, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
-from rov_ident.effects import EFFECTS, heading_error, velocity_delay
+from rov_ident.effects import EFFECTS, Values, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array, Indices
 from rov_ident.sampling.raw_streams import Streams, measured_at, orientation_at
@@ -99,9 +99,7 @@ def _keys() -> tuple[Key, ...]:
     return (*sensor_parameters(), *TIMING)
 
 
-def comparisons(
-    streams: Streams, config: Config, effects: Mapping[str, Mapping[str, float]]
-) -> list[Comparison]:
+def comparisons(streams: Streams, config: Config, effects: Values) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
     keys = sensor_parameters()
     if not streams.has_pose:  # nor has it one because it is corrected
@@ -174,7 +172,7 @@ def _has_imu(streams: Streams) -> bool:
 
 
 def _corrected_readings(
-    streams: Streams, config: Config, effects: Mapping[str, Mapping[str, float]]
+    streams: Streams, config: Config, effects: Values
 ) -> tuple[Reading, Reading, Array]:
     """Odometry at its times and IMU at its own, corrected; angular rates (M, 3) as odometry reads
     them, at the times of the IMU."""
@@ -187,7 +185,7 @@ def _corrected_readings(
     return _undone(here, effects), _undone(there, effects), rate
 
 
-def _undone(reading: Reading, effects: Mapping[str, Mapping[str, float]]) -> Reading:
+def _undone(reading: Reading, effects: Values) -> Reading:
     """A reading without what effects did to it."""
     for name, values in reversed(list(effects.items())):
         correct = EFFECTS[name].correct
@@ -196,7 +194,7 @@ def _undone(reading: Reading, effects: Mapping[str, Mapping[str, float]]) -> Rea
     return reading
 
 
-def _in_place(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
+def _in_place(streams: Streams, effects: Values) -> Streams:
     """The odometry with velocities of the time of its stamp (the last ones are held) and an
     attitude against the world."""
     delay, yaw = velocity_delay(effects), heading_error(effects)
@@ -422,7 +420,7 @@ def common_squares(
     return out[out[:, -1].any(axis=1)]
 
 
-def corrected(streams: Streams, effects: Mapping[str, Mapping[str, float]]) -> Streams:
+def corrected(streams: Streams, effects: Values) -> Streams:
     """The streams as good sensors would have given them."""
     streams = _in_place(streams, effects)
     nothing = np.zeros_like(streams.nu[:, :3])

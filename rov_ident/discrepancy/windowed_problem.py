@@ -9,7 +9,7 @@ import contextlib
 import copy
 import itertools
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     wrenches,
 )
 from rov_ident.discrepancy.reading_noise import SMALL, draws
-from rov_ident.effects import EFFECTS, compiled, steered
+from rov_ident.effects import EFFECTS, Values, compiled, steered
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import Array, Model, RigidBody
@@ -176,11 +176,11 @@ class WindowedProblem:
         """Every further simulation, in any thread, raises CancelledError."""
         self._stopped = True
 
-    def thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+    def thrust(self, effects: Values) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
         return self._thrusts.of(_inputs(effects), lambda: thrust(self.steps, compiled(effects)))
 
-    def driven(self, effects: Mapping[str, Mapping[str, float]]) -> Steps:
+    def driven(self, effects: Values) -> Steps:
         """The time axis with the inputs as they act, after the effects on fins."""
         key = tuple(sorted((n, *v.values()) for n, v in effects.items() if EFFECTS[n].steer))
         if not key:
@@ -192,7 +192,7 @@ class WindowedProblem:
 
         return steps._replace(inputs=self._driven.of(key, acting))
 
-    def noisy_thrust(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+    def noisy_thrust(self, effects: Values) -> Array:
         """What noise of the reading adds to the mean thrust in each step, (K, 6, draws)."""
 
         def added() -> Array:
@@ -204,7 +204,7 @@ class WindowedProblem:
 
         return self._noisy.of(_inputs(effects), added)
 
-    def response(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+    def response(self, effects: Values) -> Array:
         """What a unit of each reading of the wrench adds to the mean thrust in each step, (K, 6,
         D), by changes of the size of their noise."""
         base, acting = self.thrust(effects)[0], compiled(effects)
@@ -286,9 +286,7 @@ class WindowedProblem:
             nu_dot=motion.nu_dot + np.hstack([turning, zero]),
         )
 
-    def _wrenches(
-        self, h: Hypothesis, effects: Mapping[str, Mapping[str, float]], motion: Motion
-    ) -> Array:
+    def _wrenches(self, h: Hypothesis, effects: Values, motion: Motion) -> Array:
         """Wrench effects and current (K, 6) along a motion; remembered for the last one."""
         acting = compiled(effects)
         acted = self.thrust(effects)[0]
@@ -320,7 +318,7 @@ class WindowedProblem:
 
     def change(
         self, h: Hypothesis, motion: Motion, effect: Effect,
-        after: Mapping[str, Mapping[str, float]],
+        after: Values,
     ) -> Array:  # fmt: skip
         """Change (K, 6) of the wrench where an effect has other parameters."""
         now, moved = h.effects.get(effect.name) or h.nulls(effect.name), after[effect.name]
@@ -425,7 +423,7 @@ class WindowedProblem:
         return self.measured[at].copy()
 
 
-def _inputs(effects: Mapping[str, Mapping[str, float]]) -> tuple[object, ...]:
+def _inputs(effects: Values) -> tuple[object, ...]:
     """What the thrust depends on."""
     inputs = {n: tuple(v.values()) for n, v in effects.items() if EFFECTS[n].act is not None}
     return tuple(sorted(inputs.items()))
