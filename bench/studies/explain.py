@@ -50,6 +50,7 @@ from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Key
 from rov_ident.discrepancy.output_error import fit, refit
 from rov_ident.discrepancy.results import Finding, Gain
 from rov_ident.discrepancy.search import Search
+from rov_ident.discrepancy.sensor_choice import Data
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.io import cdr
@@ -216,10 +217,10 @@ def true_gains(case: Case, streams: Streams) -> list[float]:
     sensors = [n for n in case.effects if n in SENSOR_EFFECTS]
     gains = dict.fromkeys(case.effects, math.nan)
     if sensors:
-        found, std = sensor_consistency.search(streams, case.config, to_fit, sensors)
-        args = (streams, streams, case.config, found, std, to_fit, held)
-        gains |= {f.effect: _certain(f.gain) for f in sensor_findings(*args)}
-        streams = sensor_consistency.corrected(streams, found)
+        data = Data(streams, to_fit, streams, held, case.config)
+        choice = data.fitted(sensors, frozenset())
+        gains |= {f.effect: _certain(f.gain) for f in sensor_findings(data, choice)}
+        streams = sensor_consistency.corrected(streams, choice.sensors)
     others = [n for n in case.effects if n not in SENSOR_EFFECTS]
     if others:
         search, judge = Search(streams, case.config, to_fit), Judge(WindowedProblem(streams, held))

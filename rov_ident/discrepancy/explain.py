@@ -308,10 +308,7 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
     recorded = sensor_choice.Data(streams, to_fit, judged, to_judge, config)
     choice = sensor_choice.chosen(recorded, any(headings))
-    findings = sensor_findings(
-        streams, judged, config, choice.sensors, choice.std, to_fit, to_judge,
-        choice.alternatives, choice.fixed, as_headed, choice.unsure,
-    )  # fmt: skip
+    findings = sensor_findings(recorded, choice, as_headed)
     if len(bags) > 1:
         findings = repetition.of_sensors(bags, config, findings, headings[: len(bags)])
     own_delays = []

@@ -1,7 +1,7 @@
 """Findings: effects with their parameters, gains and rivals, in numbers and in sentences."""
 
 import dataclasses
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import chdtri
@@ -30,11 +30,13 @@ from rov_ident.discrepancy.sensor_choice import (
     HEADING,
     NEGLECTING,
     NOISE,
+    Choice,
+    Data,
     may_be_noise,
     with_noise,
 )
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import EFFECTS, Values
+from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
@@ -282,40 +284,25 @@ def noise_finding(judge: Judge, final: Fitted, given: Config, std: Mapping[str, 
     return Finding(name, axes, parameters, None, gain, True, None, (), words)
 
 
-def sensor_findings(
-    streams: Streams,
-    judged: Streams,
-    config: Config,
-    found: Values,
-    std: Mapping[Key, float],
-    fit: Spans,
-    held: Spans,
-    alternatives: Mapping[str, Sequence[str]] | None = None,
-    fixed: Container[Key] = (),
-    as_headed: Streams | None = None,
-    unsure: Container[str] = (),
-) -> list[Finding]:
-    """Findings of the sensor effects ``found`` in the spans ``fit`` of the streams, by how much
-    better the sensors agree in the spans ``held`` of the streams ``judged``. Each cannot be told
-    from its ``alternatives``, nor those ``unsure`` from what has no name; the parameters ``fixed``
-    are at their null. ``as_headed``: the streams judged with the headings of their records as they
-    were."""
-    findings = []
-    after = sensor_consistency.comparisons(judged, config, found)
-    for name in found:
-        others = [n for n in found if n != name]
-        rest, _ = sensor_consistency.search(streams, config, fit, others, fixed)
-        given = as_headed if name == HEADING and as_headed is not None else judged
-        before = sensor_consistency.comparisons(given, config, rest)
-        gain = kinematic_gain((before, after), held)
+def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None) -> list[Finding]:
+    """Findings of the sensor effects of a choice, by how much better the sensors agree where they
+    are judged. ``as_headed``: the streams judged with the headings of their records as they were.
+    """
+    config, findings = data.config, []
+    after = sensor_consistency.comparisons(data.judged, config, choice.sensors)
+    for name, values in choice.sensors.items():
+        rest = data.fitted([n for n in choice.sensors if n != name], choice.fixed)
+        given = as_headed if name == HEADING and as_headed is not None else data.judged
+        before = sensor_consistency.comparisons(given, config, rest.sensors)
+        gain = kinematic_gain((before, after), data.held)
         parameters = {
-            p.name: Value(found[name][p.name], std[name, p.name], p.unit)
+            p.name: Value(values[p.name], choice.std[name, p.name], p.unit)
             for p in EFFECTS[name].parameters
-            if (name, p.name) in std
+            if (name, p.name) in choice.std
         }
         words = sentence(name, parameters, gain)
-        rivals = tuple(Alternative(n, _EQUAL) for n in (alternatives or {}).get(name, ()))
-        sure = not rivals and name not in unsure
+        rivals = tuple(Alternative(n, _EQUAL) for n in choice.alternatives.get(name, ()))
+        sure = not rivals and name not in choice.unsure
         run = None if sure else EFFECTS[name].manoeuvre
         findings.append(Finding(name, (), parameters, None, gain, sure, run, rivals, words))
     return findings
