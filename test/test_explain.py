@@ -32,7 +32,7 @@ from rov_ident.discrepancy import screening, sensor_consistency
 from rov_ident.discrepancy import search as discrepancy
 from rov_ident.discrepancy.explain import (
     CUT_SHORT,
-    _beside_a_payload,
+    _beside_each_other,
     _gains_elsewhere,
     _is_between_readings,
     _with_all_data,
@@ -439,14 +439,14 @@ def test_what_gains_where_it_does_not_act_may_stand_for_something_else():
     assert [_gains_elsewhere(f) for f in (of_sway, of_both, of_sensor)] == [True, False, False]
 
 
-def test_inertia_beside_a_payload_may_be_its_own():
+def test_inertia_beside_each_other_may_be_its_own():
     gain = Gain("q", 0.1, 0.05, 50.0, 40.0, 60.0)
     coupling, payload, drag = (
         Finding(name, ("M",), {}, None, gain, True, None, (), "")
         for name in ("added_mass_coupling", "payload", "quadratic_damping")
     )
-    assert _beside_a_payload([coupling, drag]) == [coupling, drag]
-    beside = _beside_a_payload([payload, coupling, drag])
+    assert _beside_each_other([coupling, drag]) == [coupling, drag]
+    beside = _beside_each_other([payload, coupling, drag])
     assert [f.separable for f in beside] == [True, False, True]
 
 

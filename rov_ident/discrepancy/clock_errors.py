@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from rov_ident.config import Config
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.results import Finding
-from rov_ident.discrepancy.search import LATE_THRUST
 from rov_ident.effects import EFFECTS
 from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams
@@ -38,7 +37,7 @@ class ClockErrors:
     def beside(self, found: Finding) -> Finding:
         """The finding, not sure where wrong stamps may have made it."""
         made = self.ahead and not EFFECTS[found.effect].of_sensors
-        late = self.behind and found.effect in LATE_THRUST
+        late = self.behind and "late" in EFFECTS[found.effect].traits
         return unsure(found) if made or late else found
 
 

@@ -53,7 +53,7 @@ from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
-from rov_ident.effects import EFFECTS, Values
+from rov_ident.effects import EFFECTS, Values, with_trait
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
@@ -65,8 +65,6 @@ _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its p
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
 _NEAR_NOISE = 3.0  # times what noise makes of a prediction: coefficients are not exact, either
 _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
-_LIKE_ITS_MASS = ("added_mass_coupling", "coriolis", "battery_sag")  # ... of a payload
-_OF_A_DIVE = ("ocean_current", HEADING)  # not the vehicle's
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
@@ -227,7 +225,7 @@ def explain(
     notes += [_OWN_HEADINGS] if any(data.headings) else []
     notes += [_OWN_DELAYS] if data.delays else []
     notes += shared.notes
-    passing = [name for name in _OF_A_DIVE if name in best.effects]
+    passing = [name for name in with_trait("dive") if name in best.effects]
     notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
     notes += [_FILTERED] if data.late else []
     notes += data.clocks.notes
@@ -421,7 +419,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
         found = list(map(unsure, found))
     found = [unsure(f) if _is_between_readings(f, data.streams) else f for f in found]
     found = list(map(data.clocks.beside, found))
-    found = _beside_a_payload(found)
+    found = _beside_each_other(found)
     return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
 
 
@@ -490,12 +488,10 @@ def _is_between_readings(found: Finding, streams: Streams) -> bool:
     return abs(found.parameters["delay"].value) < 0.5 * interval
 
 
-def _beside_a_payload(found: list[Finding]) -> list[Finding]:
-    """Inertia, and what grows with time, are not sure where there is a payload: the effect of that
-    has a weight in water, and its mass is inertia from then on, off the diagonal, too."""
-    if all(f.effect != "payload" for f in found):
-        return found
-    return [unsure(f) if f.effect in _LIKE_ITS_MASS else f for f in found]
+def _beside_each_other(found: list[Finding]) -> list[Finding]:
+    """Those that another one blurs (`Effect.blurs`) are not sure."""
+    blurred = {name for f in found for name in EFFECTS[f.effect].blurs}
+    return [unsure(f) if f.effect in blurred else f for f in found]
 
 
 def _gains_elsewhere(found: Finding) -> bool:

@@ -28,7 +28,6 @@ from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import (
     BIAS,
     HEADING,
-    NEGLECTING,
     NOISE,
     Choice,
     Data,
@@ -36,7 +35,7 @@ from rov_ident.discrepancy.sensor_choice import (
     with_noise,
 )
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, with_trait
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
@@ -67,7 +66,7 @@ def finding(
         without = retuned.hypothesis
     gain = judge.gain(without, final.hypothesis, except_for, axes)
     alternatives, separable = _alternatives(search, judge, final, name, trial, except_for)
-    if name in NEGLECTING and may_be_noise(trial.rest, axes):
+    if name in with_trait("neglecting") and may_be_noise(trial.rest, axes):
         alternatives, separable = (*alternatives, Alternative(NOISE, _EQUAL)), False
     stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
     values = final.hypothesis.values

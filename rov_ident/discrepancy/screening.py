@@ -25,7 +25,7 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.selection import PENALTY, scores_of
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
-from rov_ident.effects import EFFECTS, reading_noise
+from rov_ident.effects import EFFECTS, reading_noise, with_trait
 from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
@@ -34,8 +34,7 @@ from rov_ident.sampling.wrench_scatter import SHARE
 T = TypeVar("T")
 R = TypeVar("R")
 
-HULL_DAMPING = ("quadratic_damping", "linear_damping")
-"""Terms that every hull has: what a model lacks of them is the likeliest cause."""
+HULL_DAMPING = with_trait("hull")  # what a model lacks of it is the likeliest cause
 
 THREADS = 2  # that fit: more would wait for each other, as some of a fit is Python
 FARTHEST = 3.0  # typical sizes from null at which a fit of an input effect begins, as the wrench is

@@ -36,15 +36,15 @@ from rov_ident.discrepancy.patterns import INTERPLAY, PatternSearch, choice_pena
 from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening, Workers
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, with_trait
 from rov_ident.model.coefficients import parse
 from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
 
-LIKELIEST = (*HULL_DAMPING, "thrust_scale", "ocean_current")  # of the vehicle, thrust and water
+LIKELIEST = (*HULL_DAMPING, *with_trait("likely"))
 INTERPLAY_NAME = f"{UNKNOWN} {INTERPLAY}"  # it makes a name unsure, and is none itself
-LATE_THRUST = ("thruster_lag", "actuation_delay")  # what every thruster has a little of
+LATE_THRUST = with_trait("late")
 
 # What is likelier beforehand needs less evidence. The rates in docs/explain-bench.md were measured
 # with these.

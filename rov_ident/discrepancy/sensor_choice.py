@@ -34,10 +34,6 @@ from rov_ident.sampling.wrench_scatter import RESTING
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
 LATENCY = "velocity_latency"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"
-NEGLECTING = (
-    "thruster_deadband", "thruster_failure", "thruster_gain", "thrust_scale", "thrust_curve",
-)  # fmt: skip
-"""Effects with which a model may follow the wrench as read less, and noise with it."""
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _WATER = (("ocean_current", "north"), ("ocean_current", "east"))
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %

@@ -27,6 +27,7 @@ from rov_ident.effects.base import (
     Effect,
     EffectParameter,
     Reading,
+    Trait,
     a_reading,
     faults,
 )
@@ -192,6 +193,11 @@ def of_the_vehicle(effects: Values) -> Values:
 def affects_sensors(effects: Values) -> bool:
     """Whether :func:`correct` changes anything."""
     return any(effect.name in effects for effect in _SENSE)
+
+
+def with_trait(trait: Trait) -> tuple[str, ...]:
+    """The names of the effects that have it."""
+    return tuple(name for name, effect in EFFECTS.items() if trait in effect.traits)
 
 
 def parameter(effect: str, name: str) -> EffectParameter:

@@ -57,6 +57,7 @@ def _forget(queue, entries, count):
 EFFECT = Effect(
     place="input",
     summary="The thrusters follow their command a little later.",
+    traits=("late",),
     manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
     parameters=(EffectParameter("delay", "s", "from command to thrust", 0.0, 0.0, 0.5, 0.05),),

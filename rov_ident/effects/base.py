@@ -56,6 +56,7 @@ Array = NDArray[np.float64]
 SIZE = 44  # the most parameters that a kernel takes
 
 Place = Literal["input", "motion", "wrench"]
+Trait = Literal["hull", "likely", "late", "factor", "neglecting", "dive"]
 Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed", "shape"]
 Axes = tuple[str, str, str]
 
@@ -158,7 +159,12 @@ class Effect:
     that shows it and tells it from its neighbours. ``beyond``: the effect that does nearly the same
     and that every vehicle has, without which this one is not looked for. ``lasting``: what one with
     an onset cannot be told from if it was there from the start. ``within``: the effect of which
-    this is a special case.
+    this is a special case. ``blurs``: effects that are not sure where this one is.
+
+    ``traits``: *hull*, drag that every hull has; *likely*, lacking so often that it is always tried
+    in full; *late*, thrust comes later, as every thruster's does a little; *factor*, its parameters
+    are factors of the thrust, of all axes or of one; *neglecting*, with it a model may follow the
+    wrench as read less, and noise with it; *dive*, it is the dive's and not the vehicle's.
     """
 
     place: Place
@@ -171,6 +177,8 @@ class Effect:
     beyond: str = ""
     lasting: tuple[str, ...] = ()
     within: str = ""
+    blurs: tuple[str, ...] = ()
+    traits: tuple[Trait, ...] = ()
     body: Callable[..., Any] | None = None
     wrench: Callable[..., None] | None = None
     water: Callable[..., Array] | None = None

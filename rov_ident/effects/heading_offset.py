@@ -10,6 +10,7 @@ from rov_ident.effects.base import Effect, EffectParameter
 EFFECT = Effect(
     place="motion",
     summary="The heading of the pose is off by a constant angle, the velocities are right.",
+    traits=("dive",),
     manoeuvre="thrust ahead and to the side from rest, with a position fix",
     source="Kinsey, Whitcomb (2007), In situ alignment calibration of attitude and Doppler sensors "
     "for precision underwater vehicle navigation, IEEE J. Oceanic Eng. 32(2)",

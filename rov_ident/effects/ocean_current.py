@@ -15,6 +15,7 @@ def water(north: float, east: float, down: float) -> Array:
 EFFECT = Effect(
     place="motion",
     summary="The water moves: the vehicle is faster or slower through it than over ground.",
+    traits=("likely", "dive"),
     manoeuvre="runs at headings 90 degrees apart, and drifting without thrust",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.3",
     parameters=vector("north east down", "m/s", "velocity of the water", 3.0, 0.1, NED),

@@ -24,6 +24,7 @@ EFFECT = Effect(
     place="wrench",
     summary="Something heavy (or buoyant) is taken up at a time, or was there from the start.",
     lasting=("buoyancy", "cog_offset", "constant_force"),
+    blurs=("added_mass_coupling", "coriolis", "battery_sag"),  # its mass is inertia, too
     manoeuvre="drifting without thrust, level and tilted, before and after it was taken up",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
     parameters=(

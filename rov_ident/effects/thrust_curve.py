@@ -22,6 +22,7 @@ def act(p, state, t, dt, wrench):
 EFFECT = Effect(
     place="input",
     summary="Thrust is not in proportion to its command.",
+    traits=("neglecting",),
     manoeuvre="steps of thrust along the axis at several levels up to the largest, from rest",
     source="Bessa, Dutra, Kreuzer (2013), Dynamic positioning of underwater robotic vehicles with "
     "thruster dynamics compensation, Int. J. Advanced Robotic Systems 10(9): thrust over command; "

@@ -14,6 +14,7 @@ EFFECT = Effect(
     place="input",
     summary="All thrusters give more or less than commanded, by one factor.",
     within="thruster_gain",
+    traits=("likely", "factor", "neglecting"),
     manoeuvre="steps of thrust together with motion along the other axes, and at two tilts",
     source="Blue Robotics, T200 thruster, performance charts: thrust over supply voltage",
     parameters=(EffectParameter("scale", "1", "acting over commanded", 1.0, 0.0, 5.0, 0.1),),

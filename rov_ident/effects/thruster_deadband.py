@@ -18,6 +18,7 @@ def act(p, state, t, dt, wrench):
 EFFECT = Effect(
     place="input",
     summary="Small commands do nothing, and larger ones lack that much.",
+    traits=("neglecting",),
     manoeuvre="small steps of thrust either way around zero, from rest, beside large ones",
     source="Yoerger, Cooke, Slotine (1990), The influence of thruster dynamics on underwater "
     "vehicle behavior and their incorporation into control system design, "

@@ -18,6 +18,7 @@ EFFECT = Effect(
     place="input",
     summary="From a time on, a part of the thrust is missing.",
     lasting=("thruster_gain",),
+    traits=("neglecting",),
     manoeuvre="the same steps of thrust on every axis at the beginning and at the end of the bag",
     source="Sarkar, Podder, Antonelli (2002), Fault-accommodating thruster force allocation of an "
     "AUV considering thruster redundancy and saturation, IEEE Trans. Robotics and Automation 18(2)",

@@ -13,6 +13,7 @@ def act(p, state, t, dt, wrench):
 EFFECT = Effect(
     place="input",
     summary="The thrusters give more or less than commanded, in proportion.",
+    traits=("factor", "neglecting"),
     manoeuvre="steps of thrust on the axis together with motion along the others, and at two tilts",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
     parameters=per_axis("gain", "factor on the command", 1.0, 0.0, 5.0, 0.1),

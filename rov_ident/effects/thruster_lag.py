@@ -31,6 +31,7 @@ def act(p, state, t, dt, wrench):
 EFFECT = Effect(
     place="input",
     summary="The thrusters follow their command with a first-order lag, the same on every axis.",
+    traits=("late",),
     manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
     parameters=(EffectParameter("time_constant", "s", "of the lag", 0.0, 0.0, 3.0, 0.1),),

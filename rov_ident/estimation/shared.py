@@ -29,8 +29,6 @@ REACH = 10.0  # prior standard deviations, which no coefficient is off; for RLS'
 # of what looks like noise of the reading, below which the vehicle follows it ("Noise of the
 # wrench's reading" in docs/accuracy.md)
 FOLLOWED = 0.1
-# Effects whose parameters are factors of the thrust, of all axes or of one.
-_FACTORS = ("thrust_scale", "thruster_gain")
 
 INFO = record(
     [
@@ -104,7 +102,7 @@ def factors_of(config: Config) -> NDArray[np.bool_]:
     """(k, 6): of which components of the thrust each estimated parameter of effects is a factor."""
     factors = np.zeros((len(config.estimate_effects), 6), dtype=bool)
     for k, (effect, own) in enumerate(config.estimate_effects):
-        if effect in _FACTORS:
+        if "factor" in EFFECTS[effect].traits:
             axis = parameter(effect, own).axis
             factors[k, AXES.index(axis) if axis else slice(None)] = True
     return factors
