@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import FrameDefaults
+from rov_ident.core.frames import FrameDefaults, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.messages import Array
 from rov_ident.effects import EFFECTS, Values, rigid_body
 from rov_ident.model import thruster_allocation as thrusters
 from rov_ident.model.coefficients import INPUTS, Coefficient
@@ -311,6 +312,11 @@ class ImuSensor:
     gyro_bias_std: float = not_negative(
         0.01, "prior standard deviation of the gyroscope bias", "rad/s"
     )
+
+    @property
+    def to_body(self) -> Array:
+        """The matrix (3, 3) that takes vectors in sensor axes to body axes."""
+        return quaternion_to_matrix(quaternion_from_euler(*self.rotation))
 
 
 @dataclass(frozen=True, kw_only=True)

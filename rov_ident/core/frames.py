@@ -91,6 +91,12 @@ def quaternion_to_matrix(q: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rotated(r: Array, x: Array) -> Array:
+    """Vectors x (N, 3), each turned by the matrix of its row, r (N, 3, 3): from body to world by
+    attitudes."""
+    return np.einsum("kij,kj->ki", r, x)
+
+
 def gravity_direction(q: ArrayLike) -> Array:
     """World down (NED z) in body axes, (..., 3), unit, of unit quaternions (..., 4)."""
     return quaternion_to_matrix(q)[..., 2, :].copy()

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rov_ident.core.frames import rotated
 from rov_ident.core.linalg import scaled_solve, unit_diagonal
 from rov_ident.core.noise import robust_std
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key
@@ -271,7 +272,7 @@ class Linearisation:
         e = self.problem
         error = self._whitened(self.error[:, None].copy()).reshape(-1, 6) * self._weight
         wrench = adjoint(self.motion, e.first, e.last, error, e.nodes)
-        in_world = np.einsum("kij,kj->ki", e.steps.middle, wrench[:, :3])
+        in_world = rotated(e.steps.middle, wrench[:, :3])
         force = in_world if axis is None else wrench[:, axis : axis + 1]
         t = 0.5 * (e.steps.t[1:] + e.steps.t[:-1])
         step = 2.0 * MAX_STEP

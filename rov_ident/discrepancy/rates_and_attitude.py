@@ -19,6 +19,7 @@ from rov_ident.core.frames import (
     quaternion_from_euler,
     quaternion_multiply,
     quaternion_to_matrix,
+    rotated,
     turns,
 )
 from rov_ident.core.linalg import integral, interpolated, scaled_solve
@@ -95,7 +96,7 @@ def _with_gyro_set_right(
 ) -> Streams:
     """The streams with a gyro whose scale is that of the attitude, as velocities are carried from
     one message to the next by it. Its bias is looked for elsewhere (`sensor_consistency`)."""
-    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    mounting = config.imu.to_body
     gyro = streams.gyro @ mounting.T
     rates = interpolated(streams.imu_t, gyro, streams.t)
     of_gyro = dataclasses.replace(streams, nu=np.hstack([streams.nu[:, :3], rates]))
@@ -142,7 +143,7 @@ def _turned(streams: Streams, rate: float) -> Streams:
     yaw = quaternion_from_euler(0.0, 0.0, rate * streams.t)
     orientation, position = quaternion_multiply(yaw, streams.orientation), streams.position
     if streams.is_reckoned:
-        world = np.einsum("kij,kj->ki", quaternion_to_matrix(orientation), streams.nu[:, :3])
+        world = rotated(quaternion_to_matrix(orientation), streams.nu[:, :3])
         position = position[0] + integral(streams.t, world)
     return dataclasses.replace(streams, orientation=orientation, position=position)
 
@@ -162,7 +163,7 @@ def _between(streams: Streams, config: Config) -> Array:
         return np.zeros((len(streams.t) - 1, 3))
     t = np.union1d(streams.t, streams.imu_t)
     first, *_, last = at = np.searchsorted(t, streams.t)
-    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    mounting = config.imu.to_body
     gyro = interpolated(streams.imu_t, streams.gyro, t) @ mounting.T
     angle = integral(t, gyro)
     steps, so_far = np.diff(angle, axis=0), angle[first:last]

@@ -28,6 +28,7 @@ from rov_ident.core.frames import (
     quaternion_from_euler,
     quaternion_multiply,
     quaternion_to_matrix,
+    rotated,
     velocity_of_arm,
 )
 from rov_ident.core.jit import kernel
@@ -123,9 +124,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
     made: list[tuple[str, Array, Array, list[Array]]] = []
     none = [np.zeros_like(here.linear)] * len(TIMING)
     if streams.has_pose:
-        way, *ways = (
-            integral(streams.t, np.einsum("kij,kj->ki", r, m.linear)) for m in (here, *moved)
-        )
+        way, *ways = (integral(streams.t, rotated(r, m.linear)) for m in (here, *moved))
         y, columns = streams.position - way, [-w for w in ways]
         made.append(("pose", streams.t, y, [*columns, *none]))
     if inertial is not None:
@@ -133,9 +132,9 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
         inside = measured_at(streams.imu_t, streams.t)
         t = streams.t[inside]
-        y = (np.einsum("kij,kj->ki", r, here.linear) - inertial.velocity)[inside]
+        y = (rotated(r, here.linear) - inertial.velocity)[inside]
         columns = [
-            (np.einsum("kij,kj->ki", r, m.linear) - inertial.integrated(s.specific_force))[inside]
+            (rotated(r, m.linear) - inertial.integrated(s.specific_force))[inside]
             for m, s in zip(moved, shift, strict=True)
         ]
         held = np.clip(np.searchsorted(streams.demand_t, t, side="right") - 1, 0, None)
@@ -152,9 +151,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
             clock = (early - late) / (2.0 * _CLOCK)
         arms = none[:3]
         if streams.has_pose:
-            arms = [
-                -np.einsum("kij,kj->ki", r, velocity_of_arm(gyrating, axis)) for axis in np.eye(3)
-            ]
+            arms = [-rotated(r, velocity_of_arm(gyrating, axis)) for axis in np.eye(3)]
         columns += [c[inside] for c in (*arms, clock)]
         made.append(("imu", t, y, columns))
         y = here.angular[inside] - here.gyro[inside]
@@ -176,7 +173,7 @@ def _corrected_readings(
 ) -> tuple[Reading, Reading, Array]:
     """Odometry at its times and IMU at its own, corrected; angular rates (M, 3) as odometry reads
     them, at the times of the IMU."""
-    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
+    mounting = config.imu.to_body
     gyro, nothing = streams.gyro @ mounting.T, np.zeros_like(streams.nu[:, 3:])
     rate = interpolated(streams.t, streams.nu[:, 3:], streams.imu_t)
     gyro_at = interpolated(streams.imu_t, gyro, streams.t) if _has_imu(streams) else nothing
@@ -240,7 +237,7 @@ class _DeadReckoning:
 
     def integrated(self, force: Array) -> Array:
         """The integral (N, 3) of specific forces (M, 3) turned into the world."""
-        total = integral(self._t, np.einsum("kij,kj->ki", self.rotation, force))
+        total = integral(self._t, rotated(self.rotation, force))
         return interpolated(self._t, total, self._at)
 
 
@@ -249,7 +246,7 @@ def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | Non
     (N, 3), whose integral drifts. The velocity sensor stands in for either where it is missing."""
     t, width = streams.t, _STEADY if inertial is None else _DRIFT
     inertial = np.zeros_like(measured) if inertial is None else inertial
-    in_world = np.einsum("kij,kj->ki", r, measured)
+    in_world = rotated(r, measured)
     order, step = int(streams.has_pose), float(np.median(np.diff(t)))
     out = np.empty_like(measured)
     for piece in _pieces(t, width):

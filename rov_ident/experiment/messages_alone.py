@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix, turns
+from rov_ident.core.frames import quaternion_to_matrix, rotated, turns
 from rov_ident.core.linalg import integral
 from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import MOTIONS
@@ -92,9 +92,8 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         remarks.append(Remark("vehicle.frame", BAD, text))
     r = quaternion_to_matrix(streams.orientation)
     if len(streams.imu_t) > _FEWEST_IMU:
-        mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
         attitude = r[np.clip(np.searchsorted(streams.t, streams.imu_t), 0, len(r) - 1)]
-        force = np.einsum("kij,jl,kl->ki", attitude, mounting, streams.specific_force)
+        force = np.einsum("kij,jl,kl->ki", attitude, config.imu.to_body, streams.specific_force)
         mean = np.median(force, axis=0)
         upward = -float(mean[2]) / config.gravity
         level, text = GOOD, f"gravity is where it should be ({upward:.2f} g upward at rest)"
@@ -110,7 +109,7 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
     remarks += _rates_and_turns(streams, first, last)
     if len(first) and streams.has_pose and streams.nu[:, :3].any():
         moved = streams.position[last] - streams.position[first]
-        way = integral(streams.t, np.einsum("kij,kj->ki", r, streams.nu[:, :3]))
+        way = integral(streams.t, rotated(r, streams.nu[:, :3]))
         told, axes = way[last] - way[first], ("north", "east", "down")
         remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
     late = delays.odometry_behind_imu(streams, config)

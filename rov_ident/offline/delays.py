@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
 from rov_ident.estimation.consistency import Test
@@ -75,8 +75,7 @@ def ahead_of_wrench(ahead: float) -> str:
 
 def gyro_at(streams: Streams, config: Config) -> Array:
     """Rates (N, 3) of the gyro in body axes at the times of the odometry."""
-    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))
-    return interpolated(streams.imu_t, streams.gyro @ mounting.T, streams.t)
+    return interpolated(streams.imu_t, streams.gyro @ config.imu.to_body.T, streams.t)
 
 
 def odometry_behind_imu(streams: Streams, config: Config) -> Delay | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, to_core
+from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, rotated, to_core
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
 from rov_ident.core.noise import robust_std, second_differences
 from rov_ident.model.coefficients import AXES, INPUTS, VELOCITIES
@@ -84,7 +84,7 @@ class Streams:
     def is_reckoned(self) -> bool:
         """Whether the position is dead reckoning, the sum of the velocities along the attitude with
         their noise: it agrees with them whatever is wrong. Depth may still be measured."""
-        v = np.einsum("kij,kj->ki", quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
+        v = rotated(quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
         dt = np.diff(self.t)[:, None]
         step = np.diff(self.position[:, :2], axis=0)
         noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(dt)

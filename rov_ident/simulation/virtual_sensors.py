@@ -146,7 +146,7 @@ def measure(
         angular = _coarse(sensed.angular[i] + suite.angular_std * noise[9:])
         odometry = Odometry(0, *_FRAMES, position, attitude, linear, angular, variance)
         messages.append(_stamped(t[i], ODOMETRY, odometry))
-    mounting = quaternion_to_matrix(quaternion_from_euler(*config.imu.rotation))  # IMU -> body
+    mounting = config.imu.to_body
     gyro_variance, variance = np.full(3, suite.gyro_std**2), np.full(3, suite.accelerometer_std**2)
     accelerometer_bias = suite.accelerometer_bias_std * rng.standard_normal(3)
     gyro_bias = suite.gyro_bias_std * rng.standard_normal(3)
