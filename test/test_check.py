@@ -413,7 +413,7 @@ def test_what_is_promised_is_what_a_fit_then_states(tmp_path):
     fit = fit_batch(flown, shipped, "ml")
     n = len(shipped.estimate)
     driven = np.array([p.std for p in proposal.after])
-    stated = fit.std[:n] / np.hypot(driven, proposal.of_scales)
+    stated = fit.std[:n] / np.hypot(driven, proposal.beyond_driving)
     # damping of zero is at its bound, and half of a normal distribution is narrower
     assert stated[true.model.theta != 0.0].min() > 0.5 and stated.max() < 2.0
     error = (fit.values[:n] - true.model.theta) / driven

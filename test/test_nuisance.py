@@ -20,10 +20,10 @@ from rov_ident.config.prior import (
     ATTITUDE_LASTS,
     attitude_covariance,
     cob_std,
+    covariance_beyond_driving,
     drift_of,
     prior_of,
     rigid_body_covariance,
-    scale_covariance,
 )
 from rov_ident.core.states import State
 from rov_ident.estimation.online import OnlineEstimator
@@ -120,8 +120,8 @@ def test_the_scale_of_a_velocity_sensor_is_in_the_intervals(kind, seed):
     report = online.report()
     at = [report.names.index(name) for name in THETA]
     off = np.abs([report.by_name[name] - vehicle.theta[name] for name in THETA])
-    assert report.of_scales is not None
-    own = np.sqrt(report.std**2 - report.of_scales)
+    assert report.beyond_driving is not None
+    own = np.sqrt(report.std**2 - report.beyond_driving)
     assert np.all(off < 3.0 * report.std[at])
     assert np.max(off / own[at]) > 3.0  # which is owed to them
 
@@ -283,7 +283,7 @@ def test_a_scale_of_the_velocity_sensor_is_one_of_inertia_and_drag(heavy, off):
     variance, need the same wrench, along one axis at a time."""
     names, theta = heavy.model.names, heavy.model.theta
     config = replace(heavy, odometry=replace(heavy.odometry, scale_std=abs(off)))
-    covariance = scale_covariance(config, names, theta)
+    covariance = covariance_beyond_driving(config, names, theta)
     moved = (
         -np.sign(off)
         * np.sqrt(np.diag(covariance))
@@ -310,7 +310,7 @@ def test_the_righting_arm_is_what_thrust_is_compared_with(heavy, factor):
     parameters["wrench"].pop("scale_std", None)
     config = configuration.from_parameters(parameters).with_nuisance
     prior, body = prior_of(config, effects=True), config.model.body
-    covariance = scale_covariance(config, prior.names, prior.mean)
+    covariance = covariance_beyond_driving(config, prior.names, prior.mean)
     arm = -body.cob[2] * body.buoyancy / body.weight
     of_arm = np.hypot(0.001 / arm, 0.15 / 3.0)
     by_itself = [np.hypot(of_arm, 0.15 / 3.0) if n[0] in "XYZN" else of_arm for n in prior.names]
@@ -395,7 +395,7 @@ def test_a_lost_buoyancy_scales_with_what_weight_leaves(heavy, factor):
     values[at] = np.random.default_rng(3).normal(0.0, 2.0)
     arm = -body.cob[2] * body.buoyancy / body.weight
     by_itself = np.sqrt((0.001 / arm) ** 2 + 2.0 * (0.15 / 3.0) ** 2)
-    moved = np.sqrt(scale_covariance(config, prior.names, values)[at, at]) / by_itself
+    moved = np.sqrt(covariance_beyond_driving(config, prior.names, values)[at, at]) / by_itself
     net = body.weight - body.buoyancy + values[at]
     assert moved == pytest.approx(abs(net))
     # and so it does move alike
@@ -449,15 +449,15 @@ def test_stamps_of_the_imu_that_are_two_milliseconds_off(kind, seed):
     exact = configuration.from_parameters(told)
     del told["wrench"]["lag_std"], told["odometry"]["latency_std"]
     config = configuration.from_parameters(told).with_nuisance
-    assert not scale_covariance(exact, exact.estimate, exact.model.theta).any()
+    assert not covariance_beyond_driving(exact, exact.estimate, exact.model.theta).any()
     online = OnlineEstimator(config, kind)
     for _, role, message in sea.measured(truth, sea.Sea(), rng):
         early = 2_000_000 if role == "imu" else 0
         online.push(role, message._replace(stamp=message.stamp - early))
     report = online.report()
     assert report.consistency.consistent, report.consistency.sentence
-    assert report.of_scales is not None
-    bare = np.sqrt(np.diag(report.covariance) - report.of_scales)
+    assert report.beyond_driving is not None
+    bare = np.sqrt(np.diag(report.covariance) - report.beyond_driving)
     off = {
         name: (value - vehicle.theta[name], std, alone)
         for name, value, std, alone in zip(report.names, report.values, report.std, bare)
@@ -482,7 +482,7 @@ def test_a_trim_is_told_in_shares_of_the_righting_arm(heavy, seed):
     at = [names.index(f"cog_offset.{d}") for d in ("dx", "dy", "dz")]
     values[at] = rng.normal(0.0, 0.003, 3)
     scale = names.index("thrust_scale.scale")
-    part = scale_covariance(config, names, values)[np.ix_([*at, scale], [*at, scale])]
+    part = covariance_beyond_driving(config, names, values)[np.ix_([*at, scale], [*at, scale])]
     share = min(np.hypot(0.001 / (arm * body.buoyancy / body.weight), 0.05), 0.15)
     moved = share * np.append(values[at], 1.0)
     np.testing.assert_allclose(part, np.outer(moved, moved), rtol=1e-9)

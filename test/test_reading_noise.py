@@ -77,8 +77,8 @@ def _dive(
             due += 5.0
             report = online.report()
             i = report.names.index("thrust_scale.scale")
-            assert report.of_scales is not None
-            std = float(np.sqrt(report.std[i] ** 2 - report.of_scales[i]))
+            assert report.beyond_driving is not None
+            std = float(np.sqrt(report.std[i] ** 2 - report.beyond_driving[i]))
             found.append((float(report.values[i]), std, report.messages[i]))
     return found
 

@@ -166,11 +166,11 @@ def rigid_body_covariance(
     return _consider_covariance(sources, names, gain)
 
 
-def scale_covariance(
+def covariance_beyond_driving(
     config: Config, names: tuple[str, ...], values: Array, gain: Array | None = None
 ) -> Array:
-    """What scales that no manoeuvre tells add to the same: as driving does not reduce it,
-    convergence is judged without it.
+    """What no manoeuvre tells adds to the same, scales and errors of stamps: as driving does not
+    reduce it, convergence is judged without it.
 
     The equations of motion stay the same with the righting moment, thrust, drag and all inertia,
     added and own, times k. So only the righting arm, and the thrust in roll and pitch, determine a
@@ -179,7 +179,7 @@ def scale_covariance(
     The thrust of each other axis may be off by itself. And a velocity sensor that reads too much
     makes the same forces belong to velocities and accelerations that are as much smaller.
 
-    And stamps that are off: see :func:`_of_stamps`.
+    Of the stamps see :func:`_of_stamps`.
     """
     body = config.model.body
     masses, moments = _own_inertia(body)

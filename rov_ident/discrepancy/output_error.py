@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import stdtrit
 
-from rov_ident.config.prior import ONE_AXIS, cob_std, scale_covariance
+from rov_ident.config.prior import ONE_AXIS, cob_std, covariance_beyond_driving
 from rov_ident.core.linalg import scaled_inverse, scaled_solve
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
@@ -136,7 +136,8 @@ class Fitted:
         rigid body, and of the height of the centre of buoyancy (consider parameters, Schmidt 1966),
         as large as the configuration says that they may be and the residuals leave them. With the
         righting moment, thrust and all coefficients times k nothing moves otherwise
-        (:func:`prior.scale_covariance`, of which the velocity sensor's scale is taken as it is).
+        (:func:`prior.covariance_beyond_driving`, of which the velocity sensor's scale is taken as
+        it is).
         """
         linear, at, h = self.linear, self._smooth, self.hypothesis
         error = self.linearisation.sensitivity_to(self._errors_of_the_file())
@@ -149,7 +150,7 @@ class Fitted:
         out[np.ix_(at, at)] = moves @ (left + np.outer(likely, likely)) @ moves.T
         names = tuple(name if effect == COEFFICIENTS else "" for effect, name in linear.keys)
         values = np.array([h.values[k] for k in linear.keys])
-        return out + scale_covariance(h.config, names, values)
+        return out + covariance_beyond_driving(h.config, names, values)
 
     def _errors_of_the_file(self) -> Array:
         """The wrench (K, 6, E) of one standard deviation of each error of the file."""

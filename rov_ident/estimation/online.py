@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from rov_ident.config import Config, load
 from rov_ident.config.prior import (
     attitude_covariance,
+    covariance_beyond_driving,
     first_centre,
     gain_of,
     prior_of,
     rigid_body_covariance,
-    scale_covariance,
 )
 from rov_ident.core.errors import UserError, require
 from rov_ident.core.jit import interpreting
@@ -72,9 +72,9 @@ class Report:
     information's root in prior units: 1 before any data, and an estimate has some
     ``16 - log10(condition)`` digits; NaN where it is not known. ``consistency`` says whether model
     and data agree, None where it is not known; where they do not, intervals are wider, and nothing
-    has converged. ``of_scales`` (n,) is the part of the variances that no driving reduces (of
-    :func:`~rov_ident.config.prior.scale_covariance`), without which convergence is judged; None
-    where it is not known.
+    has converged. ``beyond_driving`` (n,) is the part of the variances that no driving reduces
+    (:func:`~rov_ident.config.prior.covariance_beyond_driving`), without which convergence is
+    judged; None where it is not known.
     """
 
     stamp: int
@@ -90,7 +90,7 @@ class Report:
     messages: tuple[str, ...]
     condition: float = math.nan
     consistency: Consistency | None = None
-    of_scales: Array | None = None
+    beyond_driving: Array | None = None
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -487,12 +487,12 @@ class OnlineEstimator:
             else self._judge(i, values, std, raw.values, excitation, consistency, waiting.get(i))
             for i in range(len(values))
         ]
-        of_scales = np.zeros(len(values))
+        beyond_driving = np.zeros(len(values))
         if not diverged:
             seconds = float(self._state.monitor["judged"].max())
             trim = attitude_covariance(self.config, raw.names, seconds, gain)
-            scales = scale_covariance(self.config, raw.names, raw.values, gain)
-            covariance, of_scales = covariance + trim + scales, np.diag(scales)
+            lasting = covariance_beyond_driving(self.config, raw.names, raw.values, gain)
+            covariance, beyond_driving = covariance + trim + lasting, np.diag(lasting)
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
         upper = np.minimum(values + NORMAL * std, self.prior.upper)
@@ -511,7 +511,7 @@ class OnlineEstimator:
             tuple(text for _, text in judged),
             self._module.condition(self._task, self._state),
             consistency,
-            of_scales,
+            beyond_driving,
         )
 
     def _waiting(self, values: Array) -> dict[int, str]:

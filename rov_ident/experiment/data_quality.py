@@ -258,7 +258,7 @@ def _model_remarks(quick: Fit) -> Iterator[Remark]:
     yield Remark(_MODEL, GOOD if agree else BAD, quick.consistency.sentence)
     prior = prior_of(quick.given, effects=True)
     # a righting arm that is off is one of the reasons that are told
-    own = np.sqrt(np.maximum(quick.std**2 - quick.of_scales, 0.0))
+    own = np.sqrt(np.maximum(quick.std**2 - quick.beyond_driving, 0.0))
     columns = quick.values, own, prior.mean, prior.std
     values = dict(zip(quick.names, quick.values.tolist(), strict=True))
     seen = [

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.config.prior import (
+    covariance_beyond_driving,
     first_centre,
     gain_of,
     prior_of,
     rigid_body_covariance,
-    scale_covariance,
     theta_of,
     typical,
 )
@@ -76,14 +76,14 @@ class Candidate:
 @dataclass(frozen=True)
 class Proposal(Shown):
     """The best candidate, what is known before it and what is predicted after it, but for what no
-    driving tells: the standard deviations ``of_scales``, which a fit adds."""
+    driving tells: the standard deviations ``beyond_driving``, which a fit adds."""
 
     config: Config = field(repr=False)
     best: Candidate
     worst: str
     before: tuple[Prospect, ...]
     after: tuple[Prospect, ...]
-    of_scales: tuple[float, ...]
+    beyond_driving: tuple[float, ...]
     others: tuple[tuple[str, float], ...]
     """Every candidate's name and the relative standard deviation of its worst coefficient."""
     left_out: tuple[str, ...]
@@ -91,7 +91,7 @@ class Proposal(Shown):
 
     @property
     def sentence(self) -> str:
-        rows = zip(self.before, self.after, self.of_scales, strict=True)
+        rows = zip(self.before, self.after, self.beyond_driving, strict=True)
         now, then, beside = next(row for row in rows if row[0].name == self.worst)
         told = (
             f"{self.worst}, known worst, goes from ± {NORMAL * now.std:.2g} to "
@@ -122,7 +122,7 @@ class Proposal(Shown):
         """What is known of every coefficient now, and what after the manoeuvre."""
         rows = [
             [b.name, f"{b.value:.4g}", *(f"{NORMAL * x:.2g}" for x in (b.std, a.std, s)), b.unit]
-            for b, a, s in zip(self.before, self.after, self.of_scales, strict=True)
+            for b, a, s in zip(self.before, self.after, self.beyond_driving, strict=True)
         ]
         columns = (f"{PLUS_MINUS} {label}" for label in ("now", "after it", "scales"))
         head = ["", "configured", *columns, "unit"]
@@ -149,7 +149,7 @@ class Proposal(Shown):
             "sentence": self.sentence,
             "coefficients": {
                 b.name: {"std_now": b.std, "std_after": a.std, "std_of_scales": s, "unit": b.unit}
-                for b, a, s in zip(self.before, self.after, self.of_scales, strict=True)
+                for b, a, s in zip(self.before, self.after, self.beyond_driving, strict=True)
             },
             "candidates": [
                 {"name": n, "worst_relative_std": s if np.isfinite(s) else None}
@@ -218,10 +218,10 @@ def propose(
     scores = [float(r[shown].max() * (1.0 + _OTHERS * np.mean(r[shown]))) for r in predicted]
     best = int(np.argmin(scores))
     after = known_after(about, now + candidates[best].information)
-    of_scales = _not_by_driving(about, now + candidates[best].information)
+    beyond_driving = _not_by_driving(about, now + candidates[best].information)
     others = [(c.manoeuvre.name, s) for c, s in zip(candidates, scores, strict=True)]
     return Proposal(
-        config, candidates[best], worst, before, after, of_scales,
+        config, candidates[best], worst, before, after, beyond_driving,
         tuple(sorted(others, key=lambda o: o[1])), tuple(left_out), tuple(candidates),
     )  # fmt: skip
 
@@ -264,7 +264,7 @@ def _not_by_driving(about: Config, information: Array) -> tuple[float, ...]:
     """The standard deviations that a fit adds, for each coefficient, after information (n, n)."""
     prior, covariance = prior_of(about, effects=True), covariance_of(about, information)
     with_data = prior.names, prior.mean, gain_of(covariance, prior.std)
-    added = rigid_body_covariance(about, *with_data) + scale_covariance(about, *with_data)
+    added = rigid_body_covariance(about, *with_data) + covariance_beyond_driving(about, *with_data)
     std: list[float] = np.sqrt(np.diag(added)).tolist()
     return tuple(std[: len(about.estimate)])
 

@@ -16,11 +16,11 @@ from rov_ident.config import Config
 from rov_ident.config.prior import (
     Prior,
     attitude_covariance,
+    covariance_beyond_driving,
     first_centre,
     gain_of,
     prior_of,
     rigid_body_covariance,
-    scale_covariance,
 )
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
@@ -332,12 +332,12 @@ def _stage(
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
     seconds = float(sum(archive.each(_seconds)))
     covariance = covariance + attitude_covariance(config, names, seconds, gain)
-    of_scales = scale_covariance(config, names, found, gain)
+    beyond_driving = covariance_beyond_driving(config, names, found, gain)
     # What moments and tilt suggest of these is in the values, but the intervals are the prior's.
     own = _coefficients(config).items()
     impossible = [n for n, c in own if unmeasured and is_impossible(c)]
     for i in (names.index(n) for n in impossible):
-        covariance[i] = covariance[:, i] = of_scales[i] = of_scales[:, i] = 0.0
+        covariance[i] = covariance[:, i] = beyond_driving[i] = beyond_driving[:, i] = 0.0
         covariance[i, i] = prior.std[i] ** 2
     more |= {"impossible": impossible} if unmeasured else {}
     removed = 1.0 - np.diag(covariance) / prior.std**2
@@ -360,7 +360,7 @@ def _stage(
     if free[0] and not any(archive.each(_has_surge_thrust)):
         notes += _scale_notes(config, names, covariance)
     return _Stage(
-        names, values, asked, covariance + of_scales, states, more, unexplained, lasting, noise
+        names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting, noise
     )
 
 

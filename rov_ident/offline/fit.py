@@ -59,7 +59,7 @@ class Fit(Shown, Result):
     duration: float
     rmse: Array
     consistency: Consistency
-    of_scales: Array | float = field(default=0.0, repr=False)
+    beyond_driving: Array | float = field(default=0.0, repr=False)
     """(n,) the part of the variances that no driving reduces; of batch fits not told."""
     more: dict[str, Any] = field(default_factory=dict)
     """Further parts of the JSON that only some estimators have."""
@@ -261,8 +261,8 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         else:
             estimator.take(record.samples)
     report = estimator.report()
-    assert report.consistency is not None and report.of_scales is not None
-    own = np.sqrt(np.maximum(report.std**2 - report.of_scales, 0.0))
+    assert report.consistency is not None and report.beyond_driving is not None
+    own = np.sqrt(np.maximum(report.std**2 - report.beyond_driving, 0.0))
     states = [
         of_fit(value, std, prior, 1.0 - (std / prior) ** 2 > IDENTIFIABLE, now is State.AT_BOUND)
         if now is not State.DIVERGED
@@ -293,5 +293,5 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=curves(read.bags, before, after),
-        of_scales=report.of_scales,
+        beyond_driving=report.beyond_driving,
     ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)
