@@ -35,7 +35,7 @@ Sums = TypeVar("Sums", bound=tuple[Any, ...])
 
 
 @dataclass(frozen=True)
-class Bag:
+class ReadBag:
     """What is kept of a bag beside its samples."""
 
     path: Path
@@ -54,7 +54,7 @@ class Archive:
     """
 
     def __init__(
-        self, bags: Sequence[Bag], notes: Sequence[str], each: Mapper, reread: "Reader"
+        self, bags: Sequence[ReadBag], notes: Sequence[str], each: Mapper, reread: "Reader"
     ) -> None:
         self.bags, self.notes, self.each, self.reread = tuple(bags), tuple(notes), each, reread
 
@@ -127,7 +127,7 @@ def opened(
         )
 
 
-Outcome = tuple[Bag, Any] | str
+Outcome = tuple[ReadBag, Any] | str
 """A bag and where its samples are (the array, a file, or a future), or why it was left out."""
 
 
@@ -159,9 +159,9 @@ def _archive(
     return Archive(bags, notes, partial(each, [where for _, where in read]), reread)
 
 
-def _bag_and_samples(record: Record) -> tuple[Bag, Samples]:
+def _bag_and_samples(record: Record) -> tuple[ReadBag, Samples]:
     samples = smoothed(record.samples)
-    bag = Bag(
+    bag = ReadBag(
         record.path,
         record.sha256,
         record.notes,
@@ -241,7 +241,7 @@ def _cluster(address: str, jobs: int) -> Iterator[Any]:
         yield stack.enter_context(client)
 
 
-def _bag_alone(outcome: Outcome) -> Bag | str:
+def _bag_alone(outcome: Outcome) -> ReadBag | str:
     return outcome if isinstance(outcome, str) else outcome[0]
 
 

@@ -33,7 +33,7 @@ from rov_ident.model.coefficients import MOTIONS, Coefficient
 from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
-from rov_ident.offline.archive import Archive, Bag, Samples, total
+from rov_ident.offline.archive import Archive, ReadBag, Samples, total
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
@@ -491,7 +491,7 @@ def _size(samples: Samples) -> tuple[Array, Array]:
     return np.sqrt(np.mean(samples["nu"] ** 2, axis=0)), noise
 
 
-def validation(bags: Sequence[Bag], before: OpenLoop, after: OpenLoop) -> dict[str, Any]:
+def validation(bags: Sequence[ReadBag], before: OpenLoop, after: OpenLoop) -> dict[str, Any]:
     """RMSE of the open-loop simulation on bags that no fit has seen, with one configuration and
     another, for the JSON of a fit."""
     return {

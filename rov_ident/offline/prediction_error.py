@@ -12,7 +12,7 @@ from rov_ident.core.messages import Array
 from rov_ident.core.states import State
 from rov_ident.effects import EFFECTS, Acting, compiled
 from rov_ident.model.equations import Model
-from rov_ident.offline.archive import Archive, Bag, Samples
+from rov_ident.offline.archive import Archive, ReadBag, Samples
 from rov_ident.sampling.records import HORIZON, measured_motion, predicted
 from rov_ident.sampling.sample import free_axes
 
@@ -61,7 +61,7 @@ def _simulated(
     return known * squares, known * told.sum(), drawn
 
 
-def curves(bags: Sequence[Bag], before: OpenLoop, after: OpenLoop) -> tuple[Curves, ...]:
+def curves(bags: Sequence[ReadBag], before: OpenLoop, after: OpenLoop) -> tuple[Curves, ...]:
     """One for each of the ``bags``, simulated with one configuration and another."""
     return tuple(
         Curves(bag.path.name, t, measured, simulated, interpolated(later, fitted, t))
