@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rov_ident.api.reading import File, Files, axes, existing, load, once, read, same_data, several
+from rov_ident.api.reading import File, Files, axes, existing, load, once, same_data, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError, require
@@ -34,6 +34,7 @@ from rov_ident.offline.captive_prior import disagreements, with_prior
 from rov_ident.offline.fit import Fit, fit_online
 from rov_ident.offline.prediction_error import curves, open_loop
 from rov_ident.sampling.raw_streams import Streams, gather
+from rov_ident.sampling.records import read_record
 from rov_ident.sampling.without_velocity import (
     has_velocity,
     is_without_velocity,
@@ -150,7 +151,7 @@ def fit(
     settings = Settings(stages, prior, weighted, process)
     with contextlib.ExitStack() as stack:
         if live:
-            records = [read(path, given, progress) for path in paths]
+            records = [read_record(path, given, say) for path in paths]
             for record in records:
                 if is_without_velocity(record.samples):
                     raise refusal(record.path.name)
@@ -233,7 +234,7 @@ def _reference(path: Path, config: Config, duration: float, say: Progress) -> di
     from rov_ident.estimation.reference_ukf import compare
 
     held = config.with_effects_held
-    samples = read(path, held, say).samples
+    samples = read_record(path, held, say).samples
     samples = samples[samples["t"] < samples["t"][0] + duration]
     return compare(held, samples, say)
 
