@@ -40,6 +40,7 @@ from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.reports.result import NORMAL
+from rov_ident.reports.table import with_unit
 from rov_ident.sampling.raw_streams import Streams
 
 _ALL = 0.98  # share of what a finding explains that counts as all of it: 2 % is no practical weight
@@ -215,7 +216,7 @@ def _axes(search: Search, final: Fitted, keys: Sequence[Key]) -> tuple[str, ...]
 
 def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
     values = ", ".join(
-        f"{n} = {v.value:.3g}{'' if v.unit == '1' else ' ' + v.unit} (± {NORMAL * v.std:.2g}, 95 %)"
+        f"{n} = {with_unit(f'{v.value:.3g}', v.unit)} (± {NORMAL * v.std:.2g}, 95 %)"
         for n, v in parameters.items()
     )
     return f"{EFFECTS[name].summary} {values}. The {improved(gain)}."

@@ -18,7 +18,7 @@ from rov_ident.model.equations import Array
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
 from rov_ident.reports.result import NORMAL, Figure
-from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate, number
+from rov_ident.reports.table import PLUS_MINUS, Table, Tables, estimate, number, with_unit
 from rov_ident.sampling import records
 
 UNITS = dict(zip(VELOCITIES, records.UNITS))
@@ -40,10 +40,6 @@ _SPEED_BINS = 11  # odd: one is about rest
 _LEAST = 20  # samples in a bin, below which its error means nothing
 _STILL = 0.05  # of the largest motion: below it an axis counts as not moved
 _GAP = 1.0  # s without a measurement: curves break
-
-
-def with_unit(text: str, unit: str) -> str:
-    return text if unit == "1" else f"{text} {unit}"
 
 
 def valued(name: str, v: Value) -> str:

@@ -19,6 +19,7 @@ from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.scales import authority
 from rov_ident.reports.result import NORMAL
+from rov_ident.reports.table import with_unit
 from rov_ident.sampling.records import VELOCITIES
 
 CAUSE = "rov-ident explain looks for the cause"
@@ -226,11 +227,11 @@ def consistency_of(
     for i in of_nuisance:
         name = prior.names[i]
         mean, half = prior.mean[i], NORMAL * prior.std[i]
-        off = abs(values[i] - mean) / prior.std[i]
+        off, asked = abs(values[i] - mean) / prior.std[i], f"{values[i]:.3g}"
         tests.append(
             Test(
                 f"{_PRIOR}{name}", float(off), SUPPOSED,
-                f"the data ask for {name} = {_with_unit(values[i], prior.units[i])}, which the "
+                f"the data ask for {name} = {with_unit(asked, prior.units[i])}, which the "
                 f"configuration takes for impossible ({mean:.3g} ± {half:.2g}): "
                 "check the wrench, the stamps and the vehicle's file, or say what is known of it",
             )
@@ -240,11 +241,11 @@ def consistency_of(
         by_clocks = np.array([STAMPS if unit == "s" else 0.0 for unit in prior.units])
         beyond = np.maximum(prior.lower - values, values - upper) / np.hypot(std, by_clocks)
         for i in np.flatnonzero(beyond > 0.0).tolist():
-            name = prior.names[i]
+            name, asked = prior.names[i], f"{values[i]:.3g}"
             tests.append(
                 Test(
                     f"bound of {name}", float(beyond[i]), _BEYOND,
-                    f"the data ask for {name} = {_with_unit(values[i], prior.units[i])}, which is "
+                    f"the data ask for {name} = {with_unit(asked, prior.units[i])}, which is "
                     "impossible: check that wrench, odometry and IMU are stamped by one clock, at "
                     f"the time of measurement; {CAUSE}",
                 )
@@ -259,8 +260,3 @@ def consistency_of(
             )
         )  # fmt: skip
     return Consistency(tuple(tests))
-
-
-def _with_unit(value: float, unit: str) -> str:
-    """A value with its unit, if it has one."""
-    return f"{value:.3g} {unit}".removesuffix(" 1")

@@ -32,7 +32,7 @@ from rov_ident.offline import archive
 from rov_ident.offline.batch_fit import AT_REST, fit_batch
 from rov_ident.offline.fit import Fit, fit_online, thrust_or_mass
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
-from rov_ident.reports.table import Table, Tables
+from rov_ident.reports.table import Table, Tables, with_unit
 from rov_ident.sampling.raw_streams import Streams, gather
 from rov_ident.sampling.records import Record, read_record
 from rov_ident.sampling.without_velocity import blanked, is_without_velocity
@@ -262,7 +262,7 @@ def _model_remarks(quick: Fit) -> Iterator[Remark]:
     columns = quick.values, own, prior.mean, prior.std
     values = dict(zip(quick.names, quick.values.tolist(), strict=True))
     seen = [
-        (*name.split("."), f"{x:.3g} ± {NORMAL * std:.2g} {unit}".removesuffix(" 1"), mean)
+        (*name.split("."), with_unit(f"{x:.3g} ± {NORMAL * std:.2g}", unit), mean)
         for name, unit, x, std, mean, wide in zip(quick.names, quick.units, *columns, strict=True)
         if "." in name and abs(x - mean) > max(SUPPOSED * std, _MATTERS * wide)
     ]

@@ -124,6 +124,10 @@ def number(x: float, digits: int = 3) -> str:
     return f"{round(x, decimals):.{max(decimals, 0)}f}"
 
 
+def with_unit(number: str, unit: str) -> str:
+    return number if unit == "1" else f"{number} {unit}"
+
+
 def estimate(value: float, doubt: float) -> tuple[str, str]:
     """A value with the digits that its doubt leaves, and the doubt: a standard deviation, or half
     of an interval."""
