@@ -15,6 +15,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
+from rov_ident.model.equations import INERTIA
 from rov_ident.reports.result import NORMAL, Figure, Result, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table, estimate
 
@@ -284,9 +285,7 @@ def _numbers_of_config(config: Config, label: str) -> Estimates:
         entries.append((f"{_BODY}{key}", unit, getattr(body, key)))
     for key in ("cog", "cob"):
         entries += [(f"{_BODY}{key}.{axis}", "m", x) for axis, x in zip("xyz", getattr(body, key))]
-    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-        name = f"{_BODY}inertia.{'xyz'[i]}{'xyz'[j]}"
-        entries.append((name, "kg m2", body.inertia[i, j]))
+    entries += [(f"{_BODY}inertia.{n}", "kg m2", body.inertia[at]) for n, at in INERTIA.items()]
     names, units, values = zip(*entries)
     none = np.zeros(len(names))
     return Estimates(label, names, units, np.array(values), none, none, is_config=True)

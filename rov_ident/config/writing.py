@@ -13,7 +13,7 @@ from rov_ident.config.schema import PARAMETERS, VEHICLE_PARAMETERS, Config
 from rov_ident.core.files import write_file
 from rov_ident.core.yaml_file import Dumper
 from rov_ident.model.coefficients import DIAGONAL, catalogue, input_catalogue
-from rov_ident.model.equations import RigidBody
+from rov_ident.model.equations import INERTIA, RigidBody
 
 
 def to_parameters(config: Config) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def vehicle_section(name: str, body: RigidBody) -> dict[str, Any]:
         "buoyancy": float(body.buoyancy),
         "cog": (body.cog + 0.0).tolist(),
         "cob": (body.cob + 0.0).tolist(),
-        "inertia": (body.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] + 0.0).tolist(),
+        "inertia": [float(body.inertia[at]) + 0.0 for at in INERTIA.values()],
     }
 
 

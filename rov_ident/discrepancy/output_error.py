@@ -28,10 +28,10 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.reading_noise import DRAWS
 from rov_ident.discrepancy.selection import variance_inflation
-from rov_ident.discrepancy.windowed_problem import INERTIA, ONSET_STEP, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
-from rov_ident.model.equations import Array, Indices
+from rov_ident.model.equations import INERTIA, Array, Indices
 from rov_ident.model.scales import semi_axes
 from rov_ident.sampling.raw_streams import PAUSE
 
@@ -160,7 +160,7 @@ class Fitted:
         known = config.vehicle_uncertainty
         moments = np.diag(body.inertia)
         own = [known.mass_std * body.mass]
-        own += [known.inertia_std * np.sqrt(moments[i] * moments[j]) for i, j in INERTIA]
+        own += [known.inertia_std * np.sqrt(moments[i] * moments[j]) for i, j in INERTIA.values()]
         thrust = problem.thrust(h.effects)[0]
         stronger = thrust[:, :, None] * config.wrench.scale_std
         axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]

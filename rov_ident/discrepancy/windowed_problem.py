@@ -40,7 +40,7 @@ from rov_ident.discrepancy.reading_noise import SMALL, draws
 from rov_ident.effects import EFFECTS, Values, compiled, steered
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
-from rov_ident.model.equations import Array, Model, RigidBody
+from rov_ident.model.equations import INERTIA, Array, Model, RigidBody
 from rov_ident.sampling.raw_streams import Streams, orientation_at
 from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
@@ -55,8 +55,6 @@ _COUNTED_SECONDS = 120.0  # to fit, of three minutes: a shorter dive may take as
 _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
-
-INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz
 
 Spans = list[tuple[float, float]]  # from and to [s] each
 Simulated = Hypothesis | Sequence[Hypothesis]  # one model, or that of each window
@@ -366,7 +364,7 @@ class WindowedProblem:
         """What a kilogram more of mass (of the same weight) and 1 kg m2 more of each moment and
         product of inertia, in the order of ``inertia``, adds to the wrench, (K, 6, 7)."""
         others = [replace(body, mass=body.mass + 1.0)]
-        for i, j in INERTIA:
+        for i, j in INERTIA.values():
             more = np.zeros((3, 3))
             more[i, j] = more[j, i] = 1.0
             others.append(replace(body, inertia=body.inertia + more))

@@ -45,6 +45,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 GRAVITY = 9.81  # m/s2, where nothing else is said
+INERTIA = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
+"""Entries of the tensor of inertia, in the order in which files have them."""
 
 
 class Structure(NamedTuple):

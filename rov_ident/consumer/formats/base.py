@@ -15,9 +15,10 @@ import numpy as np
 from rov_ident.config import Config, Thrusters
 from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
+from rov_ident.model import equations
 from rov_ident.model.coefficients import DIAGONAL, Coefficient
 
-INERTIA = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
+INERTIA = {f"i{name}": place for name, place in equations.INERTIA.items()}
 """The place of each element in the tensor."""
 
 
