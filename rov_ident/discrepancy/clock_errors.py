@@ -43,11 +43,8 @@ class ClockErrors:
 
 def of(bags: Sequence[Streams], config: Config) -> ClockErrors:
     """The errors of the clocks of some bags, the worst of each kind."""
+    tests = [test for bag in bags for test in delays.tests_of(bag, config)]
     return ClockErrors(
-        max(_ahead(bag, config) for bag in bags),
+        max((test.value for test in tests if not test.passed), default=0.0),
         max(delays.surely_behind_imu(bag, config) for bag in bags),
     )
-
-
-def _ahead(streams: Streams, config: Config) -> float:
-    return max((t.value for t in delays.tests_of(streams, config) if not t.passed), default=0.0)

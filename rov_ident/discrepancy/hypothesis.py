@@ -224,11 +224,6 @@ def axis_of(key: Key) -> str:
     return AXES[parse(name).row] if section == COEFFICIENTS else parameter(key).axis
 
 
-def moves_input(p: EffectParameter, h: Hypothesis) -> bool:
-    """Whether a parameter belongs to no input, or to one that is heard and does something."""
-    return not p.input or (p.input in h.model.inputs and p.input in h.config.inputs.joints)
-
-
 def units(effect: Effect, h: Hypothesis, roles: Container[str]) -> list[tuple[Key, ...]]:
     """The parameters of an effect that ``h`` lacks, in the groups in which they may join."""
     if effect.coefficients:
@@ -238,7 +233,9 @@ def units(effect: Effect, h: Hypothesis, roles: Container[str]) -> list[tuple[Ke
     mine = [(effect.name, p.name) for p in effect.parameters if p.role in roles]
     if effect.steer and not any(f in h.config.inputs.joints for f in h.model.inputs if f != "n"):
         return []
-    mine = [key for key in mine if moves_input(parameter(key), h)]
+    # of none of the inputs, or of one that is heard and does something
+    heard = {"", *h.model.inputs} & {"", *h.config.inputs.joints}
+    mine = [key for key in mine if parameter(key).input in heard]
     if any(p.axis or p.input for p in effect.parameters):
         return [(key,) for key in mine if key not in h.values]
     return [] if effect.name in h.effects else [tuple(mine)]
