@@ -24,12 +24,13 @@ from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
 from rov_ident.io import topics
+from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.offline import archive
 from rov_ident.offline.fit import Fit, rmse_change
 from rov_ident.offline.prediction_error import open_loop
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables
-from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, numbers
+from rov_ident.sampling.records import HORIZON, UNITS, numbers
 from rov_ident.sampling.without_velocity import is_without_velocity
 
 _WORSE = 1.05  # of two errors: 5 % is the scatter between dives, as in `estimation.consistency`

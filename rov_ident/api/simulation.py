@@ -18,12 +18,12 @@ from rov_ident.core.progress import Progress
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.effects import compiled
 from rov_ident.io.write_messages import write_messages
+from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table
 from rov_ident.sampling.records import (
     HORIZON,
     UNITS,
-    VELOCITIES,
     Score,
     measured_motion,
     numbers,

@@ -8,10 +8,11 @@ import numpy as np
 
 from rov_ident.config import Config
 from rov_ident.estimation.online import Report
+from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
 from rov_ident.reports.result import NORMAL
-from rov_ident.sampling.records import HORIZON, UNITS, VELOCITIES, Record, predicted, score
+from rov_ident.sampling.records import HORIZON, UNITS, Record, predicted, score
 
 
 def history_of(reports: Sequence[Report]) -> plots.History:

@@ -16,11 +16,10 @@ from rov_ident.core.linalg import widened
 from rov_ident.core.messages import Array
 from rov_ident.core.states import IDENTIFIABLE, State
 from rov_ident.estimation.process_noise import FIRST_FORCE
-from rov_ident.model.coefficients import AXES
+from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.scales import authority
 from rov_ident.reports.result import NORMAL
 from rov_ident.reports.table import with_unit
-from rov_ident.sampling.records import VELOCITIES
 
 CAUSE = "rov-ident explain looks for the cause"
 _PRIOR = "prior of "  # begins the name of such a test

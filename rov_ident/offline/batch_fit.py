@@ -29,7 +29,7 @@ from rov_ident.core.states import CONTRADICTED, IDENTIFIABLE, State, of_fit
 from rov_ident.estimation.consistency import Test, consistency_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
-from rov_ident.model.coefficients import MOTIONS, Coefficient
+from rov_ident.model.coefficients import MOTIONS, VELOCITIES, Coefficient
 from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares, maximum_likelihood
@@ -37,7 +37,7 @@ from rov_ident.offline.archive import Archive, ReadBag, Samples, total
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
-from rov_ident.sampling.records import HORIZON, VELOCITIES, numbers
+from rov_ident.sampling.records import HORIZON, numbers
 from rov_ident.sampling.sample import free_axes, parts
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from rov_ident.core.messages import Array
+from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import Curves
 from rov_ident.reports import plots
 from rov_ident.reports.html import beside_table, bullets, heading, legend, origin, panels, paragraph
 from rov_ident.reports.html import page as document
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.records import HORIZON, VELOCITIES
+from rov_ident.sampling.records import HORIZON
 
 _BEFORE, _AFTER = "as configured", "retuned"
 _MOST = 4  # bags that are drawn
@@ -75,7 +76,7 @@ def _bars(before: Array, after: Array, key: str) -> str:
         if not np.isfinite(before[pick]).any():
             continue  # not measured
         models = {_BEFORE: before[pick], _AFTER: after[pick]}
-        drawn = plots.bars(VELOCITIES[pick], models, f"RMSE, {label} [{unit}]", unit)
+        drawn = plots.bars(list(VELOCITIES[pick]), models, f"RMSE, {label} [{unit}]", unit)
         parts.append(plots.zoomable(drawn, f"{key}-{label}"))
     return panels(parts, "Root mean square error over all bags.")
 

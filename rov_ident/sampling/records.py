@@ -15,7 +15,7 @@ from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
-from rov_ident.model.coefficients import INPUTS
+from rov_ident.model.coefficients import INPUTS, VELOCITIES
 from rov_ident.model.equations import Model
 from rov_ident.sampling.sample import NO_MOMENT, after_reset, free_axes, joined, stretches
 from rov_ident.sampling.sampler import Sampler
@@ -25,7 +25,6 @@ from rov_ident.simulation.open_loop import open_loop
 from rov_ident.simulation.virtual_sensors import Dive
 
 HORIZON = 10.0  # s; of the open-loop windows by which models are judged
-VELOCITIES = tuple("uvwpqr")
 UNITS = ("m/s",) * 3 + ("rad/s",) * 3
 
 
