@@ -12,7 +12,8 @@ def act(p, state, t, dt, wrench):
 
 EFFECT = Effect(
     place="input",
-    summary="All thrusters give more or less than commanded, by one factor.",
+    summary="All thrusters give more or less than commanded, by one factor; or mass and inertia "
+    "are off by its inverse.",
     within="thruster_gain",
     traits=("likely", "factor", "neglecting"),
     manoeuvre="steps of thrust together with motion along the other axes, and at two tilts",

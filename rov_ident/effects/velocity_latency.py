@@ -9,6 +9,7 @@ from rov_ident.effects.base import Effect, EffectParameter
 EFFECT = Effect(
     place="motion",
     summary="The linear velocities are late against pose, angular velocities and thrust.",
+    blurs=("velocity_scale",),  # a filter makes quick motion smaller, too
     manoeuvre="quick reversals of thrust along each axis, with a position fix or an IMU",
     source="Kelly, Sukhatme (2014), A general framework for temporal calibration of multiple "
     "proprioceptive and exteroceptive sensors, Experimental Robotics (Springer)",
