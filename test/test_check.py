@@ -243,6 +243,29 @@ def test_the_command(heavy_path, messages, tmp_path):
     assert result["coefficients"]["X_u"]["predicted_std"] > 0.0
 
 
+@pytest.mark.parametrize("factor, told", [(-1.0, BAD), (-0.1, GOOD)])
+def test_the_sign_of_a_wrench_shows_only_where_it_moves_the_vehicle(checked, factor, told):
+    """A controller's small moment against a large one of the water has no wrong sign."""
+
+    def change(role, m):
+        if not isinstance(m, Wrench):
+            return m
+        return m._replace(torque=np.array([1.0, factor, 1.0]) * m.torque)
+
+    found = of(checked(change), "wrench against motion")
+    assert found.level == told and ("against the wrench in pitch" in found.text) == (told == BAD)
+
+
+def test_motion_in_a_pause_of_the_velocities_is_not_compared_with_the_wrench(checked, messages):
+    begin = messages[0][2].stamp
+
+    def change(role, m):
+        paused = 5e9 < m.stamp - begin < 35e9
+        return None if isinstance(m, Odometry) and paused else m
+
+    assert of(checked(change), "wrench against motion").level == GOOD
+
+
 # ------------------------------------------------------------------ what the data say of the model
 
 

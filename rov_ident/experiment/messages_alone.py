@@ -31,6 +31,7 @@ _REVERSED = -0.3  # correlation of two measurements of one thing; below it the s
 _ANGULAR_LEAST, _LINEAR_LEAST, _MOTION_LEAST = 0.7, 0.5, 0.5  # correlation that good sensors reach:
 # half of the variance is common; of position and motion, which are noisier, a quarter
 _UNITS = 2.0  # times too large or small; noise and lateness do not make a rate twice the turn
+_OTHER_FORCES = 3.0  # times the wrench; where so much else moves it (a Munk moment), no sign shows
 _UNMOVED = 0.1  # of the wrench; neither a guess nor a thrust scale is ten times off
 _STILL = 1e-4  # m or rad/s; nothing moves
 _MOVES = 0.05  # m or rad/s RMS, from which a poor correlation is worth a word
@@ -196,7 +197,8 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
         text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
         return [Remark(subject, BAD, text, hopeless=True)]
-    by_name = {MOTIONS[i]: _correlation(wrench[:, i], moved[:, i]) for i in np.flatnonzero(driven)}
+    judged = driven & (np.sqrt(np.mean(moved**2, axis=0)) < _OTHER_FORCES * size)
+    by_name = {MOTIONS[i]: _correlation(wrench[:, i], moved[:, i]) for i in np.flatnonzero(judged)}
     push = _correlation_remark(
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
