@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import yaml
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfilt
 from tiers import more
 
 from bench import HEAVY
@@ -17,12 +17,14 @@ from rov_ident.core.frames import quaternion_from_rotation_vector, quaternion_mu
 from rov_ident.core.messages import WRENCH
 from rov_ident.discrepancy import extension
 from rov_ident.discrepancy.explain import explain
-from rov_ident.discrepancy.findings import parameters_of
+from rov_ident.discrepancy.findings import _is_sure_factor, parameters_of
 from rov_ident.discrepancy.held_out import Judge, split, thinned, windows
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
-from rov_ident.discrepancy.output_error import fit
+from rov_ident.discrepancy.output_error import fit, refit
+from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.effects import EFFECTS
+from rov_ident.model.coefficients import AXES
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.virtual_sensors import Suite, dive
@@ -111,6 +113,38 @@ def test_weaker_thrust_is_one_factor(seed):
     value = found.parameters["scale"]
     assert abs(value.value - 0.85) < max(4.0 * value.std, 0.01)
     assert "thruster_gain" not in [a.effect for a in found.alternatives if "as well" in a.why_not]
+
+
+@pytest.mark.parametrize("seed", [5, *more(2, 3)])
+@pytest.mark.parametrize("weak, named, told", [("XYN", "ZN", "N"), ("N", "N", "N")])
+def test_the_thrust_of_an_axis_is_compared_with_that_of_the_others(seed, weak, named, told):
+    """With surge, sway and yaw too weak, heave may look too strong instead: that is not sure. But
+    of one axis alone it is, as all others together would have to be off alike."""
+    gains = dict(zip(weak, np.random.default_rng([seed, 21]).uniform(0.8, 0.92, len(weak))))
+    case = draw(seed, conditions=MINUTE)
+    streams = streams_of(case)
+    read = streams.demand / [gains.get(axis, 1.0) for axis in AXES]
+    streams = dataclasses.replace(streams, demand=read)
+    search = Search(streams, case.config, split(streams.duration)[0])
+    rest = search.start()
+    keys = [("thruster_gain", f"gain_{axis}") for axis in named]
+    final = refit(rest.hypothesis.having(dict.fromkeys(keys, 1.0)), rest.linearisation)
+    sure = [key[1][-1] for key in keys if _is_sure_factor(search, final, rest, key)]
+    assert sure == list(told)
+
+
+@pytest.mark.parametrize("seed", [3, *more(6)])
+def test_velocities_behind_a_filter_have_no_sure_scale(seed):
+    """A filter of 0.5 Hz makes them late, and quick ones smaller."""
+    case = draw(seed, conditions=MINUTE)
+    streams = streams_of(case)
+    nu = streams.nu.copy()
+    rate = 1.0 / float(np.median(np.diff(streams.t)))
+    nu[:, :3] = sosfilt(butter(2, 0.5, fs=rate, output="sos"), nu[:, :3], axis=0)
+    findings = explain([dataclasses.replace(streams, nu=nu)], case.config).findings
+    assert "velocity_latency" in [f.effect for f in findings.effects]
+    sure = [f.effect for f in (*findings.effects, *findings.minor) if f.separable]
+    assert "velocity_scale" not in sure
 
 
 @pytest.mark.parametrize("seed", [2, *more(5)])

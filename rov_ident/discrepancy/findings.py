@@ -72,29 +72,23 @@ def finding(
     stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
     values = final.hypothesis.values
     separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)
-    separable = separable and _whichever_others_are_off(search, final, name, keys)
+    if separable and "factor" in EFFECTS[name].traits:
+        separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
     begin = None if onset is None else onset.value
     words = sentence(name, parameters, gain)
     found = Finding(name, axes, parameters, begin, gain, True, None, alternatives, words)
     return found if separable else unsure(found)
 
 
-def _whichever_others_are_off(
-    search: Search, final: Fitted, name: str, keys: Sequence[Key]
-) -> bool:
-    """Whether each factor of the thrust of an axis surely differs from one though those of the
-    other axes may, too. The inertia and the drag of an axis go with its thrust, so that it is
-    compared with that of the others: with surge and sway too weak, heave looks too strong.
+def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bool:
+    """Whether no factors of the thrust of other axes explain as much as that of one, by as few.
+
+    The inertia and the drag of an axis go with its thrust, so that it is compared with that of the
+    others: with surge and sway too weak, heave looks too strong.
     """
-    if "factor" not in EFFECTS[name].traits:
-        return True
-    others = [k for unit in search.screening.units(EFFECTS[name], final.hypothesis) for k in unit]
-    begin = final.hypothesis.having({k: bounds(k)[0] for k in others})
-    larger = refit(begin, final.linearisation) if others else final
-    if larger is None:
-        return False
-    wide = larger.covariance + larger.covariance_of_the_file
-    return all(_differs_from_null(larger, [k], wide) for k in keys)
+    other = search.with_other_factors(final, rest, key)
+    far = other is None or search.cost(other, final) - search.cost(final, final) > VERY_STRONG
+    return far
 
 
 def _alternatives(

@@ -297,6 +297,14 @@ class Search:
         rest = fitted.hypothesis.without(self.keys_of(fitted, name))
         return refit(rest, fitted.linearisation)
 
+    def with_other_factors(self, final: Fitted, rest: Fitted, key: Key) -> Fitted | None:
+        """The fit that has in place of one parameter of an effect, in ``final`` and not in
+        ``rest``, those of other axes that are worth their penalty."""
+        h = final.hypothesis.without([key])
+        others = [k for u in self.screening.units(EFFECTS[key[0]], h) for k in u if k != key]
+        begin = h.having({k: bounds(k)[0] for k in others})
+        return self._pruned(refit(begin, final.linearisation), rest) if others else None
+
     def _rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
         """What else might explain what ``name`` explains: fits by the name of the rival."""
         lacking, h = self.screening.lacks_plainer, rest.hypothesis
