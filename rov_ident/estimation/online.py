@@ -32,7 +32,7 @@ from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.process_noise import FIRST_FORCE
-from rov_ident.estimation.recent_messages import LOOK_BACK, RecentMessages
+from rov_ident.estimation.recent_messages import RecentMessages
 from rov_ident.estimation.shared import INFO, informative_axes, noisy_axes, too_noisy
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.sample import after_reset, joined
@@ -298,7 +298,7 @@ class OnlineEstimator:
                 self._follow_excitation()
                 if len(self._about):
                     self._recentre()
-            self._recent.forget_before(self.stamp - round(LOOK_BACK * 1e9))
+            self._recent.forget(self._last_t)
         if self.monitor is not None and self.sampler.commands is not None:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:

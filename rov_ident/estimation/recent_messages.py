@@ -18,25 +18,28 @@ from rov_ident.sampling.sampler import Sampler
 LOOK_BACK = 120.0
 """s; a choice: in two minutes a lag becomes known, and to learn from them again takes a second or
 two, in which messages wait."""
-_MOST = 100_000  # messages; were all topics at 200 Hz, two minutes had fewer
+_MOST = 50_000  # messages, some 60 MB: of two minutes, if all topics together have 400 Hz
 
 
 class RecentMessages:
     """Roles and messages of the last LOOK_BACK seconds, as they came."""
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[str, Message]] = deque(maxlen=_MOST)
+        # with the time when they came: their stamps may be anything
+        self._kept: deque[tuple[float, str, Message]] = deque(maxlen=_MOST)
+        self._now = 0.0
 
     def add(self, role: str, message: Message) -> None:
-        self._kept.append((role, message))
+        self._kept.append((self._now, role, message))
+
+    def forget(self, now: float) -> None:
+        """It is the time ``now`` [s] of samples; drop what came long before."""
+        self._now = now
+        while self._kept and self._kept[0][0] < now - LOOK_BACK:
+            self._kept.popleft()
 
     def clear(self) -> None:
         self._kept.clear()
-
-    def forget_before(self, stamp: int) -> None:
-        """Drop the oldest of them up to the first that is not before ``stamp`` [ns]."""
-        while self._kept and self._kept[0][1].stamp < stamp:
-            self._kept.popleft()
 
     def samples(
         self, config: Config, about: Config, kinematics: NDArray[np.void], origin: int | None,
@@ -49,6 +52,6 @@ class RecentMessages:
         sampler.recentre(about)
         sampler.origin = origin
         sampler.kinematic_filter.begin_with(kinematics)
-        made = [sampler.push(role, message) for role, message in self._kept]
+        made = [sampler.push(role, message) for _, role, message in self._kept]
         samples = joined([part for part in made if len(part)] or [sampler.flush()])
         return samples[samples["t"] <= last]
