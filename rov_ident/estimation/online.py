@@ -49,8 +49,8 @@ a sample is then wrong by is of second order in this."""
 # A time (a lag, a delay) does not act linearly: "Times" in docs/live.md has the study.
 _SETTLING_TIME = 5.0  # s; that samples are made with the same value of a time at least
 _LEARNT = 0.5  # prior standard deviations, below which an estimate of a time is followed
-_OUTDATED = 0.25  # prior standard deviations, from which what was learnt with another value is
-# given up
+# prior standard deviations, from which what was learnt with another value is given up
+_OUTDATED: dict[Kind, float] = {"rls": 0.05, "ukf": 0.25}
 EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
@@ -256,7 +256,7 @@ class OnlineEstimator:
         self.flush()
 
     def _sampled(self, role: str, message: Message) -> NDArray[np.void]:
-        if self._is_time.any():
+        if self._update and self._is_time.any():
             self._recent.add(role, message)
         return self.sampler.push(role, message)
 
@@ -356,14 +356,15 @@ class OnlineEstimator:
             self._settled = self._last_t
         early = abs(self._last_t - self._settled) < _SETTLING_TIME
         if not at_once:
-            far = np.abs(now - self._learnt_about) > _OUTDATED * unit
+            far = np.abs(now - self._learnt_about) > _OUTDATED[self.kind] * unit
             known = std < np.where(far, np.minimum(_LEARNT * unit, self._firmest), _LEARNT * unit)
             now = np.where(self._is_time & (early | ~known), self._about, now)
         if not (np.abs(now - self._about) > _RECENTRE * std).any():
             return
         whole = dict(zip(self.prior.names, physical(self.config.dynamics, self.prior, raw)))
         self._centre({**whole, **dict(zip(self.config.effect_names, now.tolist(), strict=True))})
-        outdated = self._is_time & (np.abs(now - self._learnt_about) > _OUTDATED * unit)
+        moved = np.abs(now - self._learnt_about) > _OUTDATED[self.kind] * unit
+        outdated = self._is_time & moved
         if outdated.any() and not at_once:
             self._firmest = np.where(outdated, std, self._firmest)
             self._begin_with(self._origin)
@@ -372,9 +373,10 @@ class OnlineEstimator:
     def _learn_again(self) -> None:
         """From the recent messages, with the parameters of effects as samples have them now.
 
-        Not while kernels are interpreted, when it would take minutes.
+        Not while kernels are interpreted, when it would take minutes. And RLS alone, which iterates
+        its update: the UKF's first half minute would be as poor again.
         """
-        if interpreting():
+        if not self._update or interpreting():
             return
         samples = self._recent.samples(
             self.config, self._centre_config, self._origin.kinematics, self.sampler.origin,
