@@ -256,6 +256,19 @@ def test_the_sign_of_a_wrench_shows_only_where_it_moves_the_vehicle(checked, fac
     assert found.level == told and ("against the wrench in pitch" in found.text) == (told == BAD)
 
 
+@pytest.mark.parametrize("factor", [0.06, 0.07])
+def test_where_other_forces_move_it_on_every_axis_no_sign_is_called_right(checked, factor):
+    """Shares of the largest thrust, say, from a driver that says newtons."""
+
+    def change(role, m):
+        if not isinstance(m, Wrench):
+            return m
+        return m._replace(force=factor * m.force, torque=factor * m.torque)
+
+    found = of(checked(change), "wrench against motion")
+    assert found.level == WARNING and "check its units" in found.text
+
+
 def test_motion_in_a_pause_of_the_velocities_is_not_compared_with_the_wrench(checked, messages):
     begin = messages[0][2].stamp
 

@@ -199,7 +199,8 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         return [Remark(subject, BAD, text, hopeless=True)]
     judged = driven & (np.sqrt(np.mean(moved**2, axis=0)) < _OTHER_FORCES * size)
     by_name = {MOTIONS[i]: _correlation(wrench[:, i], moved[:, i]) for i in np.flatnonzero(judged)}
-    push = _correlation_remark(
+    small = "what moves the vehicle is far more than the wrench on every axis: check its units"
+    push = Remark(subject, WARNING, small) if not by_name else _correlation_remark(
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
         "frames.body); or a controller works there against what the model lacks",
