@@ -15,6 +15,7 @@ from rov_ident.config.prior import STAMPS, Prior
 from rov_ident.core.linalg import widened
 from rov_ident.core.messages import Array
 from rov_ident.core.states import IDENTIFIABLE, State
+from rov_ident.core.whiteness import BY_CHANCE
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.scales import authority
@@ -30,7 +31,6 @@ SUPPOSED = 2.8
 _SELDOM = 1.645  # normal deviate that 5 % exceed, as of SUPPOSED
 _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
-_BY_CHANCE = 1.25  # of summed white innovations over what is expected, in one dive of a thousand
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
 _RUINED = 3.0  # times the error before, whatever the uncertainty: clean dives fitted from the right
@@ -57,7 +57,7 @@ class Test:
         """How many times larger errors are than stated, if that is what the value comes from: of
         innovations, which are said to add up to 1, the value, also within the limit, but for what
         chance makes of it."""
-        not_white = self.name.startswith(_WHITENESS) and self.value > _BY_CHANCE
+        not_white = self.name.startswith(_WHITENESS) and self.value > BY_CHANCE
         return self.value if not_white else self.value / self.limit
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.jit import inlined, record
-from rov_ident.core.whiteness import LARGEST, SUM_TIME, averaged
+from rov_ident.core.whiteness import BY_CHANCE, LARGEST, SUM_TIME, averaged
 
 # "Constants of the process noise" and "Forgetting" are tables of docs/accuracy.md.
 FIRST_TIME, TIME = 1.0, 20.0  # s; twice the power doubles the density: at first, later (same table)
@@ -77,7 +77,9 @@ def watch(m, process, i, room, moving, own, gate, innovation, considered):
     ``moving``: whether any velocity is; where none is (on the ground, on deck), what holds the
     vehicle says nothing of a dive. ``own``: whether that of this axis is. ``room``: the power of
     summed innovations, 1 being expected, from which process noise is added; noise added by chance
-    does not go away by chance, and the less room, the more information it costs.
+    does not go away by chance, and the less room, the more information it costs. There is none
+    while the power of the last minute is no chance: a model that fails in some manoeuvres only
+    would, with the noise of all others, be learnt from as if it were right.
 
     ``considered``: the correlation of the innovation with the error of what is considered and not
     estimated. That stays the same, so its share of successive innovations adds up, not its square.
@@ -99,7 +101,8 @@ def watch(m, process, i, room, moving, own, gate, innovation, considered):
         if m.seen > TIME and m.driven > _LESSON:
             m.judged += m.since
             m.power = averaged(m.power, m.judged, m.since, m.summed, expected)
-        excess = min(m.summed * m.summed / expected, STEADY) - room
+        allowed = room if m.power < BY_CHANCE**2 else 1.0
+        excess = min(m.summed * m.summed / expected, STEADY) - allowed
         blend = min(m.since / min(FIRST_TIME + 0.25 * m.seen, TIME), _FASTEST)
         density = max(m.density + blend * excess * m.acting, process.floor[i])
         m.density = min(density, process.largest[i])

@@ -49,8 +49,7 @@ a sample is then wrong by is of second order in this."""
 # A time (a lag, a delay) does not act linearly: "Times" in docs/live.md has the study.
 _SETTLING_TIME = 5.0  # s; that samples are made with the same value of a time at least
 _LEARNT = 0.5  # prior standard deviations, below which an estimate of a time is followed
-# prior standard deviations, from which what was learnt with another value is given up
-_OUTDATED: dict[Kind, float] = {"rls": 0.05, "ukf": 0.25}
+_OUTDATED = 0.05  # prior standard deviations; by less a time never counts as having moved
 EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
 long enough for some manoeuvres of a few seconds, short enough to notice a vehicle at rest."""
@@ -183,7 +182,9 @@ class OnlineEstimator:
         self._safe = self.prior.mean.copy()
         self._centre(first_centre(self.config))
         self._learnt_about, self._settled = self._about, math.nan
-        self._firmest = np.full(len(self._about), np.inf)  # std of times, when last learnt anew
+        # by how much times had moved when all was last learnt anew, and their std then
+        self._last_move = np.zeros(len(self._about))
+        self._firmest = np.full(len(self._about), np.inf)
         if self.monitor is not None:
             self.monitor.reset()
         self._begin_at(self.memory())
@@ -256,7 +257,7 @@ class OnlineEstimator:
         self.flush()
 
     def _sampled(self, role: str, message: Message) -> NDArray[np.void]:
-        if self._update and self._is_time.any():
+        if self._is_time.any():
             self._recent.add(role, message)
         return self.sampler.push(role, message)
 
@@ -343,9 +344,10 @@ class OnlineEstimator:
         """Have the sampler take over the parameters of effects as they are estimated now.
 
         But not for changes far below their uncertainty, as samples are right to first order. A time
-        is followed once the data know it. After a long step all is learnt anew: information gained
-        about another value claims to know what it does not. Each such step needs more information
-        than the one before, or two values might take turns. ``at_once``: a memory was recalled.
+        is followed once the data know it. Once it has moved by more than its uncertainty, all is
+        learnt anew: information gained about another value claims to know what it does not. To move
+        back needs more information than there was at the move before, or two values might take
+        turns. ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         own = slice(len(self.config.estimate), None)
@@ -355,28 +357,30 @@ class OnlineEstimator:
         if math.isnan(self._settled):
             self._settled = self._last_t
         early = abs(self._last_t - self._settled) < _SETTLING_TIME
+        outdated = np.maximum(_OUTDATED * unit, raw.std[own])
         if not at_once:
-            far = np.abs(now - self._learnt_about) > _OUTDATED[self.kind] * unit
-            known = std < np.where(far, np.minimum(_LEARNT * unit, self._firmest), _LEARNT * unit)
+            move = now - self._learnt_about
+            back = (np.abs(move) > outdated) & (np.sign(move) != np.sign(self._last_move))
+            known = (std < _LEARNT * unit) & ~(back & (std >= self._firmest))
             now = np.where(self._is_time & (early | ~known), self._about, now)
         if not (np.abs(now - self._about) > _RECENTRE * std).any():
             return
         whole = dict(zip(self.prior.names, physical(self.config.dynamics, self.prior, raw)))
         self._centre({**whole, **dict(zip(self.config.effect_names, now.tolist(), strict=True))})
-        moved = np.abs(now - self._learnt_about) > _OUTDATED[self.kind] * unit
-        outdated = self._is_time & moved
-        if outdated.any() and not at_once:
-            self._firmest = np.where(outdated, std, self._firmest)
+        move = now - self._learnt_about
+        far = self._is_time & (np.abs(move) > outdated)
+        if far.any() and not at_once:
+            self._last_move = np.where(far, move, self._last_move)
+            self._firmest = np.where(far, std, self._firmest)
             self._begin_with(self._origin)
             self._learn_again()
 
     def _learn_again(self) -> None:
         """From the recent messages, with the parameters of effects as samples have them now.
 
-        Not while kernels are interpreted, when it would take minutes. And RLS alone, which iterates
-        its update: the UKF's first half minute would be as poor again.
+        Not while kernels are interpreted, when it would take minutes.
         """
-        if not self._update or interpreting():
+        if interpreting():
             return
         samples = self._recent.samples(
             self.config, self._centre_config, self._origin.kinematics, self.sampler.origin,

@@ -226,15 +226,16 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
     n, place = len(task.scale), np.argsort(state.order)
     inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
-    information = inverse @ inverse.T
+    own = inverse @ inverse.T
     solution = (inverse @ state.root[:, n])[place]
     unit = task.scale[:, None] * _jacobian(task, solution)
-    covariance = calibrated(information, state.score)[np.ix_(place, place)]
+    order = np.ix_(place, place)
     return Estimate(
         prior.names,
         _values(task, solution),
-        unit @ covariance @ unit.T,
+        unit @ calibrated(own, state.score)[order] @ unit.T,
         float(state.scalars["t"][0]),
+        unit @ own[order] @ unit.T,
     )
 
 
