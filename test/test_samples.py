@@ -16,7 +16,7 @@ from rov_ident.sampling.despiking import despike
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.sample import SAMPLE, after_reset, joined
 from rov_ident.sampling.sampler import Sampler
-from rov_ident.sampling.validation import NEW_FRAME, describe
+from rov_ident.sampling.validation import AHEAD, NEW_CLOCK, NEW_FRAME, describe
 from rov_ident.simulation import virtual_sensors as sensors
 
 SECOND = 1_000_000_000
@@ -641,12 +641,36 @@ def test_a_bag_that_starts_over(heavy, jump):
     first = list(steady(100.0, 110.0))
     begin = 100.0 if jump == 0.0 else 110.0 + jump
     samples, sampler = taken(heavy, first + list(steady(begin, begin + 10.0)))
-    assert sampler.counts["clock: jumps, buffers restarted"] >= 1
+    assert sampler.counts[AHEAD if jump > 0.0 else NEW_CLOCK] >= 1
     assert samples["restart"].sum() == 2
     assert len(samples) == pytest.approx(400, abs=6)
     assert np.isfinite(samples["nu"]).all()
     k = np.flatnonzero(samples["restart"])[1]
     assert (np.diff(samples["t"][:k]) > 0).all() and (np.diff(samples["t"][k:]) > 0).all()
+
+
+@pytest.mark.parametrize("role", [ODOMETRY, IMU, WRENCH])
+def test_a_topic_that_was_silent_goes_on(heavy, role):
+    """For far longer than a clock may jump ahead: the other topics' stamps tell that none did."""
+    messages = [
+        (r, m) for r, m in steady(100.0, 150.0) if r != role or not 105.0 < m.stamp / SECOND < 140.0
+    ]
+    samples, sampler = taken(heavy, messages)
+    assert not any("clock" in name or "stamp" in name for name in sampler.counts)
+    assert sampler.counts[role] == sum(r == role for r, _ in messages)
+    assert samples["t"][-1] > 49.9
+    assert not any("clock" in note or "stamp" in note for note in gather(messages, heavy).notes)
+
+
+@pytest.mark.parametrize("role", [ODOMETRY, IMU, WRENCH])
+def test_a_topic_whose_clock_is_set_ahead_restarts(heavy, role):
+    """Alone: no pause of this topic makes its stamps run ahead of the others'."""
+    ahead = [
+        (r, m._replace(stamp=m.stamp + 60 * SECOND) if r == role else m)
+        for r, m in steady(110.0, 120.0)
+    ]
+    _, sampler = taken(heavy, [*steady(100.0, 110.0), *ahead])
+    assert sampler.counts[AHEAD] == 1
 
 
 @pytest.mark.parametrize("step", [0.3, 0.2, -0.15, -0.3, -0.8])

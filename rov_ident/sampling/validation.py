@@ -7,18 +7,21 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 
-from rov_ident.core.messages import Joints, Message, Odometry, fault
+from rov_ident.core.messages import ODOMETRY, Joints, Message, Odometry, fault
 
 NEW_CLOCK = "clock: jumps, buffers restarted"
 """Counted where stamps restart: a bag that starts over, another computer."""
+AHEAD = "clock: stepped ahead, or all topics silent, buffers restarted"
+"""Counted where stamps go on far ahead of those of all topics, as they do after a pause of all."""
 NEW_FRAME = "frame: another has the majority, buffers restarted"
 """Counted where a topic continues in another frame."""
-RESTARTS = (NEW_CLOCK, NEW_FRAME)
+RESTARTS = (NEW_CLOCK, AHEAD, NEW_FRAME)
 REPEATED = 2e3
 """The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""
 
-_LARGEST_JUMP = 10.0  # s; a stamp this far ahead, or _LARGEST_STEP_BACK behind, is another clock:
-_LARGEST_STEP_BACK = 1.0  # s; topics that are reordered or lost for a while stay well within both
+_LARGEST_JUMP = 10.0  # s; a stamp this far ahead of the stamps of all topics, or ...
+_LARGEST_STEP_BACK = 1.0  # s behind that of its own, may be of another clock: topics that are
+# reordered, or lost for a while together, stay well within both
 _AGREEMENT = 1.0  # s; two stamps out of line that are so close to one another are of one new clock
 CLOCK_STEP = 0.1  # s; ntpd steps clocks by 0.128 s and more, systemd by 0.4 s, and slews by less
 _REASONS = 100  # so many names of refusals are kept, so that a log cannot be flooded with them
@@ -110,7 +113,11 @@ class Validation:
         if last is None:
             return ""
         step = (stamp - last) * 1e-9
-        if 0.0 < step <= _LARGEST_JUMP:
+        # a topic that goes on where the others are has only been silent
+        ahead = (stamp - max(self._last_stamp.values())) * 1e-9
+        if step > 0.0 and ahead <= _LARGEST_JUMP:
+            if role == ODOMETRY and step > _LARGEST_JUMP:
+                self.forget_motion()
             return ""
         # A single wild stamp is an error. Two in a row that agree are of another clock, and so are
         # two that are both late, the second shortly after the first; reordering makes single ones.
@@ -121,7 +128,9 @@ class Validation:
             if step < -CLOCK_STEP and 0.0 < since < CLOCK_STEP:
                 return NEW_CLOCK
             return "duplicate stamp" if step == 0.0 else "backward stamp"
-        return NEW_CLOCK if abs(since) < _AGREEMENT else "stamp jumps"
+        if abs(since) >= _AGREEMENT:
+            return "stamp jumps"
+        return AHEAD if step > 0.0 else NEW_CLOCK
 
     def marked(self, message: Odometry) -> Odometry:
         """The message, its velocity marked by its variance if it has not been measured again.
