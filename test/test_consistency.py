@@ -191,6 +191,32 @@ def test_each_question_has_its_limit(heavy):
     assert failed(values=early, std=std) == ["bound of thruster_lag.time_constant"]
 
 
+@pytest.mark.parametrize(
+    ("name", "off", "told", "untold"),
+    [
+        # far beyond what is supposed, so beyond the bound of what is only supposed, too
+        ("buoyancy.delta", 12.0, "the vehicle's file", "stamp"),
+        ("cog_offset.dx", 12.0, "the vehicle's file", "stamp"),
+        ("thrust_scale.scale", -4.0, "the wrench", "stamp"),
+        ("thruster_lag.time_constant", 4.0, "the stamps", "file"),
+        # a bound that nothing may be beyond
+        ("thruster_lag.time_constant", -0.5, "is impossible", "takes for"),
+        ("X_u", 1.5, "drives the vehicle", "impossible"),
+    ],
+)
+def test_no_cause_is_named_that_cannot_be(name, off, told, untold):
+    """10 N of weight too much were said to be stamps of different clocks; no stamp weighs
+    anything."""
+    config = configuration.load("config/bluerov2_heavy.yaml").with_nuisance
+    prior, values = prior_of(config, effects=True), prior_of(config, effects=True).mean.copy()
+    i = prior.names.index(name)
+    values[i] += off * prior.std[i] * (1.0 if "." in name else abs(values[i]) / prior.std[i])
+    found = consistency_of(config, prior, values, np.full(6, np.nan), std=0.01 * prior.std)
+    sentences = [t.failure for t in found.tests if not t.passed and t.name.endswith(name)]
+    assert sentences and all(name in s and told in s and untold not in s for s in sentences)
+    assert found.sentence in sentences
+
+
 def test_nuisance_parameters_may_not_all_be_far_off():
     """A weight that hangs below a vehicle from some minute on: thrust, trim and centre of gravity
     were 2.2 to 2.6 standard deviations off each, and all coefficients 4 to 6."""
