@@ -84,7 +84,9 @@ TIMING = (
 """Nuisances: thrust that steps between two IMU samples is integrated as if it stepped elsewhere.
 
 To the accelerations of thrust that is a time offset of milliseconds, the drag that answers to them
-is not offset: together they would pass for a velocity scale of up to two percent. And the IMU's
+is not offset: together they would pass for a velocity scale of up to two percent. Further off than
+half an interval of the IMU no step is: what is, is thrust that follows the noise of the velocities
+(an autopilot's), and would pass for velocities that are late and too small. And the IMU's
 stamps may be early or late by milliseconds: only a pose of their own clock tells that velocities
 are old. And the IMU may sit elsewhere than configured: only a pose tells that of the velocities.
 """
@@ -105,6 +107,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
     keys = sensor_parameters()
     if not streams.has_pose:  # nor has it one because it is corrected
         streams = dataclasses.replace(streams, position=np.zeros_like(streams.position))
+    as_read = streams.nu[:, :3]
     streams = _in_place(streams, effects)
     here, there, rate = _corrected_readings(streams, config, effects)
     r = quaternion_to_matrix(streams.orientation)
@@ -117,7 +120,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
         np.concatenate([_smoothed(x[piece], width) for piece in _pieces(streams.t, _SMOOTHING)])
         for x in (here.angular, here.gyro)
     )
-    velocity = None if inertial is None else inertial.velocity
+    velocity = None if inertial is None else inertial.velocity_at(streams.t)
     moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
     reading = Reading(moving, turning, gyrating, here.specific_force)
     moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
@@ -130,30 +133,39 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
     if inertial is not None:
         down = inertial.rotation[:, 2]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
-        inside = measured_at(streams.imu_t, streams.t)
+        # As it is read, at the time of which it is: put back to its stamp between two readings, a
+        # velocity has less noise than either, and any delay would seem to agree better.
+        at = streams.t - velocity_delay(effects)
+        inside = measured_at(streams.imu_t, at)
+        r_then = quaternion_to_matrix(orientation_at(streams, at))
+        read = Reading(as_read, *(interpolated(streams.t, x, at) for x in here[1:]))
         t = streams.t[inside]
-        y = (rotated(r, here.linear) - inertial.velocity)[inside]
+        y = (rotated(r_then, _undone(read, effects).linear) - inertial.velocity_at(at))[inside]
         columns = [
-            (rotated(r, m.linear) - inertial.integrated(s.specific_force))[inside]
+            rotated(r_then, interpolated(streams.t, m.linear, at))[inside]
+            - inertial.integrated(s.specific_force, at)[inside]
             for m, s in zip(moved, shift, strict=True)
         ]
-        held = np.clip(np.searchsorted(streams.demand_t, t, side="right") - 1, 0, None)
+        held = np.clip(np.searchsorted(streams.demand_t, at[inside], side="right") - 1, 0, None)
         thrust = streams.demand[held, :3] / config.model.body.mass
-        columns += [r[inside][:, :, i] * thrust[:, i : i + 1] for i in range(3)]
+        columns += [r_then[inside][:, :, i] * thrust[:, i : i + 1] for i in range(3)]
         clock = none[-1]
         if streams.has_pose:
             early, late = (
                 _DeadReckoning(
                     dataclasses.replace(streams, imu_t=streams.imu_t + by), config, there, rate
-                ).velocity
+                ).velocity_at(at)
                 for by in (-_CLOCK, _CLOCK)
             )
             clock = (early - late) / (2.0 * _CLOCK)
         arms = none[:3]
         if streams.has_pose:
-            arms = [-rotated(r, velocity_of_arm(gyrating, axis)) for axis in np.eye(3)]
+            turned_then = interpolated(streams.t, gyrating, at)
+            arms = [-rotated(r_then, velocity_of_arm(turned_then, axis)) for axis in np.eye(3)]
         columns += [c[inside] for c in (*arms, clock)]
         made.append(("imu", t, y, columns))
+        inside = measured_at(streams.imu_t, streams.t)
+        t = streams.t[inside]
         y = here.angular[inside] - here.gyro[inside]
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
         made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
@@ -220,25 +232,26 @@ def _unit_change(reading: Reading, key: Key, t: Array, down: Array) -> Reading:
 
 
 class _DeadReckoning:
-    """Velocity in the world from the IMU alone, at the times of the odometry: ``velocity`` (N, 3),
-    the integral of what the IMU read, gravity included; it drifts."""
+    """Velocity in the world from the IMU alone: the integral of what it read, gravity included; it
+    drifts. ``rotation`` (M, 3, 3) is the attitude along it."""
 
     def __init__(self, streams: Streams, config: Config, imu: Reading, rate: Array) -> None:
-        self._t, self._at = streams.imu_t, streams.t
+        self._t, self._gravity = streams.imu_t, config.gravity
         q = orientation_at(streams, streams.imu_t)
         known = measured_at(streams.t, streams.imu_t)
         self.rotation = quaternion_to_matrix(_attitude(q, known, streams.imu_t, imu.gyro, rate))
-        lever, force = np.array(config.imu.position), imu.specific_force
+        lever, self._force = np.array(config.imu.position), imu.specific_force
         if lever.any():
             turn = np.gradient(imu.gyro, streams.imu_t, axis=0)
-            force = force - acceleration_of_arm(imu.gyro, turn, lever)
-        fallen = np.outer(streams.t, [0.0, 0.0, config.gravity])
-        self.velocity = self.integrated(force) + fallen
+            self._force = self._force - acceleration_of_arm(imu.gyro, turn, lever)
 
-    def integrated(self, force: Array) -> Array:
-        """The integral (N, 3) of specific forces (M, 3) turned into the world."""
-        total = integral(self._t, rotated(self.rotation, force))
-        return interpolated(self._t, total, self._at)
+    def velocity_at(self, at: Array) -> Array:
+        """The velocity (N, 3) at times (N,), but for a constant."""
+        return self.integrated(self._force, at) + np.outer(at, [0.0, 0.0, self._gravity])
+
+    def integrated(self, force: Array, at: Array) -> Array:
+        """The integral (N, 3) of specific forces (M, 3) turned into the world, at times (N,)."""
+        return interpolated(self._t, integral(self._t, rotated(self.rotation, force)), at)
 
 
 def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | None) -> Array:
@@ -354,15 +367,26 @@ def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
     return out
 
 
-def _rows(found: Sequence[Comparison], spans: Sequence[tuple[float, float]]) -> Rows:
-    """The rows whose time is in the spans, in clusters of CLUSTER seconds."""
+def _rows(
+    found: Sequence[Comparison], spans: Sequence[tuple[float, float]], streams: Streams
+) -> Rows:
+    """The rows whose time is in the spans, in clusters of CLUSTER seconds, and one for each thing
+    that is known of a nuisance beforehand, in a cluster of their own."""
     use = [within(spans, c.t) for c in found]
     at = np.concatenate([np.zeros(0), *(c.t[k] // CLUSTER for c, k in zip(found, use))])
     order = np.argsort(at, kind="stable")
     none = np.zeros((0, len(_keys())))
     columns = np.concatenate([none, *(c.columns[k] for c, k in zip(found, use))])[order]
     r = np.concatenate([np.zeros(0), *(c.r[k] for c, k in zip(found, use))])[order]
-    return Rows(columns, r, np.flatnonzero(np.diff(at[order], prepend=-1.0)))
+    first = np.flatnonzero(np.diff(at[order], prepend=-1.0))
+    if len(streams.imu_t) > 1:
+        known = np.array([k[0] == "thrust held" for k in _keys()])
+        # as far as a step is from the middle of the interval in which it falls, evenly spread
+        width = float(np.median(np.diff(streams.imu_t))) / np.sqrt(12.0)
+        first = np.append(first, len(r))
+        columns = np.concatenate([columns, np.eye(len(known))[known] / width])
+        r = np.append(r, np.zeros(known.sum()))
+    return Rows(columns, r, first)
 
 
 def _linear(rows: Rows) -> LinearProblem:
@@ -462,7 +486,7 @@ def search(
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     for _ in range(ROUNDS):
-        rows = _rows(comparisons(streams, config, found), spans)
+        rows = _rows(comparisons(streams, config, found), spans, streams)
         linear = _linear(rows)
         free = [key for key in linear.keys if key not in fixed]
         chosen = [key for key in free if key[0] in found]
