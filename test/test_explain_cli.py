@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from test_cli_edges import refused, run
 
+import rov_ident as ri
 from bench import HEAVY
 from bench.simulators.hidden import Conditions, draw
 from rov_ident import config as configuration
+from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
+from rov_ident.core.messages import ODOMETRY
 from rov_ident.discrepancy import report as told
 from rov_ident.discrepancy.results import Finding, Findings, Gain, Residual, Together, Value
 from rov_ident.effects import EFFECTS
@@ -80,6 +83,32 @@ def done(folder):
 @pytest.fixture(scope="module")
 def page(done, folder):
     return (folder / "new/out/report.html").read_text()
+
+
+def test_what_sensors_still_contradict_is_left_unexplained(done, folder, case):
+    """A compass that is off with the heading: fit and check said that attitude and IMU contradict
+    each other, explain named a bias of the IMU, surely, or nothing at all."""
+    right = json.loads((folder / "new/out/findings.json").read_text())
+    assert right["contradictions"] == []
+    compass = []
+    for t, role, message in case.messages:
+        if role == ODOMETRY:
+            w, x, y, z = message.orientation
+            heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            error = quaternion_from_euler(0.0, 0.0, 0.3 * np.sin(heading))
+            message = message._replace(orientation=quaternion_multiply(error, message.orientation))
+        compass.append((t, role, message))
+    write_messages(folder / "compass.mcap", compass)
+    assert explain(folder, bag="compass.mcap", out="compass").returncode == 0
+    findings = json.loads((folder / "compass/findings.json").read_text())
+    assert any("attitude" in why for why in findings["contradictions"])
+    assert findings["verdict"] == "unexplained"
+    assert not any(f["separable"] for f in findings["effects"] + findings["minor"])
+    assert all(
+        w in (folder / "compass/report.html").read_text() for w in findings["contradictions"]
+    )
+    fit = ri.fit(folder / "compass.mcap", folder / "compass/extended.yaml", "rls")
+    assert {*findings["contradictions"]} <= {t.failure for t in fit.consistency.tests}
 
 
 def test_files_are_written_whole_into_a_new_folder(done, folder):

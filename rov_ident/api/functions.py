@@ -20,7 +20,7 @@ from rov_ident.core.errors import UserError, require
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.velocity_sensor import tests_of
-from rov_ident.estimation.consistency import Test
+from rov_ident.estimation.consistency import Test, tests_of_sensors, worst_of
 from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.experiment import data_quality, design, messages_alone
 from rov_ident.experiment.data_quality import Check
@@ -270,7 +270,8 @@ def explain(
     UserError
         If a bag cannot be read or is too short, or the model cannot be simulated at all.
     """
-    from rov_ident.discrepancy.explain import explain as explain_streams  # here: no other needs it
+    from rov_ident.discrepancy.explain import contradicted  # here: no other needs it
+    from rov_ident.discrepancy.explain import explain as explain_streams
 
     given, say = load(config), progress or silent
     paths, repeated = once(several(bags))
@@ -286,6 +287,10 @@ def explain(
     found = explain_streams(
         [streams for streams, _ in read_bags], given, judge[0] if judge else None, say
     )
+    say("comparing odometry and IMU", 1.0)
+    ratios = worst_of(read_record(path, found.extended).contradictions for path in paths)
+    failed = (test for test in tests_of_sensors(ratios) if not test.passed)
+    found = contradicted(found, [test.failure for test in failed])
     name = given.name if isinstance(config, Config) else Path(config).name
     made: dict[str, Any] = {"rov_ident": version("rov_ident"), "config": name}
     made |= {"bags": [source for _, source in read_bags]}

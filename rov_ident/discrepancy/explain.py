@@ -254,6 +254,19 @@ def explain(
     )
 
 
+def contradicted(explained: Explanation, why: Sequence[str]) -> Explanation:
+    """The explanation where sensors contradict each other with the extended configuration, too, as
+    the sentences ``why`` say: something is left, and may have made what was found."""
+    if not why:
+        return explained
+    of = explained.findings
+    effects, minor = (tuple(map(unsure, found)) for found in (of.effects, of.minor))
+    of = dataclasses.replace(
+        of, effects=effects, minor=minor, contradictions=tuple(why), verdict="unexplained"
+    )
+    return dataclasses.replace(explained, findings=of)
+
+
 @dataclass(frozen=True)
 class _Data:
     """The bags with what their sensors contradict set right: ``streams``, all of them joined, to

@@ -67,7 +67,8 @@ def verdict(findings: Findings) -> str:
             "The structure of the simulation is right, its coefficients are off. Retuned, the "
             f"{predicted(best)} improves by {100.0 * gains[best]:.0f} %."
         )
-    named, left = _named(findings.effects), "; ".join(map(dependence, findings.residual))
+    named = _named(findings.effects)
+    left = "; ".join([*map(dependence, findings.residual), *findings.contradictions])
     if findings.verdict == "explained":
         return named
     left = f": {left}" if left else ""

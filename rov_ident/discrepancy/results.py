@@ -104,7 +104,8 @@ class Change:
 
 @dataclass(frozen=True)
 class Findings:
-    """The whole result; RMSE by velocity component, open loop, on held-out data."""
+    """The whole result; RMSE by velocity component, open loop, on held-out data. ``contradictions``
+    say in which parts odometry and IMU still differ."""
 
     baseline: dict[str, float]
     retuned: dict[str, float]
@@ -116,6 +117,7 @@ class Findings:
     verdict: Verdict
     notes: tuple[str, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    contradictions: tuple[str, ...] = ()
 
     def to_json(self) -> str:
         """As the contract has it; numbers that do not exist are null."""
@@ -129,6 +131,7 @@ class Findings:
             "effects": [asdict(f) for f in self.effects],
             "minor": [asdict(f) for f in self.minor],
             "residual": [asdict(r) for r in self.residual],
+            "contradictions": list(self.contradictions),
             "extended": {"rmse": self.extended},
             "verdict": self.verdict,
             "notes": list(self.notes),

@@ -255,6 +255,14 @@ def consistency_of(
     return Consistency((*tests, *tests_of_sensors(sensors or {})))
 
 
+def worst_of(records: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Of the test ratios of several records the largest of each part."""
+    worst: dict[str, float] = {}
+    for ratios in records:
+        worst |= {part: max(x, worst.get(part, 0.0)) for part, x in ratios.items()}
+    return worst
+
+
 def tests_of_sensors(ratios: Mapping[str, float]) -> list[Test]:
     """Whether the parts of the odometry and the IMU agree, by their test ratios."""
     return [

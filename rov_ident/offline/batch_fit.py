@@ -26,7 +26,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONTRADICTED, IDENTIFIABLE, State, of_fit
-from rov_ident.estimation.consistency import Test, consistency_of
+from rov_ident.estimation.consistency import Test, consistency_of, worst_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
 from rov_ident.model.coefficients import MOTIONS, VELOCITIES, Coefficient
@@ -143,9 +143,7 @@ def fit_batch(
     judged = read.as_read_by(now, config)
     after = open_loop(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
-    sensors: dict[str, float] = {}
-    for bag in judged.bags:
-        sensors |= {p: max(r, sensors.get(p, 0.0)) for p, r in bag.contradictions.items()}
+    sensors = worst_of(bag.contradictions for bag in judged.bags)
     std = np.sqrt(np.diag(covariance)) if kind == "ml" else None
     consistency = consistency_of(config, prior, asked, unexplained, lasting, sensors, std)
     consistency = replace(consistency, asks=kind == "ml")
