@@ -612,9 +612,9 @@ def test_thrust_of_other_axes_is_a_rival_of_drag_and_of_thrust(begun, monkeypatc
     there, start = begun
     monkeypatch.setattr(there.patterns, "interplay", lambda rest: rest)
     for name in ("oblique_damping", "crossflow", "tether_drag", "thruster_deadband"):
-        assert INTERPLAY_NAME in there._rivals(start, name)
+        assert INTERPLAY_NAME in there._patterns_for(start, name)
     for name in ("quadratic_damping", "velocity_scale", "thrust_advance"):
-        assert INTERPLAY_NAME not in there._rivals(start, name)
+        assert INTERPLAY_NAME not in there._patterns_for(start, name)
     assert search.INTERPLAY is patterns.INTERPLAY
 
 

@@ -45,6 +45,7 @@ from rov_ident.sampling.raw_streams import Streams
 
 _ALL = 0.98  # share of what a finding explains that counts as all of it: 2 % is no practical weight
 _ACTS = 0.2  # of the wrench on the axis it acts on most, over the authority: acts on this one, too
+_MOST = 0.5  # of the same: a rival that explains less is none, whatever the righting arm
 _PARTIAL = "fitted in its stead, it explains only {:.0f} % of this"
 _COSTLY = "fitted in its stead, it needs more parameters to explain as much"
 _EQUAL = "fits this bag as well"
@@ -103,13 +104,20 @@ def _alternatives(
     cannot, only those that it cannot be told from."""
     best = search.cost(final, final)
     explained = trial.rest.squares - final.squares
-    found, separable = [], trial.rivals is not None
-    for rival, fitted in (trial.rivals or {}).items():
+    found, separable = [], trial.whole
+
+    def with_arm(fitted: Fitted) -> float:
+        own, square = search.with_own_arm(fitted, final.inflation)
+        return search.cost(own, final) + square
+
+    for rival, fitted in trial.rivals.items():
         if rival.startswith(UNKNOWN):
             separable = separable and search.cost(fitted, final) > best - VERY_STRONG
             continue
         share = (trial.rest.squares - fitted.squares) / max(explained, 1e-9)
         close = search.cost(fitted, final) - best < VERY_STRONG
+        if not close and share > _MOST and {name, rival} & {*with_trait("weight")}:
+            close = with_arm(fitted) - with_arm(final) < VERY_STRONG
         # a rival with parameters beyond this effect's own predicts better by chance alone
         larger = EFFECTS[name].within == rival if name in EFFECTS else False
         if close or (not larger and judge.better(fitted.hypothesis, final.hypothesis, except_for)):

@@ -10,13 +10,14 @@ patterns of no known cause (`patterns`). One that does not earn its place leaves
 import contextlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rov_ident.config import Config
+from rov_ident.config.prior import cob_std
 from rov_ident.core.errors import UserError
-from rov_ident.core.linalg import scaled_inverse
+from rov_ident.core.linalg import scaled_inverse, scaled_solve
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     UNKNOWN,
@@ -61,6 +62,7 @@ _LEAST_SHARE = 0.3  # of the best score: a candidate with less is not fitted
 _MOST_EFFECTS = 6  # added one after the other: twice as many as the study hides
 _MOST_PATTERNS = 3  # without a name, which are told, not mended
 _ROUNDS = 3  # in which effects may give way to rivals
+_ARM_STEPS = 4  # of Gauss-Newton in the height of the centre of buoyancy, which is nearly linear
 _SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
 _FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
 BUDGET = 600_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
@@ -68,11 +70,12 @@ BUDGET = 600_000  # steps moved for each second of data (docs/explain.md, the ca
 
 @dataclass(frozen=True)
 class Trial:
-    """A named effect put to the test: the model without it, and with each rival in its place (None
-    where the budget was spent before)."""
+    """A named effect put to the test: the model without it, and with each rival in its place;
+    ``whole``: with patterns of no known cause, too, for which the budget may not be left."""
 
     rest: Fitted
-    rivals: Mapping[str, Fitted] | None
+    rivals: Mapping[str, Fitted]
+    whole: bool = True
 
 
 Trials = dict[str, Trial]
@@ -290,7 +293,9 @@ class Search:
         return {n: self._trial(rest, n) for n, rest in pairs if rest is not None}
 
     def _trial(self, rest: Fitted, name: str) -> Trial:
-        return Trial(rest, None if self._budget_spent() else self._rivals(rest, name))
+        whole = not self._budget_spent()
+        rivals = self._rivals(rest, name) if whole or name in EFFECTS else {}
+        return Trial(rest, rivals | self._patterns_for(rest, name) if whole else rivals, whole)
 
     def rest(self, fitted: Fitted, name: str) -> Fitted | None:
         """The fit without an effect."""
@@ -305,8 +310,30 @@ class Search:
         begin = h.having({k: bounds(k)[0] for k in others})
         return self._pruned(refit(begin, final.linearisation), rest) if others else None
 
+    def with_own_arm(self, fitted: Fitted, inflation: float) -> tuple[Fitted, float]:
+        """The fit with the height of the centre of buoyancy that suits it, as far as the file
+        leaves that open, where squares count as if white over ``inflation``; and the square of how
+        far that is, in standard deviations."""
+        std, raised = cob_std(self.config), 0.0
+        for _ in range(_ARM_STEPS if std > 0.0 else 0):
+            h, line = fitted.hypothesis, fitted.linearisation
+            column = line.sensitivity_to(std * self.problem.raising(h.model.body)[:, :, None])
+            base = line.columns
+            column -= base @ scaled_solve(fitted.linear.normal, base.T @ column, 1e-9)
+            slope, normal = float(column[:, 0] @ line.error), float(np.sum(column**2))
+            step = (slope - inflation * raised) / (normal + inflation)
+            model = h.config.model
+            cob = model.body.cob + [0.0, 0.0, std * step]
+            model = replace(model, body=replace(model.body, cob=cob))
+            there = refit(replace(h, config=h.config.with_model(model)), line)
+            if there is None or there.rss + inflation * (2.0 * raised + step) * step > fitted.rss:
+                break
+            fitted, raised = there, raised + step
+        return fitted, raised**2
+
     def _rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
-        """What else might explain what ``name`` explains: fits by the name of the rival."""
+        """What other effects might explain what ``name`` explains: fits by the name of the rival.
+        An effect is not named without them, whatever the budget: they take little of it."""
         lacking, h = self.screening.lacks_plainer, rest.hypothesis
         candidates = [
             c
@@ -315,8 +342,11 @@ class Search:
         ]
         fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
         fits.pop(name, None)  # two families share some coefficients
-        fits |= self.patterns.fits(rest)
-        given = (*HULL_DAMPING, "thrust_advance")
+        return fits
+
+    def _patterns_for(self, rest: Fitted, name: str) -> dict[str, Fitted]:
+        """The same of patterns of no known cause."""
+        fits, given = self.patterns.fits(rest), (*HULL_DAMPING, "thrust_advance")
         if name in EFFECTS and EFFECTS[name].place in ("wrench", "input") and name not in given:
             interplay = self.patterns.interplay(rest)
             fits |= {} if interplay is None else {INTERPLAY_NAME: interplay}
@@ -330,7 +360,7 @@ class Search:
         there = self.named(final)
         explained = max(trial.rest.squares - final.squares, 1e-9)
         choices = [trial.rest]
-        for rival, fitted in (trial.rivals or {}).items():
+        for rival, fitted in trial.rivals.items():
             margin = 0.0
             if rival == INTERPLAY_NAME or (rival in EFFECTS and EFFECTS[rival].beyond == name):
                 continue

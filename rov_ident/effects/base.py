@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 SIZE = 44  # the most parameters that a kernel takes
 
 Place = Literal["input", "motion", "wrench"]
-Trait = Literal["hull", "likely", "late", "factor", "neglecting", "dive"]
+Trait = Literal["hull", "likely", "late", "factor", "neglecting", "dive", "weight"]
 Role = Literal["amplitude", "limit", "place", "onset", "frequency", "phase", "fixed", "shape"]
 Axes = tuple[str, str, str]
 
@@ -164,7 +164,8 @@ class Effect:
     ``traits``: *hull*, drag that every hull has; *likely*, lacking so often that it is always tried
     in full; *late*, thrust comes later, as every thruster's does a little; *factor*, its parameters
     are factors of the thrust, of all axes or of one; *neglecting*, with it a model may follow the
-    wrench as read less, and noise with it; *dive*, it is the dive's and not the vehicle's.
+    wrench as read less, and noise with it; *dive*, it is the dive's and not the vehicle's;
+    *weight*, of what weighs or floats, which with another righting arm look like one another.
     """
 
     place: Place

@@ -17,6 +17,7 @@ EFFECT = Effect(
     place="wrench",
     summary="The buoyancy is not the configured one: fresh water, ballast, trapped air.",
     manoeuvre="drifting without thrust, level, then pitched and rolled by thrust moments",
+    traits=("weight",),
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
     parameters=(EffectParameter("delta", "N", "buoyancy lost", 0.0, -1e5, 1e5, 2.0),),
     body=body,

@@ -16,6 +16,7 @@ EFFECT = Effect(
     place="wrench",
     summary="The centre of gravity is not where it is configured.",
     manoeuvre="drifting without thrust at different roll and pitch angles",
+    traits=("weight",),
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, ch. 3, 4",
     parameters=vector("dx dy dz", "m", "added to vehicle.cog", 1.0, 0.01),
     body=body,

@@ -18,6 +18,7 @@ EFFECT = Effect(
     place="wrench",
     summary="A constant force, fixed in the world, pulls at the body origin.",
     manoeuvre="drifting without thrust at headings 90 degrees apart",
+    traits=("weight",),
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.2",
     parameters=vector("fx fy fz", "N", "force", 1e5, 2.0, NED),
     wrench=wrench,

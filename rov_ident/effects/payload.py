@@ -26,6 +26,7 @@ EFFECT = Effect(
     lasting=("buoyancy", "cog_offset", "constant_force"),
     blurs=("added_mass_coupling", "coriolis", "battery_sag"),  # its mass is inertia, too
     manoeuvre="drifting without thrust, level and tilted, before and after it was taken up",
+    traits=("weight",),
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 4.1",
     parameters=(
         EffectParameter("mass_wet", "kg", "mass less that of the water", 0.0, -1e4, 1e4, 0.3),
