@@ -17,7 +17,7 @@ from rov_ident.core.frames import quaternion_from_rotation_vector, quaternion_mu
 from rov_ident.core.messages import WRENCH
 from rov_ident.discrepancy import extension
 from rov_ident.discrepancy.explain import explain
-from rov_ident.discrepancy.findings import _is_sure_factor, parameters_of
+from rov_ident.discrepancy.findings import _is_sure_factor, _may_be_lost_thrust, parameters_of
 from rov_ident.discrepancy.held_out import Judge, split, thinned, windows
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
 from rov_ident.discrepancy.output_error import fit, refit
@@ -25,6 +25,7 @@ from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
+from rov_ident.model.scales import semi_axes
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.virtual_sensors import Suite, dive
@@ -97,6 +98,28 @@ def test_each_cause_is_named_alone_and_with_its_size(heavy, name, seed):
     for parameter, true in (values | coefficients).items():
         value = found.parameters[parameter]
         assert abs(value.value - true) < max(4.0 * value.std, 0.04 * abs(true)), parameter
+
+
+@pytest.mark.parametrize(
+    ("arm", "std", "may_be"), [(0.02, 0.15, True), (0.08, 0.15, False), (0.02, 0.0, False)]
+)
+def test_thrust_that_is_lost_takes_its_moment_along(heavy, arm, std, may_be):
+    """Of a quarter of a metre of hull, 30 % of the thrust are an arm of 70 mm; none where the file
+    says that the thrust is known."""
+    config = dataclasses.replace(heavy, wrench=dataclasses.replace(heavy.wrench, scale_std=std))
+    key = ("thrust_line", "arm_Y_N")
+    assert semi_axes(config.model.body)[0] == pytest.approx(0.25, abs=0.03)
+    assert _may_be_lost_thrust(config, Hypothesis(config, {key: arm}), [key]) == may_be
+
+
+def test_a_line_of_thrust_is_not_sure_where_thrust_is_not_known(heavy):
+    rng = np.random.default_rng([1, 3])
+    values, coefficients = hidden("thrust_line", rng)
+    world, config = world_and_belief(heavy, "thrust_line", values, coefficients, rng)
+    config = dataclasses.replace(config, wrench=dataclasses.replace(config.wrench, scale_std=0.15))
+    (found,) = findings_of(world, config, seed=1).effects
+    assert found.effect == "thrust_line" and not found.separable
+    assert "thruster_gain" in [a.effect for a in found.alternatives]
 
 
 @pytest.mark.parametrize("seed", [1, *more(2)])

@@ -13,6 +13,7 @@ from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, imp
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     UNKNOWN,
+    Hypothesis,
     Key,
     at_bound,
     bounds,
@@ -38,7 +39,7 @@ from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, with_trait
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
-from rov_ident.model.scales import authority
+from rov_ident.model.scales import authority, semi_axes
 from rov_ident.reports.result import NORMAL
 from rov_ident.reports.table import with_unit
 from rov_ident.sampling.raw_streams import Streams
@@ -49,6 +50,7 @@ _MOST = 0.5  # of the same: a rival that explains less is none, whatever the rig
 _PARTIAL = "fitted in its stead, it explains only {:.0f} % of this"
 _COSTLY = "fitted in its stead, it needs more parameters to explain as much"
 _EQUAL = "fits this bag as well"
+_TAKEN = "thrust that is lost takes its moment along, which is the same"
 _EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
 
 
@@ -75,10 +77,24 @@ def finding(
     separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)
     if separable and "factor" in EFFECTS[name].traits:
         separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
+    if name == "thrust_line" and _may_be_lost_thrust(search.config, final.hypothesis, keys):
+        alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
     begin = None if onset is None else onset.value
     words = sentence(name, parameters, gain)
     found = Finding(name, axes, parameters, begin, gain, True, None, alternatives, words)
     return found if separable else unsure(found)
+
+
+def _may_be_lost_thrust(config: Config, h: Hypothesis, keys: Sequence[Key]) -> bool:
+    """Whether none of the arms is longer than a loss of thrust makes, as large as the file allows,
+    of thrusters as far from the origin as the hull reaches: the moment that was read with the force
+    is lost with it, and as drag and inertia suit any thrust of an axis, no force shows the loss."""
+    reach = NORMAL * config.wrench.scale_std * semi_axes(config.model.body)
+    for key in keys:
+        force, moment = (AXES.index(axis) % 3 for axis in key[1].split("_")[1:])
+        if abs(h.values[key]) > reach[3 - force - moment]:
+            return False
+    return True
 
 
 def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bool:
@@ -196,7 +212,7 @@ def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:
 def unsure(found: Finding) -> Finding:
     """The finding as one that something else may be behind, but no rival that was refuted."""
     run = EFFECTS[found.effect].manoeuvre
-    kept = tuple(a for a in found.alternatives if a.why_not in (_EQUAL, _EARLIER))
+    kept = tuple(a for a in found.alternatives if a.why_not in (_EQUAL, _EARLIER, _TAKEN))
     return dataclasses.replace(found, separable=False, manoeuvre=run, alternatives=kept)
 
 
