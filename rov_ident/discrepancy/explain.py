@@ -68,8 +68,9 @@ _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that d
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
-    "the search was cut short after as much simulation as it may take: not all further effects, or "
-    "rivals of those found, were tried; a configuration that fits better (rov-ident fit) helps"
+    "the search was cut short after as much simulation as it may take: not all further effects, "
+    "and in place of those found only other effects, were tried; a configuration that fits better "
+    "(rov-ident fit) helps"
 )
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"
