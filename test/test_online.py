@@ -128,11 +128,12 @@ def lagging(heavy, wrong):
     return config, [(role, m) for _, role, m in dive.messages]
 
 
-def test_what_is_learnt_anew_about_another_lag_is_not_forgotten(lagging):
-    """Once a lag is known better, the same messages teach RLS again: nothing is as unknown as at
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_learnt_anew_about_another_lag_is_not_forgotten(lagging, kind):
+    """Once a lag is known better, the same messages teach again: nothing is as unknown as at
     first."""
     config, messages = lagging
-    estimator = OnlineEstimator(config, "rls")
+    estimator = OnlineEstimator(config, kind)
     strong = [estimator.prior.names.index(name) for name in ("X_uu", "Y_vv", "Z_ww", "N_rr")]
     begun, shares, next_look = seconds(messages[0][1]), [], 0.0
     for role, message in messages:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rov_ident.config.prior import prior_of
-from rov_ident.core.whiteness import LARGEST
+from rov_ident.core.whiteness import BY_CHANCE, LARGEST
 from rov_ident.estimation import rls, ukf
 from rov_ident.estimation.innovation_monitor import NIS_TIME, TIME, first_monitor, lost, watch
 from rov_ident.estimation.process_noise import process
@@ -96,6 +96,19 @@ def test_what_lasts_a_second_in_motion_is_told_from_noise(heavy):
         watched(monitor, constants, 3, e, True)
         assert least < monitor["power"][3] < most
         assert monitor["nis"][3] < 2.5
+
+
+def test_a_model_that_fails_now_and_then_is_not_learnt_from_as_if_it_were_right(heavy):
+    """In two of ten seconds innovations have something in common; in the others there is so little
+    noise that on average all seems well. Chance does not do that, so noise is added."""
+    constants, rng = process(heavy), np.random.default_rng(6)
+    pushed = np.tile(np.repeat([2.0, 0.0], [40, 160]), 12)  # s / 20
+    for misfit, grows in ((0.0, False), (1.0, True)):
+        monitor = first_monitor(constants)
+        e = 0.5 * rng.standard_normal(len(pushed)) + misfit * pushed
+        watched(monitor, constants, 1, e, True)
+        assert (monitor["power"][1] > BY_CHANCE**2) == grows
+        assert (monitor["density"][1] > constants["first"][0, 1]) == grows
 
 
 @numba.njit(cache=True)
