@@ -53,7 +53,7 @@ from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import mean_inflation
-from rov_ident.model.scales import semi_axes
+from rov_ident.model.scales import authority, semi_axes
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.simulation import virtual_sensors
 
@@ -245,6 +245,30 @@ def test_a_demand_that_chatters_is_kept(dive):
         for role, m in messages
     ]
     assert gather(given, config).notes == ()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_first_commands_of_a_turn_are_kept(dive, seed):
+    """The most that a heading controller ever commands is in the one or two messages after a
+    heading is set anew. Guessed from their neighbours, they came late: the motion was ahead."""
+    messages, config = dive
+    rng = np.random.default_rng(seed)
+    most = rng.uniform(1.0, 1.5) * authority(config.dynamics)[5]
+    begin, fades = rng.uniform(10.0, 50.0), rng.uniform(0.62, 0.75)
+    given, first, sent = [], messages[0][1].stamp, 0
+    for role, m in messages:
+        if role == "wrench":
+            sent += 1
+            if sent % 5:  # ten commands a second
+                continue
+            since = (m.stamp - first) * 1e-9 - begin
+            turn = most * np.exp(-since / fades) if since > 0.0 else 0.0
+            m = m._replace(torque=np.array([0.0, 0.0, turn + 0.01 * most * rng.standard_normal()]))
+        given.append((role, m))
+    streams = gather(given, config)
+    commands = [m.torque for role, m in given if role == "wrench"]
+    assert streams.notes == ()
+    np.testing.assert_array_equal(np.abs(streams.demand[:, 5]), np.abs([m[2] for m in commands]))
 
 
 def test_where_no_demand_is_known_nothing_is_judged(dive):

@@ -242,16 +242,23 @@ def _despiked(
     """The messages without one or two in a row that hold what no others do.
 
     Live, an outlier is what jumps there and back; here the whole bag tells what is usual, and a
-    controller that chatters keeps its commands.
+    controller that chatters keeps its commands. What is nearer to its neighbours than they are to
+    each other is a step that overshoots, as of a heading that is set anew, and the most that is
+    ever commanded.
     """
     if len(taken) < 2:
         return taken
     x = np.array([measured_values(m) for _, m in taken])
-    x = np.abs(x - np.median(x, axis=0))
-    usual = np.maximum(_USUAL * np.quantile(x, 0.99, axis=0), largest_usual(role, config))
-    edges = np.flatnonzero(np.diff((x > usual).any(axis=1), prepend=False, append=False))
-    lone = [range(*edge) for edge in edges.reshape(-1, 2).tolist() if edge[1] - edge[0] <= 2]
-    outliers = {i for indices in lone for i in indices}
+    off = np.abs(x - np.median(x, axis=0))
+    usual = np.maximum(_USUAL * np.quantile(off, 0.99, axis=0), largest_usual(role, config))
+    edges = np.flatnonzero(np.diff((off > usual).any(axis=1), prepend=False, append=False))
+    outliers: set[int] = set()
+    for first, end in edges.reshape(-1, 2).tolist():
+        lone, ends = slice(first, end), x[[max(first - 1, 0), min(end, len(x) - 1)]]
+        apart = np.abs(x[lone, None] - ends).min(axis=1)  # from the nearer of its neighbours
+        beyond = (off[lone] > usual) & (apart > np.abs(ends[1] - ends[0]))
+        if end - first <= 2 and (beyond.any() or first == 0 or end == len(x)):
+            outliers.update(range(first, end))
     counts[f"{role}: outlier"] += len(outliers)
     return [taken[i] for i in range(len(taken)) if i not in outliers]
 
