@@ -86,10 +86,6 @@ PILOTED = {
         "resistance": rng.uniform(0.02, 0.03), "advance": rng.uniform(0.2, 0.3),
         "discharge": rng.uniform(0.3, 1.0),
     },
-    "gyro bias": lambda rng: {
-        "gyro_bias": tuple(rng.uniform(0.008, 0.02, 3) * rng.choice([-1.0, 1.0], 3)),
-        "gyro_is_shared": True,
-    },
     "clocks": lambda rng: {"imu_clock": rng.uniform(0.02, 0.03) * rng.choice([-1.0, 1.0])},
 }  # fmt: skip
 
@@ -97,7 +93,7 @@ PILOTED = {
 @pytest.mark.parametrize(
     ("case", "kind", "seed"),
     [
-        *((case, kind, 1) for case, kind in (("gyro bias", "ukf"), ("clocks", "rls"))),
+        ("clocks", "rls", 1),
         # sag is also among the dives above
         *more(("sag", "rls", 1)),
         *more(*((case, "rls" if i % 2 else "ukf", 1) for i, case in enumerate(PILOTED))),
@@ -114,6 +110,38 @@ def test_so_it_is_where_a_pilot_rests_between(case, kind, seed):
     asked = "whiteness" if case == "sag" else "odometry and IMU"
     assert any(name.startswith(asked) for name in failed), failed
     assert State.CONVERGED not in report.states
+
+
+@pytest.mark.parametrize(
+    ("is_copied", "kind", "seed"),
+    [
+        (True, "rls", 1),
+        *more(*itertools.product((True,), ("rls", "ukf"), (2, 3, 4))),
+        *more((True, "ukf", 1), (False, "rls", 1), (False, "ukf", 2)),
+    ],
+)
+def test_a_bias_of_the_gyro_is_found_whether_or_not_the_odometry_copies_it(is_copied, kind, seed):
+    """Two that read the same do not contradict each other; the attitude tells what both have."""
+    rng = np.random.default_rng([seed, 19])
+    size = rng.uniform(0.002, 0.006, 3) if is_copied else np.full(3, 0.05)
+    bias = size * rng.choice([-1.0, 1.0], 3)
+    vehicle, unknown = (
+        sea.draw_vehicle(rng),
+        sea.Sea(gyro_bias=tuple(bias.tolist()), gyro_is_shared=is_copied),
+    )
+    truth = sea.dive(vehicle, unknown, "pilot", 100.0, rng)
+    parameters = sea.told(vehicle, unknown, rng)
+    online = OnlineEstimator(configuration.from_parameters(parameters), kind)
+    for _, role, message in sea.measured(truth, unknown, rng):
+        online.push(role, message)
+    online.flush()
+    report, found = online.report(), online.sampler.kinematic_filter.state["gyro_bias"][0]
+    np.testing.assert_allclose(found, bias, atol=3e-4)  # the gyro is good to 1e-4 in a minute
+    assert report.consistency.consistent, report.consistency.sentence
+    assert State.CONVERGED in report.states
+    for name, true in vehicle.theta.items():
+        i = online.prior.names.index(name)
+        assert abs(report.values[i] - true) < 3.0 * report.std[i]
 
 
 @pytest.mark.parametrize("kind", more("rls", "ukf"))

@@ -19,13 +19,14 @@ from rov_ident.core.frames import quaternion_from_euler, quaternion_multiply
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.messages import Array, Imu, Odometry
 from rov_ident.core.quaternions import product, rotation, turned
-from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME, averaged
+from rov_ident.core.whiteness import BY_CHANCE, JUDGED_TIME, LARGEST, SUM_TIME, averaged
 from rov_ident.effects import affects_sensors, compiled, correct, heading_error
 from rov_ident.effects.base import Reading
 from rov_ident.sampling.queues import MERGE
 
-_VELOCITY, _RATE, _ATTITUDE = range(3)
-_PARTS = ("velocity", "angular rate", "attitude")  # of the odometry, each behind a gate of its own
+_VELOCITY, _RATE, _ATTITUDE, _RATE_AS_READ = range(4)
+_PARTS = ("velocity", "angular rate", "attitude")  # of the odometry, each behind a gate of its own;
+# the last of the four is its angular rate against the gyro with its bias
 
 STATE = record(
     [
@@ -53,11 +54,11 @@ STATE = record(
         ("p_vv", "f8"),
         ("p_vb", "f8"),
         ("p_bb", "f8"),
-        ("test_ratio", "f8", (3,)),  # NIS over its expectation, averaged, of _PARTS
+        ("test_ratio", "f8", (4,)),  # NIS over its expectation, averaged, of _PARTS
         # of the same, by axis: normalised innovations added up with fading memory, their variance,
         # power of these sums, averaged; s since the last one, and since the first
-        *floats((3, 3), "summed lasting"),
-        *floats((3,), "expected since judged"),
+        *floats((4, 3), "summed lasting"),
+        *floats((4,), "expected since judged"),
     ]
 )
 
@@ -100,6 +101,7 @@ _MOVING = 4.0  # mean square over noise variance from which it does; at rest it 
 _LEVER_TIME = 0.05  # s; of the filter that differentiates the gyro for the IMU's lever arm
 _BRIEF = 0.1  # s; a rate that comes and goes within it may have lasted shorter than its samples
 _GROWTH = 0.2  # of the variance with each refusal: a filter that refuses for seconds is wrong
+_LARGEST_BIAS = 3.0  # prior standard deviations of it; one gyro in 370 has more about an axis
 _AVERAGE = 0.05  # weight of one NIS in the test ratio, that of the last twenty
 _LARGEST_NIS = 1e3  # the most that one outlier counts for in it
 
@@ -168,16 +170,20 @@ class KinematicFilter:
     @property
     def test_ratios(self) -> dict[str, float]:
         """Test ratios of the parts of the odometry against the IMU, of late; 1 is expected."""
-        return dict(zip(_PARTS, self.state["test_ratio"][0].tolist(), strict=True))
+        return dict(zip(_PARTS, self.state["test_ratio"][0].tolist()))
 
     @property
     def contradictions(self) -> dict[str, float]:
         """The same, or the power of what differs for a second in the last minute if it is more; of
-        parts that have been compared."""
-        known = self.state["judged"][0] > JUDGED_TIME
-        powers = np.where(known, self.state["lasting"][0].max(axis=1), 0.0)
-        largest = np.maximum(self.state["test_ratio"][0], powers)
-        return {part: x for part, x in zip(_PARTS, largest.tolist(), strict=True) if x > 0.0}
+        parts that have been compared. Angular rates that have the gyro's bias do not contradict
+        it, as long as it is one that a gyro may have."""
+        state, settings = self.state[0], self._settings[0]
+        powers = np.where(state["judged"] > JUDGED_TIME, state["lasting"].max(axis=1), 0.0)
+        ratios = np.maximum(state["test_ratio"], powers).tolist()
+        bias_std = math.sqrt(settings["gyro_bias_variance"])
+        if np.abs(state["gyro_bias"]).max() <= _LARGEST_BIAS * bias_std:
+            ratios[_RATE] = min(ratios[_RATE], ratios[_RATE_AS_READ])
+        return {part: x for part, x in zip(_PARTS, ratios) if x > 0.0}
 
     def step(
         self,
@@ -437,14 +443,22 @@ def _correct_velocity(k, s, v, variance, begins, anew):
 
 @inlined
 def _correct_gyro_bias(k, s, rate, m, share, r_angular, gyro_variance):
-    """Compare the gyro at the odometry's instant, ``share`` of dt ago, with the odometry's rate."""
+    """Compare the gyro at the odometry's instant, ``share`` of dt ago, with the odometry's rate.
+
+    A rate that is copied from the gyro has its bias, too, and says nothing of it: it differs from
+    the gyro less before the bias is taken off, as only the attitude can have told it.
+    """
     total = k.gyro_bias_variance + r_angular + gyro_variance
     gain, angle_gain = k.gyro_bias_variance / total, k.attitude_gyro_bias / total
-    change = np.empty(3)
+    change, as_read = np.empty(3), np.empty(3)
     for i in range(3):
         then = rate[i] + share * (k.rate[i] - rate[i])
         change[i] = then - m.angular[i]
-    if _compare(k, _RATE, change, total) < s.gate**2:
+        as_read[i] = change[i] + k.gyro_bias[i]
+    _compare(k, _RATE_AS_READ, as_read, r_angular + gyro_variance)
+    near, apart = _compare(k, _RATE, change, total) < s.gate**2, k.lasting[_RATE].max()
+    copied = apart > BY_CHANCE**2 and apart > k.lasting[_RATE_AS_READ].max()
+    if near and not copied:
         k.gyro_bias_variance *= 1.0 - gain
         k.attitude_variance -= angle_gain * k.attitude_gyro_bias
         k.attitude_gyro_bias *= 1.0 - gain
@@ -505,7 +519,7 @@ def fuse(
         else:
             rate[i] = m.angular[i] if has_odometry else k.rate[i]
     if k.known:
-        for part in range(3):
+        for part in range(len(k.since)):
             k.since[part] += dt
         k.since_attitude += dt
         _predict_attitude(k, s, rate, dt, has_imu, gyro_variance)
