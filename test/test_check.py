@@ -64,6 +64,19 @@ def test_a_good_bag_is_good(checked):
     assert "20.0 Hz" in of(found, "odometry").text
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_before_the_first_odometry_is_told_where_it_is_long(
+    heavy, messages, tmp_path, seed
+):
+    """Topics never begin together."""
+    rng, begin = np.random.default_rng(seed), min(m.stamp for _, _, m in messages)
+    for late, is_told in ((rng.uniform(0.02, 0.3), False), (rng.uniform(1.0, 5.0), True)):
+        kept = [row for row in messages if row[1] != "odom" or row[2].stamp > begin + late * 1e9]
+        write_messages(tmp_path / "b.mcap", kept)
+        notes = read_record(tmp_path / "b.mcap", heavy).notes
+        assert any("no odometry yet" in note for note in notes) == is_told
+
+
 @pytest.mark.parametrize("seed", [2, *more(3, 4, 5)])
 def test_a_fit_beside_a_file_that_is_right_agrees(heavy, tmp_path, seed):
     """The truth predicts better than any fit, by what the fit's uncertainty explains."""

@@ -18,7 +18,7 @@ from rov_ident.offline import batch_fit
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.maximum_likelihood import assumed, one_pass
 from rov_ident.sampling.records import read_record
-from rov_ident.sampling.wrench_scatter import ReadingNoise
+from rov_ident.sampling.wrench_scatter import ReadingNoise, resting_noise
 
 _RATE = 50.0  # Hz
 
@@ -51,6 +51,18 @@ def test_commands_without_noise_of_their_own_have_none() -> None:
     sines = 20.0 * np.sin(2.0 * np.pi * t[:, None] * rng.uniform(0.05, 0.5, 6))
     for readings in (steps, sines, steps * (1.0 + 0.01 * rng.standard_normal(steps.shape))):
         assert (_after(readings) == 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_left_of_thrusters_that_cancel_is_no_noise(seed: int) -> None:
+    """A moment of 1e-16 N m, which two forces leave on arms whose products are rounded."""
+    rng = np.random.default_rng(seed)
+    readings = np.zeros((1000, 6))
+    readings[:, 0] = np.repeat(rng.uniform(-30.0, 30.0, 20), 50) + rng.standard_normal(1000)
+    arms = rng.uniform(0.1, 0.5, 3)
+    readings[:, 4] = (readings[:, [0]] * arms).sum(axis=1) - readings[:, 0] * arms.sum()
+    assert 0.0 < np.abs(readings[:, 4]).max() < 1e-12
+    assert _after(readings)[4] == 0.0 and resting_noise(readings)[4] == 0.0
 
 
 def _case(seed: int, noise: float, seconds: float) -> hidden.Case:

@@ -17,13 +17,13 @@ from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.topics import BATTERY, ONE_CLOCK, Reader
 from rov_ident.nodes.common import GuardedNode
 from rov_ident.nodes.conversions import to_status
-from rov_ident.sampling.validation import describe
+from rov_ident.sampling.validation import NO_ODOMETRY, NO_WRENCH, describe
 
 _LOG_PERIOD = 10.0  # s; between two equal warnings in the log, so that others can be seen
 _LATE = 2.0  # s; a checkpoint that is older than two periods of /diagnostics is worth a warning
 _SLOW = {BATTERY: 10.0}  # s; battery monitors publish at 0.1 Hz and faster
 # The consequence of something that has a warning of its own.
-_NO_WARNING = {"sample: no odometry yet", "sample: no wrench"}
+_NO_WARNING = {NO_ODOMETRY, NO_WRENCH}
 # Counts in a second up to which there is no warning: a good message now and then looks like an
 # outlier, and takes its neighbour with it.
 _CHANCE = {"imu: outlier between its neighbours": 2, "wrench: outlier between its neighbours": 2}

@@ -17,9 +17,10 @@ from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import INPUTS, VELOCITIES
 from rov_ident.model.equations import Model
+from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.sample import NO_MOMENT, after_reset, free_axes, joined, stretches
 from rov_ident.sampling.sampler import Sampler
-from rov_ident.sampling.validation import describe
+from rov_ident.sampling.validation import NO_ODOMETRY, describe
 from rov_ident.sampling.without_velocity import IMPOSSIBLE, has_velocity, is_without_velocity
 from rov_ident.simulation.open_loop import open_loop
 from rov_ident.simulation.virtual_sensors import Dive
@@ -72,7 +73,10 @@ def read_record(
     samples = after_reset(joined(parts))
     counts = sampler.counts + unusable
     notes = inputs.doubts(bag, topics, config)
-    notes += [f"{bag.path.name}: {refusal}" for refusal in describe(counts)]
+    refused = counts.copy()
+    if len(samples) and refused[NO_ODOMETRY] * np.median(samples["dt"]) <= LONGEST_INTERVAL:
+        del refused[NO_ODOMETRY]  # topics never begin together
+    notes += [f"{bag.path.name}: {refusal}" for refusal in describe(refused)]
     notes += [bag.damage] if bag.damage else []
     notes += [] if measured else [f"{bag.path.name}: {IMPOSSIBLE}"]
     notes += [] if free_axes(samples).all() else [f"{bag.path.name}: {NO_MOMENT}"]

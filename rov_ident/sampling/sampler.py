@@ -35,7 +35,14 @@ from rov_ident.sampling.kinematic_filter import KinematicFilter
 from rov_ident.sampling.late_velocities import LateVelocities
 from rov_ident.sampling.queues import LONGEST_INTERVAL, Instant, Queues, Waiting
 from rov_ident.sampling.sample import joined, one_sample, sample_type
-from rov_ident.sampling.validation import CLOCK_STEP, REPEATED, RESTARTS, Validation
+from rov_ident.sampling.validation import (
+    CLOCK_STEP,
+    NO_ODOMETRY,
+    NO_WRENCH,
+    REPEATED,
+    RESTARTS,
+    Validation,
+)
 from rov_ident.sampling.without_velocity import SimulatedVelocity, blank
 
 _SILENCE = 2.0  # usual intervals, and CLOCK_STEP, without any message: the clock may have stepped
@@ -246,8 +253,9 @@ class Sampler:
         if anew:
             self.counts["odom: contradicts the first, begun anew"] += 1
         if wrench is None or not known or missing:
-            why = "wrench" if wrench is None else "odometry yet" if not known else missing
-            self.counts[f"sample: no {why}"] += 1
+            other = f"sample: no {missing}"
+            why = NO_WRENCH if wrench is None else NO_ODOMETRY if not known else other
+            self.counts[why] += 1
             self._previous = math.nan
             return None
         self._has_fins |= bool(sample["inputs"][0, :, :3].any())

@@ -15,6 +15,8 @@ AHEAD = "clock: stepped ahead, or all topics silent, buffers restarted"
 """Counted where stamps go on far ahead of those of all topics, as they do after a pause of all."""
 NEW_FRAME = "frame: another has the majority, buffers restarted"
 """Counted where a topic continues in another frame."""
+NO_ODOMETRY, NO_WRENCH = "sample: no odometry yet", "sample: no wrench"
+"""Counted where a topic has not begun, or not again."""
 RESTARTS = (NEW_CLOCK, AHEAD, NEW_FRAME)
 REPEATED = 2e3
 """The variance that marks a velocity as not measured again; drivers use 1e3 and more for that."""

@@ -16,7 +16,8 @@ from rov_ident.core.messages import Array
 from rov_ident.core.noise import robust_std, second_differences
 
 _BLOCK = 50  # commands in which noise is measured, to a fifth
-_ROUNDING = 1e-6  # of the largest command: 32 bits round by less
+_ROUNDING = 1e-6  # of the largest command on any axis: 32 bits round by less, and thrusters that
+# cancel leave no more than that of each other
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
@@ -29,8 +30,7 @@ def resting_noise(demand: Array) -> Array:
     """Standard deviation (6,) of readings (K, 6) of the wrench where commands rest."""
     if len(demand) < _BLOCK + 2:
         return np.zeros(6)
-    std = resting(scatter(demand))
-    return np.where(std > _ROUNDING * np.abs(demand).max(axis=0), std, 0.0)
+    return resting(scatter(demand))
 
 
 def scatter(demand: Array, relative: float = 0.0) -> Array:
@@ -40,6 +40,7 @@ def scatter(demand: Array, relative: float = 0.0) -> Array:
     second = second_differences(demand)  # steps of the command are too few to move their median
     blocks = len(second) // size
     std = robust_std(second[: blocks * size].reshape(blocks, size, 6), axis=1)
+    std[std <= _ROUNDING * np.abs(demand).max()] = 0.0
     level = demand[: len(std) * size].reshape(len(std), size, 6)
     known = relative * np.sqrt(np.mean(level**2, axis=1))
     std[(std > 0.0) & (std <= _AS_LOUD * known)] = np.nan
