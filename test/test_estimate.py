@@ -9,10 +9,7 @@ from scipy.optimize import minimize
 
 from rov_ident import config as configuration
 from rov_ident.config.prior import prior_of, typical
-from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.estimation.physical import Estimate, calibrated, is_passive, physical
-from rov_ident.sampling.records import samples_of
-from rov_ident.simulation.virtual_sensors import dive
 
 
 def variant(heavy, values, remove=()):
@@ -80,31 +77,6 @@ def test_physical_is_the_nearest_set_with_the_right_signs(heavy, seed):
     found = physical(config.model, prior, Estimate(prior.names, values, covariance, 0.0))
     wanted = textbook.nearest_not_positive(values, covariance, prior.negative)
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-8 * np.abs(values).max())
-
-
-@pytest.mark.parametrize("kind", ["rls", "ukf"])
-def test_the_metric_is_that_of_the_data_not_of_what_is_published(heavy, kind):
-    """Thrust that is held at its limit takes drag and inertia along, however wide the published
-    intervals are: those end at the prior's, and would leave them where they were."""
-    config = textbook.with_section(heavy, "wrench", scale_std=0.15).with_nuisance
-    module = ESTIMATORS[kind]
-    task, prior = module.problem(config), prior_of(config, effects=True)
-    parts = samples_of(config, dive(config, "steps", 20.0, seed=3))
-    state, _ = module.fold(task, module.init(task), np.concatenate([p for p in parts if len(p)]))
-    estimate = module.estimate(task, state, prior)
-    own = estimate.inverse_information
-    np.testing.assert_allclose(np.diag(own), module.variance(task, state), rtol=1e-6)
-    thrust = prior.names.index("thrust_scale.scale")
-    values = estimate.values.copy()
-    values[thrust] = prior.lower[thrust] - 0.2
-    lost = dataclasses.replace(estimate, values=values)
-    wide = np.diag(prior.std**2)
-    found = physical(config.dynamics, prior, dataclasses.replace(lost, covariance=wide))
-    assert np.array_equal(found, physical(config.dynamics, prior, lost))
-    drag = prior.names.index("X_uu")
-    wanted = own[drag, thrust] / own[thrust, thrust] * 0.2
-    assert found[thrust] == prior.lower[thrust]
-    assert found[drag] - values[drag] == pytest.approx(wanted, rel=0.2) and abs(wanted) > 10.0
 
 
 def test_physical_keeps_what_is_not_correlated(heavy):

@@ -161,6 +161,22 @@ def test_learning_anew_does_not_depend_on_how_messages_come(lagging, kind):
     assert followed.report().covariance.tolist() == expected.covariance.tolist()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_goes_with_a_limited_thrust_does_not_depend_on_how_wide_intervals_are(heavy, kind):
+    """With 0.3 of the thrust configured, which nobody supposes, drag and inertia are those of the
+    least thrust that is possible: what the motion shows is their ratio to it."""
+    config = textbook.with_section(heavy, "wrench", scale_std=0.15)
+    weak = dataclasses.replace(heavy, effects={"thrust_scale": {"scale": 0.3}})
+    messages = [(role, m) for _, role, m in sensors.dive(weak, "steps", 60.0, seed=5).messages]
+    report = fed(OnlineEstimator(config, kind), messages).report()
+    assert report.consistency is not None and not report.consistency.consistent
+    found = dict(zip(report.names, report.values, strict=True))
+    assert found["thrust_scale.scale"] == pytest.approx(1.0 - 3.0 * 0.15)
+    for name in ("X_uu", "Y_vv", "Z_ww"):
+        ratio = found[name] / found["thrust_scale.scale"] / (heavy.value(name) / 0.3)
+        assert ratio == pytest.approx(1.0, abs=0.2), name
+
+
 def test_stamp_is_the_last_sample_s(trained, messages):
     last = max(m.stamp for role, m in messages if role in (ODOMETRY, IMU))
     assert abs(trained.report().stamp - last) <= 2

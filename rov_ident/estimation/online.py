@@ -471,13 +471,15 @@ class OnlineEstimator:
             self.config, self.prior, raw.values, self._unexplained(), self._whiteness(),
             self.sampler.kinematic_filter.contradictions, raw.std,
         )  # fmt: skip
+        # before any disagreement widens the covariance, which ends at the prior's: with a thrust
+        # that is held at its limit, drag and inertia go as the data have it
+        values = physical(self.config.dynamics, self.prior, raw)
         gain = gain_of(raw.covariance, self.prior.std)
         covariance = raw.covariance + rigid_body_covariance(
             self.config, raw.names, raw.values, gain
         )
         moved = raw.values - self.prior.mean
         raw = replace(raw, covariance=consistency.widened(covariance, self.prior.std, moved))
-        values = physical(self.config.dynamics, self.prior, raw)
         diverged = not (np.isfinite(values).all() and np.isfinite(raw.covariance).all())
         if diverged:
             values, std = self._safe, self.prior.std

@@ -13,16 +13,12 @@ from rov_ident.model.scales import WORKING_SPEED
 
 @dataclass(frozen=True)
 class Estimate:
-    """Coefficients with their covariance (n, n), at ``t`` seconds.
-
-    ``inverse_information`` (n, n) is the same before any calibration or widening, where it differs.
-    """
+    """Coefficients with their covariance (n, n), at ``t`` seconds."""
 
     names: tuple[str, ...]
     values: Array
     covariance: Array
     t: float
-    inverse_information: Array | None = None
 
     @property
     def std(self) -> Array:
@@ -43,11 +39,7 @@ def calibrated(covariance: Array, score: Array) -> Array:
 
 
 def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
-    """The values (n,) that a passive hull can have, and that the data and the prior like best.
-
-    Those are the nearest in the metric of the information. A covariance that is calibrated or
-    widened is another: it is no more than the prior's where the data pull hard, and what goes with
-    a limited thrust, the drag, would stay where it was.
+    """The values (n,) nearest the estimate, in its own metric, that a passive hull can have.
 
     Signs first: the nearest set without positive diagonal derivatives, in either direction of the
     motion (non-negative least squares in the multipliers); what is held at its limit moves the
@@ -56,15 +48,14 @@ def physical(model: Model, prior: Prior, estimate: Estimate) -> Array:
     """
     if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
         return estimate.values
-    values, metric = estimate.values.copy(), estimate.inverse_information
-    metric = estimate.covariance if metric is None else metric
+    values = estimate.values.copy()
     rows, limit = _signs(model, prior)
     if (rows @ values > limit).any():
         # minimise |theta - estimate| in the metric of P: theta = estimate - P rows' lambda
-        p = rows @ metric @ rows.T
+        p = rows @ estimate.covariance @ rows.T
         size = np.sqrt(np.where(np.diag(p) > 0.0, np.diag(p), 1.0))
         multipliers = _multipliers(p / np.outer(size, size), (rows @ values - limit) / size)
-        values -= metric @ rows.T @ (multipliers / size)
+        values -= estimate.covariance @ rows.T @ (multipliers / size)
         signed = np.flatnonzero(prior.negative)  # the first rows: what they hold is exactly zero
         held = multipliers[: len(signed)] > 0.0
         values[signed] = np.where(held, 0.0, np.minimum(values[signed], 0.0))

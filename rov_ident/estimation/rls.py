@@ -226,16 +226,15 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
     n, place = len(task.scale), np.argsort(state.order)
     inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
-    own = inverse @ inverse.T
+    information = inverse @ inverse.T
     solution = (inverse @ state.root[:, n])[place]
     unit = task.scale[:, None] * _jacobian(task, solution)
-    order = np.ix_(place, place)
+    covariance = calibrated(information, state.score)[np.ix_(place, place)]
     return Estimate(
         prior.names,
         _values(task, solution),
-        unit @ calibrated(own, state.score)[order] @ unit.T,
+        unit @ covariance @ unit.T,
         float(state.scalars["t"][0]),
-        unit @ own[order] @ unit.T,
     )
 
 

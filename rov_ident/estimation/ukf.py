@@ -144,13 +144,11 @@ def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, 
 
 def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
-    unit, own = np.outer(task.scale, task.scale), state.p[6:, 6:]
     return Estimate(
         prior.names,
         task.scale * state.x[6:],
-        calibrated(own, state.score) * unit,
+        calibrated(state.p[6:, 6:], state.score) * np.outer(task.scale, task.scale),
         float(state.scalars["t"][0]),
-        own * unit,
     )
 
 
