@@ -550,7 +550,7 @@ def finding(effect, separable=True, manoeuvre=False, alternatives=()):
 def line_of(hidden, *found, verdict="explained", residual=(), axis="", depends_on=()):
     return {
         "effects": dict.fromkeys(hidden), "found": list(found), "verdict": verdict,
-        "residual": [{"axis": a, "depends_on": d} for a, d in residual],
+        "residual": [{"axis": a, "depends_on": d, "sure": True} for a, d in residual],
         "axis": axis, "depends_on": list(depends_on),
     }  # fmt: skip
 

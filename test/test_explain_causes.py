@@ -285,6 +285,7 @@ def test_what_is_left_is_told():
     findings = explain([dataclasses.replace(streams, demand=demand)], case.config).findings
     assert findings.verdict == "unexplained"
     assert any("is left" in note and "yaw rate" in note for note in findings.notes)
+    assert findings.residual  # the contract: it is the finding
 
 
 # ------------------------------------------------------------------ sensors

@@ -317,6 +317,7 @@ def test_verdicts_in_words():
     bias = finding("imu_bias", "kinematic", ax=(0.1, "m/s2"))
     drag = finding("quadratic_damping", "v", separable=False, Y_vv=(-210.0, "N s2/m2"))
     noise = Residual("N", "time", 0.314, 0.4)
+    best = Residual("N", "pitch", None, 0.1, sure=False)
     assert told.verdict(findings("agrees")) == (
         "The simulation agrees with the measurement: there is nothing to change."
     )
@@ -342,6 +343,15 @@ def test_verdicts_in_words():
     assert told.verdict(findings("unexplained", [])) == (
         "Something is left that no effect of the library explains."
     )
+    slight = dataclasses.replace(drag, gain=dataclasses.replace(drag.gain, low=-69.0))
+    doubtful = dataclasses.replace(findings("unexplained", [], [best]), minor=(slight,))
+    assert told.verdict(doubtful) == (
+        "Something is left that no effect of the library surely explains: a moment N that depends, "
+        "if on anything, on pitch (10 % of what is left). Quadratic damping may explain it, "
+        "not beyond chance on the held-out data: a second dive (--validate) would decide."
+    )
+    nothing = Residual("N", "time", None, 0.0, sure=False)
+    assert told.dependence(nothing) == "a moment N that depends on nothing that was tried"
 
 
 def test_error_is_averaged_in_bins_that_hold_enough():

@@ -453,7 +453,7 @@ def unknown(line: Line) -> bool:
     return (
         line["verdict"] == "unexplained"
         and any(
-            r["axis"] == line["axis"] and r["depends_on"] in line["depends_on"]
+            r["sure"] and r["axis"] == line["axis"] and r["depends_on"] in line["depends_on"]
             for r in line["residual"]
         )
         and not sure(line)

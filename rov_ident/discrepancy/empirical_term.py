@@ -9,12 +9,13 @@ scale is a parameter like any other.
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rov_ident.core.linalg import scaled_solve
+from rov_ident.discrepancy.findings import of_attitude_errors
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.linearisation import Linearisation, linearise
 from rov_ident.discrepancy.output_error import Fitted, refit, solve_bounded, step_limits
@@ -127,6 +128,29 @@ def residual(of: Finding, h: Hypothesis) -> Residual:
     on = ON[int(shape["axis"])]
     axis = on if on in AXES else AXES[VELOCITIES.index(gain.component)]
     return Residual(axis, OF[int(shape["first"])], 1.0 / period if period else None, share)
+
+
+def best_dependences(problem: WindowedProblem, now: Fitted, axes: Sequence[int]) -> list[Residual]:
+    """What the residuals on body axes, of which nothing is sure but that they are there, depend on
+    best, the largest share first, of all squared residuals. If windows predict no others on any
+    axis, the first one on time."""
+    scored, found = _scored(problem, now), []
+    for axis in axes:
+        best = next((s for s in scored if s.axis == axis and not s.second), None)
+        gain = 0.0 if best is None else float(_penalised(problem, now, best)[1].sum())
+        if best is not None and gain > 0.0:
+            frequency = 1.0 / float(best.ends[0, 1]) if best.first == TIME else None
+            share = gain / now.linearisation.rss
+            found.append(Residual(AXES[axis], OF[best.first], frequency, share, sure=False))
+    none = Residual(AXES[axes[0]], "time", None, 0.0, sure=False)
+    return sorted(found, key=lambda r: -r.share) or [none]
+
+
+def exceeds_errors_of_attitude(problem: WindowedProblem, fitted: Fitted) -> bool:
+    """Whether the term of a fit is more than errors of the attitude make of the righting moment."""
+    h = fitted.hypothesis
+    force = problem.columns(h, fitted.linearisation.motion, [SCALE])[:, :, 0] * h.values[SCALE]
+    return bool(np.any(np.sqrt(np.mean(force**2, axis=0)) > of_attitude_errors(h)))
 
 
 def _fitted(problem: WindowedProblem, now: Fitted, shape: Shape) -> Fitted | None:

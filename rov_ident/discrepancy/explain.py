@@ -220,6 +220,9 @@ def explain(
             residual = residual or [empirical_term.residual(f, last.hypothesis)]
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
     verdict = _verdict(found, residual, left, improves)
+    if verdict == "unexplained" and not residual:
+        axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]
+        residual = empirical_term.best_dependences(search.problem, model.final, axes)
     everything = WindowedProblem(data.streams, blocks(data.streams))
     compared["extended"] = shared.with_own(everything, best)
     notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
@@ -597,7 +600,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     that explains as much, which is not sure, as it was not found by itself."""
     rest = model.final
     term = empirical_term.found(search.problem, rest)
-    if term is None:
+    if term is None or not empirical_term.exceeds_errors_of_attitude(search.problem, term):
         return
     best, name = term, empirical_term.NAME
     lacking, h = search.screening.lacks_plainer, rest.hypothesis

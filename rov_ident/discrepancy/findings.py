@@ -262,10 +262,10 @@ def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
 def residuals(final: Fitted, trials: Trials) -> list[Residual]:
     """What the patterns in a model say: on which axis something is left that has no name. Windows
     are predicted by fits to the others; as a pattern was chosen by all windows, from many, it must
-    surely gain what an effect must gain at all, and be more than an error of the attitude makes of
-    the righting moment. The share is one of squares."""
+    surely gain what an effect must gain at all, and be more than errors of the attitude make of the
+    righting moment, 95 % of them. The share is one of squares."""
     found, h, problem = [], final.hypothesis, final.linearisation.problem
-    righting = np.linalg.norm(h.model.body.restoring, axis=1) * h.config.odometry.attitude_std
+    of_attitude = of_attitude_errors(h)
     for name, trial in trials.items():
         if not name.startswith(UNKNOWN):
             continue
@@ -278,11 +278,18 @@ def residuals(final: Fitted, trials: Trials) -> list[Residual]:
         keys = [k for k in h.keys if effect_of(k) == name]
         columns = problem.columns(h, final.linearisation.motion, keys)
         force = columns[:, i] @ np.array([h.values[k] for k in keys])
-        acts = np.sqrt(np.mean(force**2)) > righting[i]
+        acts = np.sqrt(np.mean(force**2)) > of_attitude[i]
         if acts and gain is not None and gain.low >= 100.0 * PRACTICAL:
             share = float(1.0 - after.sum() / before.sum())
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)
+
+
+def of_attitude_errors(h: Hypothesis) -> Array:
+    """What 95 % of the attitude's errors make at most of the wrench (6,) of weight and buoyancy."""
+    size = np.linalg.norm(h.model.body.restoring, axis=1)
+    out: Array = NORMAL * h.config.odometry.attitude_std * size
+    return out
 
 
 def without_most_favourable(before: Array, after: Array) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.files import write_file
 from rov_ident.discrepancy.explain import Explanation
-from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, judged, predicted
+from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, is_sure, judged, predicted
 from rov_ident.discrepancy.results import Finding, Findings, Gain, Repetition, Residual, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -29,6 +29,14 @@ SENSES = dict(zip(VELOCITIES, _SENSES))  # what a negative and a positive veloci
 _BEFORE_THE_FIT = (
     "All from here on is from the search that came before the last fit, whose values are those "
     'above and in extended.yaml; "retuned" and "extended" are models of the search.'
+)
+_SAME_THING = (
+    "No effect of the library has this form: look for a cause that depends on the same thing, on "
+    "the vehicle or in the recording."
+)
+_MAY_EXPLAIN = (
+    "{} may explain it, not beyond chance on the held-out data: a second dive (--validate) would "
+    "decide. "
 )
 _TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
 _TOLD = 3  # parameters of an effect in the verdict
@@ -72,7 +80,14 @@ def verdict(findings: Findings) -> str:
     if findings.verdict == "explained":
         return named
     left = f": {left}" if left else ""
-    return f"Something is left that no effect of the library explains{left}. {named}".strip()
+    doubtful = [f for f in findings.minor if not EFFECTS[f.effect].of_sensors]
+    is_known = any(r.sure for r in findings.residual)  # what no effect is like
+    doubtful = [] if is_known else [f for f in doubtful if not is_sure(f.gain)]
+    may = listed([called(f.effect) for f in doubtful])
+    explains = _MAY_EXPLAIN.format(may[0].upper() + may[1:]) if may else ""
+    surely = "surely " if may else ""
+    words = f"Something is left that no effect of the library {surely}explains{left}. {explains}"
+    return f"{words}{named}".strip()
 
 
 def _named(effects: Sequence[Finding]) -> str:
@@ -113,9 +128,12 @@ def dependence(r: Residual) -> str:
     """What is left on an axis, in words."""
     kind = "force" if r.axis in AXES[:3] else "moment"
     at = "" if r.frequency_hz is None else f" at {number(r.frequency_hz, 2)} Hz"
+    if not r.share:
+        return f"a {kind} {r.axis} that depends on nothing that was tried"
+    depends, of = ("depends", f" on {r.axis}") if r.sure else ("depends, if on anything,", "")
     return (
-        f"a {kind} {r.axis} that depends on {r.depends_on}{at} "
-        f"({100.0 * r.share:.0f} % of what is left on {r.axis})"
+        f"a {kind} {r.axis} that {depends} on {r.depends_on}{at} "
+        f"({100.0 * r.share:.0f} % of what is left{of})"
     )
 
 
@@ -207,13 +225,8 @@ def sections(explanation: Explanation, fitted: Config | None = None) -> list[str
     parts += minor(f.minor)
     parts.append(report.heading("What is left"))
     if f.residual:
-        parts += [
-            report.bullets([f"{dependence(r)[2:]}." for r in f.residual]),
-            report.paragraph(
-                "No effect of the library has this form: look for a cause that depends on the "
-                "same thing, on the vehicle or in the recording."
-            ),
-        ]
+        parts.append(report.bullets([f"{dependence(r)[2:]}." for r in f.residual]))
+        parts += [report.paragraph(_SAME_THING)] if all(r.sure for r in f.residual) else []
     else:
         parts.append(report.paragraph("Nothing that depends on motion, place or time."))
     parts += _retuned(f, fitted or explanation.extended)

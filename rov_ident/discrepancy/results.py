@@ -84,12 +84,14 @@ class Finding:
 @dataclass(frozen=True)
 class Residual:
     """What no effect explains: on which axis, how it depends on what, and the share of the axis's
-    residual power that the dependence explains."""
+    residual power that the dependence explains; whether that is ``sure``, or only the best there is
+    where something is surely left, and the share one of all axes together."""
 
     axis: str
     depends_on: str
     frequency_hz: float | None
     share: float
+    sure: bool = True
 
 
 @dataclass(frozen=True)
