@@ -26,6 +26,7 @@ from rov_ident.config.prior import (
     rigid_body_covariance,
 )
 from rov_ident.core.states import State
+from rov_ident.effects import memory, steering_memory
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
 from rov_ident.sampling.effect_jacobians import EffectJacobians
@@ -167,7 +168,7 @@ def test_a_vehicle_at_rest_in_its_trim_does_not_accelerate(heavy):
     sample["orientation"][:, 0] = 1.0
     # surge and heave are held against what weight and buoyancy leave
     sample["wrench"] = -moved.dynamics.body.restoring @ sample["down"][0]
-    columns = EffectJacobians(config).about(moved)
+    columns = EffectJacobians(config).about(moved, memory(), steering_memory())
     sides = np.zeros((13, columns.size))
     columns.extend(sample, sides, np.zeros(3))
     for own, axis in (("dx", 0), ("dy", 1), ("dz", 2)):

@@ -1,6 +1,7 @@
 """The estimator that nodes, replay and offline fits share: words, bounds, garbage, reset."""
 
 import dataclasses
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.core.states import Level, State
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.estimation.physical import is_passive
+from rov_ident.sampling.sample import joined
+from rov_ident.sampling.sampler import Sampler
 from rov_ident.simulation import virtual_sensors as sensors
 from rov_ident.simulation.manoeuvres import manoeuvre
 
@@ -159,6 +162,30 @@ def test_learning_anew_does_not_depend_on_how_messages_come(lagging, kind):
     expected = pushed.report()
     assert followed.report().values.tolist() == expected.values.tolist()
     assert followed.report().covariance.tolist() == expected.covariance.tolist()
+
+
+def test_what_follows_is_sampled_with_the_lag_that_is_known_now(lagging):
+    """After learning anew, the thrust that acts has always had it."""
+    config, messages = lagging
+    estimator, compared = OnlineEstimator(config, "rls"), 0
+    for n, (role, message) in enumerate(messages):
+        before = estimator.sampler
+        estimator.push(role, message)
+        if estimator.sampler is before:
+            continue
+        compared += 1
+        expected = Sampler(estimator.config)
+        expected.recentre(estimator._centre_config)
+        for other in messages[: n + 1]:
+            expected.push(*other)
+        copy = deepcopy(estimator.sampler)
+        ours, theirs = (
+            joined([sampler.push(*other) for other in messages[n + 1 : n + 40]])
+            for sampler in (copy, expected)
+        )
+        assert len(ours) and ours["wrench"].tolist() == theirs["wrench"].tolist()
+        assert estimator.counts["wrench"] == sum(role == WRENCH for role, _ in messages[: n + 1])
+    assert compared
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1114,3 +1114,38 @@ def test_nothing_raises_and_samples_are_finite(heavy, messages, sort):
     # refused or not, a well-behaved stream goes on
     sampler_samples, _ = taken(heavy, [*messages, *steady(1000.0, 1002.0)])
     assert len(sampler_samples) > 20
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("moved", ["thrust_scale.scale", "thruster_lag.time_constant"])
+def test_what_a_lag_holds_back_moves_with_the_parameters(heavy, moved, seed):
+    """Thrust that still acts would be that of the parameters before: wrong for as long as the lag
+    lasts, which taught that they have to move on. A scale is followed exactly, a lag to first
+    order."""
+    config = with_section(heavy, "wrench", scale_std=0.15, lag_std=0.2).with_nuisance
+    rng = np.random.default_rng(seed)
+    before = {"thrust_scale.scale": rng.uniform(0.7, 1.3), "thruster_lag.time_constant": 0.25}
+    after = before | {moved: 1.1 * before[moved]}
+    messages = without_arrival(clean(heavy, seed=seed))
+    instant = sensors.START + rng.uniform(2.5, 4.5) * SECOND
+    samplers = [Sampler(config) for _ in range(3)]
+    moving = samplers[0]
+    for sampler, values in zip(samplers, (before, after, before), strict=True):
+        sampler.recentre(config.with_values(values))
+    made = []
+    for role, message in messages:
+        if message.stamp >= instant and not made:
+            moving.recentre(config.with_values(after))
+        parts = [sampler.push(role, message) for sampler in samplers]
+        if message.stamp >= instant and len(parts[0]):
+            made.append([part[["wrench", "by_wrench", "about"]] for part in parts])
+        if len(made) == 10:  # a tenth of a second
+            break
+    ours, wanted, stayed = (joined([parts[k] for parts in made]) for k in range(3))
+
+    def off(samples):
+        return np.linalg.norm(samples["wrench"] - wanted["wrench"])
+
+    assert off(stayed) > 0.1
+    assert off(ours) < (1e-9 if moved == "thrust_scale.scale" else 0.2) * off(stayed)
+    np.testing.assert_array_equal(ours["about"], wanted["about"])

@@ -117,8 +117,10 @@ class Sea:
 
     odometry_rate: float = 20.0  # Hz
     velocity_delay: float = 0.0  # s, age of the linear velocity at its stamp
+    velocity_scale: float = 1.0  # of the reading over the linear velocity
     velocity_turned: tuple[float, ...] = (0.0,) * 3  # rad, of its sensor
     smoothing: float = 0.0  # s, time constant of the filter whose output the odometry is
+    of_reading: tuple[float, ...] = (1.0,) * 6  # of each axis's wrench over what is read
     wrench_floor: tuple[float, ...] = (0.0,) * 6  # N, N m, std of the reading at any wrench
     wander: float = 0.0  # rad, std of an error of the odometry's attitude that lasts
     gyro_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # rad/s
@@ -661,6 +663,7 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
         position[frozen] = position[frozen][0]
     level = np.array([[1.0, 0.0, 0.0, 0.0]])
     linear = linear @ rotations(_tilted(level, np.array([sea.velocity_turned])))[0]
+    linear *= sea.velocity_scale
     if sea.wander:
         error = _coloured(rng, gyro.shape, sea.wander, WANDER_TIME)
         attitude = _tilted(attitude, error[np.clip(np.searchsorted(imu_t, t), 0, len(imu_t) - 1)])
@@ -681,7 +684,7 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
 
     # wrench
     shape = truth.command.shape
-    reading = truth.command * (1.0 + WRENCH_STD * rng.standard_normal(shape))
+    reading = truth.command / sea.of_reading * (1.0 + WRENCH_STD * rng.standard_normal(shape))
     reading += sea.wrench_floor * rng.standard_normal(shape)
     if sea.reversed_axis >= 0:
         reading[:, sea.reversed_axis] *= -1.0

@@ -148,6 +148,25 @@ def _ordinary(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
     }
 
 
+def _supposed(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """All that is uncertain by default, each drawn with the standard deviation that is supposed of
+    it (docs/inputs.md): the intervals then have to hold in 95 % of cases, neither less nor more."""
+    normal, arm = rng.standard_normal, float(vehicle.cog[2] - vehicle.cob[2])
+    return {
+        **_mass(rng, vehicle),
+        "thrust_scale": max(1.0 + 0.15 * normal(), 0.6),
+        "of_reading": tuple((1.0 + 0.05 * normal(6)).tolist()),
+        "lag": abs(0.2 * normal()),
+        "current": tuple((0.3 * normal(2)).tolist()),
+        "lift": 0.02 * sea.GRAVITY * vehicle.mass * normal(),
+        "cog": tuple((0.005 * normal(3)).tolist()),
+        "cob_off": max(max(0.005, 0.15 * arm) * normal(), -0.5 * arm),
+        "velocity_delay": abs(0.1 * normal()),
+        "velocity_scale": 1.0 + 0.01 * normal(),
+        "imu_clock": 0.001 * normal(),
+    }
+
+
 ALONE: dict[str, Draw] = {
     "thrust scale": _thrust_scale,
     "thruster lag": _lag,
@@ -195,7 +214,7 @@ def _stamps(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
 
 CASES: dict[str, Draw] = {
     "known": _clean, "clean": _clean, **ALONE, "ordinary sensors": _ordinary,
-    "all together": _everything,
+    "as supposed": _supposed, "all together": _everything,
 }  # fmt: skip
 LIES: dict[str, Draw] = {
     "velocity frozen": _frozen,

@@ -10,6 +10,7 @@ from rov_ident.effects.base import MEMORY, Effect, EffectParameter
 _ROOM = (MEMORY - 1) // 7
 # Past commands with their instants: half a second of changes at 290 Hz. Beyond that the oldest is
 # forgotten, as if the next one had acted in its place.
+_LONGEST = 0.5  # s; what is remembered does not depend on the delay (rov_ident.effects.base)
 
 
 @kernel
@@ -29,22 +30,30 @@ def act(p, state, t, dt, wrench):
         queue[count, 0] = t
         queue[count, 1:] = wrench
         count += 1
-    begin, end = t - delay, t + dt - delay
-    past = 0  # entries that have ended before
-    while past + 1 < count and queue[past + 1, 0] <= begin:
-        past += 1
+    past = _ended_before(queue, count, t - _LONGEST)
     _forget(queue, past, count)
     count -= past
     state[0] = count
-    wrench[:] = queue[0, 1:]
-    if count == 1 or not queue[1, 0] < end:
+    begin, end = t - delay, t + dt - delay
+    first = _ended_before(queue, count, begin)
+    wrench[:] = queue[first, 1:]
+    if count == first + 1 or not queue[first + 1, 0] < end:
         return
-    wrench *= (queue[1, 0] - begin) / dt
-    for k in range(1, count):
+    wrench *= (queue[first + 1, 0] - begin) / dt
+    for k in range(first + 1, count):
         until = min(queue[k + 1, 0], end) if k + 1 < count else end
         if until > queue[k, 0]:
             for i in range(6):
                 wrench[i] += (until - queue[k, 0]) / dt * queue[k, 1 + i]
+
+
+@kernel
+def _ended_before(queue, count, t):
+    """How many commands had ended before t."""
+    ended = 0
+    while ended + 1 < count and queue[ended + 1, 0] <= t:
+        ended += 1
+    return ended
 
 
 @kernel
@@ -60,7 +69,7 @@ EFFECT = Effect(
     traits=("late",),
     manoeuvre="sharp steps of thrust from rest, one axis at a time, with fast odometry",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 9.5",
-    parameters=(EffectParameter("delay", "s", "from command to thrust", 0.0, 0.0, 0.5, 0.05),),
+    parameters=(EffectParameter("delay", "s", "from command to thrust", 0.0, 0.0, _LONGEST, 0.05),),
     act=act,
     order=10,
 )

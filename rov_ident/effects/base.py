@@ -19,7 +19,9 @@ An effect says what it does by exactly one of these, each in the file of the eff
 ``act``
     A kernel ``act(p, state, t, dt, wrench)``: on entry ``wrench`` (6,) is commanded from ``t`` to
     ``t + dt``, on return it holds the mean of what acts meanwhile. ``state`` (:data:`MEMORY`,) is
-    the effect's own, all zeros before the first call. Effects act in the order of ``order``. With
+    the effect's own, all zeros before the first call; where estimated parameters move, it moves
+    along to first order, so that what is no smooth function of them must not depend on them.
+    Effects act in the order of ``order``. With
     ``noise(**parameters) -> (6,)``, the standard deviation of what is read beside the command,
     ``act`` takes back what it can of that, and nothing of it acts on a true command.
 ``steer``

@@ -350,8 +350,10 @@ class OnlineEstimator:
         turns. ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
+        # a lag that asks for a negative mass beside it is no lag
+        whole = physical(self.config.dynamics, self.prior, raw)
         own = slice(len(self.config.estimate), None)
-        now = np.clip(raw.values[own], self.prior.lower[own], self.prior.upper[own])
+        now = whole[own]
         std = np.sqrt(self._module.variance(self._task, self._state)[own])
         unit = self.prior.std[own]
         if math.isnan(self._settled):
@@ -365,8 +367,8 @@ class OnlineEstimator:
             now = np.where(self._is_time & (early | ~known), self._about, now)
         if not (np.abs(now - self._about) > _RECENTRE * std).any():
             return
-        whole = dict(zip(self.prior.names, physical(self.config.dynamics, self.prior, raw)))
-        self._centre({**whole, **dict(zip(self.config.effect_names, now.tolist(), strict=True))})
+        whole[own] = now
+        self._centre(dict(zip(self.prior.names, whole.tolist(), strict=True)))
         move = now - self._learnt_about
         far = self._is_time & (np.abs(move) > outdated)
         if far.any() and not at_once:
@@ -382,11 +384,13 @@ class OnlineEstimator:
         """
         if interpreting():
             return
-        samples = self._recent.samples(
-            self.config, self._centre_config, self._origin.kinematics, self.sampler.origin,
-            self._last_t,
-        )  # fmt: skip
-        samples = after_reset(samples)
+        sampler, samples = self._recent.again(
+            self.config, self._centre_config, self._origin.kinematics, self.sampler
+        )
+        if len(samples) == 0:  # the messages before were forgotten
+            return
+        self.sampler, samples = sampler, after_reset(samples)
+        self._last_t = float(samples["t"][-1])
         while len(samples):
             count = int(np.sum(samples["t"] < samples["t"][0] + CENTRING_TIME))
             self._fold(samples[:count])

@@ -41,17 +41,20 @@ class RecentMessages:
     def clear(self) -> None:
         self._kept.clear()
 
-    def samples(
-        self, config: Config, about: Config, kinematics: NDArray[np.void], origin: int | None,
-        last: float,
-    ) -> NDArray[np.void]:  # fmt: skip
-        """Samples (k,) of SAMPLE up to the time ``last`` [s], for the estimation that ``config``
-        asks for, made with the parameters of effects of ``about``. ``kinematics`` is the state of a
-        kinematic filter before the first message, ``origin`` the stamp [ns] of t = 0."""
+    def again(
+        self, config: Config, about: Config, kinematics: NDArray[np.void], live: Sampler
+    ) -> tuple[Sampler, NDArray[np.void]]:
+        """A sampler that has taken them all, for the estimation that ``config`` asks for, with the
+        parameters of effects of ``about``, and its samples (k,) of SAMPLE. It goes on in the place
+        of ``live``, in which the thrust that acts still has the lag that was supposed before.
+        ``kinematics`` is the state of a kinematic filter before the first message."""
         sampler = Sampler(config)
         sampler.recentre(about)
-        sampler.origin = origin
+        sampler.origin = live.origin
         sampler.kinematic_filter.begin_with(kinematics)
         made = [sampler.push(role, message) for _, role, message in self._kept]
         samples = joined([part for part in made if len(part)] or [sampler.flush()])
-        return samples[samples["t"] <= last]
+        sampler.commands = live.commands
+        sampler.counts.clear()
+        sampler.counts.update(live.counts)
+        return sampler, samples

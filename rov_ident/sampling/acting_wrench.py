@@ -71,7 +71,7 @@ class ActingWrench:
 
     def clear(self) -> None:
         self._command: _Command | None = None  # the one that is held
-        self._memory = memory()
+        self.memory = memory()  # of the input effects
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
         self._period = CommandPeriod()
         self._last_received = -np.inf  # s
@@ -121,7 +121,7 @@ class ActingWrench:
         held = self._command
         if held is None or end - held.t > min(self._timeout, SILENCE * self._period.longest):
             self._command = None
-            self._memory = memory()
+            self.memory = memory()
             if self._jacobians is not None:
                 self._jacobians.forget()
             return None
@@ -165,7 +165,7 @@ class ActingWrench:
         """The wrench (6,) that acts in the mean from ``begin`` to ``end`` by a held command."""
         wrench, dt = command.wrench.copy(), end - begin
         if self._has_inputs:
-            act(self._effects, self._memory, begin, dt, wrench)
+            act(self._effects, self.memory, begin, dt, wrench)
         if self._jacobians is not None:
             self._jacobians.act(begin, dt, command.wrench)
         return wrench

@@ -43,7 +43,7 @@ class Driven:
         """Forget what has come."""
         self._t: dict[str, list[float]] = {name: [] for name in INPUTS}
         self._x: dict[str, list[float]] = {name: [] for name in INPUTS}
-        self._memory = steering_memory()
+        self.memory = steering_memory()  # of the effects on fins
 
     def push(self, t: float, message: Joints) -> None:
         """Take the joints' state at t [s]; joints that nobody named are passed over."""
@@ -71,7 +71,7 @@ class Driven:
         for name in self._joints:
             times, values = self._t[name], self._x[name]
             if not times or times[0] > end or end - times[-1] > self._timeout:
-                self._memory = steering_memory()
+                self.memory = steering_memory()
                 return out, name
             _forget(times, values, begin)
             first, last = bisect_left(times, begin), bisect_left(times, end)
@@ -87,7 +87,7 @@ class Driven:
         if not self._steers:
             return inputs
         acting = inputs.copy()
-        steer(self._effects, self._memory, dt, acting)
+        steer(self._effects, self.memory, dt, acting)
         return acting
 
 

@@ -151,16 +151,26 @@ class EffectJacobians:
             _act(self._variants, self._memory, t, dt, command, self._impulse)
             self._time += dt
 
-    def about(self, config: Config) -> "EffectJacobians":
+    def about(self, config: Config, acting: Array, steering: Array) -> "EffectJacobians":
         """The same of a configuration with other values of the parameters; what is known stays.
 
-        So do the values that the columns of the rigid body are about, as the estimator's own body
-        stays: these columns are linear.
+        What effects on inputs remember, the variants here and the configured ones in ``acting``
+        and ``steering``, moves to first order to what it would be with these values: or a lag would
+        go on with thrust that was scaled otherwise. The values that the columns of the rigid body
+        are about stay, as the estimator's own body does: these columns are linear.
         """
         new = EffectJacobians(config)
-        names = "_memory _around _impulse _time _velocity _followed _lacking _rate _steering"
+        names = "_around _impulse _time _velocity _followed _lacking _rate"
         for name in names.split():
             setattr(new, name, getattr(self, name))
+        moved = (new._about - self._about) / self._width
+        low, high = self._memory[0::2], self._memory[1::2]
+        acts = np.tensordot(moved[self._acts], high - low, 1)
+        low, high = self._steering[:, 0], self._steering[:, 1]
+        steers = np.tensordot(moved[[i for i, *_ in self._steers]], high - low, 1)
+        new._memory, new._steering = self._memory + acts, self._steering + steers
+        acting += acts
+        steering += steers
         new._about[new._bodies] = self._about[self._bodies]
         return new
 

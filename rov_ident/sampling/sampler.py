@@ -100,9 +100,10 @@ class Sampler:
         self._queues.await_drive(config.inputs.joints)
 
     def recentre(self, config: Config) -> None:
-        """Go on with other values of the effects' parameters; their memory stays."""
+        """Go on with other values of the effects' parameters."""
         assert self._jacobians is not None
-        self._jacobians = self._jacobians.about(config)
+        remembered = self._acting.memory, self._driven.memory
+        self._jacobians = self._jacobians.about(config, *remembered)
         self._take_delay(config)
         self.kinematic_filter.take_effects(config)
         self._acting.configure(config, self._jacobians)
