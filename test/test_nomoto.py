@@ -275,7 +275,7 @@ def test_simulation_is_that_of_the_equations():
         return [y[1], -1.2 * y[1] + y[2] + 0.1 * d, -0.2 * y[1] - 3.0 * y[1] ** 3 + 0.06 * d]
 
     expected = solve_ivp(motion, (0.0, 20.0), first, t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.1)
-    found = nomoto_model.respond(2, True, theta, run, first)
+    found = nomoto_model.respond(nomoto_model.Structure(2, True), theta, run, first)
     np.testing.assert_allclose(found, expected.y[0], atol=1e-6)
 
 
@@ -394,7 +394,9 @@ def linearised(model, speed):
     g = inverse @ model.input_wrench(np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), rudder)[rows]
     b0 = f[1, 0] * g[0] - f[0, 0] * g[1]
     theta = np.array([np.linalg.det(f), -np.trace(f), b0, g[1], 0.0])
-    return nomoto_model.model_of(2, False, "linearised", theta, np.zeros((5, 5)), "rad", 0.0)
+    return nomoto_model.model_of(
+        nomoto_model.Structure(2), "linearised", theta, np.zeros((5, 5)), "rad", 0.0
+    )
 
 
 def test_linearised_equations_of_motion():

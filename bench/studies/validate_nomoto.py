@@ -183,7 +183,7 @@ def _relative(run: Zigzag, method: str, k: float, t: float) -> tuple[float, floa
 
 def _from_start(model: Nomoto, run: Zigzag, window: float) -> float:
     """RMSE [rad] of a prediction whose first state is fitted to the first ``window`` s alone."""
-    fine, what = run.cornered(), (model.order, model.nonlinear, model.theta)
+    fine, what = run.cornered(), (model.structure, model.theta)
     seen = replace(fine, heading=np.where(fine.t <= fine.t[0] + window, fine.heading, np.nan))
     heading = nomoto_model.respond(*what, fine, *nomoto_model.first_state(*what, seen))
     return nomoto_model.rmse(fine.heading - heading)

@@ -18,7 +18,7 @@ from rov_ident.reports.result import provenance
 from rov_ident.steering import heading_interpolation as densify
 from rov_ident.steering.nomoto_equation_error import equation_error
 from rov_ident.steering.nomoto_filter import unscented
-from rov_ident.steering.nomoto_model import Nomoto, predict, rmse
+from rov_ident.steering.nomoto_model import Nomoto, Structure, predict, rmse
 from rov_ident.steering.nomoto_output_error import descend, output_error
 from rov_ident.steering.zigzag import Zigzag
 
@@ -66,7 +66,7 @@ def fit(
     if isinstance(order, str):
         model = cross_validated(used, nonlinear)
     else:
-        model = output_error(used, order, nonlinear)
+        model = output_error(used, Structure(order, nonlinear))
     fitted = model.rmse
     if method == "ukf":
         model = unscented(used, model)
@@ -137,7 +137,7 @@ def cross_validated(runs: Sequence[Zigzag], nonlinear: bool) -> Nomoto:
     models: dict[int, Nomoto] = {}
     for order in ORDERS:
         with contextlib.suppress(UserError):
-            models[order] = output_error(runs, order, nonlinear)
+            models[order] = output_error(runs, Structure(order, nonlinear))
     if not models:
         raise UserError("the fit does not converge with either order: try without --nonlinear")
     errors = {order: _left_out(runs, model) for order, model in models.items()}
@@ -172,7 +172,7 @@ def _left_out(runs: Sequence[Zigzag], model: Nomoto) -> Array:
             out = np.minimum(place, _PARTS - 1) == part
             kept.append(dataclasses.replace(run, heading=np.where(out, np.nan, run.heading)))
             gone.append(out & run.known)
-        fitted = descend(kept, model.order, model.nonlinear, model.theta)
+        fitted = descend(kept, model.structure, model.theta)
         for run, rest, out in zip(runs, kept, gone):
             if out.any():
                 heading = predict(fitted, rest)[0]
@@ -211,7 +211,7 @@ def others(
     for method in METHODS:
         if method != model.estimator:
             with contextlib.suppress(UserError, np.linalg.LinAlgError):
-                found[method] = fit(runs, model.order, model.nonlinear, method, interpolate, step)
+                found[method] = fit(runs, *model.structure, method, interpolate, step)
     return found
 
 

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
-from rov_ident.steering.nomoto_model import Nomoto, first_state, model_of, names_of, respond
+from rov_ident.steering.nomoto_model import Nomoto, Structure, first_state, model_of, respond
 from rov_ident.steering.nomoto_output_error import robust_covariance
 from rov_ident.steering.zigzag import Zigzag
 
@@ -22,9 +22,9 @@ def equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomoto
 
     all at t; second order one difference more. ``b0 delta_0`` is the constant column.
     """
-    order, nonlinear = model.order, model.nonlinear
+    structure = model.structure
     even = [_evenly(run) for run in runs]
-    parts = [_rows(run.t, run.heading, run.rudder, order, nonlinear) for run in even]
+    parts = [_rows(run.t, run.heading, run.rudder, structure) for run in even]
     y = np.concatenate([p[0] for p in parts])
     x = np.vstack([p[1] for p in parts])
     if len(y) < 4 * x.shape[1]:
@@ -37,9 +37,8 @@ def equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomoto
         for _ in range(30):
             blocks: list[Array] = []
             for run in even:
-                first, shares = first_state(order, nonlinear, theta, run)
-                heading = respond(order, nonlinear, theta, run, first, shares)
-                blocks.append(_rows(run.t, heading, run.rudder, order, nonlinear)[1])
+                heading = respond(structure, theta, run, *first_state(structure, theta, run))
+                blocks.append(_rows(run.t, heading, run.rudder, structure)[1])
             z = np.vstack(blocks)
             if not np.abs(z).max() < 1e5:
                 raise UserError(
@@ -48,7 +47,7 @@ def equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomoto
             new = np.linalg.solve(z.T @ x, z.T @ y)
             moved = np.abs(new - solution).max() / np.abs(new).max()
             solution = new
-            theta = _from_solution(solution, order, nonlinear)
+            theta = _from_solution(solution, structure)
             if moved < 1e-8:
                 break
     elif method == "rls":
@@ -59,12 +58,12 @@ def equation_error(runs: Sequence[Zigzag], model: Nomoto, method: str) -> Nomoto
     core = robust_covariance(z, error, [len(p[0]) for p in parts])
     square = z.T @ z
     covariance = inverse @ square @ core @ square @ inverse.T
-    theta = _from_solution(solution, order, nonlinear)
+    theta = _from_solution(solution, structure)
     jacobian = np.eye(len(theta))  # of the last alone, delta_0 = (b0 delta_0) / b0
-    b0 = names_of(order, nonlinear).index("b0")
+    b0 = structure.names.index("b0")
     jacobian[-1, -1], jacobian[-1, b0] = 1.0 / theta[b0], -theta[-1] / theta[b0]
     covariance = jacobian @ covariance @ jacobian.T
-    found = model_of(order, nonlinear, method, theta, covariance, model.unit, model.rmse)
+    found = model_of(structure, method, theta, covariance, model.unit, model.rmse)
     return dataclasses.replace(found, cross_validation=model.cross_validation)
 
 
@@ -77,10 +76,9 @@ def _evenly(run: Zigzag) -> Zigzag:
     return Zigzag(run.name, t, heading, np.interp(t, run.t, run.rudder), run.unit)
 
 
-def _rows(
-    t: Array, heading: Array, rudder: Array, order: int, nonlinear: bool
-) -> tuple[Array, Array]:
+def _rows(t: Array, heading: Array, rudder: Array, structure: Structure) -> tuple[Array, Array]:
     """Left side (k,) and regressors (k, n) of the equation in forward differences."""
+    order = structure.order
     h = float(np.median(np.diff(t)))
     rate = np.diff(heading) / h
     k = len(rate) - order
@@ -88,25 +86,28 @@ def _rows(
     columns = [-rate[:k], rudder[:k]]
     if order == 2:
         columns = [-rate[:k], -np.diff(rate)[:k] / h, rudder[:k], np.diff(rudder)[:k] / h]
-    if nonlinear:
+    if structure.nonlinear:
         columns.append(-(rate[:k] ** 3))
     return left, np.column_stack([*columns, -np.ones(k)])
 
 
-def _from_solution(solution: Array, order: int, nonlinear: bool) -> Array:
+def _from_solution(solution: Array, structure: Structure) -> Array:
     """theta from the solution, whose last entry is b0 delta_0."""
-    b0 = solution[names_of(order, nonlinear).index("b0")]
+    b0 = solution[structure.names.index("b0")]
     return np.append(solution[:-1], solution[-1] / b0)
 
 
-def recursive(y: Array, x: Array, lowest: float = 0.9, memory: float = 0.995) -> Array:
+_MEMORY = 0.995  # a choice: of the average of squared prediction errors, 200 rows
+
+
+def recursive(y: Array, x: Array, lowest: float = 0.9) -> Array:
     """Recursive least squares with a dynamic forgetting factor: solutions (k, n) after each row.
 
     The factor falls from 1 towards ``lowest`` as the prediction error grows beyond its usual size
     (Park and Jun 1992: ``lowest + (1 - lowest) 2^-(e/sigma)^2``, here from one and a half sigma
-    on), sigma by exponential averaging with ``memory`` of errors clipped at three sigma, its start
-    the median of the first (0.455: that of a squared normal). What is forgotten is taken from the
-    direction just excited only, so that the covariance stays bounded where nothing moves.
+    on), sigma by exponential averaging of errors clipped at three sigma, its start the median of
+    the first (0.455: that of a squared normal). What is forgotten is taken from the direction just
+    excited only, so that the covariance stays bounded where nothing moves.
     """
     n = x.shape[1]
     size = np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-300)
@@ -134,6 +135,6 @@ def recursive(y: Array, x: Array, lowest: float = 0.9, memory: float = 0.995) ->
         elif i == first:  # by then the first guesses are past
             variance = float(np.median(errors[2 * n :] ** 2)) / 0.455 + 1e-300
         else:
-            variance += (1.0 - memory) * (min(error**2, 9.0 * variance) - variance)
+            variance += (1.0 - _MEMORY) * (min(error**2, 9.0 * variance) - variance)
         out[i] = theta / size
     return out

@@ -7,14 +7,7 @@ import numpy as np
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
-from rov_ident.steering.nomoto_model import (
-    STEP,
-    Nomoto,
-    model_of,
-    names_of,
-    numbers_of,
-    simulate_heading,
-)
+from rov_ident.steering.nomoto_model import STEP, Nomoto, Structure, model_of, simulate_heading
 from rov_ident.steering.zigzag import Zigzag
 
 
@@ -33,11 +26,10 @@ class Filter:
     """
 
     def __init__(
-        self, order: int, nonlinear: bool, theta: Array, sizes: Array, rate: float,
-        heading_noise: float, drive: float,
+        self, structure: Structure, theta: Array, sizes: Array, rate: float, heading_noise: float,
+        drive: float,
     ) -> None:  # fmt: skip
-        self.order, self.states, self.sizes = order, order + 1, sizes
-        self.names = names_of(order, nonlinear)
+        self.structure, self.states, self.sizes = structure, structure.order + 1, sizes
         self.rate, self.r, self.q = rate, heading_noise**2, drive**2
         self.x = np.concatenate([np.zeros(self.states), theta / sizes])
         self.p = np.eye(len(self.x))
@@ -49,7 +41,7 @@ class Filter:
         self.x[:n] = 0.0
         self.x[0] = heading
         self.p[:n, :] = self.p[:, :n] = 0.0
-        self.p[range(n), range(n)] = [self.r, *[self.rate**2] * self.order]
+        self.p[range(n), range(n)] = [self.r, *[self.rate**2] * self.structure.order]
 
     def predict(self, t: Array, rudder: Array, held: bool) -> None:
         """From t[0] to t[1] [s], the rudder (2,) [rad] in between as in :class:`Zigzag`."""
@@ -58,10 +50,10 @@ class Filter:
         points = self.x + np.vstack([spread, -spread])
         out, state = np.empty(2), np.zeros(3)
         for point in points:
-            numbers = numbers_of(self.names, point[self.states :] * self.sizes)
+            numbers = self.structure.numbers(point[self.states :] * self.sizes)
             state[:] = 0.0
             state[: self.states] = point[: self.states]
-            simulate_heading(self.order, *numbers, t, rudder, held, state, STEP, out)
+            simulate_heading(self.structure.order, *numbers, t, rudder, held, state, STEP, out)
             point[: self.states] = state[: self.states]
         self.x = points.mean(axis=0)
         off = points - self.x
@@ -95,10 +87,8 @@ def unscented(runs: Sequence[Zigzag], model: Nomoto) -> Nomoto:
     noise = heading_noise([run.heading[run.known] for run in runs])
 
     def filtered(log_drive: float) -> Filter:
-        f = Filter(
-            model.order, model.nonlinear, 0.5 * model.theta, sizes, rate, noise,
-            rate * np.exp(log_drive),
-        )  # fmt: skip
+        drive = rate * np.exp(log_drive)
+        f = Filter(model.structure, 0.5 * model.theta, sizes, rate, noise, drive)
         for run in runs:
             first = int(np.flatnonzero(run.known)[0])
             f.begin(run.heading[first])
@@ -121,7 +111,6 @@ def unscented(runs: Sequence[Zigzag], model: Nomoto) -> Nomoto:
     f = filtered(best.x)
     n = f.states
     covariance = f.p[n:, n:] * np.outer(sizes, sizes)
-    found = model_of(
-        model.order, model.nonlinear, "ukf", f.x[n:] * sizes, covariance, model.unit, model.rmse
-    )
+    theta = f.x[n:] * sizes
+    found = model_of(model.structure, "ukf", theta, covariance, model.unit, model.rmse)
     return dataclasses.replace(found, cross_validation=model.cross_validation)

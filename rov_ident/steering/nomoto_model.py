@@ -15,8 +15,9 @@ infinite or negative)::
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,24 +32,44 @@ STEP = 0.05  # s, largest of the integration
 MOST_JUMPS = 200  # of a rudder, beyond which their instants are not estimated
 
 
+class Structure(NamedTuple):
+    """Which terms a model has: those of ``order`` 1 or 2, and with ``nonlinear`` the cubic one."""
+
+    order: int
+    nonlinear: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of theta (n,), see the head of the module."""
+        linear = ("a0", "b0") if self.order == 1 else ("a0", "a1", "b0", "b1")
+        return (*linear, *(("c",) if self.nonlinear else ()), "delta_0")
+
+    def numbers(self, theta: Array) -> tuple[float, float, float, float, float, float]:
+        """a0, a1, b0, b1, c and delta_0, as :func:`simulate_heading` takes them."""
+        x = dict(zip(self.names, theta))
+        return x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0), x["delta_0"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Nomoto(Result):
     """A fitted model. Its numbers are K, T (and T1 T2 T3, n3, delta_0); T1 and T2 are left out
     where they are complex.
 
-    ``theta`` (n,) is what was fitted: order 1 ``a0 b0 [c] delta_0``, order 2 ``a0 a1 b0 b1 [c]
-    delta_0``, see the head of the module. ``unit`` is that of the input. ``stable``: whether the
+    ``theta`` (n,) is what was fitted. ``unit`` is that of the input. ``stable``: whether the
     straight course is; None where the 95 % intervals leave it open. ``cross_validation`` has by
     order the heading RMSE [rad] on parts left out of the fit; empty where the order was given.
     """
 
-    order: int
-    nonlinear: bool
+    structure: Structure
     theta: Array
     unit: str
     rmse: float  # rad, of the heading
     stable: bool | None
     cross_validation: Mapping[int, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def order(self) -> int:
+        return self.structure.order
 
     @property
     def growth(self) -> float:
@@ -58,18 +79,18 @@ class Nomoto(Result):
 
 
 def model_of(
-    order: int, nonlinear: bool, estimator: str, theta: Array, covariance: Array, unit: str,
-    rmse: float,
-) -> Nomoto:  # fmt: skip
+    structure: Structure, estimator: str, theta: Array, covariance: Array, unit: str, rmse: float
+) -> Nomoto:
     """The result that theta (n,) with its covariance (n, n) makes, by linear propagation."""
     functions = {
         name: (function, of)
-        for name, (function, of) in _functions(order, nonlinear, unit).items()
+        for name, (function, of) in _functions(structure, unit).items()
         if np.isfinite(function(theta))
     }
-    half = NORMAL * np.sqrt(np.diag(covariance)[:order])  # of a0 (a1), all positive: stable
-    stable = True if (theta[:order] > half).all() else None
-    if (theta[:order] < -half).any():
+    poles = theta[: structure.order]  # a0 (a1), all positive: stable
+    half = NORMAL * np.sqrt(np.diag(covariance)[: structure.order])
+    stable = True if (poles > half).all() else None
+    if (poles < -half).any():
         stable = False
     slopes = np.array([_gradient(function, theta) for function, _ in functions.values()])
     return Nomoto(
@@ -78,8 +99,7 @@ def model_of(
         units=tuple(of for _, of in functions.values()),
         values=np.array([function(theta) for function, _ in functions.values()]),
         covariance=slopes @ covariance @ slopes.T,
-        order=order,
-        nonlinear=nonlinear,
+        structure=structure,
         theta=theta,
         unit=unit,
         rmse=rmse,
@@ -87,15 +107,13 @@ def model_of(
     )
 
 
-def _functions(
-    order: int, nonlinear: bool, unit: str
-) -> dict[str, tuple[Callable[[Array], float], str]]:
+def _functions(structure: Structure, unit: str) -> dict[str, tuple[Callable[[Array], float], str]]:
     """The numbers that theta stands for, and their units."""
-    names = names_of(order, nonlinear)
+    names = structure.names
     b0, off = names.index("b0"), names.index("delta_0")
     rate = "1/s" if unit == "rad" else "rad/(s N m)"
     found: dict[str, tuple[Callable[[Array], float], str]] = {"K": (lambda x: x[b0] / x[0], rate)}
-    if order == 1:
+    if structure.order == 1:
         found["T"] = (lambda x: 1.0 / x[0], "s")
     else:
         found |= {
@@ -106,7 +124,7 @@ def _functions(
             "T1T2": (lambda x: 1.0 / x[0], "s2"),
             "T1_plus_T2": (lambda x: x[1] / x[0], "s"),
         }
-    if nonlinear:
+    if structure.nonlinear:
         c = names.index("c")
         found["n3"] = (lambda x: x[c] / x[0], "s2/rad2")
     found["delta_0"] = (lambda x: x[off], unit)
@@ -124,19 +142,6 @@ def _gradient(function: Callable[[Array], float], x: Array) -> Array:
     return np.array([(function(x + d) - function(x - d)) / (2.0 * d.sum()) for d in np.diag(steps)])
 
 
-def names_of(order: int, nonlinear: bool) -> tuple[str, ...]:
-    linear = ("a0", "b0") if order == 1 else ("a0", "a1", "b0", "b1")
-    return (*linear, *(("c",) if nonlinear else ()), "delta_0")
-
-
-def numbers_of(
-    names: Sequence[str], theta: Array
-) -> tuple[float, float, float, float, float, float]:
-    """a0, a1, b0, b1, c and delta_0, as :func:`simulate_heading` takes them."""
-    x = dict(zip(names, theta))
-    return x["a0"], x.get("a1", 0.0), x["b0"], x.get("b1", 0.0), x.get("c", 0.0), x["delta_0"]
-
-
 def to_json(model: Nomoto, validation: float | None = None, diverges: bool = False) -> str:
     """The result as JSON; ``validation`` is the heading RMSE [rad] on another run, ``diverges``
     whether that prediction does."""
@@ -144,7 +149,7 @@ def to_json(model: Nomoto, validation: float | None = None, diverges: bool = Fal
         "order": model.order,
         **model.entries(),
         "heading_rmse_rad": model.rmse,
-        "nonlinear": model.nonlinear,
+        "nonlinear": model.structure.nonlinear,
         "method": model.estimator,
         "stability": {"course_stable": model.stable, "growth_per_s": model.growth},
         "notes": list(model.notes),
@@ -196,12 +201,7 @@ def simulate_heading(order, a0, a1, b0, b1, c, bias, t, rudder, held, first, max
 
 
 def respond(
-    order: int,
-    nonlinear: bool,
-    theta: Array,
-    run: Zigzag,
-    first: Array,
-    shares: Array | None = None,
+    structure: Structure, theta: Array, run: Zigzag, first: Array, shares: Array | None = None
 ) -> Array:
     """The simulated heading (n,) [rad] of a run from its first state [psi, x1, x2], zeros at its
     end left out.
@@ -209,7 +209,6 @@ def respond(
     The rudder is linear between the rows, or where the run says so, held. ``shares`` (j,) from 0
     to 1 says when within its step each of ``run.reversals`` came about; None or empty: not at all.
     """
-    names = names_of(order, nonlinear)
     t, rudder, rows = run.t, run.rudder, None
     state = np.zeros(3)
     state[: len(first)] = first
@@ -226,7 +225,8 @@ def respond(
             rudder, twice, np.column_stack([rudder[after - 1], rudder[after]]).ravel()
         )
     out = np.empty(len(t))
-    simulate_heading(order, *numbers_of(names, theta), t, rudder, run.held, state, STEP, out)
+    numbers = structure.numbers(theta)
+    simulate_heading(structure.order, *numbers, t, rudder, run.held, state, STEP, out)
     return out if rows is None else out[rows]
 
 
@@ -251,8 +251,8 @@ def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[A
         fine = dataclasses.replace(
             run, t=both, heading=heading, rudder=np.interp(both, rudder.t, rudder.rudder)
         )
-    first, shares = first_state(model.order, model.nonlinear, model.theta, fine)
-    heading = respond(model.order, model.nonlinear, model.theta, fine, first, shares)
+    first, shares = first_state(model.structure, model.theta, fine)
+    heading = respond(model.structure, model.theta, fine, first, shares)
     if len(fine.t) > len(run.t):
         heading = heading[np.searchsorted(fine.t, run.t)]
     return heading, rmse(run.heading - heading)
@@ -268,7 +268,7 @@ def jumps_of(run: Zigzag) -> int:
     return 0 if run.held or count > MOST_JUMPS else count
 
 
-def first_state(order: int, nonlinear: bool, theta: Array, run: Zigzag) -> tuple[Array, Array]:
+def first_state(structure: Structure, theta: Array, run: Zigzag) -> tuple[Array, Array]:
     """First state (order + 1,) and shares (see :func:`respond`) that fit the heading best.
 
     Levenberg-Marquardt's damping matters where the model is unstable: a full step from rest may
@@ -276,18 +276,19 @@ def first_state(order: int, nonlinear: bool, theta: Array, run: Zigzag) -> tuple
     """
     from scipy.optimize import least_squares  # here: a node does not need it
 
-    known, jumps, states = run.known, jumps_of(run), order + 1
+    order, known, jumps = structure.order, run.known, jumps_of(run)
+    states = order + 1
     begins = [np.concatenate([[run.heading[known][0]], np.zeros(order), np.full(jumps, 0.5)])]
-    if nonlinear:  # also from the linear part's, which cannot run away within the run
-        linear = np.delete(theta, names_of(order, True).index("c"))
-        begins.append(np.concatenate(first_state(order, False, linear, run)))
+    if structure.nonlinear:  # also from the linear part's, which cannot run away within the run
+        linear = np.delete(theta, structure.names.index("c"))
+        begins.append(np.concatenate(first_state(Structure(order), linear, run)))
     speed = max(float(np.std(np.gradient(run.heading[known], run.t[known]))), 1e-9)
     sizes = np.concatenate([[0.1], np.full(order, speed), np.ones(jumps)])
     free = np.full(states, np.inf)
 
     def error(x: Array) -> Array:
         x = x * sizes
-        return (respond(order, nonlinear, theta, run, x[:states], x[states:]) - run.heading)[known]
+        return (respond(structure, theta, run, x[:states], x[states:]) - run.heading)[known]
 
     best, cost = begins[0], np.inf
     for begin in begins:

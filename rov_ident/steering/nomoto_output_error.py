@@ -12,10 +12,10 @@ from rov_ident.core.linalg import sandwich, scaled_inverse
 from rov_ident.core.messages import Array
 from rov_ident.steering.nomoto_model import (
     Nomoto,
+    Structure,
     first_state,
     jumps_of,
     model_of,
-    names_of,
     respond,
     rmse,
 )
@@ -26,7 +26,7 @@ _RIVAL = 3.0  # times the least RMSE: nine times the squared error is no doubt o
 _DIVERGED = 1e10  # rad2, the cost of a simulation that left all reason
 
 
-def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
+def output_error(runs: Sequence[Zigzag], structure: Structure) -> Nomoto:
     """Output error, the best of several starts.
 
     They are the best linear model of a grid and its mirror image without course stability; for the
@@ -35,6 +35,7 @@ def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
 
     Raises UserError if none converges.
     """
+    order, nonlinear = structure
     grid = _linear_start(runs, order)
     mirrored = grid.copy()
     mirrored[0] *= -1.0
@@ -43,17 +44,17 @@ def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
         # Of an unstable balance the cubic term is what bounds the rate, here to about that seen.
         fast = max(float(np.nanvar(np.gradient(r.heading[r.known], r.t[r.known]))) for r in runs)
         starts[1] = mirrored, 2.0 * abs(grid[0]) / fast
-        starts.append((output_error(runs, order, False).theta, 0.0))
+        starts.append((output_error(runs, Structure(order)).theta, 0.0))
     if order == 2:
-        simple = output_error(runs, 1, nonlinear)
-        x = dict(zip(names_of(1, nonlinear), simple.theta))
+        simple = output_error(runs, Structure(1, nonlinear))
+        x = dict(zip(simple.structure.names, simple.theta))
         short = 0.1 * abs(x["a0"]) ** -1.0
         a0, a1, b0 = x["a0"] / short, x["a0"] + 1.0 / short, x["b0"] / short
         starts.append((np.array([a0, a1, b0, 0.0, x["delta_0"]]), x.get("c", 0.0) / short))
     found = []
     for start, c in starts:
         theta = np.insert(start, len(start) - 1, c) if nonlinear else start
-        found.append(descend(runs, order, nonlinear, theta))
+        found.append(descend(runs, structure, theta))
     best = min(found, key=lambda m: m.rmse)
     if not math.isfinite(best.rmse):
         raise UserError("the fit does not converge: try --order 1 without --nonlinear")
@@ -71,14 +72,15 @@ def output_error(runs: Sequence[Zigzag], order: int, nonlinear: bool) -> Nomoto:
     return best
 
 
-def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, start: Array) -> Nomoto:
+def descend(runs: Sequence[Zigzag], structure: Structure, start: Array) -> Nomoto:
     """Least squares on the simulated headings over theta, from ``start`` (n,), every run's first
     state, and the instants of jumps that fall between two rows (:attr:`Zigzag.reversals`); an RMSE
     of infinity where it does not converge."""
+    order, nonlinear = structure
     n, states = len(start), order + 1
     known = [run.known for run in runs]
     speed = max(float(np.std(np.gradient(r.heading[k], r.t[k]))) for r, k in zip(runs, known))
-    names = names_of(order, nonlinear)
+    names = structure.names
     # Scales: of the offset the rudder's spread, of the cubic term one that equals a0 at r_rms,
     # of b1 what T3 of the geometric mean of T1 and T2 would make it.
     scale = np.abs(start)
@@ -97,7 +99,7 @@ def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, start: Array) -
         lower[0][names.index("c")] = 0.0
     size = np.array([0.1, *[speed] * order])
     for run, count in zip(runs, jumps):
-        first, shares = first_state(order, nonlinear, start, run)
+        first, shares = first_state(structure, start, run)
         scales += [size, np.ones(count)]
         x0 += [first / size, np.clip(shares, 0.01, 0.99)]
         lower += [np.full(states, -np.inf), np.zeros(count)]
@@ -110,7 +112,7 @@ def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, start: Array) -
         for run, seen, count in zip(runs, known, jumps):
             first, shares = x[at : at + states], x[at + states : at + states + count]
             at += states + count
-            parts.append((respond(order, nonlinear, x[:n], run, first, shares) - run.heading)[seen])
+            parts.append((respond(structure, x[:n], run, first, shares) - run.heading)[seen])
         return np.concatenate(parts)
 
     bounded = nonlinear or any(jumps)
@@ -126,16 +128,14 @@ def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, start: Array) -
     )
     if not result.cost < _DIVERGED:
         zeros = np.zeros((n, n))
-        return model_of(order, nonlinear, "oe", start, zeros, runs[0].unit, math.inf)
+        return model_of(structure, "oe", start, zeros, runs[0].unit, math.inf)
     free = result.active_mask == 0  # a jump's instant on its bound is no free parameter
     lengths = [int(k.sum()) for k in known]
     covariance = np.zeros((len(sizes), len(sizes)))
     covariance[np.ix_(free, free)] = robust_covariance(result.jac[:, free], result.fun, lengths)
     covariance *= np.outer(sizes, sizes)
-    model = model_of(
-        order, nonlinear, "oe", result.x[:n] * scale, covariance[:n, :n], runs[0].unit,
-        rmse(result.fun),
-    )  # fmt: skip
+    theta, own = result.x[:n] * scale, covariance[:n, :n]
+    model = model_of(structure, "oe", theta, own, runs[0].unit, rmse(result.fun))
     if nonlinear and not free[names.index("c")]:
         model = dataclasses.replace(model, notes=(_NO_CUBIC,))
     return model
@@ -143,7 +143,7 @@ def descend(runs: Sequence[Zigzag], order: int, nonlinear: bool, start: Array) -
 
 def _linear_start(runs: Sequence[Zigzag], order: int) -> Array:
     """Start of the search: over a grid of time constants all else of the linear model is linear."""
-    states = order + 1
+    linear, states = Structure(order), order + 1
     total = sum(int(run.known.sum()) for run in runs)
     longest = max(run.t[-1] - run.t[0] for run in runs)
     shortest = min(float(np.median(np.diff(run.t))) for run in runs)
@@ -166,10 +166,10 @@ def _linear_start(runs: Sequence[Zigzag], order: int) -> Array:
             units += [(0.0, 1.0, run, 1)] if order == 2 else []
             for b0, b1, driven, column in units:
                 theta = np.array([a0, b0, 0.0] if order == 1 else [a0, a1, b0, b1, 0.0])
-                columns[rows, column] = respond(order, False, theta, driven, np.zeros(3))[run.known]
+                columns[rows, column] = respond(linear, theta, driven, np.zeros(3))[run.known]
             theta = np.array([a0, 0.0, 0.0] if order == 1 else [a0, a1, 0.0, 0.0, 0.0])
             for column, first in enumerate(np.eye(states), order + 1 + states * i):
-                columns[rows, column] = respond(order, False, theta, run, first)[run.known]
+                columns[rows, column] = respond(linear, theta, run, first)[run.known]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         solution = np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
         error = float(np.sum((columns @ solution - target) ** 2))

@@ -20,6 +20,7 @@ import numpy as np
 
 from rov_ident.core.messages import Array
 from rov_ident.steering.nomoto_filter import Filter, heading_noise
+from rov_ident.steering.nomoto_model import Structure
 
 STEP = 0.1  # s between the samples used: a tenth of the least T in docs/nomoto.md
 GAP = 3.0  # s without a sample, after which the motion before is unknown
@@ -171,8 +172,8 @@ class RecursiveNomoto:
         theta = np.array([1.0 / time, k / time, 0.0])
         sizes = np.array([*np.abs(theta[:2]), 0.1 * max(float(np.std(rudder)), 1e-6)])
         rate = max(float(np.std(np.diff(heading) / np.diff(t))), 1e-9)
-        noise = heading_noise([heading])
-        return [Filter(1, False, 0.5 * theta, sizes, rate, noise, rate * d) for d in _DRIVES]
+        given = Structure(1), 0.5 * theta, sizes, rate, heading_noise([heading])
+        return [Filter(*given, rate * drive) for drive in _DRIVES]
 
     def _advance(self, sample: tuple[float, float, float], begins: bool) -> None:
         t, heading, rudder = sample

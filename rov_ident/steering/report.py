@@ -31,7 +31,7 @@ def page(
     others: Mapping[str, Nomoto] | None = None,
 ) -> str:
     """The page of a Nomoto fit; ``others`` are fits by other methods, for comparison."""
-    cubic = " + n3 r^3" if model.nonlinear else ""
+    cubic = " + n3 r^3" if model.structure.nonlinear else ""
     sections = [
         report.numbers(model),
         report.paragraph(
