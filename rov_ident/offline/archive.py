@@ -46,17 +46,44 @@ class ReadBag:
     contradictions: Mapping[str, float]  # as those of the record
 
 
+Outcome = tuple[ReadBag, Any] | str
+"""A bag and where its samples are (the array, a file, or a future), or why it was left out."""
+
+
 class Archive:
-    """Bags whose samples stay where they were read; :meth:`each` maps a function over them.
+    """Bags whose samples stay where they were read: in this process, in files, or on a cluster.
 
     ``bags`` in the order given; ``notes`` say what was refused, and which bags were left out.
-    ``reread(config, columns)`` is the archive of the same bags, read with another configuration.
+
+    Raises UserError if no bag could be read.
     """
 
     def __init__(
-        self, bags: Sequence[ReadBag], notes: Sequence[str], each: Mapper, reread: "Reader"
+        self,
+        outcomes: Iterable[Outcome],
+        map_over: Callable[..., list[Any]],
+        read: Callable[[Config, bool], Iterable[Outcome]],
     ) -> None:
-        self.bags, self.notes, self.each, self.reread = tuple(bags), tuple(notes), each, reread
+        """``map_over(where the samples are, function, *arguments)`` gives the function's results in
+        order; ``read`` reads all bags, as :meth:`reread`."""
+        every = list(outcomes)
+        found = [outcome for outcome in every if not isinstance(outcome, str)]
+        failures = [outcome for outcome in every if isinstance(outcome, str)]
+        if not found:
+            raise UserError("; ".join(failures))
+        self.bags = tuple(bag for bag, _ in found)
+        self.notes = (*failures, *(note for bag in self.bags for note in bag.notes))
+        self._places = [place for _, place in found]
+        self._map_over, self._read = map_over, read
+
+    def each(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """[function(samples, *arguments)] of every bag, in order."""
+        return self._map_over(self._places, function, *arguments)
+
+    def reread(self, config: Config, columns: bool) -> "Archive":
+        """The archive of the same bags, read with another configuration, with or without the
+        columns of parameters of effects (`sampling.records.read_record`)."""
+        return Archive(self._read(config, columns), self._map_over, self._read)
 
     def as_read_by(self, after: Config, before: Config) -> "Archive":
         """The archive, read by ``before``, as ``after`` reads it: with its effects on the input."""
@@ -71,9 +98,6 @@ class Archive:
         return sum(bag.duration for bag in self.bags)
 
 
-Reader = Callable[[Config, bool], Archive]
-
-
 def total(parts: Sequence[Sums]) -> Sums:
     """The sums of all bags, field by field, from those of each."""
     return type(parts[0])(*(sum(values) for values in zip(*parts, strict=True)))
@@ -81,9 +105,11 @@ def total(parts: Sequence[Sums]) -> Sums:
 
 def of_records(records: Sequence[Record]) -> Archive:
     """Records that have been read already, in this process."""
-    paths = [record.path for record in records]
-    reread = _reader(lambda *how: (_outcome(path, *how) for path in paths), _locally)
-    return _archive([_bag_and_samples(record) for record in records], _locally, reread)
+
+    def again(config: Config, columns: bool) -> Iterator[Outcome]:
+        return (_outcome(record.path, config, columns) for record in records)
+
+    return Archive([_bag_and_samples(record) for record in records], _locally, again)
 
 
 @contextlib.contextmanager
@@ -102,10 +128,11 @@ def opened(
 
     if dask:
         with children.environment(), _cluster(dask, jobs) as client:
-            on_dask = partial(_by_dask, client)
-            yield _reader(lambda *how: reported(_on_dask(client, paths, *how)), on_dask)(
-                config, False
-            )
+
+            def read(config: Config, columns: bool) -> Iterator[Outcome]:
+                return reported(_on_dask(client, paths, config, columns))
+
+            yield Archive(read(config, False), partial(_by_dask, client), read)
     elif jobs > 1 and len(paths) > 1:
         # Not forked: a process that has started threads (BLAS, a progress bar) may not be.
         with (
@@ -115,48 +142,18 @@ def opened(
         ):
             readings = count()
 
-            def in_processes(config: Config, columns: bool) -> Iterator[Outcome]:
+            def read(config: Config, columns: bool) -> Iterator[Outcome]:
                 k = next(readings)
                 files = [Path(folder) / f"{k}-{i}.npy" for i in range(len(paths))]
                 return reported(pool.map(_stored, paths, repeat(config), repeat(columns), files))
 
-            yield _reader(in_processes, partial(_by_processes, pool))(config, False)
+            yield Archive(read(config, False), partial(_by_processes, pool), read)
     else:
-        yield _reader(lambda *how: reported(_outcome(path, *how) for path in paths), _locally)(
-            config, False
-        )
 
+        def read(config: Config, columns: bool) -> Iterator[Outcome]:
+            return reported(_outcome(path, config, columns) for path in paths)
 
-Outcome = tuple[ReadBag, Any] | str
-"""A bag and where its samples are (the array, a file, or a future), or why it was left out."""
-
-
-def _reader(
-    read: Callable[[Config, bool], Iterable[Outcome]], each: Callable[..., list[Any]]
-) -> Reader:
-    """What reads the same bags again, with another configuration."""
-
-    def reread(config: Config, columns: bool) -> Archive:
-        return _archive(read(config, columns), each, reread)
-
-    return reread
-
-
-def _archive(
-    outcomes: Iterable[Outcome], each: Callable[..., list[Any]], reread: Reader
-) -> Archive:
-    """``each(where the samples are, function, *arguments)``: the function's results in order."""
-    read, failures = [], []
-    for outcome in outcomes:
-        if isinstance(outcome, str):
-            failures.append(outcome)
-        else:
-            read.append(outcome)
-    if not read:
-        raise UserError("; ".join(failures))
-    bags = [bag for bag, _ in read]
-    notes = [*failures, *(note for bag in bags for note in bag.notes)]
-    return Archive(bags, notes, partial(each, [where for _, where in read]), reread)
+        yield Archive(read(config, False), _locally, read)
 
 
 def _bag_and_samples(record: Record) -> tuple[ReadBag, Samples]:
@@ -172,7 +169,7 @@ def _bag_and_samples(record: Record) -> tuple[ReadBag, Samples]:
     return bag, samples
 
 
-def _outcome(path: Path, config: Config, columns: bool = False) -> Outcome:
+def _outcome(path: Path, config: Config, columns: bool) -> Outcome:
     try:
         return _bag_and_samples(read_record(path, config, columns=columns))
     except UserError as error:
