@@ -18,9 +18,11 @@ from rov_ident.core.frames import from_core, to_core
 from rov_ident.core.messages import IMU, ODOMETRY, Imu, Odometry
 from rov_ident.core.yaml_file import parse
 from rov_ident.io import topics
-from rov_ident.io.bag_reader import ROLE_NAMES, Bag
+from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.cdr import ROLE_TYPES, encode
+from rov_ident.io.mounting import sensor_placement
+from rov_ident.io.topics import ROLE_NAMES
 from rov_ident.simulation import virtual_sensors as sensors
 
 DEMO = ROOT / "bags" / "demo.mcap"
@@ -141,7 +143,7 @@ def test_mounting_by_any_tree(tmp_path, transforms, position, yaw):
     with BagWriter(tmp_path / "tree.mcap") as bag:
         bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, data)
     frames = {ODOMETRY: ("map", "base_link"), IMU: ("imu_link", "")}
-    found = topics.mounting(Bag(tmp_path / "tree.mcap"), frames)
+    found = sensor_placement(Bag(tmp_path / "tree.mcap"), frames)
     assert bool(found) == (position is not None)
     if found:
         np.testing.assert_allclose(found["imu.position"], position, atol=1e-9)

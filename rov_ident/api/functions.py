@@ -27,6 +27,7 @@ from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Limits, Proposal
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
+from rov_ident.io.mounting import with_mounting
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.offline import archive, batch_fit, delays
 from rov_ident.offline.batch_fit import KINDS, Settings
@@ -145,7 +146,7 @@ def fit(
     if prior_from is not None:
         given, table = with_prior(given, existing(prior_from))
     (paths, repeated), say = once(several(bags)), progress or silent
-    given, placed = topics.mounted(given, paths)
+    given, placed = with_mounting(given, paths)
     groups = [channels] if isinstance(channels, str) else channels or ()
     stages = tuple(tuple(n for n, use in zip(MOTIONS, axes(g)) if use) for g in groups)
     settings = Settings(stages, prior, weighted, process)
@@ -278,7 +279,7 @@ def explain(
     other = None if validate is None else existing(validate)
     if other and (same := same_data(other, paths)):
         raise UserError(f"{other} is what is searched ({same}): validate on a bag of another dive")
-    given, placed = topics.mounted(given, paths)
+    given, placed = with_mounting(given, paths)
     read_bags = [_streams(path, given, say) for path in paths]
     judge = None if other is None else _streams(other, given, say)
     for streams, _ in read_bags:
@@ -378,7 +379,7 @@ def plan(
     if len(sides) != 3 or not numeric:
         raise UserError(f"tank is {tank!r}, but must be three lengths [m], such as (6, 6, 2)")
     limits, paths = Limits(sides, thrust), [] if bag is None else several(bag)
-    given, _ = topics.mounted(given, paths)
+    given, _ = with_mounting(given, paths)
     known = archive.opened(paths, given, say=say) if paths else contextlib.nullcontext()
     with known as bags:
         return design.propose(given, bags, duration, limits, say)

@@ -23,7 +23,7 @@ from rov_ident.estimation.consistency import CAUSE
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import GOOD
-from rov_ident.io import topics
+from rov_ident.io.mounting import with_mounting
 from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.offline import archive
 from rov_ident.offline.fit import Fit, rmse_change
@@ -252,7 +252,7 @@ def identify(
     """
     say = progress or silent
     paths, repeated = once(several(dives))
-    given, placed = topics.mounted(load(config), paths)
+    given, placed = with_mounting(load(config), paths)
     judge = None if validate is None else existing(validate)
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}

@@ -13,8 +13,8 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError, require
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
+from rov_ident.io.mounting import with_mounting
 from rov_ident.model.coefficients import MOTIONS, Coefficient, catalogue, input_catalogue
 from rov_ident.sampling.records import Record, read_record
 
@@ -118,7 +118,7 @@ def read(bag: File, config: File | Config, progress: Progress | None = None) -> 
         If the bag cannot be read, lacks a topic or yields no sample.
     """
     path = existing(bag)
-    given, notes = topics.mounted(load(config), [path])
+    given, notes = with_mounting(load(config), [path])
     record = read_record(path, given, progress or silent)
     return replace(record, notes=(*notes, *record.notes))
 

@@ -14,11 +14,13 @@ from rov_ident.consumer.formats import holds_hydrodynamics, import_model, is_urd
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import VEHICLES, shipped, write_file
 from rov_ident.core.frames import FLIP_BODY
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.core.progress import Progress
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io import topics
 from rov_ident.io.ardupilot_log import FRAMES, SUFFIXES, read_log
 from rov_ident.io.bag_reader import Bag
+from rov_ident.io.mounting import sensor_placement
 
 _MODELS = (".urdf", ".xml", ".sdf")
 _OF_FRAME = {1: "bluerov2", 2: "bluerov2_heavy"}  # FRAME_CONFIG of ArduSub
@@ -206,21 +208,21 @@ def _add_bag(path: Path, found: _Found) -> None:
     seen, notes = topics.survey(bag)
     for role, source in seen.items():
         frame = f", frame {source.frames[0]}" if source.frames[0] else ""
-        if role != topics.IMU and f"inputs.{role}" in configuration.schema.BY_KEY:
+        if role != IMU and f"inputs.{role}" in configuration.schema.BY_KEY:
             found.put(f"inputs.{role}", source.type_name, path.name)
         told = f"{source.rate:.3g} Hz in {path.name}{frame}"
         found.put(f"topics.{role}", source.topic, told)
-    for role in (topics.ODOMETRY, topics.WRENCH):
+    for role in (ODOMETRY, WRENCH):
         if role not in seen:
             found.notes.append(
                 f"{path.name} has nothing that can be {role}: record it too (docs/inputs.md)"
             )
             found.unfit = path.name
-    if topics.IMU not in seen:
+    if IMU not in seen:
         found.notes.append(f"{path.name} has no IMU: angular rates come from the odometry alone")
     found.notes += notes
     signs = FLIP_BODY if found.parameters["vehicle"].get("frame") == "flu" else np.ones(3)
-    mounted = topics.mounting(bag, {role: source.frames for role, source in seen.items()})
+    mounted = sensor_placement(bag, {role: source.frames for role, source in seen.items()})
     for key, vector in mounted.items():
         found.put(key, [round(float(x), 6) + 0.0 for x in signs * vector], "/tf_static")
     if "/tf_static" in bag.topics and not mounted:

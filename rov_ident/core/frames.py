@@ -190,13 +190,13 @@ def to_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyM
     return _change_axes(message, defaults, _TURNS)
 
 
-def from_core(message: AnyMessage, body: str = "flu", world: str = "enu") -> AnyMessage:
-    """The inverse of `to_core(message, FrameDefaults(body, world))`: FRD/NED onto the wire.
+def from_core(message: AnyMessage, defaults: FrameDefaults = ROS_DEFAULTS) -> AnyMessage:
+    """The inverse of :func:`to_core`: a message in FRD and NED onto the wire.
 
     The frame ids of the message decide in the same way, so that a message is never written with
     axes that its frame ids deny.
     """
-    return _change_axes(message, FrameDefaults(body, world), _TURNS_BACK)
+    return _change_axes(message, defaults, _TURNS_BACK)
 
 
 def body_is_frd(frame_id: str, defaults: FrameDefaults = ROS_DEFAULTS) -> bool:

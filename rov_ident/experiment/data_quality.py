@@ -25,7 +25,8 @@ from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
-from rov_ident.model.coefficients import MOTIONS
+from rov_ident.io.mounting import sensor_placement, with_mounting
+from rov_ident.model.coefficients import MOTIONS, WRENCH_UNITS
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
 from rov_ident.offline import archive
@@ -34,10 +35,9 @@ from rov_ident.offline.fit import Fit, fit_online, thrust_or_mass
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import Table, Tables, with_unit
 from rov_ident.sampling.raw_streams import Streams, gather
-from rov_ident.sampling.records import Record, read_record
+from rov_ident.sampling.records import UNITS, Record, read_record
 from rov_ident.sampling.without_velocity import blanked, is_without_velocity
 
-UNITS = (("m/s", "N"),) * 3 + (("rad/s", "N m"),) * 3  # of velocity and wrench on each axis
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
 _MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
@@ -174,7 +174,7 @@ class Check(Shown):
 
 def check(path: Path, config: Config, say: Progress = silent) -> Check:
     """Look at a bag; UserError if it cannot be read, or lacks the messages that are needed."""
-    config, placed = inputs.mounted(config, [path])
+    config, placed = with_mounting(config, [path])
     record = read_record(path, config, say)
     say("looking at its messages")
     bag, unmeasured = Bag(path), is_without_velocity(record.samples)
@@ -189,7 +189,7 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
     remarks = [Remark("topics", GOOD, told), *of_messages(streams, config), *notes]
     remarks += _excitation_remarks(streams, config)
     remarks += [Remark("mounting", GOOD, note) for note in placed]
-    remarks += _mounting_remarks(inputs.mounting(bag, frames), config)
+    remarks += _mounting_remarks(sensor_placement(bag, frames), config)
     remarks += _inertia_remarks(config)
     failed = (test for test in tests_of(streams, config) if not test.passed)
     remarks += [Remark("velocity sensor", BAD, test.failure) for test in failed]
@@ -280,7 +280,7 @@ def _excitation_remarks(streams: Streams, config: Config) -> Iterator[Remark]:
         now = interpolated(streams.inputs_t, streams.inputs, streams.t)
         steered = config.dynamics.input_wrench(streams.nu, now)
     for i, axis in enumerate(MOTIONS):
-        unit, force = UNITS[i]
+        unit, force = UNITS[i], WRENCH_UNITS[i]
         low, high = np.quantile(streams.nu[:, i], [0.02, 0.98])
         measured = i >= 3 or streams.nu[:, :3].any()
         driven = float(np.sqrt(np.mean(streams.demand[:, i] ** 2) + np.mean(steered[:, i] ** 2)))

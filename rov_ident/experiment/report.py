@@ -8,14 +8,14 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.messages import Array
 from rov_ident.core.states import CONVERGED
-from rov_ident.experiment.data_quality import UNITS, Check, Prospect
+from rov_ident.experiment.data_quality import Check, Prospect
 from rov_ident.experiment.design import Proposal
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING
-from rov_ident.model.coefficients import AXES, VELOCITIES
+from rov_ident.model.coefficients import AXES, VELOCITIES, WRENCH_UNITS
 from rov_ident.model.scales import authority
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
-from rov_ident.sampling.records import HORIZON, measured_motion, predicted
+from rov_ident.sampling.records import HORIZON, UNITS, measured_motion, predicted
 
 _MOST = 2000  # points of a curve
 
@@ -105,7 +105,7 @@ def _excitation(found: Check, config: Config) -> str:
     limits = authority(config.dynamics)
     pictures = []
     for i, (axis, name) in enumerate(zip(AXES, VELOCITIES, strict=True)):
-        unit, force = UNITS[i]
+        unit, force = UNITS[i], WRENCH_UNITS[i]
         figure = plots.cloud(
             nu[:, i], tau[:, i], f"{axis} against {name}", f"{name} [{unit}]", f"{axis} [{force}]",
             limits[i],
@@ -143,7 +143,7 @@ def _pauses(found: Check) -> str:
 def _demand(t: Array, demand: Array) -> str:
     pictures = []
     for i, axis in enumerate(AXES):
-        figure = plots.steps(t, demand[:, i], axis, "time [s]", f"{axis} [{UNITS[i][1]}]")
+        figure = plots.steps(t, demand[:, i], axis, "time [s]", f"{axis} [{WRENCH_UNITS[i]}]")
         pictures.append(plots.zoomable(figure, f"demand{i}"))
     return report.panels(pictures, "The wrench that is asked for.", wide=True)
 

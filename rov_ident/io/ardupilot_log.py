@@ -55,7 +55,7 @@ _START = 1_000_000  # us
 _END = LAST_STAMP // 1000 - _START  # us; a stamp holds no more
 _WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
 _LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
-_LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
+LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
 _OUTPUTS = 16  # of SERVO_OUTPUT_RAW and RCOU
 _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
 _MOTOR_1 = 33  # of SERVOn_FUNCTION
@@ -136,7 +136,7 @@ class Log:
     @property
     def battery(self) -> list[float]:
         """The voltages that are a battery's."""
-        return [row[0] for row in self.voltage.rows if row[0] >= _LEAST_VOLTAGE]
+        return [row[0] for row in self.voltage.rows if row[0] >= LEAST_VOLTAGE]
 
     @property
     def motors(self) -> dict[str, list[float]]:
@@ -289,7 +289,7 @@ def _wrenches(log: Log, allocator: Allocator, usual: float, notes: list[str]) ->
     rows: list[_Row] = []
     for t, pulses in zip(log.outputs.t, log.outputs.rows, strict=True):
         i = max(bisect_right(log.voltage.t, t) - 1, 0) if known else 0
-        voltage = volts[i] if known and volts[i] >= _LEAST_VOLTAGE else usual
+        voltage = volts[i] if known and volts[i] >= LEAST_VOLTAGE else usual
         try:
             tau = allocator.wrench(pulses, voltage)
         except ValueError as error:

@@ -37,25 +37,6 @@ from rov_ident.core.files import open_input
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.other_bags import OtherFile, Ros1File, SqliteFile
 
-ROLE_NAMES = {
-    "odom": "odom",
-    "imu": "imu/data",
-    "wrench": "thruster_wrench",
-    "inputs": "joint_states",
-}
-"""As the nodes call them."""
-
-_USUAL = {
-    "odom": ("odometry/filtered", "odometry"),
-    "imu": ("imu",),
-    "wrench": ("thruster_manager/input", "wrench"),
-    "velocity": ("velocity_body", "dvl/twist", "twist"),
-    "pose": ("local_position/pose",),
-    "thruster_pwm": ("rc/out",),
-    "battery": ("battery_state",),
-}
-"""As robot_localization, mavros and uuv_simulator call them: taken where no topic has our name."""
-
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _RUN_LENGTH = 4096  # messages outside chunks that make one block
@@ -207,61 +188,6 @@ class Bag:
                 )
             pending.sort(key=log_time)
         yield from pending
-
-
-def candidates(bag: Bag, role: str, name: str, type_name: str, beside: str = "") -> list[str]:
-    """The topics that may play a ``role``, as `odom`, that is called ``name`` and of ``type_name``.
-
-    Those of that name in whatever namespace; else of a usual name; else all of the type. Where
-    these are several, the one alone that shares the first name of ``beside``, the odometry's topic:
-    a bag may hold two vehicles. Topics without messages do not count.
-    """
-    typed = [t for t, (kind, count) in bag.topics.items() if kind == type_name and count]
-    usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
-    tiers = [[topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual]
-    found = next(filter(None, tiers), typed)
-    if len(found) > 1:  # mavros has vision_pose/pose beside local_position/pose
-        own = [topic for topic in found if topic.split("/")[1:2] == beside.split("/")[1:2]]
-        closer = ([topic for topic in tier if topic in found] for tier in tiers)
-        found = next((some for some in (*closer, own) if len(some) == 1), found)
-    return found
-
-
-def select_topic(
-    bag: Bag, role: str, name: str, type_name: str, override: str, beside: str = ""
-) -> str | None:
-    """Which topic plays a ``role``: an ``override`` (if not empty), else the only one of
-    :func:`candidates`. None: there is none, and need not be.
-
-    Raises UserError: the role is missing, ambiguous or taken by a topic of another type.
-    """
-    filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
-    holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
-    if override:
-        topic = "/" + override.lstrip("/")
-        if topic not in filled:
-            raise UserError(f"{bag.path} has no messages on {topic}; it has {holds}.")
-        if filled[topic] != type_name:
-            raise UserError(f"{topic} in {bag.path} is {filled[topic]}, but {role} is {type_name}.")
-        return topic
-    found = candidates(bag, role, name, type_name, beside)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise UserError(
-            f"{bag.path} has several topics that may be {role}: {', '.join(found)}; "
-            f"name the one to use, as in topics.{role}: {found[0]}."
-        )
-    named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
-    if named:
-        raise UserError(
-            f"{named[0]} in {bag.path} is {filled[named[0]]}, but {role} must be {type_name}."
-        )
-    if role == "imu":  # it may well have none
-        return None
-    raise UserError(
-        f"{bag.path} has no {name} topic ({type_name}): record it too; the bag has {holds}."
-    )
 
 
 def _raw(file: OtherFile, topics: dict[int, tuple[str, str]]) -> Iterator[RawMessage]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
-from rov_ident.io.ardupilot_log import Log
+from rov_ident.io.ardupilot_log import LEAST_VOLTAGE, Log
 from rov_ident.model.thruster_allocation import NORMALIZED, PWM
 
 _TOPICS = (
@@ -22,8 +22,7 @@ _TOPICS = (
 )  # fmt: skip
 _ARMED = 2  # of vehicle_status.arming_state
 _MOTOR_1 = 101  # of PWM_MAIN_FUNCn
-_OUTPUTS = {"PWM_MAIN": 16, "PWM_AUX": 16, "PCA9685": 16}  # what gives pulses, and how many
-_BATTERY = 5.0  # V; an instance that never reaches it has no battery
+_OUTPUTS = ("PWM_MAIN", "PWM_AUX", "PCA9685")  # what gives pulses, 16 each
 _WORDS = {
     "motion": "valid velocity of EKF2 (vehicle_local_position)",
     "outputs": "thruster output (actuator_motors)",
@@ -48,7 +47,7 @@ def read_ulog(path: Path) -> Log:
         ulog = ULog(str(path), list(_TOPICS))
         topics: dict[str, Any] = {}
         for each in sorted(ulog.data_list, key=lambda each: each.multi_id):
-            if each.name != "battery_status" or each.data["voltage_v"].max() >= _BATTERY:
+            if each.name != "battery_status" or each.data["voltage_v"].max() >= LEAST_VOLTAGE:
                 topics.setdefault(each.name, each.data)
         log.parameters = {name: float(value) for name, value in ulog.initial_parameters.items()}
         _fill(log, topics)
@@ -133,8 +132,8 @@ def _commands(log: Log, controls: Array, reversible: Any) -> Array:
     n = controls.shape[1]
     outputs = {
         int(get(f"{kind}_FUNC{k}", 0.0)) - _MOTOR_1: (kind, k)
-        for kind, count in _OUTPUTS.items()
-        for k in range(1, count + 1)
+        for kind in _OUTPUTS
+        for k in range(1, 17)
     }
     ends = {
         i: [get(f"{kind}_{end}{k}", np.nan) for end in ("MIN", "MAX")]

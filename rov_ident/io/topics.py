@@ -10,11 +10,9 @@ along the shortest rotation.
 
 from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -22,30 +20,45 @@ import numpy as np
 
 from rov_ident.config import Config, Inputs, schema, thruster_signal
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import (
-    FLIP_BODY,
-    from_core,
-    quaternion_between,
-    quaternion_multiply,
-    quaternion_normalise,
-    quaternion_to_euler,
-    quaternion_to_matrix,
+from rov_ident.core.frames import from_core, quaternion_between
+from rov_ident.core.messages import (
+    DRIVE,
+    IMU,
+    ODOMETRY,
+    WRENCH,
+    Commands,
+    Message,
+    Odometry,
+    Pose,
+    Twist,
+    Wrench,
 )
-from rov_ident.core.messages import DRIVE, Array, Commands, Message, Odometry, Pose, Twist, Wrench
 from rov_ident.core.progress import Progress, silent
 from rov_ident.io import cdr
-from rov_ident.io.bag_reader import ROLE_NAMES, Bag, RawMessage, candidates, select_topic
+from rov_ident.io.bag_reader import Bag, RawMessage
 from rov_ident.model.thruster_allocation import Allocator, knows
 
-ODOMETRY, IMU, WRENCH, POSE, BATTERY = "odom", "imu", "wrench", "pose", "battery"
+ROLE_NAMES = {ODOMETRY: "odom", IMU: "imu/data", WRENCH: "thruster_wrench", DRIVE: "joint_states"}
+"""Topics as the nodes call them."""
+
+_USUAL = {
+    ODOMETRY: ("odometry/filtered", "odometry"),
+    IMU: ("imu",),
+    WRENCH: ("thruster_manager/input", "wrench"),
+    "velocity": ("velocity_body", "dvl/twist", "twist"),
+    "pose": ("local_position/pose",),
+    "thruster_pwm": ("rc/out",),
+    "battery": ("battery_state",),
+}
+"""As robot_localization, mavros and uuv_simulator call them: taken where no topic has our name."""
+
+POSE, BATTERY = "pose", "battery"
 _JOINTS = "sensor_msgs/JointState"
 
 _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
 _NAMED = 5  # topics; of arrays of numbers a bag may have dozens
 _FIRST = 200  # messages that tell how late a topic is: some seconds
 _LONGEST_GAP = 500_000_000  # ns; poses further apart are not interpolated
-_STATIC = "/tf_static"
-_NOWHERE = 1e-6  # m, rad: what is left of zero by rounding
 _HELD = 1000  # poses and twists that wait for each other
 _NOT_MEASURED = np.full(3, 1e6)  # a variance from which nothing is believed
 _FRAME = "base_link"  # of a wrench that comes without a frame: the axes are those of frames.body
@@ -168,7 +181,7 @@ class Reader:
             return []
         stamp = arrival if self.on_arrival else message.stamp
         wrench = Wrench(stamp, _FRAME, tau[:3], tau[3:])
-        return [(WRENCH, from_core(wrench, self._frames.body, self._frames.world))]
+        return [(WRENCH, from_core(wrench, self._frames))]
 
     def _joined(self, message: Twist | Pose) -> list[tuple[str, Message]]:
         if isinstance(message, Pose):
@@ -229,12 +242,67 @@ def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, s
             continue
         beside = chosen.get(ODOMETRY, wanted[ODOMETRY])
         try:
-            topic = select_topic(bag, role, name, _full_name(type_name), wanted[role], beside)
+            topic = _select_topic(bag, role, name, _full_name(type_name), wanted[role], beside)
         except UserError as error:
             raise UserError(f"{error}{_other_type(bag, role, type_name, wanted[role])}") from error
         if topic:
             chosen[role] = topic
     return chosen
+
+
+def _candidates(bag: Bag, role: str, name: str, type_name: str, beside: str = "") -> list[str]:
+    """The topics that may play a ``role``, as `odom`, that is called ``name`` and of ``type_name``.
+
+    Those of that name in whatever namespace; else of a usual name; else all of the type. Where
+    these are several, the one alone that shares the first name of ``beside``, the odometry's topic:
+    a bag may hold two vehicles. Topics without messages do not count.
+    """
+    typed = [t for t, (kind, count) in bag.topics.items() if kind == type_name and count]
+    usual = (name, *_USUAL.get(name, ()), *_USUAL.get(role, ()))
+    tiers = [[topic for topic in typed if f"/{topic}".endswith(f"/{n}")] for n in usual]
+    found = next(filter(None, tiers), typed)
+    if len(found) > 1:  # mavros has vision_pose/pose beside local_position/pose
+        own = [topic for topic in found if topic.split("/")[1:2] == beside.split("/")[1:2]]
+        closer = ([topic for topic in tier if topic in found] for tier in tiers)
+        found = next((some for some in (*closer, own) if len(some) == 1), found)
+    return found
+
+
+def _select_topic(
+    bag: Bag, role: str, name: str, type_name: str, override: str, beside: str = ""
+) -> str | None:
+    """Which topic plays a ``role``: an ``override`` (if not empty), else the only one of
+    :func:`_candidates`. None: there is none, and need not be.
+
+    Raises UserError: the role is missing, ambiguous or taken by a topic of another type.
+    """
+    filled = {topic: info.type_name for topic, info in bag.topics.items() if info.message_count}
+    holds = ", ".join(f"{topic} ({type_})" for topic, type_ in filled.items())
+    if override:
+        topic = "/" + override.lstrip("/")
+        if topic not in filled:
+            raise UserError(f"{bag.path} has no messages on {topic}; it has {holds}.")
+        if filled[topic] != type_name:
+            raise UserError(f"{topic} in {bag.path} is {filled[topic]}, but {role} is {type_name}.")
+        return topic
+    found = _candidates(bag, role, name, type_name, beside)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UserError(
+            f"{bag.path} has several topics that may be {role}: {', '.join(found)}; "
+            f"name the one to use, as in topics.{role}: {found[0]}."
+        )
+    named = [topic for topic in filled if f"/{topic}".endswith(f"/{name}")]
+    if named:
+        raise UserError(
+            f"{named[0]} in {bag.path} is {filled[named[0]]}, but {role} must be {type_name}."
+        )
+    if role == IMU:  # it may well have none
+        return None
+    raise UserError(
+        f"{bag.path} has no {name} topic ({type_name}): record it too; the bag has {holds}."
+    )
 
 
 def doubts(bag: Bag, topics: Mapping[str, str], config: Config) -> list[str]:
@@ -393,7 +461,7 @@ def survey(bag: Bag) -> tuple[dict[str, Seen], list[str]]:
                 continue
             called = name or sources(Inputs(**typed))[role].topic
             beside = found[ODOMETRY].topic if ODOMETRY in found else ""
-            several = candidates(bag, role, called, _full_name(kind), beside)
+            several = _candidates(bag, role, called, _full_name(kind), beside)
             several = [topic for topic in several if topic in of_kind] or of_kind
             topic = max(several, key=lambda t: bag.topics[t].message_count)
             if len(several) > 1:
@@ -435,92 +503,3 @@ def first_frames(bag: Bag, chosen: Mapping[str, str], config: Config) -> dict[st
         if len(found) == len({ODOMETRY, IMU} & set(only)):
             break
     return found
-
-
-def mounted(config: Config, paths: Iterable[Path]) -> tuple[Config, tuple[str, ...]]:
-    """The configuration with sensors that it leaves at the body's origin, unturned, where the first
-    bag with a `/tf_static` says that they are; and a note on each that was moved."""
-    notes = []
-    for key, vector, name in _told_of_mounting(config, paths):
-        section, own = key.split(".")
-        settings = getattr(config, section)
-        if not np.any(getattr(settings, own)) and np.abs(vector).max() > _NOWHERE:
-            moved = replace(settings, **{own: tuple(vector.tolist())})
-            config = replace(config, **{section: moved})
-            told = [round(float(x), 3) + 0.0 for x in vector]
-            notes.append(
-                f"{key} is {told} (forward, starboard, down) by {_STATIC} of {name}, as the "
-                "configuration has none"
-            )
-    return config, tuple(notes)
-
-
-def _told_of_mounting(config: Config, paths: Iterable[Path]) -> list[tuple[str, Array, str]]:
-    """What the first bag with a `/tf_static` says, as `mounting` has it, and the bag's name."""
-    for path in paths:
-        with suppress(UserError):  # who reads it says what is wrong with it
-            bag = Bag(path)
-            if _STATIC in bag.topics:
-                frames = first_frames(bag, select(bag, config), config)
-                return [(key, x, path.name) for key, x in mounting(bag, frames).items()]
-    return []
-
-
-def mounting(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Array]:
-    """Where `/tf_static` says that the sensors are, (3,) each, forward-starboard-down in the body
-    frame: `imu.position` [m], `imu.rotation` [rad], `odometry.position` [m]; what it does not say
-    is left out.
-
-    ``frames`` as `first_frames` gives them. The body frame is that of the odometry (its child), or
-    `base_link`; the tree has its axes forward, left, up.
-    """
-    parents = _tree(bag)
-
-    def below_root(frame: str) -> tuple[str, Array, Array]:
-        """The frame from which the tree hangs; origin and attitude of a frame in it."""
-        origin, attitude = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-        for _ in parents:  # more steps than these lead round a loop
-            if frame not in parents:
-                break
-            frame, p, q = parents[frame]
-            origin = p + quaternion_to_matrix(q) @ origin
-            attitude = quaternion_multiply(q, attitude)
-        return frame, origin, attitude
-
-    def placed(frame: str, body: str) -> tuple[Array, Array] | None:
-        """Origin and attitude of a frame in the body's; None where the tree does not join them."""
-        (root, origin, attitude), (other, p, q) = below_root(frame), below_root(body)
-        if root != other or root in parents:
-            return None
-        back = q * [1.0, -1.0, -1.0, -1.0]
-        return quaternion_to_matrix(back) @ (origin - p), quaternion_multiply(back, attitude)
-
-    motion, child = frames.get(ODOMETRY, ("", ""))
-    found: dict[str, Array] = {}
-    if not parents:
-        return found
-    if IMU in frames and (at := placed(frames[IMU][0], child or "base_link")):
-        found["imu.position"] = FLIP_BODY * at[0]
-        found["imu.rotation"] = FLIP_BODY * quaternion_to_euler(at[1])
-    if motion and not child and (at := placed(motion, "base_link")):
-        found["odometry.position"] = FLIP_BODY * at[0]
-    return found
-
-
-def _tree(bag: Bag) -> dict[str, tuple[str, Array, Array]]:
-    """By frame of `/tf_static`: the parent, and origin and attitude (w x y z) in it; without what
-    cannot be read, or is no transform."""
-    parents = {}
-    if bag.topics.get(_STATIC, ("",))[0] == "tf2_msgs/msg/TFMessage":
-        from rosbags.typesys import Stores, get_typestore
-
-        store = get_typestore(Stores.ROS2_JAZZY)
-        for raw in bag.iter_raw([_STATIC]):
-            with suppress(Exception):  # whatever the bytes make of the library
-                for each in store.deserialize_cdr(raw.data, raw.type_name).transforms:
-                    p, q = each.transform.translation, each.transform.rotation
-                    origin = np.array([p.x, p.y, p.z])
-                    attitude = quaternion_normalise([q.w, q.x, q.y, q.z])
-                    if np.isfinite([*origin, *attitude]).all():
-                        parents[each.child_frame_id] = each.header.frame_id, origin, attitude
-    return parents

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rov_ident.core.messages import Message
-from rov_ident.io.bag_reader import ROLE_NAMES
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.cdr import ROLE_TYPES, encode
+from rov_ident.io.topics import ROLE_NAMES
 
 
 def write_messages(path: str | Path, messages: Iterable[tuple[int, str, Message]]) -> None:

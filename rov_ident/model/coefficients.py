@@ -42,6 +42,7 @@ from rov_ident.core.errors import UserError
 AXES = "XYZKMN"
 VELOCITIES = "uvwpqr"
 MOTIONS = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+WRENCH_UNITS = ("N",) * 3 + ("N m",) * 3  # of AXES
 
 DIAGONAL = {
     "added_mass": tuple(f"{a}_{b}dot" for a, b in zip(AXES, VELOCITIES)),

@@ -202,7 +202,7 @@ class EstimatorNode(GuardedNode):
         frames, frame_id = self._config.frames, self._online.sampler.validation.frame_id(WRENCH)
         for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)):
             wrench = Wrench(stamps[i], frame_id, residuals[i, :3], residuals[i, 3:])
-            self._residual.publish(encode(from_core(wrench, frames.body, frames.world)))
+            self._residual.publish(encode(from_core(wrench, frames)))
         since = stamps[-1] - self._published_stamp
         if self._lockstep and not 0 <= since < 1e9 / self._config.publish_rate:
             self._published_stamp = stamps[-1]

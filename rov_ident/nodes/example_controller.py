@@ -128,8 +128,8 @@ class ExampleController(GuardedNode):
             fresh = "fresh" if self._hydrodynamics.fresh(now) else "the last good"
             state = f"controlling with {fresh} coefficients"
         frames, stamp = self._config.frames, self.get_clock().now().nanoseconds
-        wrench = from_core(Wrench(stamp, "base_link", tau[:3], tau[3:]), frames.body, frames.world)
-        self._output.publish(encode(wrench))
+        wrench = Wrench(stamp, "base_link", tau[:3], tau[3:])
+        self._output.publish(encode(from_core(wrench, frames)))
         if state != self._state:
             self.get_logger().info(state)
             self._state = state

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rov_ident.core.messages import Array
+from rov_ident.model.coefficients import AXES, WRENCH_UNITS
 from rov_ident.offline.captive_tests import AxisFit, headline
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
@@ -17,7 +18,7 @@ def page(name: str, fits: Mapping[str, AxisFit], notes: Sequence[str] = ()) -> s
     sections = [headline(fits).html()]
     sections += [report.bullets(notes)] if notes else []
     for axis, f in fits.items():
-        unit = "N" if axis in "XYZ" else "N m"
+        unit = WRENCH_UNITS[AXES.index(axis)]
         sizes: Array = np.array([len(c.terms) for c in f.candidates], dtype=np.float64)
         errors: Array = np.array([c.cv_rmse for c in f.candidates], dtype=np.float64)
         chosen = [set(c.terms) for c in f.candidates].index(set(f.names))

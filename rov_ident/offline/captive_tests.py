@@ -31,7 +31,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
 from rov_ident.core.messages import Array
 from rov_ident.io.csv_table import CsvTable, read_csv
-from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, parse
+from rov_ident.model.coefficients import AXES, INPUT_LETTERS, VELOCITIES, WRENCH_UNITS, parse
 from rov_ident.model.equations import Model, build, coriolis, extended_states
 from rov_ident.model.fins import CROSS, X
 from rov_ident.reports.result import Result, as_json, provenance
@@ -455,7 +455,7 @@ def column(name: str, nu: Array, fins: Mapping[str, Array]) -> Array:
 def unit(name: str) -> str:
     """The unit of a term."""
     if name.endswith("_0"):
-        return "N" if name[0] in "XYZ" else "N m"
+        return WRENCH_UNITS[AXES.index(name[0])]
     return parse(name).unit
 
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, to_core
-from rov_ident.core.messages import Array, Odometry, Wrench
+from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Odometry, Wrench
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.csv_table import CsvTable, read_csv
-from rov_ident.io.topics import ODOMETRY, POSE, USUAL, WRENCH, messages, select
+from rov_ident.io.topics import POSE, USUAL, messages, select
 
 _RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
