@@ -37,7 +37,7 @@ from rov_ident.offline.archive import Archive, ReadBag, Samples, total
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
-from rov_ident.sampling.records import HORIZON, numbers
+from rov_ident.sampling.records import HORIZON, UNITS, numbers
 from rov_ident.sampling.sample import free_axes, parts
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
@@ -234,30 +234,12 @@ def _stage(
     """
     free = np.array([axis in channels for axis in MOTIONS])
     name = ", ".join(channels)
-    # an added mass belongs to both axes that it couples
-    names = tuple(
-        n
-        for n, c in _coefficients(config).items()
-        if free[c.row] and (not c.is_added_mass or free[c.column])
-    )
-    if not names:
-        raise UserError(f"no coefficient of {name} is among those to estimate (key `estimate`)")
-    config = replace(config, estimate=names)
-    if settings.stages:
-        if good := _is_good(archive, config, free):
-            notes.append(f"{name}: left alone, {good}")
-            return None
-        say(f"{name}: excitation")
-        known, reason = _excited(archive, config, free)
-        if not known:
-            notes.append(f"{name}: not fitted, {reason}")
-            return None
-        if held := [n for n in names if n not in known]:
-            notes.append(f"{name}: {', '.join(held)} held, {reason}")
-            names, config = known, replace(config, estimate=known)
+    chosen = _with_estimated(archive, config, name, free, settings, notes, say)
+    if chosen is None:
+        return None
+    config, names = chosen, chosen.estimate
     free &= np.any(archive.each(free_axes), axis=0)
-    prior = prior_of(config, effects=True)
-    coefficients = prior_of(config)
+    coefficients, prior = prior_of(config), prior_of(config, effects=True)
     precision = 1.0 if settings.prior else _NO_PRIOR
 
     def of_stage(what: str, share: float | None = None) -> None:
@@ -265,9 +247,9 @@ def _stage(
 
     unmeasured = any(archive.each(is_without_velocity))
     if unmeasured:  # as far as it is simulated, the motion tells least squares nothing
-        found, covariance = coefficients.mean, np.diag(coefficients.std**2)
         scale = np.outer(coefficients.std, coefficients.std)
         information = scale * predicted_information(archive, config.with_effects_held, free)
+        least = Estimate(names, coefficients.mean, np.diag(coefficients.std**2), 0.0)
     else:
         solution = least_squares.solve(
             archive.each,
@@ -278,31 +260,23 @@ def _stage(
             precision=precision,
             say=of_stage,
         )
-        found, covariance, information = solution.values, solution.covariance, solution.information
+        information = solution.information
+        least = Estimate(names, solution.values, solution.covariance, 0.0)
     base = least_squares.base_parameters(names, information, coefficients.std)
-    more: dict[str, Any] = {
-        "base_parameters": {
-            "identifiable": [str(c) for c in base.combinations],
-            "unidentified": list(base.unidentified),
-            "not_excited": list(base.unexcited),
-            "condition": base.condition if np.isfinite(base.condition) else None,
-            "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
-        }
-    }
-    noise, asked = None, found
+    more: dict[str, Any] = {"base_parameters": _described(base)}
+    found, covariance, asked = least.values, least.covariance, least.values
+    noise = None
     unexplained, lasting = np.full((2, 6), np.nan)
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
         else:
-            least = Estimate(names, found, covariance, 0.0)
             start = _start(archive, config, coefficients, least, free)
+        first = dict(zip(names, start.tolist(), strict=False))
         likelihood = maximum_likelihood.maximise(
             archive.each,
             config,
-            replace(config.model, body=body or config.dynamics.body).with_values(
-                dict(zip(names, start.tolist(), strict=False))
-            ),
+            replace(config.model, body=body or config.dynamics.body).with_values(first),
             free,
             precision / prior.std**2,
             settings.process,
@@ -316,11 +290,7 @@ def _stage(
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         unexplained[:2] = np.nan if unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
-        bound = np.sqrt(np.diag(likelihood.bound))
-        more["cramer_rao_std"] = dict(zip(names, bound.tolist(), strict=True))
-        more["noise"] = _noise(likelihood, free)
-        more["cost"] = likelihood.total.cost
-        more["iterations"], more["outliers"] = likelihood.iterations, likelihood.total.outliers
+        more |= _numbers_of(likelihood, names, free)
         if likelihood.held.any():
             waiting = ", ".join(n for n, held in zip(names, likelihood.held, strict=True) if held)
             notes.append(f"{waiting} held: {too_noisy(likelihood.noisy)}")
@@ -331,27 +301,15 @@ def _stage(
     seconds = float(sum(archive.each(_seconds)))
     covariance = covariance + attitude_covariance(config, names, seconds, gain)
     beyond_driving = covariance_beyond_driving(config, names, found, gain)
-    # What moments and tilt suggest of these is in the values, but the intervals are the prior's.
-    own = _coefficients(config).items()
-    impossible = [n for n, c in own if unmeasured and is_impossible(c)]
-    for i in (names.index(n) for n in impossible):
-        covariance[i] = covariance[:, i] = beyond_driving[i] = beyond_driving[:, i] = 0.0
-        covariance[i, i] = prior.std[i] ** 2
-    more |= {"impossible": impossible} if unmeasured else {}
-    removed = 1.0 - np.diag(covariance) / prior.std**2
+    if unmeasured:
+        # What moments and tilt suggest of these is in the values; the intervals are the prior's.
+        impossible = [n for n, c in _coefficients(config).items() if is_impossible(c)]
+        for i in (names.index(n) for n in impossible):
+            covariance[i] = covariance[:, i] = beyond_driving[i] = beyond_driving[:, i] = 0.0
+            covariance[i, i] = prior.std[i] ** 2
+        more["impossible"] = impossible
     estimate = Estimate(names, found, covariance, 0.0)
-    values = physical(config.dynamics, prior, estimate)
-    states = {}
-    for i, n in enumerate(names):
-        at_bound = bool(abs(found[i] - values[i]) > CONTRADICTED * estimate.std[i])
-        if at_bound:
-            notes.append(
-                f"{n}: the data ask for {found[i]:.4g}, which no passive hull has; "
-                f"{values[i]:.4g} is kept"
-            )
-        states[n] = of_fit(
-            values[i], estimate.std[i], prior.std[i], bool(removed[i] > IDENTIFIABLE), at_bound
-        )
+    values, states = _physical_states(config, prior, estimate, notes)
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
@@ -360,6 +318,64 @@ def _stage(
     return _Stage(
         names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting, noise
     )
+
+
+def _with_estimated(
+    archive: Archive,
+    config: Config,
+    name: str,
+    free: NDArray[np.bool_],
+    settings: Settings,
+    notes: list[str],
+    say: Progress,
+) -> Config | None:
+    """The configuration that estimates the coefficients of the axes ``free`` (6,), which are called
+    ``name``; of a fit in stages those that the motion shows. None, and a note, where a channel is
+    left alone."""
+    # an added mass belongs to both axes that it couples
+    names = tuple(
+        n
+        for n, c in _coefficients(config).items()
+        if free[c.row] and (not c.is_added_mass or free[c.column])
+    )
+    if not names:
+        raise UserError(f"no coefficient of {name} is among those to estimate (key `estimate`)")
+    config = replace(config, estimate=names)
+    if not settings.stages:
+        return config
+    if good := _is_good(archive, config, free):
+        notes.append(f"{name}: left alone, {good}")
+        return None
+    say(f"{name}: excitation")
+    known, reason = _excited(archive, config, free)
+    if not known:
+        notes.append(f"{name}: not fitted, {reason}")
+        return None
+    if held := [n for n in names if n not in known]:
+        notes.append(f"{name}: {', '.join(held)} held, {reason}")
+    return replace(config, estimate=known)
+
+
+def _physical_states(
+    config: Config, prior: Prior, estimate: Estimate, notes: list[str]
+) -> tuple[Array, dict[str, State]]:
+    """The values of a passive hull (n,) nearest to an estimate, and the states by name; and a note
+    on each coefficient for which the data ask for more."""
+    values = physical(config.dynamics, prior, estimate)
+    removed = 1.0 - np.diag(estimate.covariance) / prior.std**2
+    states = {}
+    for i, name in enumerate(estimate.names):
+        asked = estimate.values[i]
+        at_bound = bool(abs(asked - values[i]) > CONTRADICTED * estimate.std[i])
+        if at_bound:
+            notes.append(
+                f"{name}: the data ask for {asked:.4g}, which no passive hull has; "
+                f"{values[i]:.4g} is kept"
+            )
+        states[name] = of_fit(
+            values[i], estimate.std[i], prior.std[i], bool(removed[i] > IDENTIFIABLE), at_bound
+        )
+    return values, states
 
 
 def _has_surge_thrust(samples: Samples) -> bool:
@@ -438,9 +454,7 @@ def _excited(
         if not k
     )
     moved = ", ".join(
-        f"{axis} moves {size[i]:.2g} {'m/s' if i < 3 else 'rad/s'}"
-        for i, axis in enumerate(MOTIONS)
-        if free[i]
+        f"{axis} moves {size[i]:.2g} {UNITS[i]}" for i, axis in enumerate(MOTIONS) if free[i]
     )
     return tuple(np.array(prior.names)[known].tolist()), (
         f"the motion does not show it: it would be known to {uncertain} ({moved} rms); drive it "
@@ -500,8 +514,32 @@ def validation(bags: Sequence[ReadBag], before: OpenLoop, after: OpenLoop) -> di
     }
 
 
-def _noise(found: maximum_likelihood.Likelihood, free: NDArray[np.bool_]) -> dict[str, Any]:
-    n = found.noise
+def _described(base: least_squares.BaseParameters) -> dict[str, Any]:
+    """Which combinations the data identify, for the JSON of a fit."""
+    return {
+        "identifiable": [str(c) for c in base.combinations],
+        "unidentified": list(base.unidentified),
+        "not_excited": list(base.unexcited),
+        "condition": base.condition if np.isfinite(base.condition) else None,
+        "collinear": [{"pair": [a, b], "cosine": c} for a, b, c in base.collinear],
+    }
+
+
+def _numbers_of(
+    found: maximum_likelihood.Likelihood, names: Sequence[str], free: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Bound, noise and course of a maximum-likelihood fit, for its JSON."""
+    bound = np.sqrt(np.diag(found.bound))
+    return {
+        "cramer_rao_std": dict(zip(names, bound.tolist(), strict=True)),
+        "noise": _noise(found.noise, free),
+        "cost": found.total.cost,
+        "iterations": found.iterations,
+        "outliers": found.total.outliers,
+    }
+
+
+def _noise(n: maximum_likelihood.Noise, free: NDArray[np.bool_]) -> dict[str, Any]:
     axes = [a for a, f in zip(VELOCITIES, free, strict=True) if f]
     factor = np.sqrt(n.measurement[free])
     floor = np.sqrt(n.floor[free] / n.correlation_time)

@@ -103,10 +103,8 @@ class Fit(Shown, Result):
         """The same, judged by further ``tests``, too: where one fails, intervals are wider, and
         nothing has converged."""
         prior = prior_of(self.given, effects=True)
-        known = dict(zip(prior.names, prior.std.tolist(), strict=True))
-        of_file = dict(zip(prior.names, prior.mean.tolist(), strict=True))
-        std = np.array([known[name] for name in self.names])
-        mean = np.array([of_file[name] for name in self.names])
+        at = [prior.names.index(name) for name in self.names]
+        mean, std = prior.mean[at], prior.std[at]
         consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
         further = Consistency(tuple(tests))
         covariance = further.widened(self.covariance, std, self.values - mean)
