@@ -5,7 +5,7 @@ so that it agrees with the velocities, and said in the report.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,20 +97,10 @@ def import_csv(
 
     Raises UserError: a file, column or cell that cannot be used, or a unit that cannot be right.
     """
-    if body_frame not in _FRAME_IDS:
-        raise UserError(f"The body frame must be `frd` or `flu`, not `{body_frame}`.")
-    if wrench_timing not in ("held", "mean", "bin"):
-        raise UserError(
-            f"The wrench timing must be `held`, `mean` or `bin`, not `{wrench_timing}`."
-        )
-    if mask_rates_above is not None and not mask_rates_above > 0.0:
-        raise UserError(f"The limit of the rates must be positive, not {mask_rates_above}.")
+    _check_options(body_frame, wrench_timing, mask_rates_above)
     log = _Log.read([Path(path) for path in paths], columns or {}, depths)
     log.check_time()
-    for name in degrees:
-        if name not in log.data or name not in _IN_RADIANS:
-            raise UserError(f"--degrees {name}: the log has no such column of angles or rates")
-        log.data[name] = np.radians(log.data[name])
+    log.take_degrees(degrees)
     log.check_angles()
     notes = log.prepare(prepare) if prepare else []
     if log.left_out:
@@ -145,32 +135,59 @@ def import_csv(
         wrench_stamps[1:] = stamps[:-1] + np.diff(stamps) // 2
     elif wrench_timing == "bin":
         stamps = stamps + _bin_widths(stamps) // 2
-    joints = log.joints()
-    world, body = _FRAME_IDS[body_frame]
-    force, torque = log.matrix(_WRENCH[:3]), log.matrix(_WRENCH[3:])
-
-    def rows() -> Iterator[tuple[int, int, str, Message]]:
-        for k, (at, acts) in enumerate(zip(stamps.tolist(), wrench_stamps.tolist(), strict=True)):
-            # The wrench first: at equal stamps it already acts on the velocity that follows.
-            yield k, acts, WRENCH, Wrench(acts, body, force[k], torque[k])
-            if joints is not None:
-                names, angle, turning = joints
-                yield k, at, DRIVE, Joints(at, body, names, angle[k], turning[k])
-            if kept[k]:
-                motion = position[k], orientation[k], linear[k], angular[k], np.zeros(6)
-                yield k, at, ODOMETRY, Odometry(at, world, body, *motion)
-
-    def messages() -> Iterator[tuple[int, str, Message]]:
-        for k, arrival, role, message in rows():
-            if wrong := fault(message):
-                raise UserError(f"{log.place(k)}: no vehicle has this {role}, {wrong}: correct it")
-            yield arrival, role, message
-
-    with np.errstate(all="ignore"):  # what is absurdly large is refused above
-        write_messages(out, messages())
+    motion = position, orientation, linear, angular
+    with np.errstate(all="ignore"):  # what is absurdly large is refused
+        rows = _rows(log, stamps.tolist(), wrench_stamps.tolist(), motion, kept, body_frame)
+        write_messages(out, _checked(log, rows))
     odometry, left_out, averaged = (int(np.count_nonzero(n)) for n in (kept, masked, wrapped))
     duration = float(time[-1] - time[0])
     return ImportReport(len(stamps), odometry, left_out, averaged, duration, tuple(notes))
+
+
+def _check_options(body_frame: str, wrench_timing: str, mask_rates_above: float | None) -> None:
+    """Raises UserError for one that :func:`import_csv` does not know."""
+    if body_frame not in _FRAME_IDS:
+        raise UserError(f"The body frame must be `frd` or `flu`, not `{body_frame}`.")
+    if wrench_timing not in ("held", "mean", "bin"):
+        raise UserError(
+            f"The wrench timing must be `held`, `mean` or `bin`, not `{wrench_timing}`."
+        )
+    if mask_rates_above is not None and not mask_rates_above > 0.0:
+        raise UserError(f"The limit of the rates must be positive, not {mask_rates_above}.")
+
+
+def _rows(
+    log: "_Log",
+    stamps: Sequence[int],
+    wrench_stamps: Sequence[int],
+    motion: tuple[Array, Array, Array, Array],
+    kept: NDArray[np.bool_],
+    body_frame: str,
+) -> Iterator[tuple[int, str, Message]]:
+    """(row, role, message) of every row (n,); ``motion`` (position, orientation, linear and angular
+    velocity, each (n, ...)) of those ``kept`` as odometry."""
+    world, body = _FRAME_IDS[body_frame]
+    force, torque, joints = log.matrix(_WRENCH[:3]), log.matrix(_WRENCH[3:]), log.joints()
+    for k, (at, acts) in enumerate(zip(stamps, wrench_stamps, strict=True)):
+        # The wrench first: at equal stamps it already acts on the velocity that follows.
+        yield k, WRENCH, Wrench(acts, body, force[k], torque[k])
+        if joints is not None:
+            names, angle, turning = joints
+            yield k, DRIVE, Joints(at, body, names, angle[k], turning[k])
+        if kept[k]:
+            position, orientation, linear, angular = (x[k] for x in motion)
+            pose = position, orientation
+            yield k, ODOMETRY, Odometry(at, world, body, *pose, linear, angular, np.zeros(6))
+
+
+def _checked(
+    log: "_Log", rows: Iterable[tuple[int, str, Message]]
+) -> Iterator[tuple[int, str, Message]]:
+    """(arrival [ns], role, message). Raises UserError for one that no vehicle can have."""
+    for k, role, message in rows:
+        if wrong := fault(message):
+            raise UserError(f"{log.place(k)}: no vehicle has this {role}, {wrong}: correct it")
+        yield message.stamp, role, message
 
 
 def _bin_widths(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -349,6 +366,13 @@ class _Log:
                 f"{self.place(0)}: {heading} has steps of {np.median(steps):g} and ends at "
                 f"{time[-1]:g}; it must be in seconds."
             )
+
+    def take_degrees(self, names: Sequence[str]) -> None:
+        """Convert columns that hold degrees. Raises UserError for one that is no angle or rate."""
+        for name in names:
+            if name not in self.data or name not in _IN_RADIANS:
+                raise UserError(f"--degrees {name}: the log has no such column of angles or rates")
+            self.data[name] = np.radians(self.data[name])
 
     def check_angles(self) -> None:
         """Refuses degrees. A yaw may count its turns; then it grows no faster than the rates, of

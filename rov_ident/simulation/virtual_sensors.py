@@ -1,9 +1,11 @@
 """What the sensors of a simulated vehicle publish: rates, noise, delays, from one seed."""
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.config import Config, Shaft
 from rov_ident.core.frames import (
@@ -129,13 +131,36 @@ def measure(
         config.dynamics, t, acted(effects, t, held), start, effects=effects, inputs=acting
     )
     sensed = sense(_reading(truth, config), config.effects)
-    late = t - velocity_delay(config.effects)
-    delayed = interpolated(t, sensed.linear, late)
-    offset = quaternion_from_euler(0.0, 0.0, heading_error(config.effects))
+    messages = [
+        *_odometry(config, truth, sensed, np.searchsorted(t, odometry_t), suite, rng),
+        *_imu(config, t, sensed, np.searchsorted(t, imu_t), suite, rng),
+    ]
+    # of a generator of its own: without it everything else is as it would be anyway
+    read = demand + reading_noise(config.effects) * rng.spawn(1)[0].standard_normal(demand.shape)
+    for at, wrench in zip(demand_t, read, strict=True):
+        noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
+        messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
+    if config.inputs.joints:
+        own = rng.spawn(1)[0]
+        joint_t = _clock(suite.joint_rate, duration, own)
+        driven = interpolated(demand_t, inputs, joint_t)
+        for at, x in zip(joint_t, driven, strict=True):
+            messages.append(_stamped(at, DRIVE, _joints(config, x, suite.joint_std, own)))
+    return Dive(truth, held, _delivered(messages, suite, rng))
 
-    messages: list[tuple[int, str, Message]] = []
+
+_Stamped = tuple[int, str, Message]
+
+
+def _odometry(
+    config: Config, truth: Trajectory, sensed: Reading, rows: NDArray[np.intp], suite: Suite,
+    rng: np.random.Generator,
+) -> Iterator[_Stamped]:  # fmt: skip
+    """Noisy odometry at these rows of the truth."""
+    delayed = interpolated(truth.t, sensed.linear, truth.t - velocity_delay(config.effects))
+    offset = quaternion_from_euler(0.0, 0.0, heading_error(config.effects))
     variance = np.repeat([suite.linear_std**2, suite.angular_std**2], 3)
-    for i in np.searchsorted(t, odometry_t):
+    for i in rows:
         noise = rng.standard_normal(12)
         tilt = quaternion_from_rotation_vector(suite.attitude_std * noise[:3])
         position = _coarse(truth.position[i] + suite.position_std * noise[3:6])
@@ -145,31 +170,31 @@ def measure(
         linear = _coarse(delayed[i] + suite.linear_std * noise[6:9])
         angular = _coarse(sensed.angular[i] + suite.angular_std * noise[9:])
         odometry = Odometry(0, *_FRAMES, position, attitude, linear, angular, variance)
-        messages.append(_stamped(t[i], ODOMETRY, odometry))
+        yield _stamped(truth.t[i], ODOMETRY, odometry)
+
+
+def _imu(
+    config: Config, t: Array, sensed: Reading, rows: NDArray[np.intp], suite: Suite,
+    rng: np.random.Generator,
+) -> Iterator[_Stamped]:  # fmt: skip
+    """Noisy messages of the IMU at these rows of t (N,), with biases that stay."""
     mounting = config.imu.to_body
     gyro_variance, variance = np.full(3, suite.gyro_std**2), np.full(3, suite.accelerometer_std**2)
     accelerometer_bias = suite.accelerometer_bias_std * rng.standard_normal(3)
     gyro_bias = suite.gyro_bias_std * rng.standard_normal(3)
-    for i in np.searchsorted(t, imu_t):
+    for i in rows:
         noise = rng.standard_normal(6)
         gyro = _coarse(mounting.T @ sensed.gyro[i] + gyro_bias + suite.gyro_std * noise[:3])
         force = mounting.T @ sensed.specific_force[i] + accelerometer_bias
         force = _coarse(force + suite.accelerometer_std * noise[3:])
         imu = Imu(0, "imu_link_frd", _LEVEL, gyro, force, gyro_variance, variance)
-        messages.append(_stamped(t[i], IMU, imu))
-    # of a generator of its own: without it everything else is as it would be anyway
-    read = demand + reading_noise(config.effects) * rng.spawn(1)[0].standard_normal(demand.shape)
-    for at, wrench in zip(demand_t, read, strict=True):
-        noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
-        messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
+        yield _stamped(t[i], IMU, imu)
 
-    if config.inputs.joints:
-        own = rng.spawn(1)[0]
-        joint_t = _clock(suite.joint_rate, duration, own)
-        driven = interpolated(demand_t, inputs, joint_t)
-        for at, x in zip(joint_t, driven, strict=True):
-            messages.append(_stamped(at, DRIVE, _joints(config, x, suite.joint_std, own)))
 
+def _delivered(
+    messages: Sequence[_Stamped], suite: Suite, rng: np.random.Generator
+) -> list[_Stamped]:
+    """(arrival [ns], role, message) in order of arrival: some are lost, and all come late."""
     keep = rng.random(len(messages)) >= suite.drop
     late = suite.delay + suite.jitter * np.abs(rng.standard_normal(len(messages)))
     arrived = [
@@ -184,7 +209,7 @@ def measure(
         newest[role] = max(arrival, newest.get(role, 0))
         ordered.append((newest[role], role, message))
     ordered.sort(key=lambda m: m[0])
-    return Dive(truth, held, ordered)
+    return ordered
 
 
 def _joints(config: Config, inputs: Array, std: float, rng: np.random.Generator) -> Joints:
