@@ -226,6 +226,15 @@ def test_maximum_likelihood_finds_it_too(tmp_path):
     assert fit.fitted.effects["thrust_scale"]["scale"] == fit.values[i]
 
 
+def stated(heavy, scale_is_known=False, **vehicle):
+    """The vehicle by a file with these keys of `vehicle`, what no file knows to be estimated."""
+    parameters = configuration.to_parameters(heavy)
+    parameters["vehicle"] |= vehicle
+    if not scale_is_known:
+        parameters["wrench"].pop("scale_std", None)
+    return configuration.from_parameters(parameters).with_nuisance
+
+
 def test_what_is_known_is_not_estimated(heavy):
     assert heavy.with_nuisance == heavy
     parameters = configuration.to_parameters(heavy)
@@ -247,9 +256,7 @@ def test_what_is_known_is_not_estimated(heavy):
 
 def test_an_uncertain_rigid_body_is_one_of_added_mass(heavy):
     """A mass 1 % off is an error of 0.135 kg of all three added masses, in common."""
-    parameters = configuration.to_parameters(heavy)
-    parameters["vehicle"] |= {"mass_std": 0.01, "inertia_std": 0.05}
-    config = configuration.from_parameters(parameters)
+    config = stated(heavy, scale_is_known=True, mass_std=0.01, inertia_std=0.05)
     names = heavy.estimate
     covariance = rigid_body_covariance(config, names, np.ones(len(names)))
     at = [names.index(name) for name in ("X_udot", "Y_vdot", "Z_wdot", "K_pdot", "X_u")]
@@ -262,10 +269,7 @@ def test_an_uncertain_rigid_body_is_one_of_added_mass(heavy):
 def test_where_the_thrust_is_not_known_the_mass_scales_everything(heavy):
     """With mass, moments of inertia, weight, thrust and all coefficients times k, nothing moves
     otherwise: what a wrong mass does to the estimate is this scaling."""
-    parameters = configuration.to_parameters(heavy)
-    parameters["vehicle"] |= {"mass_std": 0.01}
-    parameters["wrench"].pop("scale_std", None)
-    config = configuration.from_parameters(parameters).with_nuisance
+    config = stated(heavy, mass_std=0.01)
     prior = prior_of(config, effects=True)
     covariance = rigid_body_covariance(config, prior.names, prior.mean)
     moved = np.sqrt(np.diag(covariance)) / 0.01
@@ -306,10 +310,7 @@ def test_the_righting_arm_is_what_thrust_is_compared_with(heavy, factor):
     """A centre of buoyancy that is higher than in the file makes thrust, drag and all inertia, own
     and added, seem smaller: with that, the equations of motion are those of the file. So does more
     thrust in roll and pitch; that of each other axis is besides off by itself."""
-    parameters = configuration.to_parameters(heavy)
-    parameters["vehicle"] |= {"cob_std": 0.001}
-    parameters["wrench"].pop("scale_std", None)
-    config = configuration.from_parameters(parameters).with_nuisance
+    config = stated(heavy, cob_std=0.001)
     prior, body = prior_of(config, effects=True), config.model.body
     covariance = covariance_beyond_driving(config, prior.names, prior.mean)
     arm = -body.cob[2] * body.buoyancy / body.weight
@@ -386,10 +387,7 @@ def test_pilots_show_no_delay_where_there_is_none(seed, kind):
 def test_a_lost_buoyancy_scales_with_what_weight_leaves(heavy, factor):
     """With thrust and coefficients times k, it is the force of weight and buoyancy together that is
     k times as large, not the part of it that was lost beyond the file."""
-    parameters = configuration.to_parameters(heavy)
-    parameters["vehicle"] |= {"cob_std": 0.001, "buoyancy_std": 0.02}
-    parameters["wrench"].pop("scale_std", None)
-    config = configuration.from_parameters(parameters).with_nuisance
+    config = stated(heavy, cob_std=0.001, buoyancy_std=0.02)
     prior, body = prior_of(config, effects=True), config.model.body
     at = prior.names.index("buoyancy.delta")
     values = prior.mean.copy()
@@ -473,11 +471,8 @@ def test_a_trim_is_told_in_shares_of_the_righting_arm(heavy, seed):
     """A heel at rest tells how far the centre of gravity is to one side, over the arm: a height
     that is off by a part of the arm moves both by it, as it does the thrust."""
     rng = np.random.default_rng(seed)
-    parameters = configuration.to_parameters(heavy)
     arm = rng.uniform(0.01, 0.05)
-    parameters["vehicle"] |= {"cob": [0.0, 0.0, -arm], "cob_std": 0.001, "cog_std": 0.005}
-    parameters["wrench"].pop("scale_std", None)
-    config = configuration.from_parameters(parameters).with_nuisance
+    config = stated(heavy, cob=[0.0, 0.0, -arm], cob_std=0.001, cog_std=0.005)
     names, body = prior_of(config, effects=True).names, config.model.body
     values = prior_of(config, effects=True).mean
     at = [names.index(f"cog_offset.{d}") for d in ("dx", "dy", "dz")]

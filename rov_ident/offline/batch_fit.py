@@ -99,19 +99,9 @@ def fit_batch(
     simulated.
     """
     settings = settings or Settings()
-    unmeasured = [bag for bag, so in zip(archive.bags, archive.each(is_without_velocity)) if so]
+    unmeasured = any(archive.each(is_without_velocity))
     if unmeasured:
-        if kind != "ml" or settings.stages:
-            raise refusal(unmeasured[0].path.name)
-        if len(unmeasured) < len(archive.bags):
-            raise UserError(
-                f"{unmeasured[0].path.name} has no linear velocity, and other bags have: fit those "
-                "with and those without apart (the one result as the other's configuration)"
-            )
-        # of a horizontal current nothing shows, and no velocity is late or scaled
-        odometry = replace(config.odometry, latency_std=0.0, scale_std=0.0)
-        config = replace(config, current_std=0.0, odometry=odometry)
-        settings = replace(settings, readings=2 * settings.readings)
+        config, settings = _without_velocity(archive, config, kind, settings)
     say("open loop, as configured")
     read, given = archive, config
     before = open_loop(read, given)
@@ -180,6 +170,25 @@ def fit_batch(
         more=more,
         curves=curves(read.bags, before, after),
     )
+
+
+def _without_velocity(
+    archive: Archive, config: Config, kind: str, settings: Settings
+) -> tuple[Config, Settings]:
+    """Configuration and settings for bags without linear velocity. Raises UserError where another
+    fit than all channels by maximum likelihood is asked for, or only some of the bags lack it."""
+    unmeasured = [bag for bag, so in zip(archive.bags, archive.each(is_without_velocity)) if so]
+    if kind != "ml" or settings.stages:
+        raise refusal(unmeasured[0].path.name)
+    if len(unmeasured) < len(archive.bags):
+        raise UserError(
+            f"{unmeasured[0].path.name} has no linear velocity, and other bags have: fit those "
+            "with and those without apart (the one result as the other's configuration)"
+        )
+    # of a horizontal current nothing shows, and no velocity is late or scaled
+    odometry = replace(config.odometry, latency_std=0.0, scale_std=0.0)
+    config = replace(config, current_std=0.0, odometry=odometry)
+    return config, replace(settings, readings=2 * settings.readings)
 
 
 def _relinearised(
