@@ -1,4 +1,5 @@
-"""Accuracy of the live estimators, over seeds: the tables of docs/accuracy.md.
+"""Accuracy of the live estimators, over seeds: the tables of docs/accuracy.md and
+docs/choices.md.
 
     python -m bench.studies.accuracy [STUDY ...] [--seeds N] [--long-seeds N] [--few-seeds N]
                                      [--jobs N] [--minutes T] [--folder DIR] [--data DIR]

@@ -109,7 +109,7 @@ def drift_of(config: Config, names: tuple[str, ...]) -> Array:
 
     That of a current: it turns, and differs from place to place. And that of a trim: the error of
     an attitude lasts, and that of the righting moment with it, which a vehicle at rest does not
-    tell from a centre of gravity that moves ("Trim" in docs/accuracy.md). Neither where the file
+    tell from a centre of gravity that moves ("Trim" in docs/choices.md). Neither where the file
     says that it is known (``current_std: 0`` ...).
     """
     supposed = {".".join(key): std for key, std in config.nuisance_std.items()}
@@ -133,7 +133,7 @@ def attitude_covariance(
     """What the attitude's error adds to the covariance (n, n) of estimates from ``seconds``.
 
     It lasts, and the moment of weight turned by it is that of a centre of gravity that is to one
-    side by the arm times the error ("Trim" in docs/accuracy.md): by their mean over the record.
+    side by the arm times the error ("Trim" in docs/choices.md): by their mean over the record.
     """
     mean = np.sqrt(min(2.0 * ATTITUDE_LASTS / max(seconds, 1e-9), 1.0))
     body = config.model.body

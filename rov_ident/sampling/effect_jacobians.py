@@ -11,7 +11,7 @@ motion and the measured velocity become::
 configured ones, of effects on fins in what the configured fins make, and of the wrench effects, at
 the measured motion; of effects on the rigid body
 ``dG down - dM nu_dot - C(dM nu) nu``, with the acceleration that the IMU measures ("Trim" in
-docs/accuracy.md). ``V`` (6, k) is the change of the measured velocity: of moving water, and of
+docs/choices.md). ``V`` (6, k) is the change of the measured velocity: of moving water, and of
 effects on the velocity sensors.
 """
 

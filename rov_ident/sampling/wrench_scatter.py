@@ -5,7 +5,7 @@ estimator finds the same noise in its innovations and in the sensitivities, whic
 and takes what the vehicle does not follow for a weaker thrust or a heavier vehicle (attenuation:
 Fuller 1987, ch. 1). On an axis that is driven far above the noise that is nothing; elsewhere a
 minute of it outweighs all that the motion tells ("Noise of the wrench's reading" in
-docs/accuracy.md).
+docs/choices.md).
 """
 
 import math
