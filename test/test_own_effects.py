@@ -7,14 +7,13 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from bench import ROOT
 from rov_ident.effects import EFFECTS
-from rov_ident.effects.base import faults
+from rov_ident.effects.checks import faults
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "own-effects.md").read_text()
 
 USE = """

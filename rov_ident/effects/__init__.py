@@ -29,8 +29,8 @@ from rov_ident.effects.base import (
     Reading,
     Trait,
     a_reading,
-    faults,
 )
+from rov_ident.effects.checks import faults
 from rov_ident.model.equations import RigidBody, add_current
 
 
@@ -58,7 +58,7 @@ def _library() -> dict[str, Effect]:
     ours = {
         module.name: replace(import_module(f"{__name__}.{module.name}").EFFECT, name=module.name)
         for module in iter_modules(__path__)
-        if module.name != "base"
+        if module.name not in ("base", "checks")
     }
     return {**dict(_installed_effects(ours)), **ours}
 
