@@ -75,6 +75,18 @@ def fit(
     errors = [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
     measured = np.concatenate(errors)
     notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted, nonlinear)]
+    notes += _doubtful_times(model, runs)
+    return dataclasses.replace(
+        model,
+        rmse=rmse(measured),
+        notes=tuple(notes),
+        provenance=provenance((run.name, run.sha256) for run in runs),
+    )
+
+
+def _doubtful_times(model: Nomoto, runs: Sequence[Zigzag]) -> list[str]:
+    """What makes the time constants doubtful, in words."""
+    notes = []
     if _outlasts(model, runs):
         notes.append(
             f"the response is slower than the longest run ({_longest(runs):.3g} s), which hardly "
@@ -90,12 +102,7 @@ def fit(
             f"T3 is negative: the heading answers some {late:.2g} s late, which no rudder does; T "
             "contains a dead time, the servo (is the rudder angle the command?) or two clocks"
         )
-    return dataclasses.replace(
-        model,
-        rmse=rmse(measured),
-        notes=tuple(notes),
-        provenance=provenance((run.name, run.sha256) for run in runs),
-    )
+    return notes
 
 
 def _remarks(model: Nomoto, errors: Sequence[Array], fitted: float, nonlinear: bool) -> list[str]:

@@ -37,12 +37,31 @@ _PLUGIN = "gz::sim::systems::Hydrodynamics"
 
 def write(config: Config) -> Written:
     """A model with one link `base_link`; the world needs Gazebo's Buoyancy plugin."""
-    model, body = config.model, config.dynamics.body
-    gravity = config.gravity
-    lost = lost_besides(config, held=("ocean_current",))
+    body = config.dynamics.body
     # The net force is what floats or sinks the vehicle: it is kept where the weight cannot be.
-    buoyancy = body.buoyancy + (gravity * body.mass - body.weight)
-    if abs(gravity * body.mass - body.weight) > 1e-9 * body.weight:
+    beyond_weight = config.gravity * body.mass - body.weight
+    lost = _lost(config, beyond_weight)
+    sdf = ET.Element("sdf", version="1.10")
+    root = ET.SubElement(sdf, "model", name=config.name)
+    _add_link(root, config, body.buoyancy + beyond_weight)
+    one_sided = _add_plugin(root, config)
+    if one_sided:
+        lost.append(f"the coefficients {', '.join(one_sided)}: its damping knows no direction")
+    ET.indent(sdf)
+    head = (
+        f"gravity of the world: 0 0 -{config.gravity:g}; its Buoyancy plugin: "
+        f"uniform_fluid_density {DENSITY:g}; physics engine: dartsim"
+    )
+    text = ET.tostring(sdf, encoding="unicode")
+    return Written(f'<?xml version="1.0"?>\n<!-- {head} -->\n{text}\n', tuple(lost))
+
+
+def _lost(config: Config, beyond_weight: float) -> list[str]:
+    """What the format has no place for, but for coefficients; ``beyond_weight`` [N] is what mass
+    times gravity has beyond the weight."""
+    model, body, gravity = config.model, config.dynamics.body, config.gravity
+    lost = lost_besides(config, held=("ocean_current",))
+    if abs(beyond_weight) > 1e-9 * body.weight:
         lost.append(
             f"a weight of {body.weight:g} N (Gazebo takes mass times gravity, "
             f"{gravity * body.mass:g} N): the buoyancy is changed by the same amount"
@@ -53,9 +72,12 @@ def write(config: Config) -> Written:
         lost.append(
             "what ocean_current does to the added mass: in Gazebo it changes the damping alone"
         )
+    return lost
 
-    sdf = ET.Element("sdf", version="1.10")
-    root = ET.SubElement(sdf, "model", name=config.name)
+
+def _add_link(root: ET.Element, config: Config, buoyancy: float) -> None:
+    """Inertia, added mass, and a box that displaces the water of this buoyancy [N]."""
+    model, body = config.model, config.dynamics.body
     link = ET.SubElement(root, "link", name="base_link")
     inertial = ET.SubElement(link, "inertial")
     _text(inertial, "pose", *(FLIP_BODY * body.cog), 0.0, 0.0, 0.0)
@@ -68,13 +90,15 @@ def write(config: Config) -> Written:
     added = ET.SubElement(inertial, "fluid_added_mass")
     for tag, place in _ADDED.items():
         _text(added, tag, water[place])
-
     collision = ET.SubElement(link, "collision", name="displaced_water")
     _text(collision, "pose", *(FLIP_BODY * body.cob), 0.0, 0.0, 0.0)
     box = ET.SubElement(ET.SubElement(collision, "geometry"), "box")
-    edge = float(np.cbrt(buoyancy / (DENSITY * gravity)))
+    edge = float(np.cbrt(buoyancy / (DENSITY * config.gravity)))
     _text(box, "size", edge, edge, edge)
 
+
+def _add_plugin(root: ET.Element, config: Config) -> list[str]:
+    """The damping and the current. Returns the coefficients for which there is no place."""
     plugin = ET.SubElement(root, "plugin", filename="gz-sim-hydrodynamics-system", name=_PLUGIN)
     ET.SubElement(plugin, "link_name").text = "base_link"
     ET.SubElement(plugin, "disable_added_mass").text = "true"
@@ -82,23 +106,14 @@ def write(config: Config) -> Written:
     if current := config.effects.get("ocean_current"):
         ned = np.array([current[axis] for axis in ("north", "east", "down")])
         _text(plugin, "default_current", *(FLIP_WORLD @ ned))
-    values, one_sided = model.values, []
-    for c in model.coefficients:
+    values, one_sided = config.model.values, []
+    for c in config.model.coefficients:
         if c.is_one_sided:
             one_sided.append(c.name)
         elif not (c.is_added_mass or c.inputs):
             tag, sign = _damping_tag(c)
             _text(plugin, tag, sign * values[c.name])
-    if one_sided:
-        lost.append(f"the coefficients {', '.join(one_sided)}: its damping knows no direction")
-
-    ET.indent(sdf)
-    head = (
-        f"gravity of the world: 0 0 -{gravity:g}; its Buoyancy plugin: uniform_fluid_density "
-        f"{DENSITY:g}; physics engine: dartsim"
-    )
-    text = ET.tostring(sdf, encoding="unicode")
-    return Written(f'<?xml version="1.0"?>\n<!-- {head} -->\n{text}\n', tuple(lost))
+    return one_sided
 
 
 def _damping_tag(c: Coefficient) -> tuple[str, float]:
