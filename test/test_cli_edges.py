@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from program import messages_in, run, run_alone
 
-from bench import HEAVY
+from bench import DEMO, HEAVY
 from rov_ident.cli.common import EXAMPLES
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import shipped
@@ -23,7 +23,6 @@ COMMANDS = (
     "simulate", "import", "export", "import-model", "nomoto", "forces", "coast-down", "steer",
     "coefficients",
 )  # fmt: skip
-DEMO = HEAVY.parents[1] / "bags" / "demo.mcap"
 
 
 def simulate(out, *options, source=("--manoeuvre", "steps", "--duration", 5)):

@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench import CONFIGS
 from rov_ident.config import (
     LARGEST,
     PARAMETERS,
@@ -29,8 +30,6 @@ from rov_ident.config.reading import unflatten
 from rov_ident.config.schema import ANY, PULSE_TYPES, WRENCH_TYPES
 from rov_ident.core.errors import UserError
 from rov_ident.effects import EFFECTS
-
-CONFIGS = sorted((Path(__file__).parent.parent / "config").glob("*.yaml"))
 
 MINIMAL = """\
 /**:

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import program
 import pytest
@@ -15,12 +14,12 @@ from program import lay_out_shipped
 from test_inputs import configured
 from tiers import more
 
+from bench import ROOT
 from rov_ident import config
 from rov_ident.cli.program import _commands, _parser
 from rov_ident.effects import EFFECTS
 from rov_ident.io.topics import _CHOICES
 
-ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 FRONT = sorted(ROOT.glob("*.md"))  # README and its like, which are not pages of the site

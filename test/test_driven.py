@@ -3,13 +3,13 @@
 import dataclasses
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from tiers import more
 
 import rov_ident as ri
+from bench import REMUS, ROOT
 from rov_ident import config as configuration
 from rov_ident.api.simulation import simulate
 from rov_ident.config.prior import prior_of
@@ -24,8 +24,6 @@ from rov_ident.sampling.records import predicted, read_record
 from rov_ident.simulation.open_loop import simulate as integrate
 from rov_ident.simulation.virtual_sensors import Suite
 
-ROOT = Path(__file__).resolve().parents[1]
-REMUS = ROOT / "config" / "remus100.yaml"
 HEAVY = ROOT / "config" / "bluerov2_heavy.yaml"
 DOWN = np.array([0.0, 0.0, 1.0])
 PROPELLED = {"X_nn": 0.02, "K_nn": -0.0008, "X_un": -0.01}

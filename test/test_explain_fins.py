@@ -1,18 +1,17 @@
 """Dives under fins: what lies between the angles that are read and those that act is named."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 from tiers import more
 
 import rov_ident as ri
+from bench import REMUS
 from rov_ident import config as configuration
 from rov_ident.effects import EFFECTS
 from rov_ident.simulation.virtual_sensors import Suite
 
-REMUS = Path(__file__).resolve().parents[1] / "config" / "remus100.yaml"
 LEAN = Suite(odometry_rate=10.0, imu_rate=50.0)
 
 

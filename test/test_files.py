@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from test_inputs import GEOMETRY, configured
 
+from bench import ROOT
 from rov_ident import config as configuration
 from rov_ident.api.comparison import compare
 from rov_ident.cli import common, main
@@ -22,7 +23,6 @@ from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.csv_log import import_csv, parse_columns
 from rov_ident.steering import zigzag
 
-ROOT = Path(__file__).parent.parent
 DEMO, HEAVY = ROOT / "bags/demo.mcap", ROOT / "bench/bluerov2_heavy_known.yaml"
 
 

@@ -1,10 +1,9 @@
 """Fins: names, the wrench by the fins' normals, tails, and the vehicle under its fins."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from bench import REMUS, ROOT
 from rov_ident import config
 from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
@@ -13,9 +12,6 @@ from rov_ident.model.coefficients import catalogue, input_catalogue, parse, pars
 from rov_ident.model.equations import extended_states
 from rov_ident.model.fins import CROSS, X
 from rov_ident.steering import autopilot
-
-ROOT = Path(__file__).resolve().parents[1]
-REMUS = ROOT / "config" / "remus100.yaml"
 
 
 @pytest.fixture(scope="module")

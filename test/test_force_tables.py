@@ -3,13 +3,12 @@
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from bench import DATA
+from bench import DATA, ROOT
 from rov_ident import config
 from rov_ident.api.comparison import compare
 from rov_ident.cli.program import main
@@ -21,7 +20,6 @@ from rov_ident.offline import captive_report
 from rov_ident.offline import captive_tests as force_tables
 from rov_ident.steering import autopilot
 
-ROOT = Path(__file__).resolve().parents[1]
 REMUS = str(ROOT / "config" / "remus100.yaml")
 CAPTIVE = DATA / "kvlcc2-model" / "captive.csv"
 

@@ -9,7 +9,6 @@ by some units in the last place of the *largest* of the terms, not of the sum, w
 
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
+from bench import CONFIGS
 from rov_ident import config
 from rov_ident.core.errors import UserError
 from rov_ident.model.coefficients import EXTENDED_SIZE, catalogue
@@ -34,7 +34,6 @@ from rov_ident.simulation.open_loop import simulate
 
 Array = NDArray[np.float64]
 
-CONFIGS = sorted((Path(__file__).parent.parent / "config").glob("*.yaml"))
 AXES = "XYZKMN"
 VELOCITIES = "uvwpqr"
 DOWN = np.array([0.0, 0.0, 1.0])

@@ -3,7 +3,6 @@
 import json
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from test_inputs import twist_and_pose, with_twist
 from test_inputs import write as write_rows
 from tiers import more
 
-from bench import DATA
+from bench import DATA, ROOT
 from rov_ident import config
 from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
@@ -25,7 +24,6 @@ from rov_ident.steering import autopilot, nomoto, nomoto_equation_error, nomoto_
 from rov_ident.steering.heading_interpolation import densify, spiral
 from rov_ident.steering.zigzag import Zigzag, read
 
-ROOT = Path(__file__).resolve().parents[1]
 KVLCC2 = DATA / "kvlcc2-model"
 FINE = 0.01  # s
 

@@ -23,10 +23,10 @@ from threadpoolctl import threadpool_info
 from tiers import more
 
 import rov_ident as ri
+from bench import ROOT
 from rov_ident.cli.program import main
 from rov_ident.config import dump, from_parameters, to_parameters
 
-ROOT = Path(__file__).parent.parent
 CONTRACT = (
     "load read fit explain check simulate plan compare OnlineEstimator HydrodynamicModel Model "
     "Config Record EFFECTS coefficients UserError __version__"

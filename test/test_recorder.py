@@ -9,19 +9,18 @@ import struct
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import zstandard
 from program import run
 
+from bench import DEMO
 from rov_ident.core.errors import UserError
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
-DEMO = Path(__file__).parent.parent / "bags" / "demo.mcap"
 PROGRAM = [sys.executable, "-m", "rov_ident"]
 
 

@@ -17,14 +17,13 @@ from xml.etree import ElementTree
 import pytest
 from rcl_interfaces.msg import ParameterType
 
-from bench import HEAVY
+from bench import HEAVY, ROOT
 from bench.simulators.live import Vehicle, end_node, start_node
 from rov_ident import config
 from rov_ident.config import Inputs, schema
 from rov_ident.io.topics import sources
 from rov_ident.nodes import controller_bridge, dashboard_node, estimator_node, parameters
 
-ROOT = HEAVY.parent.parent
 LAUNCH = sorted((ROOT / "launch").glob("*.py"))
 OF_ESTIMATORS = {p.key for p in config.VEHICLE_PARAMETERS + config.PARAMETERS} | {"use_sim_time"}
 DECLARED = {

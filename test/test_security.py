@@ -21,7 +21,7 @@ from packaging.utils import canonicalize_name
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
-from bench import HEAVY
+from bench import HEAVY, ROOT
 from bench.studies import fuzz
 from rov_ident import config
 from rov_ident.config import PARAMETERS
@@ -29,7 +29,6 @@ from rov_ident.core.errors import UserError
 from rov_ident.io.write_messages import write_messages
 from rov_ident.nodes.common import LATCHED
 
-ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "rov_ident").rglob("*.py")) + sorted((ROOT / "launch").glob("*.py"))
 
 # Modules that turn bytes into objects of their choice, or run what they are told.

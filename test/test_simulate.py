@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from bench import CONFIGS
 from rov_ident import config
 from rov_ident.core.errors import UserError
 from rov_ident.model.equations import Model, RigidBody, build
@@ -19,7 +20,6 @@ from rov_ident.simulation.open_loop import Guide, open_loop
 
 Array = NDArray[np.float64]
 
-CONFIGS = sorted((Path(__file__).parent.parent / "config").glob("*.yaml"))
 HEAVY = config.load(Path(__file__).parent.parent / "config" / "bluerov2_heavy.yaml").model
 
 # CG off the origin, products of inertia, off-diagonal added mass, terms of all kinds.

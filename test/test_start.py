@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 from test_bags import write_mcap
 
 import rov_ident as ri
-from bench import DATA, ROOT
+from bench import DATA, DEMO, ROOT
 from rov_ident.api import identification
 from rov_ident.cli.program import main
 from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS, from_parameters, to_parameters
@@ -25,7 +25,6 @@ from rov_ident.io.mounting import sensor_placement
 from rov_ident.io.topics import ROLE_NAMES
 from rov_ident.simulation import virtual_sensors as sensors
 
-DEMO = ROOT / "bags" / "demo.mcap"
 LOGS = DATA / "ardusub"
 SHIPPED = ROOT / "config" / "bluerov2_heavy.yaml"
 

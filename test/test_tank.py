@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiers import more
 
-from bench import DATA
+from bench import DATA, ROOT
 from rov_ident import config as configuration
 from rov_ident.discrepancy.explain import explain
 from rov_ident.effects import compiled
@@ -21,7 +21,6 @@ from rov_ident.nodes.replay import replay
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.records import predicted, read_record, score
 
-ROOT = Path(__file__).resolve().parents[1]
 TANK = DATA / "bluerov2-heavy-tank"
 CONFIG = ROOT / "config" / "bluerov2_heavy_tank.yaml"
 CHANNELS = np.array([True, True, True, False, False, False])
