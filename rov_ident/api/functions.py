@@ -171,18 +171,20 @@ def fit(
         if table:
             found = _with_table_notes(found, given, table)
         found = dataclasses.replace(found, notes=(*repeated, *placed, *found.notes))
-        if validate is None:
-            return found
-        other = existing(validate)
-        if same := same_data(other, paths):
-            note = f"{other} is what was fitted ({same}): it tells nothing of other dives"
-            found = dataclasses.replace(found, notes=(note, *found.notes))
-        judge = stack.enter_context(archive.opened([other], given, say=say))
+        return found if validate is None else _judged(found, given, validate, paths, say)
+
+
+def _judged(found: Fit, given: Config, validate: File, fitted: list[Path], say: Progress) -> Fit:
+    """The fit, with its open-loop errors on the bag ``validate``."""
+    bag, notes = existing(validate), found.notes
+    if same := same_data(bag, fitted):
+        notes = (f"{bag} is what was fitted ({same}): it tells nothing of other dives", *notes)
+    with archive.opened([bag], given, say=say) as judge:
         say("simulating in open loop")
         reread = judge.as_read_by(found.fitted, given)
         runs = judge.bags, open_loop(judge, given), open_loop(reread, found.fitted)
-        more = {"validation": batch_fit.validation(*runs)}
-        return dataclasses.replace(found, more=found.more | more, judged=curves(*runs))
+        more = found.more | {"validation": batch_fit.validation(*runs)}
+        return dataclasses.replace(found, notes=notes, more=more, judged=curves(*runs))
 
 
 def _message_tests(paths: Sequence[Path], config: Config) -> list[Test]:

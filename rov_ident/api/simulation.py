@@ -182,6 +182,13 @@ def simulate(
             run = dive(given, manoeuvre, duration, suite, seed)
         return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
     assert bag is not None
+    return _beside(bag, given, free, progress)
+
+
+def _beside(
+    bag: File, given: Config, free: NDArray[np.bool_] | None, progress: Progress | None
+) -> Simulation:
+    """Driven by a bag's wrench: in one run, and anew from the measured motion each HORIZON."""
     record = read(bag, given, progress)
     samples, model, effects = record.samples, given.dynamics, compiled(given.effects)
     free = simulated_axes(samples, free)
