@@ -34,7 +34,8 @@ from rov_ident.io.write_messages import write_messages
 from rov_ident.model.coefficients import parse
 from rov_ident.model.equations import Array, Model
 from rov_ident.offline.archive import Archive, total
-from rov_ident.offline.maximum_likelihood import LIKELY, Noise, assumed, inverse_of, one_pass
+from rov_ident.offline.maximum_likelihood import LIKELY, Noise, assumed, one_pass
+from rov_ident.offline.newton import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
 from rov_ident.sampling.records import samples_of

@@ -32,7 +32,7 @@ from rov_ident.estimation.shared import too_noisy
 from rov_ident.model.coefficients import MOTIONS, VELOCITIES, Coefficient
 from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
-from rov_ident.offline import least_squares, maximum_likelihood
+from rov_ident.offline import least_squares, maximum_likelihood, newton
 from rov_ident.offline.archive import Archive, ReadBag, Samples, total
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
@@ -450,7 +450,7 @@ def _excited(
     """Names of the coefficients that the motion shows, and why not the others."""
     prior = prior_of(config)
     information = predicted_information(archive, config, free)
-    covariance = maximum_likelihood.inverse_of(information + np.diag(prior.std**-2.0))
+    covariance = newton.inverse_of(information + np.diag(prior.std**-2.0))
     std = np.sqrt(np.diag(covariance))
     size, noise = _sizes(archive)
     # A wrong trim alone makes the prediction move where the vehicle does not: look at it, too.

@@ -31,20 +31,18 @@ these noise levels. Coefficients' covariances are not taken from it alone, as re
 coloured: the covariance of the accumulated score stands between two inverse informations.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
-from rov_ident.core.errors import UserError
 from rov_ident.core.jit import floats, inlined, kernel, record
-from rov_ident.core.linalg import sandwich, scaled_inverse, widened
+from rov_ident.core.linalg import sandwich, widened
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME
 from rov_ident.effects import EFFECTS
@@ -72,11 +70,10 @@ from rov_ident.estimation.shared import (
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
+from rov_ident.offline.newton import inverse_of, minimise
 from rov_ident.sampling.kinematic_filter import SUREST
 from rov_ident.sampling.sample import NO_SIDES, free_axes, parts
 from rov_ident.sampling.wrench_scatter import SHARE
-
-T = TypeVar("T")
 
 _LAG = 1.0  # s; window over the correlation of the score in time
 _GATE = 6.0  # standard deviations; one of 500 million normal innovations is further off
@@ -371,81 +368,89 @@ def maximise(
     own = estimated < len(model.theta)
     effects = mean[~own] if effects is None else effects
     precision = np.zeros(len(mean)) if precision is None else precision
-    likely = assumed(config)
-    if process:
-        # Also from above: where there is next to no process noise, its level hardly shows, and a
-        # search would stay there; from far above it ends before it is there.
-        doubtful = np.maximum(likely.floor, (_DOUBTFUL * authority(config.dynamics)) ** 2)
-        starts = [likely, replace(likely, floor=doubtful)]
-    else:
-        exact = np.zeros_like(likely.restoring)
-        starts = [replace(likely, floor=np.zeros(6), relative=0.0, restoring=exact)]
-    if first_noise is not None:
-        starts = [starts[0], first_noise]  # that of a wrong lag may be a valley far away
+    starts = _first_levels(config, process, first_noise)
 
-    def at_values(theta: Array) -> Model:
+    def model_at(theta: Array) -> Model:
         moved = model.theta.copy()
         moved[estimated[own]] = theta[own]
         return model.with_theta(moved)
 
-    def look(theta: Array, gate: float, noise: Noise) -> tuple[Pass, float]:
-        there = at_values(theta)
-        if np.linalg.eigvalsh(there.mass_matrix)[0] <= 0.0:
+    def evaluate(theta: Array, gate: float, noise: Noise) -> tuple[Pass, float]:
+        moved = model_at(theta)
+        if np.linalg.eigvalsh(moved.mass_matrix)[0] <= 0.0:
             return nothing, np.inf
-        found = total(each(one_pass, there, estimated, noise, free, gate, theta[~own]))
+        found = total(each(one_pass, moved, estimated, noise, free, gate, theta[~own]))
         cost = float(found.cost + precision @ (theta - mean) ** 2)
         # an outlier is worth its gate, so that refusing one gains nothing
         if np.isfinite(gate):
             cost += found.outliers * gate**2
         return found, cost if np.isfinite(cost) else np.inf
 
-    looks = count(1)
     readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
     of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
     taught = informative_axes(config)
+    step = count(1)
 
-    def slope_of(theta: Array, at: Pass) -> tuple[Array, Array]:
-        say(f"step {next(looks)}")
+    def derivatives(theta: Array, at: Pass) -> tuple[Array, Array]:
+        say(f"step {next(step)}")
         return at.score + precision * (mean - theta), at.information + np.diag(precision)
 
     nothing = Pass(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), 0.0, 0, 0)
     theta, at, steps = np.append(model.theta[estimated[own]], effects), nothing, 0
-    settled, converged, enough = theta, False, 1e-6 * len(theta)
+    of_noise, converged, tolerance = theta, False, 1e-6 * len(theta)
     for stage, gate in enumerate((np.inf, _GATE, _GATE, _GATE)):
-        far = theta - settled
+        far = theta - of_noise
         if stage >= 2 and far @ at.information @ far < 0.1 * len(theta):
             break  # the noise levels would be the same
         # Before the first step, too: with less noise than there is, the likelihood of a model that
         # is not right yet has valleys far from it.
-        settled = theta
+        of_noise = theta  # at which the noise levels are found
         say("noise levels")
         levels = [
-            _noise_levels(each, at_values(theta), start, free, process, theta[~own])
+            _noise_levels(each, model_at(theta), start, free, process, theta[~own])
             for start in starts
         ]
-        costs = [look(theta, _GATE, level)[1] for level in levels]
+        costs = [evaluate(theta, _GATE, level)[1] for level in levels]
         noise = levels[int(np.argmin(costs))]
         starts = [noise, *starts[:1]] if stage == 0 else [noise]
-        # loud, and not a command that trembles, which the vehicle would follow
+        # readings of much noise, but not of a trembling command, which the vehicle would follow
         noisy = (readings > SHARE * wrenches) & (samples * noise.floor > FOLLOWED * readings)
         held = (taught & noisy).any(axis=1) & (precision > 0.0)
         noise = replace(noise, untaught=(of_thrust & ~held[own.sum() :])[:, None] & noisy)
         bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
-        there = partial(look, gate=gate, noise=noise)
+        cost = partial(evaluate, gate=gate, noise=noise)
         theta = np.clip(theta, *bounds)
-        theta, at, more, converged = minimise(theta, bounds, there, slope_of, enough, _ITERATIONS)
+        theta, at, more, converged = minimise(
+            theta, bounds, cost, derivatives, tolerance, _ITERATIONS
+        )
         steps += more
-    last = at_values(theta), noise, free, gate, theta[~own], config.odometry.attitude_std
+    last = model_at(theta), noise, free, gate, theta[~own], config.odometry.attitude_std
     seconds, power = np.sum(each(whiteness, *last), 0)
     known = seconds > JUDGED_TIME
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
-    slope, curvature = slope_of(theta, at)
+    slope, curvature = derivatives(theta, at)
     asked, ours = theta.copy(), np.ix_(~held, ~held)
     asked[~held] += inverse_of(curvature[ours]) @ slope[~held]
     bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
     return Likelihood(
         theta, asked, covariance, bound, noise, at, lasting, held, noisy, steps, converged
     )
+
+
+def _first_levels(config: Config, process: bool, also: Noise | None) -> list[Noise]:
+    """The noise from which the search for its levels begins, of which the best result counts."""
+    stated = assumed(config)
+    if not process:
+        exact = np.zeros_like(stated.restoring)
+        stated = replace(stated, floor=np.zeros(6), relative=0.0, restoring=exact)
+    if also is not None:
+        return [stated, also]  # that of a wrong lag may be a valley far away
+    if not process:
+        return [stated]
+    # Also from above: where there is next to no process noise, its level hardly shows, and a
+    # search would stay there; from far above it ends before it is there.
+    doubtful = np.maximum(stated.floor, (_DOUBTFUL * authority(config.dynamics)) ** 2)
+    return [stated, replace(stated, floor=doubtful)]
 
 
 def _with_consider_parameters(
@@ -486,73 +491,19 @@ def _noise_levels(
     least[6:12] = np.log((_SMALLEST * authority(model)) ** 2 * noise.correlation_time)
     least[12] = np.log(1e-10)
 
-    def look(levels: Array) -> tuple[Noise, float]:
-        there = _at_levels(noise, levels, process)
+    def evaluate(levels: Array) -> tuple[Noise, float]:
+        moved = _at_levels(noise, levels, process)
         off = np.sum((levels - start) ** 2) / _KNOWN**2
-        return there, float(sum(each(noise_cost, model, there, free, effects)) + off)
+        return moved, float(sum(each(noise_cost, model, moved, free, effects)) + off)
 
-    def slope_of(levels: Array, there: Noise) -> tuple[Array, Array]:
-        slopes = each(noise_slope, model, there, free, process, effects)
+    def derivatives(levels: Array, moved: Noise) -> tuple[Array, Array]:
+        slopes = each(noise_slope, model, moved, free, process, effects)
         gradient = sum(s[1] for s in slopes) - (levels - start) / _KNOWN**2
         return gradient, sum(s[0] for s in slopes) + np.eye(13) / _KNOWN**2
 
     highest = np.full(13, np.inf)
-    return minimise(start, (least, highest), look, slope_of, _NEAR, _NOISE_ITERATIONS, 1.5)[1]
-
-
-def minimise(
-    x: Array,
-    bounds: tuple[Array, Array],
-    look: Callable[[Array], tuple[T, float]],
-    slope_of: Callable[[Array, T], tuple[Array, Array]],
-    enough: float,
-    most: int,
-    longest: float = np.inf,
-) -> tuple[Array, T, int, bool]:
-    """Minimise a cost, twice the negative logarithm of a likelihood, from ``x`` (n,) on.
-
-    Newton's method between ``bounds``, with steps that are at most ``longest`` in each component,
-    and halved until the cost falls. ``look`` gives what is known at a place, and its cost;
-    ``slope_of`` minus half the gradient (n,) and half the curvature (n, n) there. It ends where a
-    step gains less than ``enough``: the squared distance from the least, in standard deviations.
-    Returns the place, what is known at it, the number of steps, and whether that was the end.
-    """
-    (lower, upper), (at, cost), steps = bounds, look(x), 0
-    while steps < most:
-        slope, curvature = slope_of(x, at)
-        # what the data would have beyond its bound stays there
-        held = ((x <= lower) & (slope < 0.0)) | ((x >= upper) & (slope > 0.0))
-        slope[held] = 0.0
-        curvature[held] = curvature[:, held] = 0.0
-        curvature[held, held] = 1.0
-        change = np.clip(inverse_of(curvature) @ slope, -longest, longest)
-        if slope @ change < enough:
-            return x, at, steps, True
-        factor, gained = 1.0, -1.0
-        while factor > 1e-3 and not gained > 0.0:
-            moved = np.clip(x + factor * change, lower, upper)
-            found, there = look(moved)
-            factor, gained = 0.5 * factor, cost - there
-        if not gained > 0.0:
-            return x, at, steps, True
-        x, at, cost, steps = moved, found, there, steps + 1
-        if gained < enough:
-            return x, at, steps, True
-    return x, at, steps, False
-
-
-def inverse_of(information: Array) -> Array:
-    """Inverse of an information matrix, scaled to a unit diagonal meanwhile.
-
-    Raises UserError if it is not finite, as the model could not be simulated.
-    """
-    if not np.isfinite(information).all():
-        raise UserError(
-            "the simulation diverges along this motion: check the signs and sizes of the "
-            "coefficients and the axes of the bag"
-        )
-    # The rounding of sums over a hundred thousand samples leaves some 1e-14 of the largest.
-    return scaled_inverse(information, rcond=1e-13)
+    bounds = least, highest
+    return minimise(start, bounds, evaluate, derivatives, _NEAR, _NOISE_ITERATIONS, 1.5)[1]
 
 
 # ------------------------------------------------------------------ kernels
