@@ -194,7 +194,7 @@ def covariance_beyond_driving(
         moved = {n: share * v for n, v in scaled.items()}
         moved |= {n: share * off for n, off in _off_centre(config, of_all).items()}
         sources.append(moved)
-        for row in ("X", "Y", "Zb", "N"):  # a buoyancy is what heave thrust balances
+        for row in ("X", "Y", "Zb", "N"):  # b: heave thrust balances `buoyancy.delta`, too
             sources.append({n: by_axis * v for n, v in scaled.items() if n[0] in row})
     of_velocity = {n: _degree(n) * (v - masses.get(n, 0.0)) for n, v in of_all.items()}
     sources.append({n: config.odometry.scale_std * v for n, v in of_velocity.items()})

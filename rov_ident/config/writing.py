@@ -76,7 +76,7 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
         value = given.pop(p.key, p.default)
         active = p.required or p.key in remarks or value != p.default
         meaning = (f"{p.unit}: " if p.unit else "") + p.description
-        if p.choices and name != "wrench":  # whose types are in docs/inputs.md
+        if p.choices and name != "wrench":  # its many types are listed in docs/inputs.md
             meaning += f" ({', '.join(p.choices)})"
         line = _line(name, value, meaning, remarks.get(p.key, ""))
         if p.required and value is None:

@@ -12,7 +12,7 @@ AVERAGE_TIME = 60.0  # s; over which the power is averaged: several manoeuvres o
 JUDGED_TIME = 20.0  # s; after which it is known: chance then takes its root beyond 1.5 in 0.1 %
 BY_CHANCE = 1.25
 """Root of the power that chance reaches in one dive of a thousand (table in docs/live.md)."""
-_MOST = 100.0  # that one sum counts for: 10 sigma, or what is long over would be held against it
+_MOST = 100.0  # 10 sigma: a sum counts for no more, or one error would weigh for minutes
 
 
 @inlined

@@ -169,7 +169,7 @@ def _conditioned(config: Config, axis: _Axis) -> tuple[dict[str, float], dict[st
     mean, std = np.array([(known | held)[own] for own in beside]).reshape(-1, 2).T
     slopes = np.array(list(beside.values())).reshape(-1, len(axis.names)).T
     values = axis.values - slopes @ mean
-    # of the axis's terms, then of those left out, which stay as they are
+    # joint covariance: first the axis's terms, then those left out, whose values stay
     joint = np.vstack([slopes * -std, np.diag(std)])
     joint = joint @ joint.T
     n = len(axis.names)

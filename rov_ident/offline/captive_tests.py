@@ -55,7 +55,7 @@ _SHOWN = 20  # candidates, beside the chosen: a screenful
 _WORTH = 2.0  # standard errors, which chance exceeds one time in forty
 _FAR = 12.0  # median errors: eight standard deviations (0.674 each) of a normal distribution
 _LIGHT = 1e-3  # weight of a structure, the best one's being 1, which changes no standard deviation
-_SLIP = 0.5  # of the force itself: noise in proportion to it is less, a sign or unit more
+_SLIP = 0.5  # share of the force: its noise is less, a slip of sign or unit makes more
 _UNLIKE = 0.25  # of the force (RMS); runs of a condition repeat to a few percent, poor ones to ten
 _DOUBT = 12.0  # of a term, in mean squared errors over the rows: beyond |t| of about five
 

@@ -36,7 +36,7 @@ _CALM = 3.0  # times as far as its neighbours move is what stands between two ca
 _BRIEF, _LASTING = 0.02, 0.1  # s; a message this far from the next is brief: nobody means it; or it
 # lasts: a pilot's tap, or a turn of the vehicle; in between, in proportion
 _MEANT = 0.2  # of working wrench and command; with GATE all of it, for a command that lasts
-_FULL_SCALE = 0.5  # of the working wrench: over a whole bag, what no controller commands alone
+_FULL_SCALE = 0.5  # of the working wrench: in a whole bag no smaller command is an outlier
 
 
 def measured_values(message: Message) -> Array:

@@ -52,8 +52,8 @@ class Queues:
         self._by_role = {ODOMETRY: self.odometry, IMU: self.imu, WRENCH: self.wrench}
         self._first = math.nan  # s
         self._latest = -math.inf  # s; of all topics
-        # s; no topic will bring anything before this. Of commands one more is waited for: it tells,
-        # with the others, whether one is an outlier.
+        # s; no topic will bring anything before this. A sample waits for one command more than it
+        # uses: that one tells whether the last used is an outlier.
         self._reach = dict.fromkeys((*self._by_role, *self._drives), -math.inf)
         self._newest_command = -math.inf  # s
 
