@@ -26,7 +26,7 @@ from rov_ident.sampling.queues import MERGE
 
 _VELOCITY, _RATE, _ATTITUDE, _RATE_AS_READ = range(4)
 _PARTS = ("velocity", "angular rate", "attitude")  # of the odometry, each behind a gate of its own;
-# the last of the four is its angular rate against the gyro with its bias
+# the last of the four is its angular rate against the gyro as it was read
 
 STATE = record(
     [
@@ -83,6 +83,7 @@ _MEASURED = record(
         ("variance", "f8", (6,)),  # of linear and angular; zeros: not given
         ("has_imu", "?"),
         ("gyro", "f8", (3,)),  # rad/s, sensor axes
+        ("gyro_error", "f8", (3,)),  # rad/s, body axes: what the effects on sensors took off it
         ("gyro_variance", "f8"),  # as the message has it; zero or negative: not given
         ("specific_force", "f8", (3,)),  # m/s2, sensor axes
     ]
@@ -236,14 +237,16 @@ class KinematicFilter:
 
     def _take_imu(self, message: Imu) -> None:
         into = self._into
-        gyro, force = message.angular_velocity, message.linear_acceleration
+        gyro, force, error = message.angular_velocity, message.linear_acceleration, _ZERO
         if self._corrects:
             to_body = self._settings["imu_rotation"][0]
             given = Reading(_ZERO, _ZERO, to_body @ gyro, to_body @ force)
             reading = correct(given, self._effects)
-            gyro = gyro + to_body.T @ (reading.gyro - given.gyro)
+            error = given.gyro - reading.gyro
+            gyro = gyro - to_body.T @ error
             force = force + to_body.T @ (reading.specific_force - given.specific_force)
         into["gyro"][0] = gyro
+        into["gyro_error"][0] = error
         into["specific_force"][0] = force
         into["gyro_variance"][0] = sum(message.angular_variance.tolist()) / 3.0
 
@@ -446,7 +449,8 @@ def _correct_gyro_bias(k, s, rate, m, share, r_angular, gyro_variance):
     """Compare the gyro at the odometry's instant, ``share`` of dt ago, with the odometry's rate.
 
     A rate that is copied from the gyro has its bias, too, and says nothing of it: it differs from
-    the gyro less before the bias is taken off, as only the attitude can have told it.
+    the gyro less before the bias is taken off, as only the attitude can have told it, or the
+    configuration has it.
     """
     total = k.gyro_bias_variance + r_angular + gyro_variance
     gain, angle_gain = k.gyro_bias_variance / total, k.attitude_gyro_bias / total
@@ -454,7 +458,7 @@ def _correct_gyro_bias(k, s, rate, m, share, r_angular, gyro_variance):
     for i in range(3):
         then = rate[i] + share * (k.rate[i] - rate[i])
         change[i] = then - m.angular[i]
-        as_read[i] = change[i] + k.gyro_bias[i]
+        as_read[i] = change[i] + k.gyro_bias[i] + m.gyro_error[i]
     _compare(k, _RATE_AS_READ, as_read, r_angular + gyro_variance)
     near, apart = _compare(k, _RATE, change, total) < s.gate**2, k.lasting[_RATE].max()
     copied = apart > BY_CHANCE**2 and apart > k.lasting[_RATE_AS_READ].max()
