@@ -180,7 +180,8 @@ def explain(
     search, start = _with_reading(Search(data.streams, config, thinned(data.to_fit)), data.to_fit)
     retuned, model, residual = _searched(search, start, say)
     say("judging on held-out data", 0.9)
-    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors)
+    likeliest = model.final.hypothesis
+    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, likeliest)
     _judge_effects(search, judge, retuned, model, data)
     _add_term(search, judge, retuned, model)
     of_sensors = list(data.findings)
@@ -199,7 +200,8 @@ def explain(
             search, judge, data, retuned, model, last, of_dynamics
         )
     given = Hypothesis(config, {})
-    as_recorded = Judge(WindowedProblem(data.recorded.judged, data.to_judge))
+    problem = WindowedProblem(data.recorded.judged, data.to_judge)
+    as_recorded = Judge(problem, likeliest=likeliest)
     final = _without_minor_noise(shared.judged, data, of_sensors)
     written = extension.kept(judge, as_recorded.summed(given), final)
     if written.model is None:
@@ -212,7 +214,7 @@ def explain(
     }
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
-    left = _left(data.judged, rmse[2], judge.rmse_of_noise(compared["extended"]))
+    left = _left(data.judged, rmse[2], judge.rmse_of_noise())
     found = _sure_or_not(data, of_sensors + of_dynamics, left)
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:

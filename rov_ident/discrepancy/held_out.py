@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rov_ident.discrepancy.reading_noise import draws
+from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.results import Gain, Together
 from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
 from rov_ident.effects import Values, sense
@@ -34,6 +34,7 @@ MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch ra
 CHUNK = 2.5  # seconds; of the chunks that the bootstrap resamples: four to a block
 PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
 _DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
+_LEAST_NOISE = 1e-3  # standard deviations of the motion: a simulated dive may have less, or none
 _FAILED = 3.0  # standard deviations of the motion: a simulation further off counts as so far off
 
 
@@ -79,19 +80,35 @@ def thinned(spans: Spans) -> Spans:
 class Judge:
     """Open-loop simulation on data that no fit has seen."""
 
-    def __init__(self, problem: WindowedProblem, sensors: Values | None = None) -> None:
-        """``sensors``: the effects that were taken off the data, which are judged as recorded."""
+    def __init__(
+        self,
+        problem: WindowedProblem,
+        sensors: Values | None = None,
+        likeliest: Hypothesis | None = None,
+    ) -> None:
+        """``sensors``: the effects that were taken off the data, which are judged as recorded.
+
+        ``likeliest``: a model that says how the noise of each window's first state grows. Squared
+        errors then count in inverse proportion to the variance that noise gives them, of any model
+        alike, and as much as ever where that is the noise of the velocity itself. Where a vehicle
+        is not stable, they would tell how each window began, and nothing of a model."""
         self.problem, self._sensors = problem, sensors or {}
         self._guided, self.free = problem.guided, ~problem.guided  # axes (6,)
         self._limit = _FAILED * problem.measured.std(axis=0) + 1e-9
+        std = np.maximum(problem.noise_std()[3:], _LEAST_NOISE * problem.measured.std(axis=0))
+        self._noise, self._weight = std**2 + 1e-18, np.ones_like(problem.measured)
+        if likeliest is not None:
+            grown = problem.variance_of_errors(likeliest)
+            self._weight = self._noise / (self._noise + grown)
         chunk = (problem.times / CHUNK).astype(int)
         self._number, self._chunk = np.unique(chunk, return_inverse=True)
 
     def squares(self, h: Simulated) -> Array:
-        """Squared errors (N, 6); a simulation that fails is as far off as the motion is large."""
+        """Squared errors (N, 6) as they count; a simulation that fails is as far off as the motion
+        is large."""
         error = np.abs(self._as_recorded(self.problem.errors(h)))
         capped: Array = np.where(error < self._limit, error, self._limit) ** 2
-        return capped
+        return self._weight * capped
 
     def _as_recorded(self, error: Array) -> Array:
         """Errors (N, 6) of the corrected velocities as those of the recorded ones."""
@@ -105,19 +122,14 @@ class Judge:
         return np.hstack([measured.linear - simulated.linear, error[:, 3:]])
 
     def rmse(self, h: Simulated) -> dict[str, float]:
-        error = np.where(self._guided, np.nan, np.sqrt(self.squares(h).mean(axis=0)))
+        square = self.squares(h).sum(axis=0) / self._weight.sum(axis=0)
+        error = np.where(self._guided, np.nan, np.sqrt(square))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
 
-    def rmse_of_noise(self, h: Simulated) -> Array:
-        """What the errors (6,) are where nothing but noise is wrong: that of the velocities, and
-        what that of each window's first state and of the wrench's reading makes of the motion."""
-        problem, std, random = self.problem, self.problem.noise_std(), np.random.default_rng(0)
-        here, squares = problem.errors(h), []
-        for taken in draws(problem.reading_std, len(problem.streams.demand)):
-            aside = std * random.standard_normal((len(problem.first), len(std)))
-            squares.append((problem.with_less(taken).errors(h, aside) - here) ** 2)
-        made = np.concatenate(squares)
-        return np.sqrt(std[3:] ** 2 + np.where(np.isfinite(made), made, 0.0).mean(axis=0))
+    def rmse_of_noise(self) -> Array:
+        """What the errors (6,) are where nothing but noise is wrong."""
+        out: Array = np.sqrt(self._noise / self._weight.mean(axis=0))
+        return out
 
     def gain(
         self,
@@ -132,10 +144,10 @@ class Judge:
         then all of these together: a lag moves each a little."""
         free, use = np.flatnonzero(~self._guided), self._used(except_for)
         a, b = (self.summed(h)[use] for h in (before, after))
-        count = int(use[self._chunk].sum())
+        count = self._weight[use[self._chunk]].sum(axis=0)
         own = np.array([i for i in free if AXES[i] in axes], dtype=int)
         sets = [of for of in (free, own) if len(of)]
-        gains = [gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count) for of in sets]
+        gains = [gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count[of]) for of in sets]
         found = next((g for g in gains if g.low > 0.0), gains[0])
         if found.low <= 0.0 and len(own) > 1:
             found = replace(found, together=together(a[:, own], b[:, own]))

@@ -235,12 +235,13 @@ def _left_out(
         else:
             spans = [s for begin, end in records.blocks(others) for s in windows(begin, end)]
             there = _fitted(records.streams, spans, last)
-        try:
-            judge = Judge(WindowedProblem(records.streams, records.blocks([b])))
-        except UserError:  # too little odometry
-            return {}
         if there is None:
             return {}
+        try:
+            problem = WindowedProblem(records.streams, records.blocks([b]))
+        except UserError:  # too little odometry
+            return {}
+        judge = Judge(problem, likeliest=there.hypothesis)
         after.append(judge.summed(there.hypothesis)[:, judge.free])
         for name in names:
             without = there.hypothesis.without(search.keys_of(last, name))

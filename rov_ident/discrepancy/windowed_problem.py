@@ -17,12 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import (
-    quaternion_from_rotation_vector,
-    quaternion_multiply,
-    quaternion_to_matrix,
-    turns,
-)
+from rov_ident.core.frames import quaternion_to_matrix, turns
 from rov_ident.core.linalg import integral, interpolated
 from rov_ident.core.noise import robust_std
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
@@ -52,6 +47,8 @@ _AMPLITUDE_STEP = 0.05  # typical sizes; the same for an input effect, whose thr
 _SMALL_STEP = 1e-3  # typical sizes; the same where the wrench is smooth
 _COUNTED_RATE = 50.0  # Hz; the search allows more time for data that are denser (docs/explain.md)
 _COUNTED_SECONDS = 120.0  # to fit, of three minutes: a shorter dive may take as long as these
+_FASTEST = 1e6  # m/s, rad/s; of what noise is taken to become: squares of it stay finite
+_KURTOSIS = 3.0  # mean fourth power of a normal number
 _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
@@ -345,13 +342,18 @@ class WindowedProblem:
     def tilting(self, body: RigidBody) -> Array:
         """What an error of the attitude about each body axis adds to the wrench, (K, 6, 6): three
         that fade over each window, and three that grow."""
-        down = np.cross(self.steps.middle[:, 2, None], np.eye(3))  # how it turns, an axis a row
-        wrench = np.swapaxes(down @ body.restoring.T, 1, 2)
+        wrench = self._tilted_by(body)
         grown = np.zeros((len(wrench), 1, 1))
         for first, last in zip(self.first, self.last, strict=True):
             grown[first:last, 0, 0] = (np.arange(last - first) + 0.5) / (last - first)
         out: Array = np.concatenate([(1.0 - grown) * wrench, grown * wrench], axis=2)
         return out
+
+    def _tilted_by(self, body: RigidBody) -> Array:
+        """What a constant error of the attitude about each body axis adds to it, (K, 6, 3)."""
+        down = np.cross(self.steps.middle[:, 2, None], np.eye(3))  # how it turns, an axis a row
+        wrench: Array = np.swapaxes(down @ body.restoring.T, 1, 2)
+        return wrench
 
     def raising(self, body: RigidBody) -> Array:
         """What a centre of buoyancy one metre further along the body's z axis adds to the wrench,
@@ -380,19 +382,14 @@ class WindowedProblem:
         inputs = np.abs(self.steps.inputs).max(axis=0)
         return float(inputs[INPUTS.index(p.input)] if p.input else 4.0 * inputs[:3].max())
 
-    def errors(self, h: Simulated, aside: Array | None = None) -> Array:
+    def errors(self, h: Simulated) -> Array:
         """Measured minus simulated velocity (N, 6) in open loop, each window from its measured
-        state, or from so far ``aside`` (W, 9) of its attitude [rad] and velocity; NaN where that
-        diverges."""
+        state; NaN where that diverges."""
         guide, nu = None, self._measured_at(self.steps.t)
         simulated = np.full((len(self.steps.t), 6), np.nan)
-        starts, attitudes = self.measured_starts(), self.orientation[self.first]
-        if aside is not None:
-            turn = quaternion_from_rotation_vector(aside[:, :3])
-            starts, attitudes = starts + aside[:, 3:], quaternion_multiply(attitudes, turn)
         each = [h] * len(self.first) if isinstance(h, Hypothesis) else h
-        for there, first, last, start, attitude in zip(
-            each, self.first, self.last, starts, attitudes, strict=True
+        for there, first, last, start in zip(
+            each, self.first, self.last, self.measured_starts(), strict=True
         ):
             (mean, slope), inputs = self.thrust(there.effects), self.driven(there.effects).inputs
             nodes = slice(first, last + 1)
@@ -402,10 +399,58 @@ class WindowedProblem:
             with contextlib.suppress(UserError):
                 simulated[nodes] = simulate(
                     there.model, self.steps.t[nodes], mean[at], start, self.steps.position[at[0]],
-                    orientation=attitude, wrench_slope=slope[at], guide=guide,
+                    orientation=self.orientation[first], wrench_slope=slope[at], guide=guide,
                     effects=compiled(there.effects), inputs=inputs[at],
                 ).nu  # fmt: skip
         return self.measured - simulated[self.nodes]
+
+    def variance_of_errors(self, h: Hypothesis) -> Array:
+        """Mean squares (N, 6) of :meth:`errors` where nothing but noise is wrong, without that of
+        the velocity measured there: what the noise of each window's first state, and of the
+        wrench's reading, has become. ``Phi P0 Phi'`` of the linearised equations, and the next term
+        along the direction that has grown most: surge has errors of sway times yaw rate.
+
+        About the motion as measured: a simulation that noise has taken elsewhere may have come to
+        where no noise grows."""
+        t, middle, starts = self.steps.t, self.steps.middle, self._measured_at(self.steps.t)[:-1]
+        equations, each = guided_by(h.equations, self.guided), np.arange(len(starts))
+        thrust, driven = self.thrust(h.effects), self.driven(h.effects)
+
+        def shot(aside: Array) -> Motion:
+            return shoot(equations, driven, thrust, each, each + 1, starts + aside)
+
+        step, dt = shot(np.zeros(6)), np.diff(t)[:, None, None]
+        turning, std = dt * middle, self.noise_std()
+        if self.guided[3:].any():  # the attitude is measured
+            turning, std[:3] = np.zeros_like(turning), 0.0
+        std[3:] *= ~self.guided
+        righting = step.gamma @ self._tilted_by(h.model.body) @ np.swapaxes(middle, 1, 2)
+        read = step.gamma @ self.noisy_thrust(h.effects)
+        added = np.concatenate([np.zeros((len(read), 6, 9)), read], axis=2)
+        added /= np.sqrt(read.shape[2])
+
+        def carried(begin: Array, added: Array) -> Array:
+            """How far (K + 1, 6, C) each of C causes has moved the velocity: a change ``begin``
+            (9, C) of each window's first attitude and velocity, and one of the velocity that is
+            ``added`` (K, 6, C) in each step. The attitude turns about axes of the world."""
+            out = np.zeros((len(t), *begin[3:].shape))
+            for first, last in zip(self.first, self.last, strict=True):
+                turn, out[first] = self.steps.rotation[first] @ begin[:3], begin[3:]
+                for k in range(first, last):
+                    turn = turn + 0.5 * turning[k] @ out[k, 3:]
+                    moved = step.phi[k] @ out[k] + righting[k] @ turn + added[k]
+                    out[k + 1] = np.clip(moved, -_FASTEST, _FASTEST)
+                    turn = turn + 0.5 * turning[k] @ out[k + 1, 3:]
+            return np.nan_to_num(out, nan=_FASTEST)
+
+        moved = carried(np.diag(std) @ np.eye(9, added.shape[2]), added)
+        size = self.measured.std(axis=0) + 1e-9
+        power, axes = np.linalg.eigh(np.einsum("kic,kjc->kij", moved, moved) / np.outer(size, size))
+        most = size * axes[:-1, :, -1] * np.sqrt(np.maximum(power[:-1, -1:], 0.0))
+        bent = 0.5 * (shot(most).nu_dot + shot(-most).nu_dot) - step.nu_dot
+        second = carried(np.zeros((9, 1)), dt * bent[:, :, None])
+        squares: Array = np.sum(moved**2, axis=2) + _KURTOSIS * second[:, :, 0] ** 2
+        return squares[self.nodes]
 
     def noise_std(self) -> Array:
         """Standard deviations (9,) of the noise of attitude [rad] and velocities, from second
