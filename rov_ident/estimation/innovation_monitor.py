@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rov_ident.core.jit import inlined, record
 from rov_ident.core.whiteness import BY_CHANCE, LARGEST, SUM_TIME, averaged
 
-# "Constants of the process noise" and "Forgetting" are tables of docs/accuracy.md.
+# "Constants of the process noise" and "Forgetting" are tables of docs/choices.md.
 FIRST_TIME, TIME = 1.0, 20.0  # s; twice the power doubles the density: at first, later (same table)
 _FASTEST = 0.1  # the most by which one innovation moves an average: ten are needed for anything
 STEADY = 4.0  # a squared sum counts for at most this: 2 sigma, beyond which 5 % of normal ones are

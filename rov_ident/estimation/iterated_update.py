@@ -2,7 +2,7 @@
 
 A row is right to first order in the error of the coefficients that it is linearised about. While
 little is known, rows claim combinations of coefficients that the motion does not determine, and no
-later row corrects that ("Looking back" in docs/accuracy.md). So the samples of a window are kept
+later row corrects that ("Looking back" in docs/choices.md). So the samples of a window are kept
 with the state from before them, and folded again from it, about the present estimate, once that has
 moved: the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a
 Gauss-Newton step.

@@ -182,9 +182,6 @@ class OnlineEstimator:
         self._safe = self.prior.mean.copy()
         self._centre(first_centre(self.config))
         self._learnt_about, self._settled = self._about, math.nan
-        # by how much times had moved when all was last learnt anew, and their std then
-        self._last_move = np.zeros(len(self._about))
-        self._firmest = np.full(len(self._about), np.inf)
         if self.monitor is not None:
             self.monitor.reset()
         self._begin_at(self.memory())
@@ -345,35 +342,28 @@ class OnlineEstimator:
 
         But not for changes far below their uncertainty, as samples are right to first order. A time
         is followed once the data know it. Once it has moved by more than its uncertainty, all is
-        learnt anew: information gained about another value claims to know what it does not. To move
-        back needs more information than there was at the move before, or two values might take
-        turns. ``at_once``: a memory was recalled.
+        learnt anew: information gained about another value claims to know what it does not.
+        ``at_once``: a memory was recalled.
         """
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         # a lag that asks for a negative mass beside it is no lag
         whole = physical(self.config.dynamics, self.prior, raw)
         own = slice(len(self.config.estimate), None)
-        now = whole[own]
+        now, unit = whole[own], self.prior.std[own]
         std = np.sqrt(self._module.variance(self._task, self._state)[own])
-        unit = self.prior.std[own]
         if math.isnan(self._settled):
             self._settled = self._last_t
         early = abs(self._last_t - self._settled) < _SETTLING_TIME
-        outdated = np.maximum(_OUTDATED * unit, raw.std[own])
         if not at_once:
-            move = now - self._learnt_about
-            back = (np.abs(move) > outdated) & (np.sign(move) != np.sign(self._last_move))
-            known = (std < _LEARNT * unit) & ~(back & (std >= self._firmest))
-            now = np.where(self._is_time & (early | ~known), self._about, now)
+            waits = early | (std >= _LEARNT * unit)
+            now = np.where(self._is_time & waits, self._about, now)
         if not (np.abs(now - self._about) > _RECENTRE * std).any():
             return
         whole[own] = now
         self._centre(dict(zip(self.prior.names, whole.tolist(), strict=True)))
-        move = now - self._learnt_about
-        far = self._is_time & (np.abs(move) > outdated)
-        if far.any() and not at_once:
-            self._last_move = np.where(far, move, self._last_move)
-            self._firmest = np.where(far, std, self._firmest)
+        outdated = np.maximum(_OUTDATED * unit, raw.std[own])
+        moved = self._is_time & (np.abs(now - self._learnt_about) > outdated)
+        if moved.any() and not at_once:
             self._begin_with(self._origin)
             self._learn_again()
 

@@ -12,7 +12,7 @@ from rov_ident.config import Config
 from rov_ident.core.jit import inlined, record
 from rov_ident.model.scales import authority
 
-# docs/accuracy.md: "The floor of the process noise and its first value"
+# docs/choices.md: "The floor of the process noise and its first value"
 FIRST_FORCE = 0.01  # of the working wrench, lasting a second: before any innovation
 LARGEST_FORCE = 0.3  # at most: with more, 30 % of a coefficient would not show in a second
 

@@ -15,7 +15,7 @@ squares for the deviation x from the values that the observer works with::
 
 It is *recursive least squares* still, on the rows of a linearised prediction error. Equation error
 (filtered accelerations and products of measured velocities) would need no observer, but ends at six
-times the Cramer-Rao bound instead of one and a half (docs/accuracy.md).
+times the Cramer-Rao bound instead of one and a half (docs/choices.md).
 
 Rows that were taken about poor coefficients are taken again (``iterated_update``).
 
@@ -110,9 +110,9 @@ REASONS = (
 REFUSALS = (GATED, NOT_FINITE, UNPREDICTABLE)
 
 _PERIOD = 0.1  # s; the observer takes over the present coefficients, and forgets, this often
-_ROOM = 1.2  # for innovation_monitor.watch ("Constants of the process noise" in docs/accuracy.md)
-_CHANGED = 3.0  # NIS from which the vehicle has changed ("Forgetting" in docs/accuracy.md)
-# "What does not move is not learnt" in docs/accuracy.md
+_ROOM = 1.2  # for innovation_monitor.watch ("Constants of the process noise" in docs/choices.md)
+_CHANGED = 3.0  # NIS from which the vehicle has changed ("Forgetting" in docs/choices.md)
+# "What does not move is not learnt" in docs/choices.md
 _PEAK_TIME = 5.0  # s; over which a peak of a velocity is remembered
 _MOVING = 4.0  # that peak's square over the noise variance from which the component moves: 2 sigma
 _NOISE_PEAK = 16.0  # variances: 4 sigma, which noise exceeds once in 16 000 samples, or minutes

@@ -27,7 +27,7 @@ WALK_PERIOD = 1.0  # s; parameters that change by themselves gain variance this 
 REACH = 10.0  # prior standard deviations, which no coefficient is off; for RLS's observer alone
 
 # of what looks like noise of the reading, below which the vehicle follows it ("Noise of the
-# wrench's reading" in docs/accuracy.md)
+# wrench's reading" in docs/choices.md)
 FOLLOWED = 0.1
 
 INFO = record(

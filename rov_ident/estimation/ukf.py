@@ -83,7 +83,7 @@ REFUSALS = (GATED, NOT_FINITE, REPAIRED, UNPREDICTABLE)
 LANES = 32  # sigma points side by side: with half as many their loops would not be vectorised
 KNOWN = 1e-12  # (rad/s)2; of a rate that is guided: as good as none, for the root to exist
 _PERIOD = 0.2  # s; the innovations' influence is summed and the coefficients walk this often
-_ROOM = 1.5  # for innovation_monitor.watch ("Constants of the process noise" in docs/accuracy.md)
+_ROOM = 1.5  # for innovation_monitor.watch ("Constants of the process noise" in docs/choices.md)
 
 # square root of the state's size + lambda (van der Merwe 2004), weight of an outer sigma point,
 # beta - alpha^2; gate, NIS from which the vehicle has changed; corner of the residual [rad/s]
