@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from textbook import with_section
 
-from rov_ident.core.frames import from_core, quaternion_to_matrix
+from rov_ident.core.frames import FrameDefaults, from_core, quaternion_to_matrix
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
@@ -473,7 +473,7 @@ def test_axes_of_the_input_do_not_matter(heavy, body, world):
             message = message._replace(frame_id="odom", child_frame_id="base_link")
         else:
             message = message._replace(frame_id="base_link" if role == WRENCH else "imu_link")
-        turned.append((role, from_core(message, body, world)))
+        turned.append((role, from_core(message, FrameDefaults(body, world))))
     samples, _ = taken(told, turned)
     assert len(samples) == len(reference)
     for name in SAMPLE.names:
