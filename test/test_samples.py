@@ -1149,3 +1149,28 @@ def test_what_a_lag_holds_back_moves_with_the_parameters(heavy, moved, seed):
     assert off(stayed) > 0.1
     assert off(ours) < (1e-9 if moved == "thrust_scale.scale" else 0.2) * off(stayed)
     np.testing.assert_array_equal(ours["about"], wanted["about"])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_that_wait_are_remembered_without_a_delay(heavy, seed):
+    """An estimated delay that begins at none, or comes back from there, acts on past commands."""
+    rng = np.random.default_rng(seed)
+    config = dataclasses.replace(
+        heavy,
+        effects={"actuation_delay": {"delay": 0.0}},
+        estimate_effects=(("actuation_delay", "delay"),),
+    )
+    delayed = config.with_values({"actuation_delay.delay": rng.uniform(0.02, 0.2)})
+    messages = without_arrival(clean(heavy, seed=seed))
+    instant = sensors.START + rng.uniform(2.5, 4.5) * SECOND
+    moving, always, made = Sampler(config), Sampler(config), []
+    always.recentre(delayed)
+    for role, message in messages:
+        if message.stamp >= instant and not made:
+            moving.recentre(delayed)
+        parts = [sampler.push(role, message) for sampler in (moving, always)]
+        if message.stamp >= instant and len(parts[0]):
+            made.append([part[["wrench", "by_wrench"]] for part in parts])
+    ours, wanted = (joined([parts[k] for parts in made]) for k in range(2))
+    np.testing.assert_allclose(ours["wrench"], wanted["wrench"], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(ours["by_wrench"], wanted["by_wrench"], rtol=1e-9, atol=1e-6)

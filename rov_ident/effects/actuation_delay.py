@@ -15,9 +15,7 @@ _LONGEST = 0.5  # s; what is remembered does not depend on the delay (rov_ident.
 
 @kernel
 def act(p, state, t, dt, wrench):
-    delay = p[0]
-    if delay <= 0.0:
-        return
+    delay = p[0]  # none, too, remembers: an estimate may come back from there
     queue = state[1 : 1 + 7 * _ROOM].reshape(_ROOM, 7)  # instant, command; oldest first
     count = int(state[0])
     new = count == 0
