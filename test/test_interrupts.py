@@ -98,6 +98,28 @@ def test_what_would_be_lost_waits(number):
 
 
 @pytest.mark.parametrize("number", NUMBERS)
+def test_an_object_in_the_making_goes_silently(number):
+    """The compiler's (llvmlite) close in their finalisers what they open as they are made."""
+    program = f"""if True:
+        import os
+        from rov_ident.core.interrupts import Interrupted, raise_interrupts
+        class HalfMade:
+            def __init__(self):
+                os.kill(os.getpid(), {number:d})
+                self.opened = True
+            def __del__(self):
+                del self.opened
+        raise_interrupts()
+        try:
+            HalfMade()
+        except Interrupted as error:
+            print(error.status)
+    """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=600)
+    assert (done.stdout.split(), done.stderr) == ([str(128 + number).encode()], b"")
+
+
+@pytest.mark.parametrize("number", NUMBERS)
 def test_a_file_in_the_making_goes(tmp_path, number):
     program = f"""if True:
         import os

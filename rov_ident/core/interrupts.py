@@ -6,6 +6,7 @@ one that crosses a library of C++ aborts the process.
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,6 +57,8 @@ def raise_interrupts() -> None:
             signal.setitimer(signal.ITIMER_REAL, _SOON)
         else:
             waiting = 0
+            # An object that is half made now may fail in its finaliser, and nobody asked to know.
+            sys.unraisablehook = lambda _: None
             raise Interrupted(number)
 
     for number in INTERRUPTS:
