@@ -87,14 +87,43 @@ def test_flu_keeps_ros_axes(tmp_path, out):
 def test_what_the_log_does_not_tell_agrees_with_the_velocities(tmp_path, out):
     report = import_csv([save(tmp_path / "log.csv", table(BASE, rows=101, u=2.0, r=0.5))], out)
     assert len(report.notes) == 3
-    assert "integrated" in report.notes[0]
-    assert "roll and pitch" in report.notes[1]
+    assert "roll and pitch" in report.notes[0]
+    assert "yaw" in report.notes[1]
     assert "x y z" in report.notes[2]
     last = contents(out)["odom"][-1]
     expected = frames.quaternion_from_euler(0.0, 0.0, 5.0)
     np.testing.assert_allclose(np.abs(last.orientation @ expected), 1.0)
     circle = 2.0 / 0.5 * np.array([np.sin(5.0), 1.0 - np.cos(5.0), 0.0])
     np.testing.assert_allclose(last.position, circle, atol=5e-3)  # of the trapezoidal rule
+
+
+@pytest.mark.parametrize("given", [[], ["yaw"], ["roll", "yaw"], ["pitch"]])
+def test_angles_that_the_log_lacks_follow_the_rates(tmp_path, out, given):
+    """A righting moment acts on a vehicle that rolls: to take roll for zero would hide it."""
+    rng = np.random.default_rng(3)
+    t = 0.05 * np.arange(1200)
+    angles, speeds = np.zeros((3, len(t))), np.zeros((3, len(t)))
+    for i, size in enumerate((0.08, 0.05, 0.3)):  # each a few waves, and roll and pitch level
+        for _ in range(3):
+            pulse, phase = rng.uniform(0.5, 3.0), rng.uniform(0.0, 2.0 * np.pi)
+            angles[i] += size * np.sin(pulse * t + phase)
+            speeds[i] += size * pulse * np.cos(pulse * t + phase)
+    (roll, pitch, _), (d_roll, d_pitch, d_yaw) = angles, speeds
+    rates = {
+        "p": d_roll - d_yaw * np.sin(pitch),
+        "q": d_pitch * np.cos(roll) + d_yaw * np.sin(roll) * np.cos(pitch),
+        "r": -d_pitch * np.sin(roll) + d_yaw * np.cos(roll) * np.cos(pitch),
+    }
+    noisy = {k: v + 0.01 + rng.normal(0.0, 0.005, len(t)) for k, v in rates.items()}  # a bias, too
+    known = {name: angles[EULER.index(name)] for name in given}
+    columns = table(BASE, len(t), 0.05, **noisy, **known)
+    report = import_csv([save(tmp_path / "log.csv", columns)], out)
+    lacking = [name for name in ("roll", "pitch") if name not in given]
+    assert any(f"no {' and '.join(lacking)} given: integrated" in note for note in report.notes)
+    got = [frames.quaternion_to_euler(message.orientation) for message in contents(out)["odom"]]
+    error = np.array(got).T[:2] - angles[:2]
+    # it is 1 where they are taken for zero
+    assert (np.sqrt(np.mean(error**2, axis=1)) < 0.4 * np.std(angles[:2], axis=1)).all()
 
 
 def test_depth_alone_is_kept(tmp_path, out):

@@ -7,6 +7,7 @@ so that it agrees with the velocities, and said in the report.
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from rov_ident.model.coefficients import AXES, VELOCITIES
 _VELOCITIES, _WRENCH = tuple(VELOCITIES), tuple(AXES)
 _POSITIONS = ("x", "y", "z")
 _ANGLES = ("roll", "pitch", "yaw")
+_LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _REQUIRED = ("t_s", *_VELOCITIES, *_WRENCH)
 _FINS = ("delta_s", "delta_r", "delta_a")
@@ -233,17 +235,36 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
             )
         return frames.quaternion_normalise(quaternion), none
 
-    roll, pitch = (log.data.get(name, np.zeros(len(angular))) for name in ("roll", "pitch"))
+    t = log.data["t_s"]
+    tilt = {name: log.data[name] for name in ("roll", "pitch") if name in log.data}
+    if missing := [name for name in ("roll", "pitch") if name not in tilt]:
+        text = f"no {' and '.join(missing)} given: integrated from the rates, level on average"
+        notes.append(text)
+        tilt = _tilt(t - t[0], angular) | tilt
+    roll, pitch = tilt["roll"], tilt["pitch"]
     if "yaw" in log.data:
         yaw = log.data["yaw"]
     else:
         rate = (angular[:, 1] * np.sin(roll) + angular[:, 2] * np.cos(roll)) / np.cos(pitch)
-        yaw = integral(log.data["t_s"], rate[:, None])[:, 0]
+        yaw = integral(t, rate[:, None])[:, 0]
         notes.append("no yaw is given: it is integrated from the rates, from 0")
-    if missing := [name for name in ("roll", "pitch") if name not in log.data]:
-        notes.append(f"no {' and '.join(missing)} given: taken as 0")
     quaternion = frames.quaternion_from_euler(roll, pitch, yaw)
     return quaternion, _jumps_back(quaternion)
+
+
+def _tilt(t: Array, angular: Array) -> dict[str, Array]:
+    """Roll and pitch (n,) [rad] from the angular velocities (n, 3) at the times t (n,) [s].
+
+    Mean and drift of the tilt are taken away: weight keeps a vehicle level, and a gyro has a bias.
+    """
+    turns = frames.quaternion_from_rotation_vector(np.diff(integral(t, angular), axis=0))
+    attitudes = np.array([*accumulate(turns, frames.quaternion_multiply, initial=_LEVEL)])
+    down = frames.quaternion_to_matrix(attitudes)[:, :2, 2]  # north and east of the body's z
+    line = np.vander(t, 2)
+    north, east = (line @ np.linalg.lstsq(line, down)[0]).T
+    back = frames.quaternion_from_rotation_vector(np.column_stack([east, -north, 0.0 * t]))
+    euler = frames.quaternion_to_euler(frames.quaternion_multiply(back, attitudes))
+    return {"roll": euler[:, 0], "pitch": euler[:, 1]}
 
 
 def _jumps_back(quaternion: Array) -> NDArray[np.bool_]:

@@ -123,7 +123,7 @@ class Fit(Shown, Result):
             return ()
         i, advice = self.names.index(THRUST_SCALE), []
         scale = float(self.values[i])
-        if abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
+        if self.identifiable[i] and abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
             advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
         of_arm = min(righting_arm_share(self.given), self.given.wrench.scale_std) * scale
         turned = np.isfinite(self.rmse[3:]).any()  # by moments that are known: else no arm tells
