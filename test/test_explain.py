@@ -35,6 +35,7 @@ from rov_ident.discrepancy.explain import (
     _beside_each_other,
     _gains_elsewhere,
     _is_between_readings,
+    _of_guided,
     _with_all_data,
     _with_reading,
     explain,
@@ -145,6 +146,15 @@ def test_rotation_is_as_measured_where_no_moment_is_known():
     for rmse in (findings.retuned, findings.extended):
         assert math.isfinite(rmse["u"]) and all(math.isnan(rmse[c]) for c in "pqr")
     assert not any(name[0] in "KMN" for name in findings.changed)
+
+
+def test_velocities_that_never_change_are_no_missing_moment():
+    """A record in the plane holds zeros for heave, roll and pitch: what turns it is known."""
+    streams = streams_of(draw(3, conditions=PLACES["a minute"]))
+    streams.nu[:, 2:5] = 0.0
+    assert list(streams.guided) == [False, False, True, True, True, False]
+    (note,) = _of_guided(streams)
+    assert note.endswith("left as they are: w, p, q")
 
 
 def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):

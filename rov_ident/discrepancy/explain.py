@@ -91,6 +91,7 @@ _FILTERED = (
     "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
     "cause beside it is sure; record what the filter is fed with"
 )
+_UNMEASURED = "not measured, as they never change, and left as they are: {}"
 _ONLY_FITTED = (
     "the extended model cannot be simulated through all of the data: its values are those of the "
     "part that the search fitted"
@@ -235,7 +236,7 @@ def explain(
     notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
     notes += [_FILTERED] if data.late else []
     notes += data.clocks.notes
-    notes += [NO_MOMENT] if data.streams.guided.any() else []
+    notes += _of_guided(data.streams)
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
     findings = Findings(
@@ -519,6 +520,13 @@ def _gains_elsewhere(found: Finding) -> bool:
     gain = found.gain
     alone = gain.together is None and gain.component in VELOCITIES
     return alone and AXES[VELOCITIES.index(gain.component)] not in found.axes
+
+
+def _of_guided(streams: Streams) -> list[str]:
+    """Notes on velocities that are taken as measured."""
+    never = ", ".join(c for c, so in zip(VELOCITIES, streams.unmeasured, strict=True) if so)
+    notes = [] if streams.is_turned else [NO_MOMENT]
+    return [*notes, _UNMEASURED.format(never)] if never else notes
 
 
 def _told(left: Mapping[str, float]) -> str:

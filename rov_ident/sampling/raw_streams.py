@@ -96,12 +96,21 @@ class Streams:
     def guided(self) -> NDArray[np.bool_]:
         """Axes (6,) whose velocity a simulation can only take as measured.
 
-        Rates, if neither the wrench holds a moment nor fins are heard. A velocity that never
-        changes was not measured: a record in the plane holds zeros for the rest.
+        Rates, if nothing is known that turns the vehicle, and velocities that were not measured.
         """
-        is_turned = holds_moment(np.abs(self.demand).max(axis=0)) or self.inputs[:, :3].any()
-        unknown: NDArray[np.bool_] = np.repeat([False, not is_turned], 3)
-        return unknown | (np.nanmax(self.nu, axis=0) == np.nanmin(self.nu, axis=0))
+        unknown: NDArray[np.bool_] = np.repeat([False, not self.is_turned], 3)
+        return unknown | self.unmeasured
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether it is known what turns the vehicle: the wrench holds a moment, or fins move."""
+        return bool(holds_moment(np.abs(self.demand).max(axis=0)) or self.inputs[:, :3].any())
+
+    @property
+    def unmeasured(self) -> NDArray[np.bool_]:
+        """Velocities (6,) that never change: a record in the plane holds zeros for the rest."""
+        never: NDArray[np.bool_] = np.nanmax(self.nu, axis=0) == np.nanmin(self.nu, axis=0)
+        return never
 
     @property
     def duration(self) -> float:
