@@ -14,7 +14,7 @@ from rov_ident import config as configuration
 from rov_ident.api.simulation import simulate
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
-from rov_ident.core.messages import DRIVE, Joints
+from rov_ident.core.messages import DRIVE, WRENCH, Joints
 from rov_ident.io import cdr
 from rov_ident.io.csv_log import import_csv
 from rov_ident.io.write_messages import write_messages
@@ -298,3 +298,18 @@ def test_fin_coefficients_are_found_again(estimator, dives):
     assert len(errors) == 4 * len(dives)
     assert missed <= 2
     assert np.median(errors) < 0.5 * SPREAD / math.sqrt(3.0)
+
+
+def test_where_no_thruster_pushes_nobody_is_sent_to_weigh_the_vehicle(remus, tmp_path):
+    """Without any thrust nothing is said of its scale, which the estimators carry all the same."""
+    messages = [
+        (t, role, m._replace(force=0.0 * m.force, torque=0.0 * m.torque))
+        if role == WRENCH
+        else (t, role, m)
+        for t, role, m in run_of(remus, 3).messages
+    ]
+    path = tmp_path / "driven_by_fins.mcap"
+    write_messages(path, messages)
+    fit = ri.fit(path, remus, estimator="rls")
+    assert "thrust_scale.scale" in fit.names and not fit.has_thrust
+    assert fit.to_measure == ()

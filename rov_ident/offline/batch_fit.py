@@ -38,7 +38,7 @@ from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, UNITS, numbers
-from rov_ident.sampling.sample import free_axes, parts
+from rov_ident.sampling.sample import free_axes, parts, thrust_axes
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
@@ -169,6 +169,7 @@ def fit_batch(
         notes=tuple(notes),
         more=more,
         curves=curves(read.bags, before, after),
+        has_thrust=bool(np.any(archive.each(thrust_axes))),
     )
 
 
@@ -322,7 +323,7 @@ def _stage(
     unknown = [n for n in base.unidentified if states[n] is State.HELD]
     if unknown and not settings.stages:
         notes.append("the motion does not tell apart or does not show: " + ", ".join(unknown))
-    if free[0] and not any(archive.each(_has_surge_thrust)):
+    if free[0] and not np.any(archive.each(thrust_axes), axis=0)[0]:
         notes += _scale_notes(config, names, covariance)
     return _Stage(
         names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting, noise
@@ -385,10 +386,6 @@ def _physical_states(
             values[i], estimate.std[i], prior.std[i], bool(removed[i] > IDENTIFIABLE), at_bound
         )
     return values, states
-
-
-def _has_surge_thrust(samples: Samples) -> bool:
-    return bool(samples["wrench"][:, 0].any())
 
 
 def _scale_notes(config: Config, names: Sequence[str], covariance: Array) -> list[str]:

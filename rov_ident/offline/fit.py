@@ -22,6 +22,7 @@ from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_l
 from rov_ident.reports.result import Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, Record, numbers
+from rov_ident.sampling.sample import thrust_axes
 
 TITLES = {"ls": "least squares", "iv": "instrumental variables", "ml": "maximum likelihood",
           "rls": "recursive least squares", "ukf": "unscented Kalman filter"}  # fmt: skip
@@ -59,6 +60,8 @@ class Fit(Shown, Result):
     duration: float
     rmse: Array
     consistency: Consistency
+    has_thrust: bool = field(default=True, repr=False)
+    """Whether thrusters ever push; else nothing tells the scale of what they do."""
     beyond_driving: Array | float = field(default=0.0, repr=False)
     """(n,) the part of the variances that no driving reduces; of batch fits not told."""
     more: dict[str, Any] = field(default_factory=dict)
@@ -119,7 +122,7 @@ class Fit(Shown, Result):
     def to_measure(self) -> tuple[str, ...]:
         """What to weigh or measure of the vehicle: where its mass may be off instead of the thrust,
         and where its righting arm makes most of the intervals."""
-        if THRUST_SCALE not in self.names:
+        if THRUST_SCALE not in self.names or not self.has_thrust:
             return ()
         i, advice = self.names.index(THRUST_SCALE), []
         scale = float(self.values[i])
@@ -291,5 +294,6 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         provenance=provenance(((r.path.name, r.sha256) for r in records), vehicle=config.name),
         notes=tuple(note for record in records for note in record.notes),
         curves=curves(read.bags, before, after),
+        has_thrust=any(thrust_axes(record.samples).any() for record in records),
         beyond_driving=report.beyond_driving,
     ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)

@@ -75,6 +75,12 @@ def free_axes(samples: NDArray[np.void]) -> NDArray[np.bool_]:
     return known
 
 
+def thrust_axes(samples: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Axes (6,) along which thrusters ever push in samples (k,)."""
+    pushed: NDArray[np.bool_] = (samples["wrench"] != samples["surroundings"]).any(axis=0)
+    return pushed
+
+
 def stretches(samples: NDArray[np.void]) -> Iterator[tuple[int, int]]:
     """Where each stretch of samples (k,) without a gap begins and ends."""
     edges = np.flatnonzero(samples["restart"]).tolist()
