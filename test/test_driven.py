@@ -15,6 +15,7 @@ from rov_ident.api.simulation import simulate
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import DRIVE, WRENCH, Joints
+from rov_ident.core.states import State
 from rov_ident.io import cdr
 from rov_ident.io.csv_log import import_csv
 from rov_ident.io.write_messages import write_messages
@@ -284,7 +285,7 @@ def dives(remus, tmp_path_factory):
     return found
 
 
-@pytest.mark.parametrize("estimator", [*more("rls"), "ukf"])
+@pytest.mark.parametrize("estimator", [*more("rls"), "ukf", "ls"])
 def test_fin_coefficients_are_found_again(estimator, dives):
     """Of 8 intervals of 95 % at most 2 miss (three or more: 0.6 % of such tests), and the error
     that the prior had, 17 %, falls to less than half in the median."""
@@ -298,6 +299,22 @@ def test_fin_coefficients_are_found_again(estimator, dives):
     assert len(errors) == 4 * len(dives)
     assert missed <= 2
     assert np.median(errors) < 0.5 * SPREAD / math.sqrt(3.0)
+
+
+def test_inertia_that_no_known_force_tells_is_held(dives):
+    """Least squares would cancel the vehicle's own inertia in sway and yaw, and find nothing left
+    to explain. What it holds instead is as uncertain as before, and the others relative to it."""
+    given, truth, path = dives[0]
+    fit = ri.fit(path, given, estimator="ls")
+    prior = prior_of(given)
+    found = dict(zip(fit.names, zip(fit.values, fit.std, prior.std, fit.states), strict=True))
+    for name in ("Y_vdot", "Y_rdot", "N_rdot"):
+        value, std, before, state = found[name]
+        assert value == given.model.values[name] and std >= before and state is State.HELD, name
+    rudder, std, before, _ = found["N_uudr"]
+    assert std < before and abs(rudder - truth["N_uudr"]) < 2.0 * std
+    # the righting moment tells the inertia in pitch
+    assert found["M_qdot"][0] != given.model.values["M_qdot"]
 
 
 def test_where_no_thruster_pushes_nobody_is_sent_to_weigh_the_vehicle(remus, tmp_path):

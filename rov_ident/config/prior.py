@@ -286,8 +286,11 @@ def _consider_covariance(
 
 def gain_of(covariance: Array, std: Array) -> Array:
     """The share (n, n) of the data in an estimate: I - P P0^-1, P (n, n) after them and P0 the
-    prior's, diagonal with ``std`` (n,)."""
-    return np.eye(len(std)) - covariance / std**2
+    prior's, diagonal with ``std`` (n,). What is known no better than before follows the data in
+    nothing, even if others are known only relative to it."""
+    gain = np.eye(len(std)) - covariance / std**2
+    gain[np.diag(covariance) >= std**2] = 0.0
+    return gain
 
 
 THRUST_SCALE, _BUOYANCY = "thrust_scale.scale", "buoyancy.delta"

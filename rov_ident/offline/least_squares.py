@@ -12,6 +12,12 @@ simulated from the wrench with the present coefficients, and again with the new 
 instrumental variables; Young 2011; Ljung 1999, sec. 7.6). That cures the first bias, the added
 masses', not the second, that of quadratic damping. Maximum likelihood has neither.
 
+On an axis without a known force, as fins or a propeller drive whose coefficients are estimated, all
+may be multiplied by any number. With no inertia (an added mass that cancels the vehicle's own) and
+no other coefficient, only the known forces are left over: least squares would take that for the
+best fit. So where the configured inertia leaves more than these, it is *held*: thrust and drag are
+relative to it, and have its uncertainty besides their own (consider parameters).
+
 Sums over the samples of several bags are sums over bags: an archive is one fit.
 """
 
@@ -97,11 +103,15 @@ def solve(
     prior: Array = np.eye(len(task.scale)) * precision
     repeats = 2.0 / (task.corner * PERIOD)
     forces = authority(config.dynamics)
+    on_axis = _inertia_of(task)
+    held = np.asarray(on_axis.any(axis=1), dtype=bool)
 
     def solved(moments: Moments, weight: Array) -> tuple[Array, Array]:
         sums = np.einsum("k,kij->ij", weight / repeats, moments.sums)
-        information = sums[:-1, :-1]
-        return information, np.array(np.linalg.solve(information + prior, sums[:-1, -1]))
+        information, x = sums[:-1, :-1], np.zeros(len(held))
+        told = np.ix_(~held, ~held)
+        x[~held] = np.linalg.solve((information + prior)[told], sums[:-1, -1][~held])
+        return information, x
 
     def residual(moments: Moments, x: Array) -> Array:
         tail = np.append(-x, 1.0)
@@ -112,6 +122,9 @@ def solve(
     moments = total(each(moments_of, batch))
     # ordinary: forces and moments in units of their own size, else a metre would decide
     weight = np.where(free, 1.0 / (0.03 * forces) ** 2, 0.0)
+    _, x = solved(moments, weight)
+    known = np.sqrt(sum(each(known_squares, batch)) / np.maximum(moments.rows, 1.0))
+    held = np.asarray((on_axis & free & (known < residual(moments, x))).any(axis=1), dtype=bool)
     information, x = solved(moments, weight)
     for _ in range(3 if weighted else 0):
         noise = np.maximum(residual(moments, x), 1e-6 * forces)
@@ -132,8 +145,15 @@ def solve(
             break
     say("residuals")
     scatter = sum(each(scatter_of, batch, x, weight / repeats)) + prior
-    inverse = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)
-    covariance = widened(sandwich(inverse, scatter), np.diag(scaled_inverse(information + prior)))
+    told, by_held = np.ix_(~held, ~held), np.ix_(~held, held)
+    inverse = np.asarray(np.linalg.inv((normal + prior)[told]), dtype=np.float64)
+    least = np.diag(scaled_inverse((information + prior)[told]))
+    covariance = np.zeros_like(prior)
+    covariance[told] = widened(sandwich(inverse, scatter[told]), least)
+    moved = np.eye(len(held))[:, held]  # all, by what is held
+    moved[~held] = -inverse @ normal[by_held]
+    covariance += moved @ moved.T / precision
+    information = np.where(np.outer(~held, ~held), information, 0.0)
     return Solution(
         task.theta[task.estimated] + task.scale * x,
         covariance * np.outer(task.scale, task.scale),
@@ -150,6 +170,25 @@ def moments_of(samples: Samples, batch: Batch) -> Moments:
     """The sums of one bag's samples (k,) of SAMPLE."""
     phi, z = _rows_and_instruments(samples, batch)
     return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(len(phi))))
+
+
+def known_squares(samples: Samples, batch: Batch) -> Array:
+    """(6,) over one bag's rows: of the forces that are known, thrusters', weight's and those of
+    coefficients that are not estimated."""
+    theta = batch.task.theta.copy()
+    theta[batch.task.estimated] = 0.0
+    task = batch.task._replace(theta=theta, rigid_body=np.zeros((6, 6)))
+    known = filtered_rows(task, parts(samples)[0], PERIOD)[:, :, -1]
+    squares: Array = np.sum(known[np.isfinite(known).all(axis=1)] ** 2, axis=0)
+    return squares
+
+
+def _inertia_of(task: Regression) -> NDArray[np.bool_]:
+    """(n, 6): which coefficients are added masses of which axes."""
+    row, column = task.structure.mass_row, task.structure.mass_column
+    on_axis = np.zeros((len(task.theta), 6), dtype=bool)
+    on_axis[np.arange(len(row)), row] = on_axis[np.arange(len(row)), column] = True
+    return on_axis[task.estimated]
 
 
 def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
