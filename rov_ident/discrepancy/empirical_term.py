@@ -96,19 +96,14 @@ def found(problem: WindowedProblem, now: Fitted) -> Fitted | None:
     both = [[s for s in scored if bool(s.second) == pair][:_FITTED] for pair in (False, True)]
     for shape in itertools.chain(*both):
         gain = _penalised(problem, now, shape)[1]
-        sure = max(_standard_scores(gain))
+        # Also without the window that gains most: next to one that gains twenty times as much, the
+        # gain of all others looks like scatter.
+        of = gain, np.sort(gain)[:-1]
+        sure = max(g.sum() / max(g.std(ddof=1) * np.sqrt(len(g)), 1e-9) for g in of)
         worth = float(gain.sum()) * (_PLAINER if shape.second else 1.0)
         if sure > _SURE and (best is None or worth > best[0]):
             best = worth, shape
     return None if best is None else _fitted(problem, now, best[1])
-
-
-def _standard_scores(gain: Array) -> tuple[float, float]:
-    """The mean gain of windows (W,) in its standard deviations; and without the window that gains
-    most: next to one that gains twenty times as much, the gain of all others looks like scatter."""
-    of = gain, np.sort(gain)[:-1]
-    first, second = (float(g.sum() / max(g.std(ddof=1) * np.sqrt(len(g)), 1e-9)) for g in of)
-    return first, second
 
 
 def described(of: Finding, h: Hypothesis) -> Finding:

@@ -613,9 +613,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     if term is None or not empirical_term.exceeds_errors_of_attitude(search.problem, term):
         return
     best, name = term, empirical_term.NAME
-    lacking, h = search.screening.lacks_plainer, rest.hypothesis
-    candidates = [c for c in search.screening.candidates(rest) if not lacking(c.name, h)]
-    rivals = {added_effect(rest, f): f for f in search.fit_best(rest, candidates)}
+    rivals = {added_effect(rest, f): f for f in search.fit_best(rest, search.candidates(rest))}
     for rival, fitted in rivals.items():
         as_good = rest.squares - fitted.squares >= _AS_GOOD * (rest.squares - term.squares)
         as_good = as_good and not judge.surely_better(term.hypothesis, fitted.hypothesis)

@@ -35,7 +35,7 @@ from rov_ident.discrepancy.sensor_choice import (
     may_be_noise,
     with_noise,
 )
-from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import Spans
 from rov_ident.effects import EFFECTS, with_trait
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
 from rov_ident.model.equations import Array
@@ -79,10 +79,22 @@ def finding(
         separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
     if name == "thrust_line" and _may_be_lost_thrust(search.config, final.hypothesis, keys):
         alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
+    found = in_words(name, axes, parameters, gain, alternatives)
+    return found if separable else unsure(found)
+
+
+def in_words(
+    name: str,
+    axes: tuple[str, ...],
+    parameters: dict[str, Value],
+    gain: Gain,
+    alternatives: tuple[Alternative, ...] = (),
+) -> Finding:
+    """A finding that is sure, and its sentence."""
+    onset = parameters.get("onset")
     begin = None if onset is None else onset.value
     words = sentence(name, parameters, gain)
-    found = Finding(name, axes, parameters, begin, gain, True, None, alternatives, words)
-    return found if separable else unsure(found)
+    return Finding(name, axes, parameters, begin, gain, alternatives=alternatives, sentence=words)
 
 
 def _may_be_lost_thrust(config: Config, h: Hypothesis, keys: Sequence[Key]) -> bool:
@@ -104,8 +116,7 @@ def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bo
     others: with surge and sway too weak, heave looks too strong.
     """
     other = search.with_other_factors(final, rest, key)
-    far = other is None or search.cost(other, final) - search.cost(final, final) > VERY_STRONG
-    return far
+    return other is None or search.cost(other, final) - search.cost(final, final) > VERY_STRONG
 
 
 def _alternatives(
@@ -162,18 +173,14 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
     it, or errors of the file may have made all of it."""
     keys, wide = search.keys_of(last, found.effect), last.covariance + last.covariance_of_the_file
     parameters = parameters_of(last, keys, wide)
-    onset = parameters.get("onset")
-    if not (is_certain(search, last, found.effect) and _differs_from_null(last, keys, wide)):
-        found = unsure(found)
-    return possibly_earlier(
-        dataclasses.replace(
-            found,
-            parameters=parameters,
-            onset_s=None if onset is None else onset.value,
-            sentence=sentence(found.effect, parameters, found.gain),
-        ),
-        _first_seen(last.linearisation.problem),
-    )
+    sure = is_certain(search, last, found.effect) and _differs_from_null(last, keys, wide)
+    told = in_words(found.effect, found.axes, parameters, found.gain, found.alternatives)
+    if not (found.separable and sure):
+        told = unsure(told)
+    # What began before the end of the first window is told from what was there before the bag by
+    # that window alone, whose thrust comes from commands that nobody knows.
+    problem = last.linearisation.problem
+    return possibly_earlier(told, float(problem.steps.t[problem.last[0]]))
 
 
 def is_left(search: Search, last: Fitted, name: str) -> bool:
@@ -189,12 +196,6 @@ def _differs_from_null(fitted: Fitted, keys: Sequence[Key], covariance: Array) -
     off = np.array([fitted.hypothesis.values[k] - bounds(k)[0] for k in keys])
     square = off @ scaled_solve(covariance[np.ix_(at, at)], off, 1e-9)
     return not keys or bool(square > chdtri(len(keys), 0.05))
-
-
-def _first_seen(problem: WindowedProblem) -> float:
-    """The end [s] of the first window: what began before it is told from what was there before
-    the bag by that window alone, whose thrust comes from commands that nobody knows."""
-    return float(problem.steps.t[problem.last[0]])
 
 
 def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:
@@ -324,8 +325,7 @@ def noise_finding(judge: Judge, final: Fitted, given: Config, std: Mapping[str, 
     without = with_noise(h, given.effects.get(name, {}))
     rest = refit(without, final.linearisation)
     gain = judge.gain(without if rest is None else rest.hypothesis, h, None, axes)
-    words = sentence(name, parameters, gain)
-    return Finding(name, axes, parameters, None, gain, True, None, (), words)
+    return in_words(name, axes, parameters, gain)
 
 
 def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None) -> list[Finding]:
@@ -344,11 +344,9 @@ def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None
             for p in EFFECTS[name].parameters
             if (name, p.name) in choice.std
         }
-        words = sentence(name, parameters, gain)
         rivals = tuple(Alternative(n, _EQUAL) for n in choice.alternatives.get(name, ()))
-        sure = not rivals and name not in choice.unsure
-        run = None if sure else EFFECTS[name].manoeuvre
-        findings.append(Finding(name, (), parameters, None, gain, sure, run, rivals, words))
+        found = in_words(name, (), parameters, gain, rivals)
+        findings.append(unsure(found) if rivals or name in choice.unsure else found)
     return findings
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.findings import kinematic_gain, parameters_of, sentence, unsure
+from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, unsure
 from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
 from rov_ident.discrepancy.hypothesis import role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
@@ -187,9 +187,8 @@ def late_finding(
     gain = kinematic_gain(pair, held)
     most = max(late, key=lambda v: abs(v.value))
     each = tuple({"delay": v} for v in late)
-    words = sentence(LATENCY, {"delay": most}, gain)
-    f = Finding(LATENCY, (), {"delay": most}, None, gain, True, None, (), words)
-    return _with(f, Repetition(False, None, each))
+    found = in_words(LATENCY, (), {"delay": most}, gain)
+    return _with(found, Repetition(False, None, each))
 
 
 def _agree(of: Sequence[Value]) -> bool:

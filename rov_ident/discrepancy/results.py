@@ -74,10 +74,10 @@ class Finding:
     parameters: dict[str, Value]
     onset_s: float | None
     gain: Gain
-    separable: bool
-    manoeuvre: str | None
-    alternatives: tuple[Alternative, ...]
-    sentence: str
+    separable: bool = True
+    manoeuvre: str | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    sentence: str = ""
     repetition: Repetition | None = None
 
 

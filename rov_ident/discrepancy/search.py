@@ -141,7 +141,7 @@ class Search:
 
     def extended(self, now: Fitted, progress: Progress | None = None) -> Fitted | None:
         """The model with the one effect more that explains most; None where nothing is left."""
-        candidates = self._candidates(now, now.hypothesis)
+        candidates = self.candidates(now)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.score:.0f}" for c in candidates[:5]))
         fits = self.fit_best(now, candidates) + self._with_late_thrust(now)
@@ -153,10 +153,12 @@ class Search:
             best = self._best(now, damping, HULL_DAMPING_ASKED)
         return best and (refit(best.hypothesis, best.linearisation, update_noise=True) or best)
 
-    def _candidates(self, now: Fitted, h: Hypothesis) -> list[Candidate]:
-        """But for those that imitate a term that every vehicle has and ``h`` lacks."""
+    def candidates(self, now: Fitted, of: Fitted | None = None, name: str = "") -> list[Candidate]:
+        """But for those that imitate a term that every vehicle has and the model ``of`` (None:
+        ``now``) lacks, unless that term is the effect ``name``."""
+        h, lacking = (of or now).hypothesis, self.screening.lacks_plainer
         found = self.screening.candidates(now)
-        return [c for c in found if not self.screening.lacks_plainer(c.name, h)]
+        return [c for c in found if EFFECTS[c.name].beyond == name or not lacking(c.name, h)]
 
     def _best(
         self, now: Fitted, fits: Sequence[Fitted], asked: float = VERY_STRONG
@@ -190,7 +192,7 @@ class Search:
             damped = refit(begin, now.linearisation)
             if damped is None:
                 continue
-            fits = self.fit_best(damped, self._candidates(damped, now.hypothesis))
+            fits = self.fit_best(damped, self.candidates(damped, now))
             fits += self._with_late_thrust(damped)
             pruned = [self._pruned(f, now) for f in fits]
             both = [f for f in pruned if f and set(zeros) & set(f.hypothesis.keys)]
@@ -334,12 +336,7 @@ class Search:
     def _rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
         """What other effects might explain what ``name`` explains: fits by the name of the rival.
         An effect is not named without them, whatever the budget: they take little of it."""
-        lacking, h = self.screening.lacks_plainer, rest.hypothesis
-        candidates = [
-            c
-            for c in self.screening.candidates(rest)
-            if c.name != name and (EFFECTS[c.name].beyond == name or not lacking(c.name, h))
-        ]
+        candidates = [c for c in self.candidates(rest, name=name) if c.name != name]
         fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
         fits.pop(name, None)  # two families share some coefficients
         return fits
