@@ -591,7 +591,7 @@ def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
     values = {v.key: v.value for v in status.values}
     assert values["effect"] == "quadratic_damping"
     assert values["axis"] == "X"
-    assert float(values["score"]) > float(values["price"])
+    assert float(values["score"]) > float(values["penalty"])
     found, unit = values["quadratic_damping.X_uu"].split(" ", 1)
     assert unit == "N s2/m2"
     assert float(found) < 0.0

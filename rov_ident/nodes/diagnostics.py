@@ -227,7 +227,6 @@ class Diagnostics:
             values[f"axis{number}"] = suspicion.axes
             values[f"score{number}"] = f"{suspicion.score:.3g}"
             values[f"penalty{number}"] = f"{suspicion.penalty:.3g}"
-            values[f"price{number}"] = values[f"penalty{number}"]  # an alias for one release
             values[f"share{number}"] = f"{suspicion.share:.3g}"
             values[f"alternatives{number}"] = " ".join(suspicion.rivals)
             for name, value in suspicion.parameters.items():
