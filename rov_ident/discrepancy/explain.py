@@ -48,9 +48,7 @@ from rov_ident.discrepancy.held_out import (
 from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, Key
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
 from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Value, Verdict
-from rov_ident.discrepancy.screening import HULL_DAMPING
 from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
-from rov_ident.discrepancy.selection import VERY_STRONG
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, Values, with_trait
@@ -570,7 +568,6 @@ def _judge_effects(
             for name, trial in known.items()
         ]
         slight = [f for f in found if not is_practical(f.gain)]
-        slight = [f for f in slight if not _supports_another(search, judge, model, f.effect)]
         slight = [f for f in slight if not _gains_in_each(search, judge, model, data, f)]
         if len(slight) < 2:
             break
@@ -630,22 +627,6 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
         gain = dataclasses.replace(gain, alternatives=(*gain.alternatives, term_too))
     model.final = best
     model.found.append(gain)
-
-
-def _supports_another(search: Search, judge: Judge, model: _Model, name: str) -> bool:
-    """Whether a term that every hull has is what makes another effect show: worth nothing without
-    the term, so what both gain together counts."""
-    final, rest = model.final, model.trials[name].rest
-    for other in model.trials if name in HULL_DAMPING else ():
-        if other == name or other.startswith(UNKNOWN):
-            continue
-        keys = [k for n in (name, other) for k in search.keys_of(final, n)]
-        neither = refit(final.hypothesis.without(keys), final.linearisation)
-        if neither is None or search.improvement(neither, rest, final) >= VERY_STRONG:
-            continue
-        if is_practical(judge.gain(neither.hypothesis, final.hypothesis, axes=AXES)):
-            return True
-    return False
 
 
 def _with_all_data(streams: Streams, final: Fitted) -> tuple[Fitted, list[str]]:
