@@ -236,7 +236,7 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
         return frames.quaternion_normalise(quaternion), none
 
     t = log.data["t_s"]
-    tilt = {name: log.data[name] for name in ("roll", "pitch") if name in log.data}
+    tilt: dict[str, Array] = {n: log.data[n] for n in ("roll", "pitch") if n in log.data}
     if missing := [name for name in ("roll", "pitch") if name not in tilt]:
         text = f"no {' and '.join(missing)} given: integrated from the rates, level on average"
         notes.append(text)
