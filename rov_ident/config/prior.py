@@ -286,11 +286,16 @@ def _consider_covariance(
 
 def gain_of(covariance: Array, std: Array) -> Array:
     """The share (n, n) of the data in an estimate: I - P P0^-1, P (n, n) after them and P0 the
-    prior's, diagonal with ``std`` (n,). What is known no better than before follows the data in
-    nothing, even if others are known only relative to it."""
+    prior's, diagonal with ``std`` (n,).
+
+    In prior standard deviations P is at most 1 where the data were weighed as a prior is, and then
+    no element of the share is above the root of its row's diagonal. Where P is not (consider
+    parameters, errors in a row), it is kept to that: what is known no better than before follows
+    the data in nothing, even if others are known only relative to it.
+    """
     gain = np.eye(len(std)) - covariance / std**2
-    gain[np.diag(covariance) >= std**2] = 0.0
-    return gain
+    limit = np.outer(np.sqrt(np.maximum(np.diag(gain), 0.0)) * std, 1.0 / std)
+    return np.clip(gain, -limit, limit)
 
 
 THRUST_SCALE, _BUOYANCY = "thrust_scale.scale", "buoyancy.delta"
