@@ -126,7 +126,10 @@ class Fit(Shown, Result):
             return ()
         i, advice = self.names.index(THRUST_SCALE), []
         scale = float(self.values[i])
-        if self.identifiable[i] and abs(scale - 1.0) > _NOTICED * self.given.wrench.scale_std:
+        # of the data alone: a mass that is off is one of the reasons that are told
+        variance = self.covariance[i, i] - np.broadcast_to(self.beyond_driving, len(self.names))[i]
+        least = _NOTICED * self.given.wrench.scale_std
+        if (scale - 1.0) ** 2 > max(variance, least**2):
             advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
         of_arm = min(righting_arm_share(self.given), self.given.wrench.scale_std) * scale
         turned = np.isfinite(self.rmse[3:]).any()  # by moments that are known: else no arm tells
