@@ -366,6 +366,22 @@ def test_rates_that_agree_with_the_attitude_are_left_alone():
     assert agreed(seldom) is seldom
 
 
+@pytest.mark.parametrize("late", [0.0, 0.2])
+def test_rates_in_the_plane_are_those_of_the_heading(late):
+    """A record of a ship holds zeros for roll and pitch, whose noise is none of the heading's: of a
+    measured one the yaw rate was said to be 0.43 s late, and set right."""
+    streams, true = turning()
+    rng, t, rate = np.random.default_rng(4), streams.t, true[:, 2]
+    heading = integral(t, rate[:, None])[:, 0] + rng.normal(0.0, 0.003, len(t))
+    nu = np.zeros_like(streams.nu)
+    nu[:, 5] = np.interp(t - late, t, rate) + rng.normal(0.0, 0.004, len(t))
+    level = quaternion_from_euler(0.0, 0.0, heading)
+    streams = dataclasses.replace(streams, orientation=level, nu=nu)
+    notes = rates_and_attitude.agreed(streams, a_configuration()).streams.notes
+    assert len(notes) == (late > 0.0)
+    assert all("0.2 s late" in note for note in notes)
+
+
 def test_a_position_that_is_reckoned_from_the_velocities_says_nothing_of_them():
     """It would show them to be late by half an interval of the odometry, whatever is right."""
     _, streams, config = streams_of("clean", "pilot", 0, 90.0)

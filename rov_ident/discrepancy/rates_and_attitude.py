@@ -178,17 +178,19 @@ def _apart(streams: Streams, between: Array, errors: Sequence[Array]) -> tuple[A
     """How much of each of P rate ``errors`` (N, 3) [rad/s] the angular velocities have beside the
     turns of the attitude, and how late they are [s]: (P + 1,), zero where that is not sure; and the
     standard deviations of that, with what was set to zero. What rates do ``between`` the times of
-    the odometry (N - 1, 3) is added to them."""
-    t, turn = streams.t, turns(streams.orientation)
+    the odometry (N - 1, 3) is added to them. Rates that never change were not measured: that they
+    differ by nothing tells no noise of the others."""
+    t, turn, measured = streams.t, turns(streams.orientation), ~streams.unmeasured[3:]
     value, std, nothing = (np.zeros(len(errors) + 1) for _ in range(3))
-    if t[-1] - t[0] < _FEWEST_CLUSTERS * CLUSTER or not turn.any():
+    if t[-1] - t[0] < _FEWEST_CLUSTERS * CLUSTER or not turn[:, measured].any():
         return nothing, nothing
     turned = np.vstack([np.zeros(3), np.cumsum(turn - between, axis=0)])
     grows = [integral(t, error) for error in errors]
     for _ in range(ROUNDS):
         rate = _rates(streams, errors, value)
         apart = integral(t, rate) - turned
-        at, r, columns, _ = whitened(t, apart, [*grows, rate[0] - rate], walk=True)
+        causes = [x[:, measured] for x in (*grows, rate[0] - rate)]
+        at, r, columns, _ = whitened(t, apart[:, measured], causes, walk=True)
         if len(at) < FEWEST:
             return nothing, nothing
         cluster = (at // CLUSTER).astype(int)
