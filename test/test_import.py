@@ -114,7 +114,7 @@ def test_angles_that_the_log_lacks_follow_the_rates(tmp_path, out, given):
         "q": d_pitch * np.cos(roll) + d_yaw * np.sin(roll) * np.cos(pitch),
         "r": -d_pitch * np.sin(roll) + d_yaw * np.cos(roll) * np.cos(pitch),
     }
-    noisy = {k: v + 0.01 + rng.normal(0.0, 0.005, len(t)) for k, v in rates.items()}  # a bias, too
+    noisy = {k: v + 0.003 + rng.normal(0.0, 0.005, len(t)) for k, v in rates.items()}  # a bias, too
     known = {name: angles[EULER.index(name)] for name in given}
     columns = table(BASE, len(t), 0.05, **noisy, **known)
     report = import_csv([save(tmp_path / "log.csv", columns)], out)
@@ -124,6 +124,15 @@ def test_angles_that_the_log_lacks_follow_the_rates(tmp_path, out, given):
     error = np.array(got).T[:2] - angles[:2]
     # it is 1 where they are taken for zero
     assert (np.sqrt(np.mean(error**2, axis=1)) < 0.4 * np.std(angles[:2], axis=1)).all()
+
+
+def test_a_gyro_that_drifts_far_tells_no_roll_and_pitch(tmp_path, out):
+    """Its bias of 5 mrad/s would have turned the vehicle by 1.5 rad in five minutes."""
+    columns = table(BASE, 3000, 0.1, p=0.005 + 0.05 * np.cos(0.3 * np.arange(3000)))
+    report = import_csv([save(tmp_path / "log.csv", columns)], out)
+    assert "no roll and pitch given: taken as 0" in report.notes
+    last = frames.quaternion_to_euler(contents(out)["odom"][-1].orientation)
+    np.testing.assert_allclose(last, 0.0, atol=1e-9)
 
 
 def test_depth_alone_is_kept(tmp_path, out):

@@ -37,6 +37,7 @@ _VELOCITIES, _WRENCH = tuple(VELOCITIES), tuple(AXES)
 _POSITIONS = ("x", "y", "z")
 _ANGLES = ("roll", "pitch", "yaw")
 _LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+_DRIFTED = 0.7  # rad; up to there an angle and its sine differ by 8 % at most
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _REQUIRED = ("t_s", *_VELOCITIES, *_WRENCH)
 _FINS = ("delta_s", "delta_r", "delta_a")
@@ -238,9 +239,11 @@ def _attitude(log: "_Log", angular: Array, notes: list[str]) -> tuple[Array, NDA
     t = log.data["t_s"]
     tilt: dict[str, Array] = {n: log.data[n] for n in ("roll", "pitch") if n in log.data}
     if missing := [name for name in ("roll", "pitch") if name not in tilt]:
-        text = f"no {' and '.join(missing)} given: integrated from the rates, level on average"
-        notes.append(text)
-        tilt = _tilt(t - t[0], angular) | tilt
+        integrated = _tilt(t - t[0], angular)
+        text = "integrated from the rates, level on average" if integrated else "taken as 0"
+        notes.append(f"no {' and '.join(missing)} given: {text}")
+        level = {name: np.zeros(len(t)) for name in missing}
+        tilt = (integrated or level) | tilt
     roll, pitch = tilt["roll"], tilt["pitch"]
     if "yaw" in log.data:
         yaw = log.data["yaw"]
@@ -256,12 +259,15 @@ def _tilt(t: Array, angular: Array) -> dict[str, Array]:
     """Roll and pitch (n,) [rad] from the angular velocities (n, 3) at the times t (n,) [s].
 
     Mean and drift of the tilt are taken away: weight keeps a vehicle level, and a gyro has a bias.
+    Nothing where that has turned the vehicle too far for a line.
     """
     turns = frames.quaternion_from_rotation_vector(np.diff(integral(t, angular), axis=0))
     attitudes = np.array([*accumulate(turns, frames.quaternion_multiply, initial=_LEVEL)])
     down = frames.quaternion_to_matrix(attitudes)[:, :2, 2]  # north and east of the body's z
     line = np.vander(t, 2)
     north, east = (line @ np.linalg.lstsq(line, down)[0]).T
+    if max(np.ptp(north), np.ptp(east)) > _DRIFTED:
+        return {}
     back = frames.quaternion_from_rotation_vector(np.column_stack([east, -north, 0.0 * t]))
     euler = frames.quaternion_to_euler(frames.quaternion_multiply(back, attitudes))
     return {"roll": euler[:, 0], "pitch": euler[:, 1]}
