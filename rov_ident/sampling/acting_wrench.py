@@ -57,6 +57,7 @@ class ActingWrench:
     def __init__(self, config: Config) -> None:
         self._noise = ReadingNoise()
         self._largest = np.zeros(6)  # N, N m
+        self.has_moment = False  # whether any command held one so far
         self.configure(config)
         self.clear()
 
@@ -76,11 +77,6 @@ class ActingWrench:
         self._period = CommandPeriod()
         self._last_received = -np.inf  # s
         self._estimated: deque[_Command] = deque()  # of those that were dropped
-
-    @property
-    def has_moment(self) -> bool:
-        """Whether any command held a moment so far."""
-        return holds_moment(self._largest)
 
     @property
     def hold(self) -> float:
@@ -154,6 +150,7 @@ class ActingWrench:
             return None
         wrench, _, doubt = despiker.judge(WRENCH, queue)
         np.maximum(self._largest, np.abs(wrench), out=self._largest)
+        self.has_moment = holds_moment(self._largest)
         self._noise.take(at, queue.popleft().values)
         self._estimated.clear()
         if last > -np.inf:

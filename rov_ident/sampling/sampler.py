@@ -217,7 +217,8 @@ class Sampler:
         missing = ""
         if self._driven.used:
             read, missing = self._driven.over(begin, t)
-            sample["inputs"][0] = self._driven.acting(t - begin, read)
+            sample["inputs"][0] = acting = self._driven.acting(t - begin, read)
+            self._has_fins |= not missing and bool(acting[:, :3].any())
             if self._jacobians is not None and not missing:
                 self._jacobians.steer(t - begin, read)
         imu = self._queues[IMU].popleft().message if instant.has_imu else None
@@ -259,7 +260,6 @@ class Sampler:
             self.counts[why] += 1
             self._previous = math.nan
             return None
-        self._has_fins |= bool(sample["inputs"][0, :, :3].any())
         if not (self._has_fins or self._acting.has_moment):
             sample["wrench_doubt"][0, 3:] = np.inf
         self._acting.surround(sample)
