@@ -201,6 +201,13 @@ def test_bags_that_cannot_be_used(tmp_path, bag):
     refused(fit(tmp_path / "text.mcap"), "text.mcap")
 
 
+def test_an_option_is_named_in_full(tmp_path, bag):
+    """--out was taken for --output-error, and the file behind it for a second bag."""
+    done = run("fit", bag, "--config", HEAVY, "--out", tmp_path / "fitted.yaml")
+    assert done.returncode == 2
+    assert "--out" in done.stderr.splitlines()[-1]
+
+
 def test_bags_without_a_topic(tmp_path, bag):
     for missing, kept in (("odom", "wrench"), ("wrench", "odom")):
         path = tmp_path / f"no_{missing}.mcap"

@@ -95,8 +95,9 @@ def command(
     # Raw: an example that is broken into lines cannot be copied.
     raw = argparse.RawDescriptionHelpFormatter
     parser = commands.add_parser(
-        name, help=text, description=text, epilog=example, formatter_class=raw
-    )
+        name, help=text, description=text, epilog=example, formatter_class=raw,
+        allow_abbrev=False,  # or `fit --out FILE` would be --output-error, and FILE a bag
+    )  # fmt: skip
     parser.set_defaults(run=run, out_kind=out)
     for path in paths.split():
         parser.add_argument(path, type=Path, **_PATHS[path])
