@@ -589,13 +589,15 @@ def _judge_effects(
 def _gains_in_each(
     search: Search, judge: Judge, model: _Model, data: _Data, found: Finding
 ) -> bool:
-    """Whether an effect gains where each of several records has values of its own: of currents
-    that turned, the average may be worth nothing."""
+    """Whether several records differ in an effect, and it gains where each has values of its own:
+    of currents that turned, the average may be worth nothing."""
     if len(data.bags) < 2 or data.validated:
         return False
     records, final = data.records, model.final
     keys = search.keys_of(final, found.effect)
     there = repetition.alone(records, final, data.to_fit)
+    if not repetition.differ(final, there, keys):
+        return False
     judged, own = own_parameters.parted(there, final.hypothesis, keys)
     after = _Shared(judged, judged, records, own).with_own(judge.problem, judged)
     rest = model.trials[found.effect].rest

@@ -8,7 +8,7 @@ differs, and does not predict other records, belongs to each record (`own_parame
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, unsure
 from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
-from rov_ident.discrepancy.hypothesis import role_of
+from rov_ident.discrepancy.hypothesis import Key, role_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
 from rov_ident.discrepancy.search import Search
@@ -71,12 +71,19 @@ def in_each(
         names = [k for k in keys if role_of(k) in _LINEAR]
         each = tuple(parameters_of(there or last, names) for there in alone)
         first = 0 if f.onset_s is None else records.at(f.onset_s)
-        same = all(_agree([of[n] for of in each[first:]]) for n in each[0])
+        same = _is_same(each[first:])
         told = _with(f, Repetition(same and not first, repeats.get(f.effect), each), first)
         if not (same and not first) and not repeats.get(f.effect):
             own.append(f.effect)
         out.append(told if f.onset_s is None else _begun(told, records, f.onset_s, same))
     return out, own
+
+
+def differ(last: Fitted, alone: Sequence[Fitted | None], keys: Sequence[Key]) -> bool:
+    """Whether records, to each of which the model ``last`` was fitted ``alone``, differ by more
+    than chance in those of its parameters that a record can have of its own."""
+    names = [k for k in keys if role_of(k) in _LINEAR]
+    return not _is_same([parameters_of(there or last, names) for there in alone])
 
 
 def alone(records: Records, last: Fitted, spans: Spans | None = None) -> list[Fitted | None]:
@@ -134,8 +141,7 @@ def of_sensors(
                 {n: dataclasses.replace(v, value=v.value + yaw) for n, v in of.items()}
                 for of, yaw in zip(values, headings, strict=True)
             ]
-        same = all(_agree([of[name] for of in values]) for name in f.parameters)
-        out.append(_with(f, Repetition(same, None, tuple(values))))
+        out.append(_with(f, Repetition(_is_same(values), None, tuple(values))))
     return out
 
 
@@ -189,6 +195,11 @@ def late_finding(
     each = tuple({"delay": v} for v in late)
     found = in_words(LATENCY, (), {"delay": most}, gain)
     return _with(found, Repetition(False, None, each))
+
+
+def _is_same(each: Sequence[Mapping[str, Value]]) -> bool:
+    """Whether the parameters of ``each`` of several records differ by no more than chance."""
+    return all(_agree([of[name] for of in each]) for name in each[0])
 
 
 def _agree(of: Sequence[Value]) -> bool:
