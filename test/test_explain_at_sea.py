@@ -439,7 +439,7 @@ def test_what_is_found_beside_a_refuted_correction_is_not_sure():
     data = sensor_choice.Data(streams, spans[0], streams, spans[1], config)
     choice = data.fitted(["velocity_latency", "sensor_lever_arm"], frozenset())
     lever = choice.sensors["sensor_lever_arm"]
-    wrong = {**choice.sensors, "sensor_lever_arm": {**lever, "z": lever["z"] + 0.3}}
+    wrong = {**choice.sensors, "sensor_lever_arm": {**lever, "z": lever["z"] + 0.5}}
     left = sensor_choice._without_refuted(data, dataclasses.replace(choice, sensors=wrong))
     assert left.sensors.keys() == {"velocity_latency"} == left.unsure
 

@@ -198,6 +198,8 @@ def explain(
         of_dynamics, shared = _in_each_record(
             search, judge, data, retuned, model, last, of_dynamics
         )
+        minor += [f for f in of_dynamics if not is_practical(f.gain)]
+        of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
     given = Hypothesis(config, {})
     problem = WindowedProblem(data.recorded.judged, data.to_judge)
     as_recorded = Judge(problem, likeliest=likeliest)

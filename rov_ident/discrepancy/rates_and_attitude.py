@@ -55,7 +55,6 @@ def agreed(streams: Streams, config: Config) -> Agreed:
         errors = [*body, *_scaled(streams.nu[:, 3:])]
         streams = _with_gyro_set_right(streams, between, body, config)
     value, std = _apart(streams, between, errors)
-    value[:3] *= np.ptp(streams.nu[:, 3:], axis=0) > 0.0
     value[3:-1] *= np.abs(value[3:-1]) < _LARGEST_SCALE
     if std.any():
         streams = dataclasses.replace(streams, rates_std=std[:3])
