@@ -19,12 +19,19 @@ from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
 from rov_ident.experiment.data_quality import _inertia_remarks, check
 from rov_ident.experiment.design import propose
-from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, _correlation, _delay_remark
+from rov_ident.experiment.messages_alone import (
+    BAD,
+    GOOD,
+    WARNING,
+    _correlation,
+    _delay_remark,
+    of_dynamics,
+)
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.batch_fit import fit_batch
-from rov_ident.offline.delays import Delay
+from rov_ident.offline.delays import Delay, Filtered, motion_behind_wrench
 from rov_ident.sampling.records import read_record
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -164,6 +171,26 @@ def test_a_wrench_that_stays_shows_no_inertia(checked):
     assert said.level == WARNING and "hardly changes" in said.text
 
 
+def test_a_wrench_that_holds_shows_no_delay():
+    rows = Filtered(
+        np.random.default_rng(1).standard_normal((50, 6, 4)), np.ones((50, 6)), np.ones(6, bool)
+    )
+    assert np.isnan(motion_behind_wrench(rows).value)
+
+
+def test_velocities_along_the_axes_of_the_world_are_named(at_sea):
+    """As position controllers and simulators publish them."""
+
+    def change(role, m):
+        if not isinstance(m, Odometry):
+            return m
+        return m._replace(linear=quaternion_to_matrix(m.orientation[None])[0] @ m.linear)
+
+    told = of(check(*at_sea(1, change)), "pose against velocity")
+    assert told.level == BAD and "along the axes of the world" in told.text
+    assert of(check(*at_sea(1)), "pose against velocity").level == GOOD
+
+
 def test_a_controller_that_pushes_as_the_vehicle_slows_is_no_wrong_sign():
     rng = np.random.default_rng(1)
     speed = 1.0 + 0.1 * rng.standard_normal(400)
@@ -171,6 +198,8 @@ def test_a_controller_that_pushes_as_the_vehicle_slows_is_no_wrong_sign():
     assert np.corrcoef(wrench, speed)[0, 1] < -0.99 and _correlation(wrench, speed) > 0.9
     pushed = 30.0 * speed
     assert _correlation(pushed, speed) > 0.9 and _correlation(-pushed, speed) < -0.9
+    with np.errstate(all="raise"):
+        assert _correlation(pushed, np.zeros(400)) == 0.0  # as where a moment turns nothing
 
 
 def test_a_late_wrench_is_noticed(checked):
@@ -306,7 +335,8 @@ def at_sea(tmp_path_factory):
         messages = sea.measured(sea.dive(vehicle, what, "six-axis", 45.0, rng), what, rng)
         config = configuration.from_parameters(sea.told(vehicle, what, rng))
         path = folder / "bag.mcap"
-        write_messages(path, [(at, role, change(role, m)) for at, role, m in messages])
+        rows = [(at, role, change(role, m)) for at, role, m in messages]
+        write_messages(path, [row for row in rows if row[2] is not None])
         return path, config
 
     return run
@@ -381,8 +411,30 @@ def test_a_vehicle_that_is_not_armed(at_sea):
 
     path, config = at_sea(8, change)
     assert "was it armed" in of(check(path, config), "wrench against motion").text
-    with pytest.raises(UserError, match="was it armed"):
-        ri.fit(path, config, "ls")
+    for run in (ri.fit, ri.explain):
+        with pytest.raises(UserError, match="bag.mcap: the vehicle does not move.*was it armed"):
+            run(path, config)
+
+
+def test_a_vehicle_at_a_steady_speed_moves(at_sea):
+    """Drag balances the wrench; hardly anything accelerates it."""
+    speed = np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0])
+    _, config = at_sea(9)
+    drag = config.dynamics.damping_matrix(speed) @ speed
+
+    def change(role, m):
+        noise = np.random.default_rng(m.stamp).standard_normal((2, 3))
+        if isinstance(m, Odometry):
+            level = np.array([1.0, 0.0, 0.0, 0.0])
+            m = m._replace(linear=speed[:3] + 0.008 * noise[0], angular=0.004 * noise[1])
+            return m._replace(orientation=level, position=np.zeros(3))
+        if isinstance(m, Wrench):
+            return m._replace(force=drag[:3] * (1.0 + 0.02 * noise[0]), torque=np.zeros(3))
+        return None if isinstance(m, Imu) else m
+
+    path, config = at_sea(9, change)
+    told = of_dynamics(read_record(path, config).samples, config)
+    assert told[0].level == GOOD and "goes where it is pushed" in told[0].text
 
 
 # ------------------------------------------------------------------ manoeuvres

@@ -320,6 +320,16 @@ def test_a_fit_that_predicts_worse_than_its_file_is_said_to(heavy):
     assert not any(test.passed for test in ruined.tests)  # no uncertainty excuses that
 
 
+def test_a_fit_whose_prediction_diverges_is_said_to_predict_worse(heavy):
+    before, after = np.full(6, 0.1), np.array([0.05, np.inf, 0.1, 0.1, 0.1, np.nan])
+    found = Consistency(()).with_open_loop(before, after, np.zeros(6))
+    assert [test.name for test in found.tests if not test.passed] == ["open loop: v"]
+    wide = found.widened(np.diag([0.0, 1e-6]), np.ones(2), np.zeros(2))
+    assert wide[0, 0] == 0.0 and 0.5 < wide[1, 1] <= 1.0  # as the prior, and no more
+    both = Consistency(()).with_open_loop(np.full(6, np.inf), np.full(6, np.inf), np.zeros(6))
+    assert both.consistent
+
+
 def test_it_is_said_where_no_motion_was_judged(heavy):
     prior, nothing = prior_of(heavy), np.full(6, np.nan)
     silent = consistency_of(heavy, prior, prior.mean, nothing, nothing)

@@ -228,8 +228,8 @@ def _refuse_unusable(many: archive.Archive, config: Config) -> None:
             f"{many.samples} samples are too few for {unknowns} coefficients of one axis: record "
             "for longer (rov-ident plan says what)"
         )
-    for remarks in many.each(messages_alone.of_dynamics, config):
-        messages_alone.refuse_reversed(remarks)
+    for bag, remarks in zip(many.bags, many.each(messages_alone.of_dynamics, config), strict=True):
+        messages_alone.refuse_reversed(bag.path.name, remarks)
 
 
 def _reference(path: Path, config: Config, duration: float, say: Progress) -> dict[str, Any]:
@@ -284,9 +284,9 @@ def explain(
     given, placed = with_mounting(given, paths)
     read_bags = [_streams(path, given, say) for path in paths]
     judge = None if other is None else _streams(other, given, say)
-    for streams, _ in read_bags:
+    for path, (streams, _) in zip(paths, read_bags, strict=True):
         seen = delays.samples_of(streams)
-        messages_alone.refuse_reversed(messages_alone.of_dynamics(seen, given))
+        messages_alone.refuse_reversed(path.name, messages_alone.of_dynamics(seen, given))
     found = explain_streams(
         [streams for streams, _ in read_bags], given, judge[0] if judge else None, say
     )

@@ -130,7 +130,7 @@ class Identification(Shown):
         ratio = {n: after / before for n, (before, after) in self.errors.items()}
         worse = [n for n, r in ratio.items() if r > _WORSE]
         but = f" (but {' and '.join(worse)} worse)" if worse else ""
-        if float(np.median([*ratio.values()])) >= 1.0:
+        if not float(np.median([*ratio.values()])) < 1.0:  # nor if both diverge
             advice.append("Keep the configuration: extended.yaml predicts no better than it does.")
         elif self._doubt:
             advice.append(

@@ -35,6 +35,7 @@ _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table
 _WORSE = 1.05  # what the scatter of a second dive allows
 _RUINED = 3.0  # times the error before, whatever the uncertainty: clean dives fitted from the right
 # file reach 2.0 ("What is asked", docs/live.md)
+_DIVERGES = 1e3  # times: any number does that leaves no interval narrower than the prior's
 _CHANCE = 2.0  # standard deviations: what 5 % of fits exceed if one direction decides
 
 
@@ -135,7 +136,8 @@ class Consistency:
     def with_open_loop(self, before: Array, after: Array, chance: Array) -> "Consistency":
         """The same, asked also whether a fit predicts worse than what it began with.
 
-        ``before`` and ``after`` (6,) are errors of the open-loop simulation, NaN where not known;
+        ``before`` and ``after`` (6,) are errors of the open-loop simulation, NaN where not known,
+        infinite where it diverges;
         ``chance`` (6,) is the part of the latter that the uncertainty of the fit explains. Without
         it, no fit could stand beside a configuration that is right already; but what has been
         fitted to these very data does not miss them by far.
@@ -145,10 +147,10 @@ class Consistency:
         allowed = np.minimum(allowed, _RUINED / _WORSE * before)
         columns = before.tolist(), after.tolist(), allowed.tolist()
         for component, old, new, most in zip(VELOCITIES, *columns, strict=True):
-            if np.isfinite([old, new]).all() and old > 0.0:
+            if 0.0 < old < np.inf and not np.isnan(new):
                 tests.append(
                     Test(
-                        f"open loop: {component}", new / most, _WORSE,
+                        f"open loop: {component}", min(new / most, _DIVERGES), _WORSE,
                         f"the fit predicts {component} worse than the configuration does (error "
                         f"{new:.3g} instead of {old:.3g}): {CAUSE}",
                     )

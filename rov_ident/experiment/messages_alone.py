@@ -27,9 +27,11 @@ _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) 
 _FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes
 _UPWARD = 0.9  # g; mean specific force upward; a sign or an axis that is wrong gives 0.7 or less
 _SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
+_POSE = "pose against velocity"
 _REVERSED = -0.3  # correlation of two measurements of one thing; below it the sign is wrong
 _ANGULAR_LEAST, _LINEAR_LEAST, _MOTION_LEAST = 0.7, 0.5, 0.5  # correlation that good sensors reach:
 # half of the variance is common; of position and motion, which are noisier, a quarter
+_SAME = 0.9  # correlation of two measurements of one thing, less noise
 _UNITS = 2.0  # times too large or small; noise and lateness do not make a rate twice the turn
 _OTHER_FORCES = 3.0  # times the wrench; where so much else moves it (a Munk moment), no sign shows
 _UNMOVED = 0.1  # of the wrench; neither a guess nor a thrust scale is ten times off
@@ -52,11 +54,11 @@ def of_messages(streams: Streams, config: Config) -> list[Remark]:
     return [*_rate_remarks(streams), *_axes_remarks(streams, config)]
 
 
-def refuse_reversed(remarks: Iterable[Remark]) -> None:
-    """UserError where remarks of :func:`of_dynamics` say that no fit can make sense of the data."""
+def refuse_reversed(bag: str, remarks: Iterable[Remark]) -> None:
+    """UserError where remarks of :func:`of_dynamics` say that no fit can make sense of a bag."""
     for remark in remarks:
         if remark.hopeless:
-            raise UserError(f"{remark.text} (rov-ident check says more)")
+            raise UserError(f"{bag}: {remark.text} (rov-ident check says more)")
 
 
 def _rate_remarks(streams: Streams) -> list[Remark]:
@@ -112,7 +114,11 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         moved = streams.position[last] - streams.position[first]
         way = integral(streams.t, rotated(r, streams.nu[:, :3]))
         told, axes = way[last] - way[first], ("north", "east", "down")
-        remarks.append(_agreement("pose against velocity", told, moved, axes, _LINEAR_LEAST))
+        way = integral(streams.t, streams.nu[:, :3])
+        remarks.append(
+            _along_world_axes(way[last] - way[first], told, moved)
+            or _agreement(_POSE, told, moved, axes, _LINEAR_LEAST)
+        )
     late = delays.odometry_behind_imu(streams, config)
     if late is not None:
         behind = delays.surely_behind_imu(streams, config)
@@ -149,6 +155,26 @@ def _rates_and_turns(
     told = ", ".join(f"{share[i]:.2g} times in {MOTIONS[3 + i]}" for i in np.flatnonzero(wrong))
     text = f"the odometry's angular velocities are the turns of its attitude {told}"
     return [Remark(subject, BAD, f"{text}: check units (rad/s), signs and frame ids")]
+
+
+def _along_world_axes(as_read: Array, turned: Array, moved: Array) -> Remark | None:
+    """That velocities go along with the position's (k, 3) as they are, but for a constant turn, and
+    not once they are turned by the attitude."""
+    way = moved[:, 0] + 1j * moved[:, 1]
+
+    def coherence(other: Array) -> float:
+        x = other[:, 0] + 1j * other[:, 1]
+        return float(abs(np.vdot(x, way))) / max(
+            float(np.linalg.norm(x) * np.linalg.norm(way)), _STILL
+        )
+
+    if coherence(turned) >= _LINEAR_LEAST or coherence(as_read) <= _SAME:
+        return None
+    text = (
+        "the velocities are along the axes of the world, not of the vehicle: turn them by the "
+        "attitude, or record those of the odometry's child frame"
+    )
+    return Remark(_POSE, BAD, text)
 
 
 def _agreement(subject: str, a: Array, b: Array, names: Sequence[str], least: float) -> Remark:
@@ -194,7 +220,9 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     subject, moved = "wrench against motion", wrench - rows.phi[:, :, -1]
     if not driven.any():
         return [Remark(subject, BAD, "no axis is driven: nothing can be identified")]
-    if np.all(np.std(moved, axis=0)[driven] < _UNMOVED * size[driven]):
+    trim = config.dynamics.restoring_force(samples["down"].mean(axis=0))  # which rest needs, too
+    motion = np.hypot(np.std(moved, axis=0), np.mean(moved, axis=0) - trim)
+    if np.all(motion[driven] < _UNMOVED * size[driven]):
         text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
         return [Remark(subject, BAD, text, hopeless=True)]
     judged = driven & (np.sqrt(np.mean(moved**2, axis=0)) < _OTHER_FORCES * size)
@@ -204,7 +232,7 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
         subject, by_name, np.full(len(by_name), _MOTION_LEAST),
         "the vehicle moves against the wrench in {}: check its sign and axes (its frame id, "
         "frames.body); or a controller works there against what the model lacks",
-        "motion and wrench hardly go together in {}: check axes and units",
+        "motion and wrench hardly go together in {}: check signs, axes and units",
         "the vehicle goes where it is pushed",
         -_MOTION_LEAST,  # a wrench that is reversed gives minus what a right one gives
     )  # fmt: skip
@@ -222,7 +250,8 @@ def _correlation(a: Array, b: Array) -> float:
     wrong sign turns both; a controller that pushes harder as a vehicle slows turns only the first.
     """
     about_zero = float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300)
-    return max(about_zero, float(np.corrcoef(a, b)[0, 1]))
+    a, b = a - a.mean(), b - b.mean()
+    return max(about_zero, float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-300))
 
 
 def _delay_remark(subject: str, late: Delay, wrong: str) -> Remark:

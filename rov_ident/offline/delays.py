@@ -170,7 +170,7 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
     slope = np.gradient(wrench, PERIOD, axis=0)
     table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)[1:-1]
     n = table.shape[2] - 1
-    if not driven.any() or len(table) < 5 * n:
+    if not slope[:, driven].any() or len(table) < 5 * n:  # a wrench that holds shows no time
         return NO_DELAY
     weight = np.where(driven, 1.0 / np.maximum(np.mean(wrench**2, axis=0), 1e-12), 0.0)
     prior = np.append(np.ones(n - 1), 0.0)

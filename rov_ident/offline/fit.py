@@ -244,6 +244,8 @@ class Fit(Shown, Result):
 
 def rmse_change(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> str:
     """How the RMSE of open-loop prediction changes, by velocity, in half a sentence."""
+    if np.inf in after.values():
+        return f"the {HORIZON:g} s prediction diverges"
     ratios = [a / b for b, a in zip(before.values(), after.values()) if a is not None and b]
     share = 100.0 * (1.0 - float(np.median(ratios))) if ratios else 0.0
     change = f"falls by {share:.0f} %" if share >= 1.0 else "does not fall"

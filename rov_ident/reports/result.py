@@ -2,6 +2,7 @@
 which data they come; and what every result of a command can do: table, picture, file, JSON."""
 
 import json
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
@@ -173,8 +174,16 @@ class Result:
 
 
 def as_json(document: Mapping[str, Any]) -> str:
-    """A result as text for machines. Raises ValueError for a number that is not finite."""
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+    """A result as text for machines; what is infinite is null. Raises ValueError for NaN."""
+    return json.dumps(_without_infinity(document), indent=2, allow_nan=False) + "\n"
+
+
+def _without_infinity(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_infinity(x) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_infinity(x) for x in value]
+    return None if isinstance(value, float) and math.isinf(value) else value
 
 
 def provenance(files: Iterable[tuple[str, str]], **more: str) -> dict[str, Any]:

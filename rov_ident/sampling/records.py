@@ -180,10 +180,8 @@ def score(samples: NDArray[np.void], simulated: Array) -> Score:
 
 
 def numbers(values: Array) -> dict[str, float | None]:
-    """By velocity component; None where there is none, as JSON wants it."""
-    return {
-        n: v if np.isfinite(v) else None for n, v in zip(VELOCITIES, values.tolist(), strict=True)
-    }
+    """By velocity component; None where there is none, infinite where a simulation diverges."""
+    return {n: None if np.isnan(v) else v for n, v in zip(VELOCITIES, values.tolist(), strict=True)}
 
 
 def samples_of(config: Config, run: Dive, velocity: bool = True) -> Iterator[np.ndarray]:
