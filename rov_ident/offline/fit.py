@@ -1,5 +1,6 @@
 """Offline fits, all with one type of result."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
 from rov_ident.offline import archive
 from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_loop
-from rov_ident.reports.result import Figure, Result, Shown, as_json, provenance
+from rov_ident.reports.result import NORMAL, Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
 from rov_ident.sampling.records import HORIZON, Record, numbers
 from rov_ident.sampling.sample import thrust_axes
@@ -31,13 +32,14 @@ _MOST = 0.5  # of a variance
 _NOTICED = 0.1  # of the scale's prior standard deviation: 1.5 % of thrust
 
 
-def thrust_or_mass(scale: float) -> str:
+def thrust_or_mass(scale: float, std: float = 0.0) -> str:
     """What a thrust that is ``scale`` times the configured one may be instead."""
+    within = f" (± {NORMAL * std:.2f}, 95 %)" if std else ""
     return (
-        f"thrust is {scale:.2f} times what the configuration says, or mass, inertia and buoyancy "
-        f"are {1.0 / scale:.2f} times that, or the height of the centre of buoyancy above that of "
-        "gravity is (hang a weight to one side: docs/live.md): motion alone cannot tell the one "
-        "from the other"
+        f"thrust is {scale:.2f}{within} times what the configuration says, or mass, inertia and "
+        f"buoyancy are {1.0 / scale:.2f} times that, or the height of the centre of buoyancy above "
+        "that of gravity is (hang a weight to one side: docs/live.md): motion alone cannot tell "
+        "the one from the other"
     )
 
 
@@ -130,7 +132,8 @@ class Fit(Shown, Result):
         variance = self.covariance[i, i] - np.broadcast_to(self.beyond_driving, len(self.names))[i]
         least = _NOTICED * self.given.wrench.scale_std
         if (scale - 1.0) ** 2 > max(variance, least**2):
-            advice.append(f"Weigh the vehicle: {thrust_or_mass(scale)}.")
+            std = math.sqrt(self.covariance[i, i])
+            advice.append(f"Weigh the vehicle: {thrust_or_mass(scale, std)}.")
         of_arm = min(righting_arm_share(self.given), self.given.wrench.scale_std) * scale
         turned = np.isfinite(self.rmse[3:]).any()  # by moments that are known: else no arm tells
         if turned and of_arm**2 > _MOST * self.covariance[i, i]:
