@@ -106,6 +106,15 @@ def test_a_hidden_effect_is_named_first(name):
         assert abs(value - true) < 4.0 * std
 
 
+def test_a_fit_that_explains_less_than_promised_begins_once_more():
+    """A vehicle that is easily tumbled: with the coefficients of the model without the force, the
+    fit that has it ended far from the best, and a term of the position was told instead."""
+    case = draw(240111013604781, ("constant_force",), [0.14])
+    streams = streams_of(case)
+    search = Search(streams, case.config, thinned(split(streams.duration)[0]))
+    assert search.named(search.run()[-1]) == ["constant_force"]
+
+
 @pytest.mark.parametrize("place", ["a minute", *more("a minute, off 50 %"), "a minute, no IMU"])
 def test_nothing_is_claimed_where_nothing_is_hidden(place):
     line = found_in("clean", 0, place)

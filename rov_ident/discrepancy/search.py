@@ -58,6 +58,7 @@ _OWN_DRAG = 0.5  # of the hull's drag that must remain beside an effect that imi
 # Effort: the times and rates in docs/explain-bench.md were measured with these.
 _FITTED = 6  # candidates that are fitted in full at each step, ...
 _FITTED_WHITE = 3  # ... and those with the best scores as if what they leave were white
+_PROMISED = 0.5  # of what a linearisation promises; with less, the fit begins once more elsewhere
 _LEAST_SHARE = 0.3  # of the best score: a candidate with less is not fitted
 _MOST_EFFECTS = 6  # added one after the other: twice as many as the study hides
 _MOST_PATTERNS = 3  # without a name, which are told, not mended
@@ -224,17 +225,23 @@ class Search:
         chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
         chosen += [c for c in candidates if c.name in LIKELIEST and c not in chosen]
         found = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
+        if chosen and _is_far_from(now, found[0], chosen[0]):
+            both = filter(None, (found[0], self._fit_candidate(now, chosen[0], from_file=True)))
+            found[0] = min(both, key=lambda f: f.squares, default=None)
         fits = [f for f in found if f is not None]
         # here, not by the threads, of which now one, now the other is first
         self._ends |= {frozenset(f.hypothesis.keys): f.hypothesis for f in fits}
         return fits
 
-    def _fit_candidate(self, now: Fitted, candidate: Candidate) -> Fitted | None:
+    def _fit_candidate(
+        self, now: Fitted, candidate: Candidate, from_file: bool = False
+    ) -> Fitted | None:
         """A full fit; one of the same parameters, as rivals often are, begins where the last one
         has ended."""
         h = now.hypothesis.having(candidate.start)
         known = self._ends.get(frozenset(h.keys))
-        there = refit(h, now.linearisation, known=known)
+        start = now.linearisation
+        there = self._from_file(now, h) if from_file else refit(h, start, known=known)
         apart = any(p.axis for p in EFFECTS[candidate.name].parameters)
         if there is not None and (apart or candidate.name in HULL_DAMPING):
             there = self._pruned(there, now)
@@ -244,6 +251,16 @@ class Search:
         if not any(role_of(k) in ("amplitude", "limit") for k in new):
             return None
         return there if known is not None else with_best_onsets(there, candidate.start)
+
+    def _from_file(self, now: Fitted, h: Hypothesis) -> Fitted | None:
+        """A full fit that begins from the coefficients as configured: those of a model that lacks
+        an effect may be too far off for one that has it to come back."""
+        there = fit(self.problem, h.having(self.given.values))
+        if there is None:
+            return None
+        starts = there.linearisation.starts
+        begin = linearise(self.problem, there.hypothesis, starts, now.noise)
+        return None if begin is None else refit(there.hypothesis, begin)
 
     def _pruned(self, fitted: Fitted | None, base: Fitted) -> Fitted | None:
         """Without the coefficients, and parameters of single axes, beyond ``base`` that are not
@@ -443,6 +460,12 @@ class Search:
     def _added(self, fitted: Fitted) -> list[Key]:
         own = set(self.given.keys)
         return [k for k in fitted.hypothesis.keys if k not in own]
+
+
+def _is_far_from(now: Fitted, there: Fitted | None, candidate: Candidate) -> bool:
+    """Whether a full fit explains far less than the linearisation of ``now`` promised."""
+    explained = 0.0 if there is None else now.squares - there.squares
+    return explained < _PROMISED * candidate.white_score > VERY_STRONG
 
 
 def shortened(streams: Streams, spans: Sequence[tuple[float, float]]) -> Spans:
