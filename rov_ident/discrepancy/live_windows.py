@@ -24,6 +24,7 @@ from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     Hypothesis,
     Key,
+    coefficient_sizes,
     parameter,
     role_of,
     units,
@@ -114,19 +115,13 @@ def is_watched(effect: Effect) -> bool:
 def task_of(config: Config) -> Task:
     """What is to be watched in the model of a configuration."""
     base = (*((COEFFICIENTS, name) for name in config.estimate), *config.estimate_effects)
-    size, given = _coefficient_sizes(config.model), Hypothesis(config, {})
+    size, given = coefficient_sizes(config.model), Hypothesis(config, {})
     prior = [size[k] if k in size else parameter(k).typical for k in base]
     lacking = [e for e in EFFECTS.values() if is_watched(e) and e.name not in config.effects]
     groups = [u for e in lacking for u in units(e, given, ("amplitude", "place"))]
     values = [given.value(key) for key in base]
     sizes = _sizes(config, [key for unit in groups for key in unit])
     return Task(config, base, tuple(groups), np.array(prior) ** -2.0, np.array(values), sizes)
-
-
-def _coefficient_sizes(model: Model) -> dict[Key, float]:
-    """How large each coefficient is, at least a fifth of what is typical of such a vehicle."""
-    sizes = np.maximum(np.abs(model.theta), 0.2 * typical(model)).tolist()
-    return {(COEFFICIENTS, name): size for name, size in zip(model.names, sizes, strict=True)}
 
 
 def _sizes(config: Config, keys: Sequence[Key]) -> dict[Key, float]:
