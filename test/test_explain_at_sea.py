@@ -708,7 +708,7 @@ def test_a_thrust_scale_is_tried_whatever_its_score(begun, monkeypatch):
     likelier = [Candidate(f"effect {i}", {}, 100.0 - i, 100.0 - i) for i in range(9)]
     candidates = [*likelier, Candidate("thrust_scale", {}, -5.0, 1.0)]
     tried = []
-    monkeypatch.setattr(there, "_fit_candidate", lambda now, c: tried.append(c.name))
+    monkeypatch.setattr(there, "_fit_candidate", lambda now, c, **_: tried.append(c.name))
     there.fit_best(start, candidates)
     assert "thrust_scale" in tried and "effect 8" not in tried
 
