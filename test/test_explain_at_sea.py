@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from tiers import more
 
 from bench.simulators import sea
@@ -158,21 +157,6 @@ def test_what_errors_of_the_attitude_make_of_the_righting_moment_is_not_left():
     within = (wrench <= of_attitude_errors(Hypothesis(config, {}))).mean(axis=0)
     np.testing.assert_allclose(within[[3, 4]], 0.95, atol=0.01)
     assert within.min() > 0.94
-
-
-def test_what_errors_of_the_attitude_make_at_one_frequency_is_less():
-    """Also of errors that last as long as makes most of them at that frequency."""
-    _, _, config = streams_of("clean", "six-axis", 0, 40.0)
-    rng, dt, within = np.random.default_rng(2), 0.05, []
-    for frequency, seconds in rng.uniform([0.1, 60.0], [1.0, 240.0], (400, 2)):
-        t = np.arange(0.0, seconds, dt)
-        keep = np.exp(-2.0 * np.pi * frequency * dt)
-        kicks = np.sqrt(1.0 - keep**2) * rng.standard_normal(len(t))
-        tilt = config.odometry.attitude_std * lfilter([1.0], [1.0, -keep], kicks)
-        of_it = np.abs(np.exp(-2j * np.pi * frequency * t) @ tilt) * np.sqrt(2.0) / len(t)  # rms
-        bound = of_attitude_errors(Hypothesis(config, {}), frequency * seconds)[3]
-        within.append(of_it * np.linalg.norm(config.model.body.restoring[3]) <= bound)
-    assert 0.95 < np.mean(within) < 1.0
 
 
 def test_the_covariance_of_an_attitude_error_whitens_what_it_makes():

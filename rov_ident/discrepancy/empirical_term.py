@@ -118,17 +118,11 @@ def residual(of: Finding, h: Hypothesis) -> Residual:
     """What the term stands for, as what is left is told: of one along an axis of the world, on the
     axis that gains most."""
     shape, gain = h.effects[NAME], of.gain
+    period = shape["first_high"] if int(shape["first"]) == TIME else 0.0
     share = 1.0 - (gain.rmse_after / gain.rmse_before) ** 2
     on = ON[int(shape["axis"])]
     axis = on if on in AXES else AXES[VELOCITIES.index(gain.component)]
-    return Residual(axis, OF[int(shape["first"])], _frequency(h), share)
-
-
-def _frequency(h: Hypothesis) -> float | None:
-    """Of a term that depends on the time in a period alone [Hz]."""
-    shape = h.effects[NAME]
-    alone = int(shape["first"]) == TIME
-    return 1.0 / shape["first_high"] if alone else None
+    return Residual(axis, OF[int(shape["first"])], 1.0 / period if period else None, share)
 
 
 def best_dependences(problem: WindowedProblem, now: Fitted, axes: Sequence[int]) -> list[Residual]:
@@ -151,8 +145,7 @@ def exceeds_errors_of_attitude(problem: WindowedProblem, fitted: Fitted) -> bool
     """Whether the term of a fit is more than errors of the attitude make of the righting moment."""
     h = fitted.hypothesis
     force = problem.columns(h, fitted.linearisation.motion, [SCALE])[:, :, 0] * h.values[SCALE]
-    cycles = problem.streams.duration * (_frequency(h) or 0.0)
-    return bool(np.any(np.sqrt(np.mean(force**2, axis=0)) > of_attitude_errors(h, cycles)))
+    return bool(np.any(np.sqrt(np.mean(force**2, axis=0)) > of_attitude_errors(h)))
 
 
 def _fitted(problem: WindowedProblem, now: Fitted, shape: Shape) -> Fitted | None:

@@ -266,6 +266,7 @@ def residuals(final: Fitted, trials: Trials) -> list[Residual]:
     surely gain what an effect must gain at all, and be more than errors of the attitude make of the
     righting moment, 95 % of them. The share is one of squares."""
     found, h, problem = [], final.hypothesis, final.linearisation.problem
+    of_attitude = of_attitude_errors(h)
     for name, trial in trials.items():
         if not name.startswith(UNKNOWN):
             continue
@@ -278,22 +279,17 @@ def residuals(final: Fitted, trials: Trials) -> list[Residual]:
         keys = [k for k in h.keys if effect_of(k) == name]
         columns = problem.columns(h, final.linearisation.motion, keys)
         force = columns[:, i] @ np.array([h.values[k] for k in keys])
-        cycles = float(frequency or 0.0) * problem.streams.duration
-        acts = np.sqrt(np.mean(force**2)) > of_attitude_errors(h, cycles)[i]
+        acts = np.sqrt(np.mean(force**2)) > of_attitude[i]
         if acts and gain is not None and gain.low >= 100.0 * PRACTICAL:
             share = float(1.0 - after.sum() / before.sum())
             found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
     return sorted(found, key=lambda r: -r.share)
 
 
-def of_attitude_errors(h: Hypothesis, cycles: float = 0.0) -> Array:
-    """What 95 % of the attitude's errors make at most of the wrench (6,) of weight and buoyancy; of
-    that which has one frequency, of which the data hold so many ``cycles``, if any. An error that
-    is correlated over tau (first-order Gauss-Markov) has, of its variance, 4 tau / (1 + (omega
-    tau)^2) per hertz, at most 1 / (pi f); a frequency is known to one over the duration."""
+def of_attitude_errors(h: Hypothesis) -> Array:
+    """What 95 % of the attitude's errors make at most of the wrench (6,) of weight and buoyancy."""
     size = np.linalg.norm(h.model.body.restoring, axis=1)
-    share = min(1.0, 1.0 / (np.pi * cycles)) if cycles else 1.0
-    out: Array = NORMAL * np.sqrt(share) * h.config.odometry.attitude_std * size
+    out: Array = NORMAL * h.config.odometry.attitude_std * size
     return out
 
 
