@@ -385,16 +385,16 @@ def test_an_axis_on_which_what_was_found_loses_stays_as_it_was(heavy):
     judge = Judge(WindowedProblem(streams, split(streams.duration)[1]))
     right, wrong = (COEFFICIENTS, "X_uu"), (COEFFICIENTS, "Y_vv")
     given = Hypothesis(config, {})
-    before = judge.summed(given)
+    before = extension.AsGiven(judge, judge.summed(given))
     found = Hypothesis(config, {right: theta["X_uu"], wrong: 0.5 * theta["Y_vv"]})
-    kept = extension.kept(judge, before, found)
+    kept = extension.kept(before, before, found)
     assert kept.axes == ("Y",) and kept.model.values == {right: theta["X_uu"]}
     assert "Y" in kept.note
-    assert extension.kept(judge, before, found.having({wrong: theta["Y_vv"]})).axes == ()
+    assert extension.kept(before, before, found.having({wrong: theta["Y_vv"]})).axes == ()
     both = found.having({right: 0.3 * theta["X_uu"]})
-    assert extension.kept(judge, before, both).model.values == {}
+    assert extension.kept(before, before, both).model.values == {}
     lagging = {("thruster_lag", "time_constant"): 0.5}
-    assert extension.kept(judge, before, both.having(lagging)).model is None
+    assert extension.kept(before, before, both.having(lagging)).model is None
 
 
 @pytest.mark.parametrize("seed", [5, *more(1, 2, 3, 4, 6)])

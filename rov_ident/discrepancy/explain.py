@@ -204,7 +204,11 @@ def explain(
     problem = WindowedProblem(data.recorded.judged, data.to_judge)
     as_recorded = Judge(problem, likeliest=likeliest)
     final = _without_minor_noise(shared.judged, data, of_sensors)
-    written = extension.kept(judge, as_recorded.summed(given), final)
+    written = extension.kept(
+        extension.AsGiven(judge, as_recorded.summed(given)),
+        extension.AsGiven(Judge(judge.problem, data.sensors), Judge(problem).summed(given)),
+        final,
+    )
     if written.model is None:
         shared = _Shared(given, given)
     best = written.model or given

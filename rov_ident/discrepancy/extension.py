@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.discrepancy.held_out import Judge, log_ratio, surely_less
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis
@@ -42,26 +43,49 @@ class Kept:
         )
 
 
-def kept(judge: Judge, given: Array, h: Hypothesis) -> Kept:
-    """What of a hypothesis may be written; ``given`` (C, 6) are the squared errors of the
-    configuration as given on held-out data, summed over chunks of time.
+@dataclass(frozen=True)
+class AsGiven:
+    """A judge, and the squared errors (C, 6) that the configuration as given has there, summed over
+    chunks of time."""
+
+    judge: Judge
+    errors: Array
+
+    def surely_worse(self, h: Hypothesis) -> NDArray[np.bool_]:
+        """Which velocities (6,) a hypothesis predicts worse, beyond chance."""
+        after = self.judge.summed(h)
+        return np.array(
+            [
+                free and surely_less(self.errors[:, [i]], after[:, [i]])
+                for i, free in enumerate(self.judge.free)
+            ]
+        )
+
+
+def kept(as_given: AsGiven, unweighted: AsGiven, h: Hypothesis) -> Kept:
+    """What of a hypothesis may be written.
 
     Of the choices that are nowhere worse (on axes whose coefficients stay: beyond chance) that
     which predicts best. Without any coefficient or effect it is the configuration given.
+
+    ``unweighted``: the same, each error counting alike. Weights excuse errors of a model that they
+    are from where it is wrongly unstable; without them, no velocity may be worse beyond chance.
     """
     rows = [a for a in AXES if any(row_of(h, k) == a for k in h.keys)]
+    judge, given = as_given.judge, as_given.errors
     best: tuple[float, Kept] | None = None
     for count in range(len(rows) + 1):
         for axes in combinations(rows, count):
             there = without_rows(h, axes)
-            after = judge.summed(there)
-            growth = log_ratio(after.sum(axis=0), given.sum(axis=0))  # guided axes have no errors
+            growth = log_ratio(judge.summed(there).sum(axis=0), given.sum(axis=0))
             own = np.array([a in rows and a not in axes for a in AXES])
-            worse = own & (growth > 0.0)
-            for i in np.flatnonzero(~own & judge.free):
-                worse[i] = surely_less(given[:, [i]], after[:, [i]])
-            total = float(growth[judge.free].sum())
-            if not worse[judge.free].any() and (best is None or total < best[0]):
+            worse = np.where(own, growth > 0.0, as_given.surely_worse(there))
+            total = float(growth[judge.free].sum())  # guided axes have no errors
+            if (
+                not worse[judge.free].any()
+                and (best is None or total < best[0])
+                and not unweighted.surely_worse(there).any()
+            ):
                 best = total, Kept(axes, there)
         if best is not None and count == 0:
             break  # nothing has to stay

@@ -64,13 +64,9 @@ class Test:
 
 @dataclass(frozen=True)
 class Consistency:
-    """The tests, and by how much wider they make every interval.
-
-    ``asks``: whether the method tests what the model leaves unexplained. Least squares does not.
-    """
+    """The tests, and by how much wider they make every interval."""
 
     tests: tuple[Test, ...]
-    asks: bool = True
 
     @property
     def consistent(self) -> bool:
@@ -102,8 +98,6 @@ class Consistency:
     def sentence(self) -> str:
         """What the worst test says, and what to do; or what it means that none fails."""
         failed = [test for test in self.tests if not test.passed]
-        if not failed and not self.asks:
-            return "no test fails, but least squares does not ask what the model leaves unexplained"
         if not failed and not self.judged:
             return (
                 "nothing contradicts the model, but there was too little motion, throughout or "
@@ -119,7 +113,7 @@ class Consistency:
         """Why nothing can have converged, in a few words; empty where something can."""
         if not self.consistent:
             return "data and model disagree"
-        return "too little motion yet to judge the model" if self.asks and not self.judged else ""
+        return "" if self.judged else "too little motion yet to judge the model"
 
     def of_states(self, states: Iterable[State], removed: Array) -> tuple[State, ...]:
         """The states of a fit: in :attr:`doubt` nothing has converged, and of what the intervals

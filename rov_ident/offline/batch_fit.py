@@ -136,7 +136,6 @@ def fit_batch(
     sensors = worst_of(bag.contradictions for bag in judged.bags)
     std = np.sqrt(np.diag(covariance)) if kind == "ml" else None
     consistency = consistency_of(config, prior, asked, unexplained, lasting, sensors, std)
-    consistency = replace(consistency, asks=kind == "ml")
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
     if unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
@@ -311,6 +310,10 @@ def _stage(
     seconds = float(sum(archive.each(_seconds)))
     covariance = covariance + attitude_covariance(config, names, seconds, gain)
     beyond_driving = covariance_beyond_driving(config, names, found, gain)
+    if kind != "ml":  # least squares takes the configured thrust for the true one
+        unexplained[free] = (solution.lasting / authority(config.dynamics))[free]
+        of_thrust = config.wrench.scale_std * solution.by_thrust
+        beyond_driving = beyond_driving + np.outer(of_thrust, of_thrust)
     if unmeasured:
         # What moments and tilt suggest of these is in the values; the intervals are the prior's.
         impossible = [n for n, c in _coefficients(config).items() if is_impossible(c)]

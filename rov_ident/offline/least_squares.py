@@ -44,6 +44,8 @@ from rov_ident.sampling.sample import free_axes, parts
 
 PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
 _LAG = 2.0  # s; window over the correlation of the residuals
+_LASTING = 1.0  # s, as of a force that the other estimators call unexplained; three time constants
+# of the filter, so that noise is hardly alike so far apart
 _ROUNDS = 4  # a guard: of instruments, each simulated with the coefficients of the one before
 _KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
 # quarters of the prior variance are gone
@@ -72,13 +74,17 @@ class Solution:
     """values and covariance of the estimated coefficients, in their units.
 
     ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
-    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m].
+    counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m], and
+    ``lasting`` (6,) that of the part which lasts a second. ``by_thrust`` (n,): by how much the
+    values change with the scale of all thrust, per 1.
     """
 
     values: Array
     covariance: Array
     information: Array
     noise: Array
+    lasting: Array
+    by_thrust: Array
     rows: int
 
 
@@ -153,12 +159,18 @@ def solve(
     moved = np.eye(len(held))[:, held]  # all, by what is held
     moved[~held] = -inverse @ normal[by_held]
     covariance += moved @ moved.T / precision
+    by_thrust = np.zeros(len(held))
+    pushed: Array = np.sum(np.array(each(thrust_of, batch, weight / repeats)), axis=0)
+    by_thrust[~held] = inverse @ pushed[~held]
+    lasting: Array = np.sum(np.array(each(lasting_of, batch, x)), axis=0)
     information = np.where(np.outer(~held, ~held), information, 0.0)
     return Solution(
         task.theta[task.estimated] + task.scale * x,
         covariance * np.outer(task.scale, task.scale),
         information,
         noise,
+        np.sqrt(np.maximum(lasting[0], 0.0) / np.maximum(lasting[1], 1.0)),
+        task.scale * by_thrust,
         int(moments.rows[free].sum()),
     )
 
@@ -168,8 +180,8 @@ def solve(
 
 def moments_of(samples: Samples, batch: Batch) -> Moments:
     """The sums of one bag's samples (k,) of SAMPLE."""
-    phi, z = _rows_and_instruments(samples, batch)
-    return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(len(phi))))
+    phi, z, good = _rows_and_instruments(samples, batch)
+    return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(good.sum())))
 
 
 def known_squares(samples: Samples, batch: Batch) -> Array:
@@ -193,7 +205,7 @@ def _inertia_of(task: Regression) -> NDArray[np.bool_]:
 
 def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
     """Covariance (n, n) of one bag's accumulated ``sum w Z' e``, correlation in time included."""
-    phi, z = _rows_and_instruments(samples, batch)
+    phi, z, _ = _rows_and_instruments(samples, batch)
     error = phi[:, :, -1] - phi[:, :, :-1] @ x
     score = np.einsum("ka,kai->ki", error * weight, z[:, :, :-1])
     total, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
@@ -201,7 +213,29 @@ def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array
     return total
 
 
-def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array]:
+def lasting_of(samples: Samples, batch: Batch, x: Array) -> Array:
+    """Products of one bag's residuals a second apart, and how many: sums (2, 6). Their mean is the
+    power of what lasts, to which noise adds nothing."""
+    phi, _, good = _rows_and_instruments(samples, batch)
+    error, lag = phi[:, :, -1] - phi[:, :, :-1] @ x, round(_LASTING / PERIOD)
+    products = np.sum(error[:-lag] * error[lag:], axis=0)
+    return np.stack([products, np.full(6, float(np.sum(good[:-lag] & good[lag:])))])
+
+
+def thrust_of(samples: Samples, batch: Batch, weight: Array) -> Array:
+    """(n,): one bag's ``sum w Z' F[thrust]``."""
+    phi, z, _ = _rows_and_instruments(samples, batch)
+    doubled = samples.copy()
+    for part in ("wrench", "wrench_slope"):
+        doubled[part] += samples[part] - samples[part.replace("wrench", "surroundings")]
+    twice = _rows_and_instruments(doubled, batch._replace(instruments=None))[0]
+    thrust = twice[:, :, -1] - phi[:, :, -1]
+    total: Array = np.einsum("ka,kai->i", thrust * weight, z[:, :, :-1])
+    return total
+
+
+def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """[Phi y] and [Z y] (K, 6, n + 1), and which rows (K,) are known; of all others they are 0."""
     samples, _ = parts(samples)
     z = phi = filtered_rows(batch.task, samples, PERIOD)
     if batch.instruments is not None:  # along the motion that the model says, through the water
@@ -213,10 +247,11 @@ def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array]
         simulated["nu"][:, :3] -= samples["water"]
         z = filtered_rows(batch.task, simulated, PERIOD)
         z[:, :, -1] = phi[:, :, -1]
+    good = np.asarray(np.isfinite(z).all(axis=(1, 2)), dtype=bool)
     unknown = ~free_axes(samples)
     z[:, unknown] = phi[:, unknown] = 0.0
-    good = np.isfinite(z).all(axis=(1, 2))
-    return phi[good], z[good]
+    z[~good] = phi[~good] = 0.0
+    return phi, z, good
 
 
 @kernel
