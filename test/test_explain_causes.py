@@ -395,6 +395,9 @@ def test_an_axis_on_which_what_was_found_loses_stays_as_it_was(heavy):
     assert extension.kept(before, before, both).model.values == {}
     lagging = {("thruster_lag", "time_constant"): 0.5}
     assert extension.kept(before, before, both.having(lagging)).model is None
+    excused = extension.AsGiven(judge, 100.0 * before.errors)  # by weights that suit what was found
+    assert extension.kept(excused, excused, found).axes == ()
+    assert extension.kept(excused, before, found).axes == ("Y",)
 
 
 @pytest.mark.parametrize("seed", [5, *more(1, 2, 3, 4, 6)])

@@ -4,8 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tiers import more
 
+from bench.studies.at_sea import Trial, measure
 from rov_ident.config.prior import prior_of
+from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares as ls
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.sampling import records
@@ -118,3 +121,51 @@ def test_a_rich_dive_tells_everything(heavy, two_minutes):
     assert base.unidentified == ()
     assert 1.0 < base.condition < 1e4
     assert {str(c) for c in base.combinations} == set(heavy.model.names)
+
+
+CASES = ["known", "clean", "thrust scale", "thruster lag", "current", "trim", "sag and advance"]
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("driving", "seed"), [("six-axis", 3), *more(("pilot", 4), ("pilot", 5))])
+def test_what_it_cannot_know_is_in_the_intervals_or_said(case, driving, seed):
+    """Data by a simulator that shares no code with the package."""
+    fit = measure(Trial(case, driving, seed, 60.0, "ls"))
+    lower, true, upper = (np.array(fit[key]) for key in ("lower", "true", "upper"))
+    right = np.mean((lower <= true) & (true <= upper))
+    assert right >= 0.9 or not fit["consistent"]
+    assert "converged" not in fit["state"] or fit["consistent"]
+    if case in ("known", "clean"):
+        assert fit["consistent"], fit["sentence"]
+    elif case != "thrust scale":
+        assert not fit["consistent"]
+
+
+@pytest.mark.parametrize("instrumental", [False, True])
+def test_how_values_follow_the_scale_of_thrust(heavy, off, instrumental):
+    """As when all of the wrench is 1 % more; simulated instruments move a little, too."""
+    samples = samples_of(heavy, 30.0)
+    more_thrust = samples.copy()
+    for part in ("wrench", "wrench_slope"):
+        more_thrust[part] *= 1.01
+    found, moved = (
+        ls.solve(in_one(s), off, instrumental=instrumental, weighted=False)
+        for s in (samples, more_thrust)
+    )
+    difference = (moved.values - found.values) / 0.01
+    size = np.maximum(np.abs(difference), np.abs(found.values))
+    assert np.all(np.abs(found.by_thrust - difference) < (0.05 if instrumental else 1e-6) * size)
+
+
+def test_noise_is_nothing_that_lasts(heavy, off):
+    """A force that wanders is told to a tenth; the noise of the sensors alone is far below."""
+    samples = samples_of(heavy, 120.0)
+    quiet = ls.solve(in_one(samples), off)
+    assert np.all(quiet.lasting < 0.01 * authority(heavy.dynamics))
+    rng, blown = np.random.default_rng(8), samples.copy()
+    force, keep = 0.0, np.exp(-samples["dt"] / 20.0)
+    for k, draw in enumerate(rng.standard_normal(len(samples))):
+        force = keep[k] * force + np.sqrt(1.0 - keep[k] ** 2) * 5.0 * draw
+        blown["wrench"][k, 1] -= force
+    left = ls.solve(in_one(blown), off).lasting
+    assert 1.0 < left[1] < 6.0

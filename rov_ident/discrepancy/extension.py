@@ -68,8 +68,8 @@ def kept(as_given: AsGiven, unweighted: AsGiven, h: Hypothesis) -> Kept:
     Of the choices that are nowhere worse (on axes whose coefficients stay: beyond chance) that
     which predicts best. Without any coefficient or effect it is the configuration given.
 
-    ``unweighted``: the same, each error counting alike. Weights excuse errors of a model that they
-    are from where it is wrongly unstable; without them, no velocity may be worse beyond chance.
+    ``unweighted``: the same with every error counting alike. Weights say how noise grows in the
+    likeliest model; where that is wrongly unstable they excuse its own errors.
     """
     rows = [a for a in AXES if any(row_of(h, k) == a for k in h.keys)]
     judge, given = as_given.judge, as_given.errors
