@@ -26,6 +26,7 @@ from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import Values
 from rov_ident.model.equations import Array
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams
 
 _LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
@@ -214,16 +215,20 @@ def _with(f: Finding, repetition: Repetition, first: int = 0) -> Finding:
     if first:
         return dataclasses.replace(f, repetition=repetition)
     names = repetition.records[0]  # an onset belongs to one record
-    several = [", ".join(f"{of[n].value:.3g}" for of in repetition.records) for n in names]
     if repetition.same:
         words = " It is the same in each record."
     else:
-        told = "; ".join(f"{n} {v}" for n, v in zip(names, several))
-        words = f" The records differ: {told}."
+        several = (", ".join(_in_figures(of[n]) for of in repetition.records) for n in names)
+        told = "; ".join(f"{n} {values}" for n, values in zip(names, several))
+        words = f" The records differ: {told} (± 95 %)."
     if repetition.repeats is False:
         words += " Fitted to the others, it does not predict a record that was left out."
     f = unsure(f) if repetition.repeats is False else f
     return dataclasses.replace(f, repetition=repetition, sentence=f.sentence + words)
+
+
+def _in_figures(v: Value) -> str:
+    return f"{v.value:.3g} ± {NORMAL * v.std:.2g}" if np.isfinite(v.std) else "not told"
 
 
 def _left_out(
