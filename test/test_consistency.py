@@ -361,3 +361,23 @@ def test_a_fit_to_part_of_the_commands_says_so(tmp_path):
         assert "motion ahead of the wrench" in [test.name for test in found.tests]
         assert found.consistent == (name == "all"), found.sentence
     assert "record each command" in found.sentence
+
+
+@pytest.mark.parametrize("kind", ["ls", "rls"])
+def test_late_thrust_is_told_where_nothing_in_the_model_is_late(tmp_path, kind):
+    """Least squares estimates no lag, nor does RLS where it is said to be none: added mass takes it
+    up, beside what little of it is left to other tests."""
+    _, parameters, messages = dive("", "six-axis", 3)
+    known = {"wrench": {"lag_std": 0.0}, "odometry": {"latency_std": 0.0}}
+    exact = {**parameters, **{key: {**parameters.get(key, {}), **known[key]} for key in known}}
+    early = [(t, r, m._replace(stamp=m.stamp - 25_000_000) if r == "wrench" else m)
+             for t, r, m in messages]  # fmt: skip
+    for name, sent in (("exact", messages), ("late", early)):
+        write_messages(tmp_path / f"{name}.mcap", sent)
+        found = ri.fit(tmp_path / f"{name}.mcap", configuration.from_parameters(exact), kind)
+        failed = [test.name for test in found.consistency.tests if not test.passed]
+        assert ("motion behind the wrench" in failed) == (name == "late")
+        assert found.consistency.consistent == (name == "exact"), found.consistency.sentence
+        assert (State.CONVERGED in found.states) == (name == "exact")
+    late = ri.fit(tmp_path / "late.mcap", configuration.from_parameters(parameters), "rls")
+    assert "motion behind the wrench" not in [test.name for test in late.consistency.tests]

@@ -501,13 +501,13 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
 def test_commands_that_were_not_recorded(driving, seed):
     """A controller at 50 Hz, of whose commands one in five is published: what is held is late."""
     _, streams, config = streams_of("clean", driving, seed, 120.0)
-    (test,) = delays.tests_of(streams, config)
+    (test,) = delays.tests_of(streams, config, late=True)
     assert test.passed
     tenth = slice(int(np.random.default_rng(seed).integers(5)), None, 5)
     thinned = dataclasses.replace(
         streams, demand_t=streams.demand_t[tenth], demand=streams.demand[tenth]
     )
-    (test,) = delays.tests_of(thinned, config)
+    (test,) = delays.tests_of(thinned, config, late=True)
     assert not test.passed and test.value == pytest.approx(0.04, abs=0.01)
 
 

@@ -167,7 +167,8 @@ def fit(
             _refuse_unusable(many, given)
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
-        found = found.with_tests(_message_tests([bag.path for bag in many.bags], given))
+        late = delays.is_late(found.given.effects)
+        found = found.with_tests(_message_tests([bag.path for bag in many.bags], given, late))
         if table:
             found = _with_table_notes(found, given, table)
         found = dataclasses.replace(found, notes=(*repeated, *placed, *found.notes))
@@ -187,8 +188,9 @@ def _judged(found: Fit, given: Config, validate: File, fitted: list[Path], say: 
         return dataclasses.replace(found, notes=notes, more=more, judged=curves(*runs))
 
 
-def _message_tests(paths: Sequence[Path], config: Config) -> list[Test]:
-    """Tests of sensors and clocks on the first messages of each bag: the worst result of each."""
+def _message_tests(paths: Sequence[Path], config: Config, late: bool) -> list[Test]:
+    """Tests of sensors and clocks on the first messages of each bag: the worst result of each;
+    ``late``: whether the model that was fitted has thrust or velocities that are."""
     worst: dict[str, Test] = {}
     for path in paths:
         bag = Bag(path)
@@ -196,7 +198,7 @@ def _message_tests(paths: Sequence[Path], config: Config) -> list[Test]:
         if has_velocity(bag, chosen, config):
             first = itertools.islice(topics.messages(bag, chosen, config), _COMPARED)
             streams = gather(first, config)
-            for test in (*tests_of(streams, config), *delays.tests_of(streams, config)):
+            for test in (*tests_of(streams, config), *delays.tests_of(streams, config, late)):
                 before = worst.get(test.name, test)
                 worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
     return list(worst.values())

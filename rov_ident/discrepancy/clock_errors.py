@@ -43,7 +43,7 @@ class ClockErrors:
 
 def of(bags: Sequence[Streams], config: Config) -> ClockErrors:
     """The errors of the clocks of some bags, the worst of each kind."""
-    tests = [test for bag in bags for test in delays.tests_of(bag, config)]
+    tests = [test for bag in bags for test in delays.tests_of(bag, config, late=True)]
     return ClockErrors(
         max((test.value for test in tests if not test.passed), default=0.0),
         max(delays.surely_behind_imu(bag, config) for bag in bags),

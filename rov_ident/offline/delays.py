@@ -4,6 +4,7 @@ Both are told without a simulation: the gyro reads what the odometry's attitude 
 and filtered wrench and motion are one regression, with the delay as one more coefficient.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.messages import Array
+from rov_ident.effects import EFFECTS
 from rov_ident.estimation.consistency import Test
 from rov_ident.model.scales import authority
 from rov_ident.offline.batch_fit import AT_REST
@@ -28,7 +30,7 @@ _FEWEST_TIMED = 100  # messages of the IMU; fewer say nothing of delays
 FIRST_ORDER = 1.0  # s; what is further is beyond the manoeuvres about which a delay is linear
 MATTERS = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % of its added mass
 SURELY = 5.0  # standard deviations: these are of the noise alone, and clean dives reach 4.5
-_AHEAD = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
+_EXACT = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
 # 45 simulated dives with exact stamps, while 15 ms of a wrong clock made 17
 _FEWEST_ROWS = 20  # of filtered wrench and motion; about as many as there are coefficients
 
@@ -45,7 +47,13 @@ class Delay:
         """By how much [s] what should follow is ahead, 0 where it is not; and what only stamps that
         are wrong, or commands that were not recorded, exceed."""
         ahead = -self.value if abs(self.value) < FIRST_ORDER else 0.0
-        return max(ahead, 0.0), max(_AHEAD, SURELY * self.std)
+        return max(ahead, 0.0), max(_EXACT, SURELY * self.std)
+
+    @property
+    def behind(self) -> tuple[float, float]:
+        """By how much [s] what follows is behind, 0 where it is not; and what only lag and stamps
+        exceed."""
+        return Delay(-self.value, self.std).ahead
 
 
 NO_DELAY = Delay(np.nan, np.nan)
@@ -70,6 +78,15 @@ def ahead_of_wrench(ahead: float) -> str:
     return (
         f"the motion is {1e3 * ahead:.0f} ms ahead of the wrench, as nothing that thrusts can be: "
         "correct the time stamps, or record each command that the controller sends"
+    )
+
+
+def behind_wrench(behind: float) -> str:
+    """What it means that the motion is so long [s] behind, in a model in which nothing is late."""
+    return (
+        f"the motion is {1e3 * behind:.0f} ms behind the wrench, and nothing in this fit makes it "
+        "late, so that added mass and damping do: correct the time stamps, or let the file have a "
+        "lag (wrench.lag_std, effects.thruster_lag; rls, ukf and ml estimate it)"
     )
 
 
@@ -185,12 +202,23 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
     return Delay(float(x[-1]), float(np.sqrt(variance)))
 
 
-def tests_of(streams: Streams, config: Config) -> list[Test]:
-    """Whether the motion is ahead of the wrench: what a fit asks that learns from both. Nothing
-    where nothing moves, or fins and propellers drive it, too: the wrench alone says not when."""
+def is_late(effects: Iterable[str]) -> bool:
+    """Whether any of the effects makes thrust or velocities late."""
+    return any("late" in EFFECTS[name].traits or EFFECTS[name].late for name in effects)
+
+
+def tests_of(streams: Streams, config: Config, late: bool) -> list[Test]:
+    """Whether the motion is ahead of the wrench: what a fit asks that learns from both; and where
+    nothing in its model makes thrust or velocities ``late``, whether it is behind. Nothing where
+    nothing moves, or fins and propellers drive it, too: the wrench alone says not when.
+    """
     rows = None if len(streams.inputs_t) else filtered(samples_of(streams), config)
-    late = NO_DELAY if rows is None else motion_behind_wrench(rows)
-    if not np.isfinite(late.value):
+    found = NO_DELAY if rows is None else motion_behind_wrench(rows)
+    if not np.isfinite(found.value):
         return []
-    ahead, limit = late.ahead
-    return [Test("motion ahead of the wrench", ahead, limit, ahead_of_wrench(ahead))]
+    ahead, limit = found.ahead
+    tests = [Test("motion ahead of the wrench", ahead, limit, ahead_of_wrench(ahead))]
+    if not late:
+        behind, limit = found.behind
+        tests.append(Test("motion behind the wrench", behind, limit, behind_wrench(behind)))
+    return tests
