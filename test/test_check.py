@@ -416,6 +416,21 @@ def test_a_vehicle_that_is_not_armed(at_sea):
             run(path, config)
 
 
+@pytest.mark.parametrize("more", [0.0, 0.02])
+def test_velocities_that_are_noisier_than_they_say(at_sea, more):
+    """The fit takes that for a force: what is wrong is in the messages or the file."""
+    rng = np.random.default_rng(9)
+
+    def change(role, m):
+        noise = more * rng.standard_normal(3)
+        return m._replace(linear=m.linear + noise) if isinstance(m, Odometry) else m
+
+    path, config = at_sea(9, change)
+    remarks = [r for r in check(path, config).remarks if r.subject == "noise of the velocities"]
+    assert bool(remarks) == bool(more)
+    assert all(r.level == WARNING and "0.02" in r.text for r in remarks)
+
+
 def test_a_vehicle_at_a_steady_speed_moves(at_sea):
     """Drag balances the wrench; hardly anything accelerates it."""
     speed = np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0])

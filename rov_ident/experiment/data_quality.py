@@ -20,6 +20,7 @@ from rov_ident.core.frames import quaternion_angle, quaternion_from_euler
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONVERGED, IDENTIFIABLE, State, of_fit
+from rov_ident.discrepancy.sensor_consistency import comparisons
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
@@ -42,6 +43,7 @@ _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
 _MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
 _THIN = 1.02  # a flat plate has 1; the rest is for rounded numbers
+_HALF = 2.0  # times the variance that is said of a velocity: half of its noise is not
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
 
 
@@ -191,6 +193,7 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
     remarks += [Remark("mounting", GOOD, note) for note in placed]
     remarks += _mounting_remarks(sensor_placement(bag, frames), config)
     remarks += _inertia_remarks(config)
+    remarks += _noise_remarks(streams, record, config)
     failed = (test for test in tests_of(streams, config) if not test.passed)
     remarks += [Remark("velocity sensor", BAD, test.failure) for test in failed]
     motion, quick = of_dynamics(record.samples, config), None
@@ -247,6 +250,24 @@ def _inertia_remarks(config: Config) -> Iterator[Remark]:
             f"no body has the principal moments {told} kg m2, of which one is more than the sum of "
             "the others: check the values and their order xx yy zz xy xz yz",
         )  # fmt: skip
+
+
+def _noise_remarks(streams: Streams, record: Record, config: Config) -> Iterator[Remark]:
+    """Whether the velocities are noisier than is said of them: the difference is taken for forces.
+    The IMU tells, whose integral between two messages has hardly any noise."""
+    if not streams.nu[:, :3].any():
+        return
+    against_imu = [c.scale for c in comparisons(streams, config, {}) if c.name == "imu"]
+    variance = record.samples["odometry_variance"][record.samples["measured"], :3]
+    said = float(np.sqrt(np.median(variance.mean(axis=1)))) if len(variance) else np.inf
+    for noise in against_imu:
+        if noise**2 > _HALF * said**2:
+            yield Remark(
+                "noise of the velocities", WARNING,
+                f"{noise:.2g} m/s, {noise / said:.1f} times what the messages, or else "
+                "odometry.linear_std, say: correct that, or a fit takes the difference for forces "
+                "that the model does not have",
+            )  # fmt: skip
 
 
 _MODEL = "model and data"
