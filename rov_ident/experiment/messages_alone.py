@@ -223,7 +223,10 @@ def of_dynamics(samples: NDArray[np.void], config: Config) -> list[Remark]:
     trim = config.dynamics.restoring_force(samples["down"].mean(axis=0))  # which rest needs, too
     motion = np.hypot(np.std(moved, axis=0), np.mean(moved, axis=0) - trim)
     if np.all(motion[driven] < _UNMOVED * size[driven]):
-        text = "the vehicle does not move, whatever the wrench: was it armed, and in the water?"
+        text = (
+            "the vehicle does not move, whatever the wrench: was it armed, and in the water? Or "
+            "does it hold its place (against a current, on the ground), which tells nothing?"
+        )
         return [Remark(subject, BAD, text, hopeless=True)]
     judged = driven & (np.sqrt(np.mean(moved**2, axis=0)) < _OTHER_FORCES * size)
     by_name = {MOTIONS[i]: _correlation(wrench[:, i], moved[:, i]) for i in np.flatnonzero(judged)}
