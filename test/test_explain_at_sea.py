@@ -494,6 +494,10 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
         reckoned = dataclasses.replace(streams, nu=scaled, position=way)
         tests = {test.name: test.passed for test in velocity_sensor.tests_of(reckoned, config)}
         assert tests["velocity sensor: velocity_scale"] is passes, factor
+    quiet = streams.nu * np.repeat([0.03, 1.0], 3)  # near the noise, which makes a factor too small
+    still = dataclasses.replace(streams, nu=quiet, position=0.03 * streams.position)
+    lively, limit = (velocity_sensor.tests_of(s, config)[0].limit for s in (streams, still))
+    assert lively < 0.06 and limit > 0.2
 
 
 @pytest.mark.parametrize("driving", ["pilot", "six-axis"])

@@ -25,15 +25,20 @@ def tests_of(streams: Streams, config: Config) -> list[Test]:
     Where positions are not measured, only a factor above one is judged: the IMU's noise, in both
     what is compared and what it is compared with, makes it too small on a quiet dive. A mounting is
     judged by the IMU alone, as the heading of a pose is often wrong, or its attitude tilted.
+
+    Noise in what a factor is found with makes it too small, by its share of the power at most
+    (Fuller 1987, sec. 1.1): with hardly any motion that is no factor of the sensor.
     """
     if streams.duration < 1.0 or not streams.nu[:, :3].any():
         return []
     if surely_behind_imu(streams, config) > MATTERS:
         return []
+    power = max(float(np.sum(np.var(streams.nu[:, :3], axis=0))), 1e-12)
+    scaled = _SCALED + 3.0 * config.odometry.linear_std**2 / power
     alone = dataclasses.replace(streams, position=np.zeros_like(streams.position))
     tests = []
     for name, sensors, harmless, told in (
-        ("velocity_scale", streams, _SCALED, "reads wrong by a factor, unless a filter does"),
+        ("velocity_scale", streams, scaled, "reads wrong by a factor, unless a filter does"),
         ("sensor_misalignment", alone, _MOUNTED, "is turned against the IMU"),
     ):
         if name in config.effects:
