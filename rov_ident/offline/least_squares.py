@@ -61,6 +61,21 @@ class Moments(NamedTuple):
     rows: Array
 
 
+class Residuals(NamedTuple):
+    """Of the residuals at a solution of n coefficients, in prior standard deviations.
+
+    ``scatter`` (n, n): covariance of the accumulated ``sum w Z' e``, correlation in time included;
+    ``of_thrust`` (n,): ``sum w Z' F[thrust]``; ``products`` (6,): of residuals a second apart,
+    summed over so many ``pairs`` (6,). Their mean is the power of what lasts, to which noise adds
+    nothing.
+    """
+
+    scatter: Array
+    of_thrust: Array
+    products: Array
+    pairs: Array
+
+
 class Batch(NamedTuple):
     """What the passes over the bags need to know."""
 
@@ -150,26 +165,24 @@ def solve(
         if np.abs(x - old).max() < 1e-4:
             break
     say("residuals")
-    scatter = sum(each(scatter_of, batch, x, weight / repeats)) + prior
+    left = total(each(residuals_of, batch, x, weight / repeats))
     told, by_held = np.ix_(~held, ~held), np.ix_(~held, held)
     inverse = np.asarray(np.linalg.inv((normal + prior)[told]), dtype=np.float64)
     least = np.diag(scaled_inverse((information + prior)[told]))
     covariance = np.zeros_like(prior)
-    covariance[told] = widened(sandwich(inverse, scatter[told]), least)
+    covariance[told] = widened(sandwich(inverse, (left.scatter + prior)[told]), least)
     moved = np.eye(len(held))[:, held]  # all, by what is held
     moved[~held] = -inverse @ normal[by_held]
     covariance += moved @ moved.T / precision
     by_thrust = np.zeros(len(held))
-    pushed: Array = np.sum(np.array(each(thrust_of, batch, weight / repeats)), axis=0)
-    by_thrust[~held] = inverse @ pushed[~held]
-    lasting: Array = np.sum(np.array(each(lasting_of, batch, x)), axis=0)
+    by_thrust[~held] = inverse @ left.of_thrust[~held]
     information = np.where(np.outer(~held, ~held), information, 0.0)
     return Solution(
         task.theta[task.estimated] + task.scale * x,
         covariance * np.outer(task.scale, task.scale),
         information,
         noise,
-        np.sqrt(np.maximum(lasting[0], 0.0) / np.maximum(lasting[1], 1.0)),
+        np.sqrt(np.maximum(left.products, 0.0) / np.maximum(left.pairs, 1.0)),
         task.scale * by_thrust,
         int(moments.rows[free].sum()),
     )
@@ -203,35 +216,24 @@ def _inertia_of(task: Regression) -> NDArray[np.bool_]:
     return on_axis[task.estimated]
 
 
-def scatter_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Array:
-    """Covariance (n, n) of one bag's accumulated ``sum w Z' e``, correlation in time included."""
-    phi, z, _ = _rows_and_instruments(samples, batch)
-    error = phi[:, :, -1] - phi[:, :, :-1] @ x
-    score = np.einsum("ka,kai->ki", error * weight, z[:, :, :-1])
-    total, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
-    _accumulate_scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), total, lagged)
-    return total
-
-
-def lasting_of(samples: Samples, batch: Batch, x: Array) -> Array:
-    """Products of one bag's residuals a second apart, and how many: sums (2, 6). Their mean is the
-    power of what lasts, to which noise adds nothing."""
-    phi, _, good = _rows_and_instruments(samples, batch)
+def residuals_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Residuals:
+    """What one bag's residuals ``e = y - Phi x`` tell."""
+    phi, z, good = _rows_and_instruments(samples, batch)
     error, lag = phi[:, :, -1] - phi[:, :, :-1] @ x, round(_LASTING / PERIOD)
-    products = np.sum(error[:-lag] * error[lag:], axis=0)
-    return np.stack([products, np.full(6, float(np.sum(good[:-lag] & good[lag:])))])
-
-
-def thrust_of(samples: Samples, batch: Batch, weight: Array) -> Array:
-    """(n,): one bag's ``sum w Z' F[thrust]``."""
-    phi, z, _ = _rows_and_instruments(samples, batch)
+    left = z[:, :, :-1] * weight[:, None]
+    score = np.einsum("ka,kai->ki", error, left)
+    scatter, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
+    _accumulate_scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), scatter, lagged)
     doubled = samples.copy()
-    for part in ("wrench", "wrench_slope"):
-        doubled[part] += samples[part] - samples[part.replace("wrench", "surroundings")]
+    for part, other in (("wrench", "surroundings"), ("wrench_slope", "surroundings_slope")):
+        doubled[part] += samples[part] - samples[other]
     twice = _rows_and_instruments(doubled, batch._replace(instruments=None))[0]
-    thrust = twice[:, :, -1] - phi[:, :, -1]
-    total: Array = np.einsum("ka,kai->i", thrust * weight, z[:, :, :-1])
-    return total
+    return Residuals(
+        scatter,
+        np.einsum("ka,kai->i", twice[:, :, -1] - phi[:, :, -1], left),
+        np.sum(error[:-lag] * error[lag:], axis=0),
+        np.full(6, float(np.sum(good[:-lag] & good[lag:]))),
+    )
 
 
 def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -247,9 +249,9 @@ def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array,
         simulated["nu"][:, :3] -= samples["water"]
         z = filtered_rows(batch.task, simulated, PERIOD)
         z[:, :, -1] = phi[:, :, -1]
-    good = np.asarray(np.isfinite(z).all(axis=(1, 2)), dtype=bool)
     unknown = ~free_axes(samples)
     z[:, unknown] = phi[:, unknown] = 0.0
+    good = np.asarray(np.isfinite(z).all(axis=(1, 2)), dtype=bool)
     z[~good] = phi[~good] = 0.0
     return phi, z, good
 
