@@ -20,7 +20,7 @@ from rov_ident.core.frames import quaternion_angle, quaternion_from_euler
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONVERGED, IDENTIFIABLE, State, of_fit
-from rov_ident.discrepancy.sensor_consistency import comparisons
+from rov_ident.discrepancy.sensor_consistency import comparisons, search
 from rov_ident.discrepancy.velocity_sensor import tests_of
 from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
@@ -254,10 +254,12 @@ def _inertia_remarks(config: Config) -> Iterator[Remark]:
 
 def _noise_remarks(streams: Streams, record: Record, config: Config) -> Iterator[Remark]:
     """Whether the velocities are noisier than is said of them: the difference is taken for forces.
-    The IMU tells, whose integral between two messages has hardly any noise."""
+    The IMU tells, whose integral between two messages has hardly any noise, once what sensors are
+    late or off by has been taken away."""
     if not streams.nu[:, :3].any():
         return
-    against_imu = [c.scale for c in comparisons(streams, config, {}) if c.name == "imu"]
+    sensors, _ = search(streams, config, [(0.0, streams.duration)])
+    against_imu = [c.scale for c in comparisons(streams, config, sensors) if c.name == "imu"]
     variance = record.samples["odometry_variance"][record.samples["measured"], :3]
     said = float(np.sqrt(np.median(variance.mean(axis=1)))) if len(variance) else np.inf
     for noise in against_imu:
