@@ -696,7 +696,11 @@ def test_a_thrust_scale_is_tried_whatever_its_score(begun, monkeypatch):
     likelier = [Candidate(f"effect {i}", {}, 100.0 - i, 100.0 - i) for i in range(9)]
     candidates = [*likelier, Candidate("thrust_scale", {}, -5.0, 1.0)]
     tried = []
-    monkeypatch.setattr(there, "_fit_candidate", lambda now, c, **_: tried.append(c.name))
+
+    def fit_candidate(now, candidate, from_file=False):
+        tried.append(candidate.name)
+
+    monkeypatch.setattr(there, "_fit_candidate", fit_candidate)
     there.fit_best(start, candidates)
     assert "thrust_scale" in tried and "effect 8" not in tried
 
