@@ -28,6 +28,8 @@ from bench.studies.explain import (
 )
 from rov_ident.config import from_parameters, load, to_parameters
 from rov_ident.core.errors import UserError
+from rov_ident.core.progress import silent
+from rov_ident.discrepancy import explain as explaining
 from rov_ident.discrepancy import screening, sensor_consistency
 from rov_ident.discrepancy import search as discrepancy
 from rov_ident.discrepancy.explain import (
@@ -652,3 +654,31 @@ def test_an_effect_that_ends_at_its_null_is_none(values, left):
     last = SimpleNamespace(hypothesis=SimpleNamespace(values=dict(zip(keys, values))))
     search = SimpleNamespace(keys_of=lambda fitted, name: keys)
     assert is_left(search, last, "late") is left
+
+
+def test_structure_is_not_right_while_the_held_out_data_leave_an_effect_open():
+    """Fitted data supported a lag of 0.1 s, the held-out data allowed -39 to 64 % of gain."""
+    sure, open_ = Gain("u", 0.1, 0.099, 1.0, 0.5, 1.5), Gain("u", 0.1, 0.07, 30.0, -39.0, 64.0)
+    values = {"time_constant": Value(0.1, 0.01, "s")}
+    for gain, verdict in ((sure, "retuned"), (open_, "unexplained")):
+        lag = Finding("thruster_lag", ("X",), values, None, gain, True, None, (), "")
+        assert explaining._verdict([], [lag], [], {}, True) == verdict
+        assert explaining._verdict([lag], [lag], [], {}, True) == "explained"
+    bias = Finding("imu_bias", (), values, None, open_, True, None, (), "")
+    assert explaining._verdict([], [bias], [], {}, True) == "retuned"  # the sensors', no force
+
+
+def test_a_model_from_before_the_last_effects_is_kept_where_it_is_likelier(monkeypatch):
+    """A wave led to another minimum, where a rival of it ended at nothing: its model was dearer
+    than the one that was only retuned, and the rival was named on a clean bag."""
+    monkeypatch.setattr(explaining, "residuals", lambda final, trials: [])
+    costs = {"retuned": 0.0, "with a wave": 125.0, "with its rival": 124.0}
+    search = SimpleNamespace(
+        run=lambda progress, start: ["retuned", "with a wave"],
+        try_rivals=lambda fitted, progress=None: (fitted.replace("a wave", "its rival"), {}),
+        cost=lambda fitted, best: costs[fitted],
+        unexplained=lambda fitted: [],
+    )
+    for costs["retuned"], kept in ((100.0, "retuned"), (130.0, "with its rival")):
+        _, model, _ = explaining._searched(search, None, silent)
+        assert model.final == kept

@@ -350,6 +350,11 @@ def test_verdicts_in_words():
         "if on anything, on pitch (10 % of what is left). Quadratic damping may explain it, "
         "not beyond chance on the held-out data: a second dive (--validate) would decide."
     )
+    undecided = dataclasses.replace(findings("unexplained"), minor=(slight,))
+    assert told.verdict(undecided) == (
+        "The simulation may lack quadratic damping: the data that were fitted support it, the "
+        "held-out data neither confirm nor refute it. A second dive (--validate) would decide."
+    )
     nothing = Residual("N", "time", None, 0.0, sure=False)
     assert told.dependence(nothing) == "a moment N that depends on nothing that was tried"
 

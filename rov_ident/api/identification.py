@@ -110,7 +110,7 @@ class Identification(Shown):
         advice = [*self.fit.to_measure]
         findings = self.explanation.findings if self.explanation else None
         if findings and findings.verdict == "unexplained":
-            advice.append("Something is left that no known effect explains: see below what.")
+            advice.append("Something is left that no known effect surely explains: see below what.")
         advice += [
             f"Fly next: {effect.manoeuvre} (it tells {effect.effect} from its rivals)."
             for effect in (findings.effects if findings else ())

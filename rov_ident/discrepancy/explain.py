@@ -30,6 +30,7 @@ from rov_ident.discrepancy.findings import (
     noise_finding,
     residuals,
     sensor_findings,
+    undecided,
     unsure,
     with_parameters,
 )
@@ -226,7 +227,8 @@ def explain(
             found[i] = empirical_term.described(f, last.hypothesis)
             residual = residual or [empirical_term.residual(f, last.hypothesis)]
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
-    verdict = _verdict(found, residual, left, improves)
+    minor = [f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL]
+    verdict = _verdict(found, minor, residual, left, improves)
     if verdict == "unexplained" and not residual:
         axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]
         residual = empirical_term.best_dependences(search.problem, model.final, axes)
@@ -249,7 +251,7 @@ def explain(
         rmse[2],
         changes(config, retuned),
         tuple(sorted(found, key=lambda f: -f.gain.percent)),
-        tuple(f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL),
+        tuple(minor),
         tuple(residual),
         verdict,
         (*data.streams.notes, *notes),
@@ -449,6 +451,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
 
 def _verdict(
     found: Sequence[Finding],
+    minor: Sequence[Finding],
     residual: Sequence[Residual],
     left: Mapping[str, float],
     retuning_improves: bool,
@@ -458,6 +461,8 @@ def _verdict(
         return "unexplained"
     if found:
         return "explained"
+    if undecided(minor):
+        return "unexplained"
     return "retuned" if retuning_improves else "agrees"
 
 
@@ -554,6 +559,10 @@ def _searched(
         )
     say("trying rivals", 0.6)
     final, trials = search.try_rivals(path[-1], lambda what: say("trying rivals: " + what, 0.7))
+    # effects that led to another minimum may end there as nothing, and one before was the better
+    likeliest = min((final, *path), key=lambda f: search.cost(f, final))
+    if likeliest is not final:
+        final, trials = search.try_rivals(likeliest)
     say("looking at what is left", 0.8)
     left = search.unexplained(final)
     if left:

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 from rov_ident.config import Config
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved
+from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved, is_sure
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     UNKNOWN,
@@ -196,6 +196,12 @@ def _differs_from_null(fitted: Fitted, keys: Sequence[Key], covariance: Array) -
     off = np.array([fitted.hypothesis.values[k] - bounds(k)[0] for k in keys])
     square = off @ scaled_solve(covariance[np.ix_(at, at)], off, 1e-9)
     return not keys or bool(square > chdtri(len(keys), 0.05))
+
+
+def undecided(minor: Sequence[Finding]) -> list[Finding]:
+    """Of the effects that are not worth a change those on the dynamics that the fit supports, and
+    the held-out data neither confirm nor refute: the model may lack them."""
+    return [f for f in minor if not EFFECTS[f.effect].of_sensors and not is_sure(f.gain)]
 
 
 def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:

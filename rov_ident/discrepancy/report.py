@@ -10,7 +10,8 @@ from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.files import write_file
 from rov_ident.discrepancy.explain import Explanation
-from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, is_sure, judged, predicted
+from rov_ident.discrepancy.findings import undecided
+from rov_ident.discrepancy.held_out import BLOCK, MOTIONS, improved, judged, predicted
 from rov_ident.discrepancy.results import Finding, Findings, Gain, Repetition, Residual, Value
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES, VELOCITIES, parse
@@ -37,6 +38,10 @@ _SAME_THING = (
 _MAY_EXPLAIN = (
     "{} may explain it, not beyond chance on the held-out data: a second dive (--validate) would "
     "decide. "
+)
+_MAY_LACK = (
+    "The simulation may lack {}: the data that were fitted support it, the held-out data neither "
+    "confirm nor refute it. A second dive (--validate) would decide."
 )
 _TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
 _TOLD = 3  # parameters of an effect in the verdict
@@ -79,11 +84,11 @@ def verdict(findings: Findings) -> str:
     left = "; ".join([*map(dependence, findings.residual), *findings.contradictions])
     if findings.verdict == "explained":
         return named
-    left = f": {left}" if left else ""
-    doubtful = [f for f in findings.minor if not EFFECTS[f.effect].of_sensors]
     is_known = any(r.sure for r in findings.residual)  # what no effect is like
-    doubtful = [] if is_known else [f for f in doubtful if not is_sure(f.gain)]
-    may = listed([called(f.effect) for f in doubtful])
+    may = "" if is_known else listed([called(f.effect) for f in undecided(findings.minor)])
+    if may and not (left or findings.effects):
+        return _MAY_LACK.format(may)
+    left = f": {left}" if left else ""
     explains = _MAY_EXPLAIN.format(may[0].upper() + may[1:]) if may else ""
     surely = "surely " if may else ""
     words = f"Something is left that no effect of the library {surely}explains{left}. {explains}"
