@@ -1,6 +1,7 @@
 """Batch least squares: what is identifiable, bias and its cure."""
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from tiers import more
 
 from bench.studies.at_sea import Trial, measure
 from rov_ident.config.prior import prior_of
+from rov_ident.core.linalg import sandwich
+from rov_ident.effects import compiled
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares as ls
 from rov_ident.offline.filtered_regression import filtered_rows, regression
@@ -60,6 +63,29 @@ def test_coefficients_are_found(heavy, off, two_minutes, options):
     assert error.max() < 0.1
     off_by = (found.values - heavy.model.theta) / np.sqrt(np.diag(found.covariance))
     assert np.sqrt(np.mean(off_by**2)) < 2.5
+
+
+@pytest.mark.parametrize("instrumental", [False, True])
+def test_intervals_are_those_of_leaving_blocks_out(heavy, off, two_minutes, instrumental):
+    """Against fits without each of the blocks, in prior standard deviations."""
+    task = regression(off)
+    batch = ls.Batch(task, compiled(off.effects), heavy.model if instrumental else None)
+    phi, z, _ = ls._rows_and_instruments(two_minutes, batch)
+    weight = 1.0 / authority(off.dynamics) ** 2
+
+    def fitted(rows):
+        sums = np.einsum("kai,a,kaj->ij", z[rows, :, :-1], weight, phi[rows])
+        normal = sums[:, :-1] + np.eye(len(sums))
+        return normal, np.linalg.solve(normal, sums[:, -1])
+
+    normal, x = fitted(np.arange(len(phi)))
+    inverse = np.linalg.inv(normal)
+    scatter = ls.residuals_of(two_minutes, batch, x, weight, inverse).scatter
+    edges = np.linspace(0, len(phi), 16).astype(int)  # of eight seconds
+    rows = np.arange(len(phi))
+    without = [fitted((rows < a) | (rows >= b))[1] - x for a, b in pairwise(edges)]
+    jackknife = sum(np.outer(change, change) for change in without)
+    np.testing.assert_allclose(sandwich(inverse, scatter), jackknife, rtol=1e-6)
 
 
 def test_several_bags_are_one(heavy, off):

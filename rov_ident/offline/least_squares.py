@@ -23,6 +23,7 @@ Sums over the samples of several bags are sums over bags: an archive is one fit.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -30,11 +31,10 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from rov_ident.config import Config
-from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import sandwich, scaled_inverse, widened
 from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting, compiled
-from rov_ident.estimation.shared import add_scatter
+from rov_ident.estimation.shared import LAG
 from rov_ident.model.equations import Array, Model
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
@@ -43,7 +43,8 @@ from rov_ident.sampling.records import HORIZON, predicted
 from rov_ident.sampling.sample import free_axes, parts
 
 PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
-_LAG = 2.0  # s; window over the correlation of the residuals
+_BLOCK = 2.0 * LAG  # s; of rows left out together: the area of the lag window of rls and ukf
+_FEWEST = 5  # blocks: of a shorter bag they are shorter
 _LASTING = 1.0  # s, as of a force that the other estimators call unexplained; three time constants
 # of the filter, so that noise is hardly alike so far apart
 _ROUNDS = 4  # a guard: of instruments, each simulated with the coefficients of the one before
@@ -64,7 +65,8 @@ class Moments(NamedTuple):
 class Residuals(NamedTuple):
     """Of the residuals at a solution of n coefficients, in prior standard deviations.
 
-    ``scatter`` (n, n): covariance of the accumulated ``sum w Z' e``, correlation in time included;
+    ``scatter`` (n, n): covariance of the accumulated ``sum w Z' e``, correlation in time included,
+    such that the covariance of the values is that of the jackknife (:func:`_scatter`);
     ``of_thrust`` (n,): ``sum w Z' F[thrust]``; ``products`` (6,): of residuals a second apart,
     summed over so many ``pairs`` (6,). Their mean is the power of what lasts, to which noise adds
     nothing.
@@ -165,17 +167,16 @@ def solve(
         if np.abs(x - old).max() < 1e-4:
             break
     say("residuals")
-    left = total(each(residuals_of, batch, x, weight / repeats))
-    told, by_held = np.ix_(~held, ~held), np.ix_(~held, held)
-    inverse = np.asarray(np.linalg.inv((normal + prior)[told]), dtype=np.float64)
-    least = np.diag(scaled_inverse((information + prior)[told]))
-    covariance = np.zeros_like(prior)
-    covariance[told] = widened(sandwich(inverse, (left.scatter + prior)[told]), least)
+    told = np.ix_(~held, ~held)
+    inverse, least = np.zeros_like(prior), np.zeros(len(held))
+    inverse[told] = np.linalg.inv((normal + prior)[told])
+    least[~held] = np.diag(scaled_inverse((information + prior)[told]))
+    left = total(each(residuals_of, batch, x, weight / repeats, inverse))
+    covariance = widened(sandwich(inverse, left.scatter + prior), least)
     moved = np.eye(len(held))[:, held]  # all, by what is held
-    moved[~held] = -inverse @ normal[by_held]
+    moved[~held] = -(inverse @ normal)[np.ix_(~held, held)]
     covariance += moved @ moved.T / precision
-    by_thrust = np.zeros(len(held))
-    by_thrust[~held] = inverse @ left.of_thrust[~held]
+    by_thrust = inverse @ left.of_thrust
     information = np.where(np.outer(~held, ~held), information, 0.0)
     return Solution(
         task.theta[task.estimated] + task.scale * x,
@@ -216,20 +217,20 @@ def _inertia_of(task: Regression) -> NDArray[np.bool_]:
     return on_axis[task.estimated]
 
 
-def residuals_of(samples: Samples, batch: Batch, x: Array, weight: Array) -> Residuals:
-    """What one bag's residuals ``e = y - Phi x`` tell."""
+def residuals_of(
+    samples: Samples, batch: Batch, x: Array, weight: Array, inverse: Array
+) -> Residuals:
+    """What one bag's residuals ``e = y - Phi x`` tell; ``inverse`` (n, n) is that of the normal
+    matrix of all bags."""
     phi, z, good = _rows_and_instruments(samples, batch)
     error, lag = phi[:, :, -1] - phi[:, :, :-1] @ x, round(_LASTING / PERIOD)
     left = z[:, :, :-1] * weight[:, None]
-    score = np.einsum("ka,kai->ki", error, left)
-    scatter, lagged = np.zeros((len(x), len(x))), np.zeros(len(x))
-    _accumulate_scatter(np.ascontiguousarray(score), np.exp(-PERIOD / _LAG), scatter, lagged)
     doubled = samples.copy()
     for part, other in (("wrench", "surroundings"), ("wrench_slope", "surroundings_slope")):
         doubled[part] += samples[part] - samples[other]
     twice = _rows_and_instruments(doubled, batch._replace(instruments=None))[0]
     return Residuals(
-        scatter,
+        _scatter(error, left, phi[:, :, :-1], inverse),
         np.einsum("ka,kai->i", twice[:, :, -1] - phi[:, :, -1], left),
         np.sum(error[:-lag] * error[lag:], axis=0),
         np.full(6, float(np.sum(good[:-lag] & good[lag:]))),
@@ -256,10 +257,24 @@ def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array,
     return phi, z, good
 
 
-@kernel
-def _accumulate_scatter(score, fade, total, lagged):
-    for k in range(len(score)):
-        add_scatter(score[k], fade, total, lagged)
+def _scatter(error: Array, left: Array, phi: Array, inverse: Array) -> Array:
+    """Covariance (n, n) of ``sum left' error`` over rows (K, 6), for that of the values to be the
+    jackknife's: the squares of what they change by where a block of rows is left out.
+
+    Without the block g, with its score s and its part N of the normal matrix A, they change by
+    ``-(A - N)^-1 s = -A^-1 (1 - N A^-1)^-1 s``. A block that alone tells a coefficient fits it, and
+    leaves no residual: by residuals as they are, the interval would be too narrow (Bell and
+    McCaffrey 2002; MacKinnon, Nielsen and Webb 2023).
+    """
+    count, one = max(_FEWEST, round(len(error) * PERIOD / _BLOCK)), np.eye(len(inverse))
+    edges = np.linspace(0, len(error), count + 1).astype(int)
+    scores = []
+    for a, b in pairwise(edges):
+        score = np.einsum("ka,kai->i", error[a:b], left[a:b])
+        normal = np.einsum("kai,kaj->ij", left[a:b], phi[a:b])
+        scores.append(np.linalg.solve(one - normal @ inverse, score))
+    out: Array = np.array(scores).T @ np.array(scores)
+    return out
 
 
 # ------------------------------------------------------------------ what a bag can tell
