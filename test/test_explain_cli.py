@@ -353,7 +353,8 @@ def test_verdicts_in_words():
     undecided = dataclasses.replace(findings("unexplained"), minor=(slight,))
     assert told.verdict(undecided) == (
         "The simulation may lack quadratic damping: the data that were fitted support it, the "
-        "held-out data neither confirm nor refute it. A second dive (--validate) would decide."
+        "held-out data neither confirm nor refute it. A second dive (--validate) would decide: "
+        f"{EFFECTS['quadratic_damping'].manoeuvre}."
     )
     nothing = Residual("N", "time", None, 0.0, sure=False)
     assert told.dependence(nothing) == "a moment N that depends on nothing that was tried"

@@ -19,6 +19,7 @@ from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import EXTENDED
+from rov_ident.discrepancy.findings import undecided
 from rov_ident.estimation.consistency import CAUSE
 from rov_ident.experiment.data_quality import Check
 from rov_ident.experiment.design import Proposal
@@ -113,7 +114,7 @@ class Identification(Shown):
             advice.append("Something is left that no known effect surely explains: see below what.")
         advice += [
             f"Fly next: {effect.manoeuvre} (it tells {effect.effect} from its rivals)."
-            for effect in (findings.effects if findings else ())
+            for effect in ((*findings.effects, *undecided(findings.minor)) if findings else ())
             if effect.manoeuvre
         ]
         if held:

@@ -228,6 +228,7 @@ def explain(
             residual = residual or [empirical_term.residual(f, last.hypothesis)]
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
     minor = [f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL]
+    minor = [f if is_sure(f.gain) else unsure(f) for f in minor]
     verdict = _verdict(found, minor, residual, left, improves)
     if verdict == "unexplained" and not residual:
         axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]

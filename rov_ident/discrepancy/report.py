@@ -41,7 +41,7 @@ _MAY_EXPLAIN = (
 )
 _MAY_LACK = (
     "The simulation may lack {}: the data that were fitted support it, the held-out data neither "
-    "confirm nor refute it. A second dive (--validate) would decide."
+    "confirm nor refute it. A second dive (--validate) would decide: {}."
 )
 _TOGETHER = "; all velocities on which it acts together {:.1f} % (95 %: {:.1f} to {:.1f} %)"
 _TOLD = 3  # parameters of an effect in the verdict
@@ -62,6 +62,11 @@ def valued(name: str, v: Value) -> str:
 
 def called(effect: str) -> str:
     return effect.replace("_", " ").replace("imu", "IMU").replace("cog", "CG")
+
+
+def run_to_tell(finding: Finding) -> str:
+    """The run that would tell an effect from all else."""
+    return finding.manoeuvre or EFFECTS[finding.effect].manoeuvre
 
 
 def listed(items: Sequence[str]) -> str:
@@ -85,9 +90,10 @@ def verdict(findings: Findings) -> str:
     if findings.verdict == "explained":
         return named
     is_known = any(r.sure for r in findings.residual)  # what no effect is like
-    may = "" if is_known else listed([called(f.effect) for f in undecided(findings.minor)])
+    doubtful = [] if is_known else undecided(findings.minor)
+    may = listed([called(f.effect) for f in doubtful])
     if may and not (left or findings.effects):
-        return _MAY_LACK.format(may)
+        return _MAY_LACK.format(may, "; ".join(dict.fromkeys(map(run_to_tell, doubtful))))
     left = f": {left}" if left else ""
     explains = _MAY_EXPLAIN.format(may[0].upper() + may[1:]) if may else ""
     surely = "surely " if may else ""
@@ -454,8 +460,7 @@ def _card(finding: Finding) -> str:
         heard = "Why nothing else" if finding.separable else "What else it may be"
         parts += [report.paragraph(f"{heard}:"), report.bullets(tried)]
     if not finding.separable:
-        run = finding.manoeuvre or effect.manoeuvre
-        parts.append(report.paragraph(f"{why} The run that would tell: {run}."))
+        parts.append(report.paragraph(f"{why} The run that would tell: {run_to_tell(finding)}."))
     return report.card(name[0].upper() + name[1:], parts)
 
 
@@ -473,7 +478,7 @@ def minor(effects: Sequence[Finding]) -> list[str]:
         report.heading("Minor effects"),
         report.paragraph(
             "Seen in the data, but of less than 2 % gain, not surely of any (the interval holds "
-            "0), or not supported by all of the data."
+            "0: a second dive would decide), or not supported by all of the data."
         ),
         report.table(["effect", "parameters", "gain (95 %)"], rows, text=(1,)),
     ]
