@@ -14,6 +14,7 @@ configuration that the fits start from is off by up to 50 %.
 import argparse
 import dataclasses
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +26,10 @@ from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.model.scales import WORKING_SPEED
-from rov_ident.offline.archive import Archive, Bag
+from rov_ident.offline.archive import Archive, of_records
 from rov_ident.offline.batch_fit import Settings, fit_batch
-from rov_ident.sampling.records import samples_of
-from rov_ident.sampling.smoothing import smoothed
+from rov_ident.sampling.records import Record, samples_of
+from rov_ident.sampling.sample import joined
 from rov_ident.simulation.virtual_sensors import Dive, Suite, dive
 
 ESTIMATORS = {
@@ -62,9 +63,8 @@ def told(true: Config, rng: np.random.Generator, offset: float = 0.5) -> Config:
 
 def archive_of(config: Config, run: Dive) -> Archive:
     """A simulated dive as a fit sees a bag."""
-    samples = smoothed(np.concatenate(list(samples_of(config, run))))
-    bag = Bag(Path("simulated"), "", (), len(samples), float(samples["dt"].sum()))
-    return Archive([bag], (), lambda function, *a: [function(samples, *a)])
+    samples = joined(list(samples_of(config, run)))
+    return of_records([Record(Path("simulated"), samples, Counter(), (), "")])
 
 
 @dataclasses.dataclass(frozen=True)
