@@ -1,10 +1,16 @@
 """What the studies share: bars, rows, and runs that are interrupted and resumed."""
 
 from dataclasses import dataclass
+from importlib import import_module
+from pkgutil import iter_modules
 
 import pytest
 
+from bench import studies
 from bench.harness import Bars, Row, digest, lines_of, show
+from bench.studies import validate
+from rov_ident.offline.batch_fit import fit_batch
+from rov_ident.simulation.virtual_sensors import Suite, dive
 
 
 @dataclass(frozen=True)
@@ -77,3 +83,20 @@ def test_rows_and_their_bars(capsys):
 @pytest.mark.parametrize("value", [float("nan"), 1.0 + 1e-9])
 def test_what_is_not_a_number_misses_its_bar(value):
     assert not Row("error", "rls", value, "", 1.0).met
+
+
+@pytest.mark.parametrize("name", [module.name for module in iter_modules(studies.__path__)])
+def test_every_study_loads(name):
+    """One that no test uses had not been runnable for days."""
+    try:
+        import_module(f"bench.studies.{name}")
+    except ModuleNotFoundError as missing:  # a peer, which only `make bench` installs
+        if str(missing.name).split(".")[0] in ("bench", "rov_ident"):
+            raise
+        pytest.skip(f"{missing.name} is not installed")
+
+
+def test_the_study_of_offline_fits_fits_a_dive(heavy):
+    archive = validate.archive_of(heavy, dive(heavy, "steps", 20.0, Suite(), 1))
+    assert archive.duration == pytest.approx(20.0, abs=1.0)
+    assert fit_batch(archive, heavy, "ls").consistency.consistent

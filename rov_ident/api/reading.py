@@ -1,4 +1,4 @@
-"""What the functions of this room are given: files, configurations, channels; and reading them."""
+"""Reads and checks the arguments of the API functions: files, configurations, channels."""
 
 import os
 from collections.abc import Iterable, Sequence

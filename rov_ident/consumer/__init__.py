@@ -1,4 +1,4 @@
-"""Who uses the coefficients: controllers in Python, parameters of other nodes, other simulators.
+"""Uses of the coefficients: controllers in Python, parameters of other nodes, other simulators.
 
 Takes estimates or configurations and gives them in others' terms; identifies nothing.
 """

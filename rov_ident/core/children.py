@@ -1,4 +1,4 @@
-"""Child processes, whose code is where this process has its own: never in the current folder.
+"""Child processes, which import the code of this process, never that of the current folder.
 
 Python looks there first when it is told what to run by `-m` or `-c`, and so does numba for its
 settings; but a folder of somebody's records may hold a `yaml.py`.

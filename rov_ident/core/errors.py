@@ -1,4 +1,4 @@
-"""The one family of exceptions for what the user can mend."""
+"""Exceptions for errors that the user can correct."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""How long computations say how far they are."""
+"""The interface by which long computations report their progress."""
 
 from typing import Protocol
 

@@ -1,4 +1,4 @@
-"""One thread for BLAS.
+"""BLAS is limited to one thread.
 
 The matrices here are 30 x 30, over which a second thread only waits, at full load. Our own programs
 limit their process; as a library we limit only our own calls.

@@ -1,4 +1,4 @@
-"""The configuration that is written is never worse than the one given.
+"""Makes sure that the configuration written predicts no worse than the one given.
 
 On held-out data each velocity must be predicted better than by the configuration as given; else the
 coefficients of its axis stay as they were. As the axes are coupled, all choices of axes are tried.

@@ -1,5 +1,5 @@
-"""Which data fits may see, and what an effect gains on the others: they are simulated in open loop,
-with it and without."""
+"""Data are divided into those that fits see and those held out, on which the gain of an effect is
+measured: in open loop, with it and without."""
 
 import itertools
 from collections.abc import Sequence

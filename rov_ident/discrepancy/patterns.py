@@ -1,4 +1,4 @@
-"""Wrenches of no known cause: how what a fit leaves depends on the motion, the place and the time.
+"""Forces and moments without a known cause, as functions of motion, position and time.
 
 A pattern is a force or moment on one axis as a smooth function of one variable. Patterns compete
 with the effects of the library: where one of them explains more than any effect, what is missing

@@ -1,4 +1,4 @@
-"""Whether the odometry's angular velocities are those of its attitude, and which are believed.
+"""Compares the odometry's angular velocities with its attitude, and decides which to trust.
 
 Rates that are copied from a gyro have its bias and its scale, which would pass for forces that turn
 the vehicle; filtered ones are late, which would pass for late thrust; and an attitude whose heading

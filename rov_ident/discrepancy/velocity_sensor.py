@@ -1,5 +1,5 @@
-"""Whether pose and IMU contradict the velocity sensor: to the dynamics a factor, or a mounting, is
-as if the coefficients were others, so that nothing that is asked of a fit shows it."""
+"""Tests whether pose and IMU contradict the velocity sensor. To the dynamics, a wrong factor or
+mounting looks like other coefficients, so no test of a fit can detect it."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""A window of the live watch with the wrench smoothed: without what was noise of its reading.
+"""Smooths the wrench in a window of the live monitor, to remove the noise of its reading.
 
 Noise n of the reading moves the simulated vehicle only, so it is in what the simulation leaves
 unexplained as well as in the sensitivities, and their product, the score, has a bias: a thruster

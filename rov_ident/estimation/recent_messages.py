@@ -1,4 +1,4 @@
-"""The messages of late, from which samples are made anew once a lag or a delay is known better.
+"""Keeps recent messages, which are sampled again once a lag or a delay is known better.
 
 A sample has the wrench that acts with the lag that was supposed when it was made, and is right for
 another lag to first order only. So what was learnt from samples of a wrong lag is given up, and the

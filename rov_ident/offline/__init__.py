@@ -1,4 +1,4 @@
 """Identification from whole records: batch least squares, instruments, maximum likelihood, tables.
 
-What needs all the data at once, or data that are no dive.
+Methods that need a whole record at once, or data other than dives (force tables).
 """

@@ -1,4 +1,4 @@
-"""Messages that wait for those of other topics, and the instants of the samples.
+"""Queues that align the messages of several topics, and determine the instants of the samples.
 
 Topics come at their own rates and phases. Only stamps decide, never the time of arrival.
 """
