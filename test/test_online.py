@@ -152,6 +152,32 @@ def test_what_is_learnt_anew_about_another_lag_is_not_forgotten(lagging, kind):
     assert abs(report.values[i] - 0.3) < 3.0 * report.std[i] + 0.01
 
 
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("rls", 1), *more(("ukf", 1), ("rls", 2), ("ukf", 2), ("rls", 3))]
+)
+def test_a_recording_that_begins_with_the_first_thrust(heavy, wrong, kind, seed):
+    """The vehicle is at rest, and its thrusters stand still: with a lag, known or not, what acts
+    at first is not what is commanded. Coefficients of yaw were at their bounds within seconds, and
+    the process noise that explained it hid all that came after."""
+    rng = np.random.default_rng(seed)
+    lag = {"thruster_lag": {"time_constant": rng.uniform(0.1, 0.15)}}
+    t = np.arange(0.0, 41.0, 0.02)
+    demand = manoeuvre("steps", heavy.dynamics, t, rng)
+    demand[t < 4.0] = 0.0, 0.0, rng.uniform(30.0, 50.0), 0.0, 0.0, rng.choice([-5.0, 5.0])
+    demand[t < 1.0] = 0.0
+    vehicle = dataclasses.replace(heavy, effects=lag)
+    dive = sensors.measure(vehicle, t, demand, 41.0, sensors.Suite(), rng)
+    begin = sensors.START + 1_000_000_000
+    messages = [(role, m) for _, role, m in dive.messages if m.stamp >= begin]
+    report = fed(
+        OnlineEstimator(textbook.with_section(wrong, "wrench", lag_std=0.2), kind), messages
+    ).report()
+    assert report.consistency.consistent, report.consistency.sentence
+    for name in ("N_rdot", "N_rr"):
+        i = report.names.index(name)
+        assert report.values[i] == pytest.approx(heavy.model.values[name], rel=0.05), name
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_learning_anew_does_not_depend_on_how_messages_come(lagging, kind):
     """One by one or as a recording: the same to the last bit."""

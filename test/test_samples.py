@@ -953,6 +953,29 @@ def test_a_first_demand_is_in_doubt_unless_it_lasts(heavy):
     assert not samples["wrench_doubt"][2:].any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("late", "time"), [("thruster_lag", "time_constant"), ("actuation_delay", "delay")]
+)
+def test_a_first_demand_may_come_at_rest(heavy, late, time, seed):
+    """It counts as one that has acted for long. Of a vehicle whose thrusters stood still the noise
+    covers what is wrong with that: its variance is the square of the impulse that was not there."""
+    rng = np.random.default_rng(seed)
+    config = dataclasses.replace(heavy, effects={late: {time: rng.uniform(0.05, 0.3)}})
+    demands = np.zeros((250, 6))
+    demands[100:, [0, 5]] = rng.uniform(5.0, 30.0, 2) * rng.choice([-1.0, 1.0], 2)
+    from_rest, _ = pushed(config, demands)
+    samples, _ = pushed(config, demands[100:])
+    from_rest = from_rest[from_rest["t"] > 2.0 + 1e-9][: len(samples) - 1]
+    samples = samples[1 : len(from_rest) + 1]
+    dt, lasting = samples["dt"][:, None], np.maximum(0.02, samples["hold"])[:, None]
+    impulse = np.sum(dt * (samples["wrench"] - from_rest["wrench"]), axis=0)
+    variance = np.sum(dt * lasting * samples["wrench_doubt"], axis=0)
+    assert np.abs(impulse[[0, 5]]).min() > 0.1
+    np.testing.assert_allclose(np.sqrt(variance), np.abs(impulse), rtol=0.05)
+    assert not samples["wrench_doubt"][samples["t"] > 2.0].any()  # it is forgotten
+
+
 @pytest.mark.parametrize(
     "demand",
     [

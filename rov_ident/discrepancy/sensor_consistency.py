@@ -72,6 +72,7 @@ class Comparison:
     r: Array
     columns: Array
     scale: float  # standard deviation of the noise, in the unit of the comparison
+    white: float  # the same of what is white of it: what drifts makes innovations, too
 
 
 _LIBRARY = [e for e in EFFECTS.values() if e.of_sensors and e.noise is None]
@@ -170,7 +171,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
         made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
     return [
-        Comparison(name, *whitened(t, y, columns, walk=name != "gyro"))
+        Comparison(name, *whitened(t, y, columns, walk=name != "gyro"), _white(t, y))
         for name, t, y, columns in made
         if len(t) > FEWEST
     ]
@@ -351,6 +352,16 @@ def whitened(
     keep = np.abs(e - np.median(e, axis=0)) < _OUTLIER * least
     keep[gap & walk] = False
     return np.broadcast_to(t[:, None], e.shape)[keep], e[keep] / least, full[keep] / least, least
+
+
+def _white(t: Array, y: Array) -> float:
+    """Standard deviation of the white noise of y (N, 3): by how far each is from the line between
+    its neighbours, on which a velocity stays whose accelerometer has a bias, one that drifts too.
+    """
+    share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
+    off = y[1:-1] - (1.0 - share) * y[:-2] - share * y[2:]
+    even = np.max([np.diff(t)[:-1], np.diff(t)[1:]], axis=0) <= _MAX_GAP
+    return float(robust_std((off / np.sqrt(1.0 + (1.0 - share) ** 2 + share**2))[even].ravel()))
 
 
 def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:

@@ -259,7 +259,7 @@ def _noise_remarks(streams: Streams, record: Record, config: Config) -> Iterator
     if not streams.nu[:, :3].any():
         return
     sensors, _ = search(streams, config, [(0.0, streams.duration)])
-    against_imu = [c.scale for c in comparisons(streams, config, sensors) if c.name == "imu"]
+    against_imu = [c.white for c in comparisons(streams, config, sensors) if c.name == "imu"]
     variance = record.samples["odometry_variance"][record.samples["measured"], :3]
     said = float(np.sqrt(np.median(variance.mean(axis=1)))) if len(variance) else np.inf
     for noise in against_imu:

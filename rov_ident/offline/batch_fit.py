@@ -382,7 +382,7 @@ def _physical_states(
         at_bound = bool(abs(asked - values[i]) > CONTRADICTED * estimate.std[i])
         if at_bound:
             notes.append(
-                f"{name}: the data ask for {asked:.4g}, which no passive hull has; "
+                f"{name}: the data ask for {asked:.4g}, which no passive hull has beside the others; "
                 f"{values[i]:.4g} is kept"
             )
         states[name] = of_fit(

@@ -22,6 +22,7 @@ from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams, measured_at
+from rov_ident.sampling.records import beside_odometry
 from rov_ident.sampling.sample import SAMPLE
 from rov_ident.sampling.without_velocity import is_without_velocity
 
@@ -123,7 +124,7 @@ def behind_imu(behind: float) -> str:
 
 def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
     """Wrench and motion of samples (k,) of SAMPLE, filtered alike; None where there are too few."""
-    task, samples = regression(config, _CORNER), _beside_odometry(samples)
+    task, samples = regression(config, _CORNER), beside_odometry(samples)
     still = samples.copy()
     for name in ("nu", "down", "down_slope"):
         still[name] = 0.0
@@ -135,17 +136,6 @@ def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
     if is_without_velocity(samples):  # forces drive what is simulated itself
         size[:3] = 0.0
     return Filtered(phi, wrench, size > AT_REST * authority(config.dynamics))
-
-
-def _beside_odometry(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """The samples (k,) without those in a pause of the odometry, in which velocities drift."""
-    if is_without_velocity(samples):
-        return samples
-    heard = np.where(np.isfinite(samples["odometry"]).any(axis=1), samples["t"], -np.inf)
-    beside = samples["t"] - np.maximum.accumulate(heard) <= LONGEST_INTERVAL
-    samples = samples.copy()
-    samples["restart"][1:] |= beside[1:] & ~beside[:-1]
-    return samples[beside]
 
 
 def samples_of(streams: Streams) -> NDArray[np.void]:

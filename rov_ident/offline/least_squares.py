@@ -39,7 +39,7 @@ from rov_ident.model.equations import Array, Model
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.filtered_regression import Regression, filtered_rows, regression
-from rov_ident.sampling.records import HORIZON, predicted
+from rov_ident.sampling.records import HORIZON, beside_odometry, predicted
 from rov_ident.sampling.sample import free_axes, parts
 
 PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
@@ -204,7 +204,7 @@ def known_squares(samples: Samples, batch: Batch) -> Array:
     theta = batch.task.theta.copy()
     theta[batch.task.estimated] = 0.0
     task = batch.task._replace(theta=theta, rigid_body=np.zeros((6, 6)))
-    known = filtered_rows(task, parts(samples)[0], PERIOD)[:, :, -1]
+    known = filtered_rows(task, beside_odometry(parts(samples)[0]), PERIOD)[:, :, -1]
     squares: Array = np.sum(known[np.isfinite(known).all(axis=1)] ** 2, axis=0)
     return squares
 
@@ -239,7 +239,7 @@ def residuals_of(
 
 def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array, NDArray[np.bool_]]:
     """[Phi y] and [Z y] (K, 6, n + 1), and which rows (K,) are known; of all others they are 0."""
-    samples, _ = parts(samples)
+    samples = beside_odometry(parts(samples)[0])
     z = phi = filtered_rows(batch.task, samples, PERIOD)
     if batch.instruments is not None:  # along the motion that the model says, through the water
         nu = predicted(batch.instruments, samples, np.inf, effects=batch.effects)

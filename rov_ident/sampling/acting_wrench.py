@@ -15,7 +15,7 @@ from rov_ident.config import Config
 from rov_ident.core.jit import kernel
 from rov_ident.core.messages import WRENCH, Array
 from rov_ident.core.quaternions import rotation
-from rov_ident.effects import act, add_wrenches, compiled, memory
+from rov_ident.effects import Acting, act, add_wrenches, compiled, memory
 from rov_ident.sampling.despiking import Despiker
 from rov_ident.sampling.dropped_commands import SILENCE, CommandPeriod, estimated
 from rov_ident.sampling.effect_jacobians import EffectJacobians
@@ -26,6 +26,9 @@ _ZERO = np.zeros(6)
 # m; a moment of forces at a shorter arm is the rounding of an allocation, in 32 bits, too: no
 # thruster is placed that well
 _ROUNDING_ARM = 1e-6
+# of the first command or the present: by so much a wrench is wrong anyway, by default
+# (wrench.relative_std)
+_SETTLED = 0.01
 
 
 def holds_moment(largest: Array) -> bool:
@@ -51,6 +54,35 @@ class _Command(NamedTuple):
     doubt: Array  # (6,) N2, (N m)2: mean square of what may be wrong with it
 
 
+class _FromRest:
+    """How far what acts is from what it would be, had nothing been commanded before ``first``.
+
+    Effects with a memory (a lag, a delay) take the first command to have acted for long, as where a
+    recording begins amid a dive. Where it begins with the first thrust of all, from rest, nothing
+    acts yet, and nobody can know which it is. The error lasts until it is forgotten: its impulse
+    adds up, and the noise that has its square J^2 as variance has the density dJ^2/dt.
+    """
+
+    def __init__(self, effects: Acting, first: _Command) -> None:
+        self._memory = memory()
+        act(effects, self._memory, first.t, 0.0, np.zeros(6))
+        self._impulse = np.zeros(6)  # N s, N m s
+        self._first = np.abs(first.wrench)
+
+    def density(
+        self, effects: Acting, begin: float, dt: float, command: Array, acting: Array
+    ) -> Array | None:
+        """(6,) [N2 s, (N m)2 s] from begin to begin + dt [s]; None where none is left."""
+        other = command.copy()
+        act(effects, self._memory, begin, dt, other)
+        off = np.abs(acting - other)
+        if np.all(off <= _SETTLED * np.maximum(self._first, np.abs(command))):
+            return None
+        density: Array = (2.0 * self._impulse + dt * off) * off
+        self._impulse += dt * off
+        return density
+
+
 class ActingWrench:
     """Takes commands from their queue and says what acts in each interval."""
 
@@ -65,6 +97,7 @@ class ActingWrench:
         """Take other settings and other values of effects; their memory stays."""
         self._timeout = config.timeout
         self._noise.relative = config.wrench.relative_std
+        self._lasting = config.wrench.correlation_time
         self._jacobians = jacobians
         self._effects = compiled(config.effects)
         self._has_inputs = bool(self._effects.inputs.any())
@@ -73,6 +106,7 @@ class ActingWrench:
     def clear(self) -> None:
         self._command: _Command | None = None  # the one that is held
         self.memory = memory()  # of the input effects
+        self._from_rest: _FromRest | None = None
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
         self._period = CommandPeriod()
         self._last_received = -np.inf  # s
@@ -107,9 +141,9 @@ class ActingWrench:
         while (command := self._next(end, queue, despiker)) is not None:
             if self._command is None:
                 start = now = max(command.t, start)
+                self._from_rest = _FromRest(self._effects, command) if self._has_inputs else None
             elif command.t > now:
-                wrench = self._act(self._command, now, command.t)
-                pieces.append((now, command.t, wrench, self._command.doubt))
+                pieces.append((now, command.t, *self._act(self._command, now, command.t)))
                 now = command.t
             self._command = command
             if commands is not None:
@@ -121,10 +155,10 @@ class ActingWrench:
             if self._jacobians is not None:
                 self._jacobians.forget()
             return None
-        acting = self._act(held, now, end)
+        acting, doubt = self._act(held, now, end)
         if not pieces:
-            return MeanWrench(acting, _ZERO, held.doubt)
-        pieces.append((now, end, acting, held.doubt))
+            return MeanWrench(acting, _ZERO, doubt)
+        pieces.append((now, end, acting, doubt))
         length, middle = end - start, 0.5 * (start + end)
         total = MeanWrench(np.zeros(6), np.zeros(6), np.zeros(6))
         for begin, stop, wrench, doubt in pieces:
@@ -158,14 +192,21 @@ class ActingWrench:
         self._last_received = at
         return _Command(at, wrench, doubt)
 
-    def _act(self, command: _Command, begin: float, end: float) -> Array:
-        """The wrench (6,) that acts in the mean from ``begin`` to ``end`` by a held command."""
-        wrench, dt = command.wrench.copy(), end - begin
+    def _act(self, command: _Command, begin: float, end: float) -> tuple[Array, Array]:
+        """The wrench (6,) that acts in the mean from ``begin`` to ``end`` by a held command, and
+        its doubt (6,)."""
+        wrench, doubt, dt = command.wrench.copy(), command.doubt, end - begin
         if self._has_inputs:
             act(self._effects, self.memory, begin, dt, wrench)
+        if self._from_rest is not None:
+            more = self._from_rest.density(self._effects, begin, dt, command.wrench, wrench)
+            if more is None:
+                self._from_rest = None
+            else:  # the estimators take a doubt to last as long as a command does
+                doubt = doubt + more / max(self._lasting, self.hold)
         if self._jacobians is not None:
             self._jacobians.act(begin, dt, command.wrench)
-        return wrench
+        return wrench, doubt
 
     def surround(self, sample: NDArray[np.void]) -> None:
         """Add the wrench effects along the measured motion to the sample (1,) of SAMPLE."""

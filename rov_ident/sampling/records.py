@@ -144,6 +144,17 @@ def predicted(
     return out
 
 
+def beside_odometry(samples: NDArray[np.void]) -> NDArray[np.void]:
+    """The samples (k,) without those in a pause of the odometry, in which velocities drift."""
+    if is_without_velocity(samples):
+        return samples
+    heard = np.where(np.isfinite(samples["odometry"]).any(axis=1), samples["t"], -np.inf)
+    beside = samples["t"] - np.maximum.accumulate(heard) <= LONGEST_INTERVAL
+    samples = samples.copy()
+    samples["restart"][1:] |= beside[1:] & ~beside[:-1]
+    return samples[beside]
+
+
 def over_ground(samples: NDArray[np.void]) -> Array:
     """The measured velocities (k, 6) over ground, as the odometry has them."""
     nu = samples["nu"].copy()
