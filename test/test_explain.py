@@ -141,6 +141,15 @@ def test_what_has_no_name_is_described(name):
     assert not sure(line)
 
 
+def test_a_moment_as_small_as_that_of_attitude_errors_is_left_open():
+    """Predictions gain 40 to 53 % by it: the structure was said to be right."""
+    there = bag(Trial("unknown", "reaction", 0, "19"), 165402453183294, [1.0 / 15.0])
+    findings = explain([there.streams], there.case.config).findings
+    assert findings.verdict == "unexplained"
+    assert [(r.axis, r.depends_on, r.sure) for r in findings.residual] == [("K", "u", False)]
+    assert not findings.effects
+
+
 def test_a_tilted_attitude_is_not_taken_for_an_accelerometer_bias():
     """A gyro that drifts tilts the attitude by which specific force is turned into the world."""
     (found,) = found_in("imu_bias", 1)["found"]

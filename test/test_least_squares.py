@@ -10,12 +10,14 @@ from tiers import more
 from bench.studies.at_sea import Trial, measure
 from rov_ident.config.prior import prior_of
 from rov_ident.core.linalg import sandwich
+from rov_ident.core.messages import Odometry
 from rov_ident.effects import compiled
 from rov_ident.model.scales import authority
 from rov_ident.offline import least_squares as ls
 from rov_ident.offline.filtered_regression import filtered_rows, regression
 from rov_ident.sampling import records
 from rov_ident.sampling.sample import joined
+from rov_ident.sampling.sampler import Sampler
 from rov_ident.simulation import virtual_sensors as sensors
 
 
@@ -195,3 +197,21 @@ def test_noise_is_nothing_that_lasts(heavy, off):
         blown["wrench"][k, 1] -= force
     left = ls.solve(in_one(blown), off).lasting
     assert 1.0 < left[1] < 6.0
+
+
+@pytest.mark.parametrize("kind", ["ls", "iv"])
+def test_a_pause_of_the_odometry_is_left_out(heavy, off, kind):
+    """In it velocities are those of the IMU, and drift: half a minute made errors of 48 %."""
+    run = sensors.dive(heavy, "steps", 60.0, sensors.Suite(), 4)
+    begin = run.messages[0][2].stamp
+    silent = [
+        (role, m)
+        for _, role, m in run.messages
+        if not (isinstance(m, Odometry) and 20e9 < m.stamp - begin < 40e9)
+    ]
+    sampler = Sampler(off)
+    samples = joined([*(sampler.push(role, m) for role, m in silent), sampler.flush()])
+    found = ls.solve(in_one(samples), off, instrumental=kind == "iv")
+    error = np.abs(found.values - heavy.model.theta)
+    assert np.all(error < 4.0 * np.sqrt(np.diag(found.covariance)))
+    assert np.median(error / np.abs(heavy.model.theta)) < 0.02

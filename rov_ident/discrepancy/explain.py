@@ -230,7 +230,7 @@ def explain(
     minor = [f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL]
     minor = [f if is_sure(f.gain) else unsure(f) for f in minor]
     verdict = _verdict(found, minor, residual, left, improves)
-    if verdict == "unexplained" and not residual:
+    if verdict == "unexplained" and left and not residual:
         axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]
         residual = empirical_term.best_dependences(search.problem, model.final, axes)
     everything = WindowedProblem(data.streams, blocks(data.streams))

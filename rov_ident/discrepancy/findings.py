@@ -269,8 +269,8 @@ def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
 def residuals(final: Fitted, trials: Trials) -> list[Residual]:
     """What the patterns in a model say: on which axis something is left that has no name. Windows
     are predicted by fits to the others; as a pattern was chosen by all windows, from many, it must
-    surely gain what an effect must gain at all, and be more than errors of the attitude make of the
-    righting moment, 95 % of them. The share is one of squares."""
+    surely gain what an effect must gain at all. It is not sure where errors of the attitude make as
+    much of the righting moment, in 5 % of the time. The share is one of squares."""
     found, h, problem = [], final.hypothesis, final.linearisation.problem
     of_attitude = of_attitude_errors(h)
     for name, trial in trials.items():
@@ -285,10 +285,11 @@ def residuals(final: Fitted, trials: Trials) -> list[Residual]:
         keys = [k for k in h.keys if effect_of(k) == name]
         columns = problem.columns(h, final.linearisation.motion, keys)
         force = columns[:, i] @ np.array([h.values[k] for k in keys])
-        acts = np.sqrt(np.mean(force**2)) > of_attitude[i]
-        if acts and gain is not None and gain.low >= 100.0 * PRACTICAL:
+        if gain is not None and gain.low >= 100.0 * PRACTICAL:
             share = float(1.0 - after.sum() / before.sum())
-            found.append(Residual(axis, depends_on, float(frequency) if frequency else None, share))
+            hertz = float(frequency) if frequency else None
+            sure = bool(np.sqrt(np.mean(force**2)) > of_attitude[i])
+            found.append(Residual(axis, depends_on, hertz, share, sure))
     return sorted(found, key=lambda r: -r.share)
 
 

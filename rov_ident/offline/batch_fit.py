@@ -382,8 +382,8 @@ def _physical_states(
         at_bound = bool(abs(asked - values[i]) > CONTRADICTED * estimate.std[i])
         if at_bound:
             notes.append(
-                f"{name}: the data ask for {asked:.4g}, which no passive hull has beside the others; "
-                f"{values[i]:.4g} is kept"
+                f"{name}: the data ask for {asked:.4g}, which no passive hull has beside the other "
+                f"coefficients; {values[i]:.4g} is kept"
             )
         states[name] = of_fit(
             values[i], estimate.std[i], prior.std[i], bool(removed[i] > IDENTIFIABLE), at_bound
