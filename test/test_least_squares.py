@@ -90,6 +90,15 @@ def test_intervals_are_those_of_leaving_blocks_out(heavy, off, two_minutes, inst
     np.testing.assert_allclose(sandwich(inverse, scatter), jackknife, rtol=1e-6)
 
 
+def test_wrong_inertia_of_the_file_is_not_held_where_the_wrench_tells_it(heavy, two_minutes):
+    """Even where it leaves moments (Munk's) unexplained that are larger than those that act."""
+    factors = {"X_udot": 0.2, "Y_vdot": 3.0, "Z_wdot": 0.3, "K_pdot": 1.5, "N_rdot": 1.5}
+    wrong = {name: factor * heavy.model.values[name] for name, factor in factors.items()}
+    found = ls.solve(in_one(two_minutes), heavy.with_values(wrong))
+    at = [heavy.model.names.index(name) for name in wrong]
+    np.testing.assert_allclose(found.values[at], heavy.model.theta[at], rtol=0.05)
+
+
 def test_several_bags_are_one(heavy, off):
     a, b = samples_of(heavy, 40.0, seed=1), samples_of(heavy, 40.0, seed=2)
 

@@ -15,8 +15,9 @@ masses', not the second, that of quadratic damping. Maximum likelihood has neith
 On an axis without a known force, as fins or a propeller drive whose coefficients are estimated, all
 may be multiplied by any number. With no inertia (an added mass that cancels the vehicle's own) and
 no other coefficient, only the known forces are left over: least squares would take that for the
-best fit. So where the configured inertia leaves more than these, it is *held*: thrust and drag are
-relative to it, and have its uncertainty besides their own (consider parameters).
+best fit. So where the configured inertia leaves more than these, and residuals are not far below
+them, the inertia is *held*: thrust and drag are relative to it, and have its uncertainty besides
+their own (consider parameters).
 
 Sums over the samples of several bags are sums over bags: an archive is one fit.
 """
@@ -48,6 +49,8 @@ _FEWEST = 5  # blocks: of a shorter bag they are shorter
 _LASTING = 1.0  # s, as of a force that the other estimators call unexplained; three time constants
 # of the filter, so that noise is hardly alike so far apart
 _ROUNDS = 4  # a guard: of instruments, each simulated with the coefficients of the one before
+_TOLD = 0.1  # of the known forces: by residuals of this size all coefficients become too small by
+# its square, 1 %
 _KNOWN = 3.0  # information over that of the prior at which a direction counts as identified: three
 # quarters of the prior variance are gone
 
@@ -127,33 +130,39 @@ def solve(
     repeats = 2.0 / (task.corner * PERIOD)
     forces = authority(config.dynamics)
     on_axis = _inertia_of(task)
-    held = np.asarray(on_axis.any(axis=1), dtype=bool)
 
-    def solved(moments: Moments, weight: Array) -> tuple[Array, Array]:
+    def solved(moments: Moments, weight: Array, held: NDArray[np.bool_]) -> tuple[Array, Array]:
         sums = np.einsum("k,kij->ij", weight / repeats, moments.sums)
         information, x = sums[:-1, :-1], np.zeros(len(held))
         told = np.ix_(~held, ~held)
         x[~held] = np.linalg.solve((information + prior)[told], sums[:-1, -1][~held])
         return information, x
 
-    def residual(moments: Moments, x: Array) -> Array:
+    def residual(x: Array) -> Array:
         tail = np.append(-x, 1.0)
         squares = np.einsum("i,kij,j->k", tail, moments.sums, tail)
         return np.sqrt(np.maximum(squares, 0.0) / np.maximum(moments.rows, 1.0))
 
+    def reweighted(held: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        weight = ordinary
+        information, x = solved(moments, weight, held)
+        for _ in range(3 if weighted else 0):
+            weight = np.where(free, 1.0 / np.maximum(residual(x), 1e-6 * forces) ** 2, 0.0)
+            information, x = solved(moments, weight, held)
+        return weight, information, x
+
     say("least squares")
     moments = total(each(moments_of, batch))
     # ordinary: forces and moments in units of their own size, else a metre would decide
-    weight = np.where(free, 1.0 / (0.03 * forces) ** 2, 0.0)
-    _, x = solved(moments, weight)
+    ordinary = np.where(free, 1.0 / (0.03 * forces) ** 2, 0.0)
     known = np.sqrt(sum(each(known_squares, batch)) / np.maximum(moments.rows, 1.0))
-    held = np.asarray((on_axis & free & (known < residual(moments, x))).any(axis=1), dtype=bool)
-    information, x = solved(moments, weight)
-    for _ in range(3 if weighted else 0):
-        noise = np.maximum(residual(moments, x), 1e-6 * forces)
-        weight = np.where(free, 1.0 / noise**2, 0.0)
-        information, x = solved(moments, weight)
-    noise, normal = residual(moments, x), information
+    _, configured = solved(moments, ordinary, np.asarray(on_axis.any(axis=1), dtype=bool))
+    weight, information, x = reweighted(np.zeros(len(on_axis), dtype=bool))
+    untold = free & (known < residual(configured)) & (residual(x) > _TOLD * known)
+    held = np.asarray((on_axis & untold).any(axis=1), dtype=bool)
+    if held.any():
+        weight, information, x = reweighted(held)
+    noise, normal = residual(x), information
     for round_ in range(_ROUNDS if instrumental else 0):
         say(f"instruments, round {round_ + 1}")
         theta = config.dynamics.theta.copy()
@@ -163,7 +172,7 @@ def solve(
             break
         batch, old = batch._replace(instruments=model), x
         moments = total(each(moments_of, batch))
-        normal, x = solved(moments, weight)
+        normal, x = solved(moments, weight, held)
         if np.abs(x - old).max() < 1e-4:
             break
     say("residuals")
