@@ -13,7 +13,7 @@ from bench.simulators import sea
 from rov_ident import config as configuration
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
-from rov_ident.core.messages import Imu, Odometry, Wrench
+from rov_ident.core.messages import WRENCH, Imu, Odometry, Wrench
 from rov_ident.core.states import State
 from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
@@ -249,6 +249,15 @@ def test_pauses_and_slow_topics_are_noticed(checked):
     assert "there is none" in of(found, "imu").text
     assert "pauses" in of(found, "odometry").text
     assert "least" in of(found, "odometry").text
+    assert "wrench" not in of(found, "odometry").text
+
+
+def test_a_silent_wrench_is_not_called_a_pause_of_the_odometry_alone(checked):
+    def change(role, m):
+        t = (m.stamp - sensors.START) * 1e-9
+        return None if role == WRENCH and 10.0 < t < 14.0 else m
+
+    assert "the wrench pauses" in of(checked(change), "odometry").text
 
 
 def test_a_bag_of_two_dives_has_no_wrong_signs(checked):

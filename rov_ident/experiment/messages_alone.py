@@ -35,6 +35,7 @@ _SAME = 0.9  # correlation of two measurements of one thing, less noise
 _UNITS = 2.0  # times too large or small; noise and lateness do not make a rate twice the turn
 _OTHER_FORCES = 3.0  # times the wrench; where so much else moves it (a Munk moment), no sign shows
 _UNMOVED = 0.1  # of the wrench; neither a guess nor a thrust scale is ten times off
+_SILENT = 0.5  # of a pause of the odometry: a pause of the wrench that may be its reason
 _STILL = 1e-4  # m or rad/s; nothing moves
 _MOVES = 0.05  # m or rad/s RMS, from which a poor correlation is worth a word
 
@@ -78,6 +79,8 @@ def _rate_remarks(streams: Streams) -> list[Remark]:
         if gap > LONGEST_INTERVAL and name != "wrench":
             lost = float(steps[steps > LONGEST_INTERVAL].sum())
             level, text = WARNING, f"{text}; {lost:.1f} s in all are lost to pauses"
+            if name == "odometry" and np.diff(streams.demand_t).max() > _SILENT * gap:
+                text += " (the wrench pauses, too, and without it odometry is not used)"
         if rate < _SLOW:
             level = WARNING
             text += f"; {_SLOW:g} Hz is the least that shows how the vehicle accelerates"
