@@ -1,4 +1,4 @@
-"""Rows of RLS about poor estimates are taken again about better ones."""
+"""What samples told about poor estimates is taken again about better ones."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,9 @@ import yaml
 from tiers import more
 
 from bench.studies.at_sea import dive_of
-from rov_ident.estimation import iterated_update, rls
+from rov_ident.estimation import iterated_update
 from rov_ident.estimation.online import OnlineEstimator
+from rov_ident.estimation.thrust_coordinates import values_of
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.sampling.sample import after_reset
@@ -15,16 +16,20 @@ from rov_ident.sampling.sample import after_reset
 SCALE = "thrust_scale.scale"
 
 
-@pytest.fixture(scope="module", params=[0, *more(6, 15, 16)])
+CASES = [("rls", 0), ("ukf", 0), *more(*[((k, n),) for k in ("rls", "ukf") for n in (6, 15, 16)])]
+
+
+@pytest.fixture(scope="module", params=CASES)
 def dived(request, tmp_path_factory):
     """A minute of a pilot's driving by the independent simulator: the estimator after it, all
     samples since it last began anew, and the true coefficients."""
-    dive = dive_of("clean", "pilot", request.param, 60.0)
+    kind, seed = request.param
+    dive = dive_of("clean", "pilot", seed, 60.0)
     folder = tmp_path_factory.mktemp("dive")
     (folder / "dive.mcap").write_bytes(dive.bag)
     document = {"/**": {"ros__parameters": dive.parameters}}
     (folder / "vehicle.yaml").write_text(yaml.safe_dump(document))
-    estimator = OnlineEstimator(folder / "vehicle.yaml", "rls")
+    estimator = OnlineEstimator(folder / "vehicle.yaml", kind)
     samples = []
 
     class Window(iterated_update.IteratedUpdate):
@@ -37,7 +42,7 @@ def dived(request, tmp_path_factory):
             samples.append(new.copy())
             return super().after(task, state, new)
 
-    estimator._update = Window(estimator._state)
+    estimator._update = Window(estimator._module, estimator._state)
     bag = Bag(folder / "dive.mcap")
     for role, message in topics.messages(
         bag, topics.select(bag, estimator.config), estimator.config
@@ -58,19 +63,19 @@ def true_solution(estimator, theta):
     ratio = values[i] / start[i]
     out = (np.where(task.per_thrust, values / ratio, values) - start) / task.scale
     out[i] = start[i] * (1.0 - 1.0 / ratio) / task.scale[i]
-    np.testing.assert_allclose(rls._values(task, out), values, rtol=1e-12)
-    return out
+    np.testing.assert_allclose(values_of(task, out), values, rtol=1e-12)
+    return out if estimator.kind == "rls" else task.start + out
 
 
 def test_it_claims_no_more_than_rows_about_the_truth(dived):
     """What rows about poor estimates claim to know, of the thrust scale most of all, is not there:
     without looking back the claim is half as wide as the truth's."""
     estimator, samples, theta = dived
-    task = estimator._task
-    state = rls.fold_about(task, rls.init(task), samples, true_solution(estimator, theta))
+    task, module = estimator._task, estimator._module
+    state = module.fold_about(task, module.init(task), samples, true_solution(estimator, theta))
     i = estimator.prior.names.index(SCALE)
-    honest = rls.estimate(task, state, estimator.prior).std[i]
-    claimed = rls.estimate(task, estimator._state, estimator.prior)
+    honest = module.estimate(task, state, estimator.prior).std[i]
+    claimed = module.estimate(task, estimator._state, estimator.prior)
     assert claimed.std[i] > 0.75 * honest
     assert abs(claimed.values[i] - 1.0) < 3.0 * claimed.std[i]
 
@@ -80,7 +85,7 @@ def test_only_stamps_decide(dived):
     estimator, samples, _ = dived
     states = []
     for size in (1, 977, len(samples)):
-        one = OnlineEstimator(estimator.config, "rls")
+        one = OnlineEstimator(estimator.config, estimator.kind)
         for first in range(0, len(samples), size):
             one._fold(samples[first : first + size])
         states.append(one.state)
@@ -92,9 +97,10 @@ def test_only_stamps_decide(dived):
 def test_a_window_is_folded_about_one_estimate_and_given_up(dived):
     """Twice as many samples as come in are folded again at most; nothing is kept for good."""
     estimator, samples, _ = dived
-    task, state = estimator._task, rls.init(estimator._task)
-    update, again, most = iterated_update.IteratedUpdate(state), 0, 0
-    fold_about = rls.fold_about
+    task, module = estimator._task, estimator._module
+    state = module.init(task)
+    update, again, most = iterated_update.IteratedUpdate(module, state), 0, 0
+    fold_about = module.fold_about
 
     def counted(task, state, samples, solution):
         nonlocal again
@@ -103,10 +109,10 @@ def test_a_window_is_folded_about_one_estimate_and_given_up(dived):
 
     rest = samples
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rls, "fold_about", counted)
+        patch.setattr(module, "fold_about", counted)
         while len(rest):
             count = update.until_due(rest)
-            state, _ = rls.fold(task, state, rest[:count])
+            state, _ = module.fold(task, state, rest[:count])
             state = update.after(task, state, rest[:count])
             most = max(most, sum(len(part) for part in update._samples))
             rest = rest[count:]
@@ -114,14 +120,14 @@ def test_a_window_is_folded_about_one_estimate_and_given_up(dived):
     assert most <= 1.1 * 30.0 / np.median(samples["dt"])
 
 
-def test_while_disabled_nothing_is_looked_back_on(dived):
+def test_while_disabled_nothing_is_looked_back_on(dived, monkeypatch):
     estimator, samples, _ = dived
-    one = OnlineEstimator(estimator.config, "rls")
+    one, looks = OnlineEstimator(estimator.config, estimator.kind), []
+    monkeypatch.setattr(one._update, "iterate", lambda task, state: looks.append(state) or state)
     one._fold(samples[:700])  # 7 s: the first look is due after 7.5
     one.enabled = False
-    before = one.state
     one.flush()
-    assert one.state is before
+    assert not looks
     one.enabled = True
     one.flush()
-    assert one.state is not before
+    assert len(looks) == 1

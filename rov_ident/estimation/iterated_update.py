@@ -1,12 +1,15 @@
-"""Rows of RLS that were linearised about poor estimates, linearised again about better ones.
+"""Samples that were linearised about poor estimates, linearised again about better ones.
 
-A row is right to first order in the error of the coefficients that it is linearised about. While
-little is known, rows claim combinations of coefficients that the motion does not determine, and no
-later row corrects that ("Looking back" in docs/choices.md). So the samples of a window are kept
-with the state from before them, and folded again from it, about the present estimate, once that has
-moved: the iterated update (Bell and Cathey 1993, IEEE Trans. Automat. Contr. 38, 294), a
-Gauss-Newton step.
+What a sample tells is right to first order in the error of the coefficients that it is linearised
+about. While little is known, samples claim combinations of coefficients that the motion does not
+determine, and no later one corrects that ("Looking back" in docs/choices.md). So the samples of a
+window are kept with the state from before them, and folded again from it, about the present
+estimate, once that has moved: the iterated update (Bell and Cathey 1993, IEEE Trans. Automat.
+Contr. 38, 294), a Gauss-Newton step.
 """
+
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +17,6 @@ from numpy.typing import NDArray
 from rov_ident.core.jit import interpreting
 from rov_ident.core.messages import Array
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.estimation import rls
 from rov_ident.estimation.shared import Problem
 from rov_ident.sampling.sample import joined
 
@@ -26,15 +28,17 @@ _LARGEST_CHANGE = 1.0  # standard deviations, by which an estimate may be off in
 
 
 class IteratedUpdate:
-    """The samples of a window and the state before them; begins with a ``state``."""
+    """The samples of a window and the state before them; begins with a ``state`` of an estimator,
+    the ``module``."""
 
-    def __init__(self, state: rls.State) -> None:
+    def __init__(self, module: ModuleType, state: Any) -> None:
+        self._module = module
         self.begin(state)
 
-    def begin(self, state: rls.State) -> None:
+    def begin(self, state: Any) -> None:
         """A new window: what was learnt before stays as it is."""
         self._before, self._samples = state, list[NDArray[np.void]]()
-        self._about: Array = state.solution[np.argsort(state.order)]
+        self._about: Array = self._module.about_of(state)
         self._began, self._looks = np.nan, 0
 
     def until_due(self, samples: NDArray[np.void]) -> int:
@@ -46,7 +50,7 @@ class IteratedUpdate:
             return len(samples)
         return int(np.argmax(samples["t"] >= due)) + 1
 
-    def after(self, task: Problem, state: rls.State, samples: NDArray[np.void]) -> rls.State:
+    def after(self, task: Problem, state: Any, samples: NDArray[np.void]) -> Any:
         """The state to go on with, after these samples (k,) were folded."""
         self._samples.append(samples)
         if samples["t"][-1] < self._began + _TIMES[self._looks]:
@@ -58,22 +62,22 @@ class IteratedUpdate:
         return state
 
     @one_blas_thread()
-    def iterate(self, task: Problem, state: rls.State) -> rls.State:
+    def iterate(self, task: Problem, state: Any) -> Any:
         """The state with the window's samples folded about its estimate, if that has moved.
 
         Repeated until rows and the estimate that follows from them agree; where they never do, too
         little is known yet, and the state stays. So it does while kernels are interpreted, when all
         this would take minutes.
         """
-        about, std = rls.solution_of(state)
+        about, std = self._module.solution_of(state)
         if interpreting() or not self._samples or not _differ(about, self._about, std):
             return state
         samples = joined(self._samples)
         for _ in range(_PASSES):
-            again = rls.fold_about(task, self._before, samples, about)
+            again = self._module.fold_about(task, self._before, samples, about)
             if again is None:
                 break
-            solution, std = rls.solution_of(again)
+            solution, std = self._module.solution_of(again)
             if not _differ(solution, about, std):
                 self._about = about
                 return again

@@ -169,7 +169,7 @@ class OnlineEstimator:
         """Back to the prior; the input buffers and counts go on, in whatever frames come next."""
         self.sampler.validation.forget_frames()
         self._state = self._module.init(self._task)
-        self._update = IteratedUpdate(self._state) if self.kind == "rls" else None
+        self._update = IteratedUpdate(self._module, self._state)
         self._last_t = math.nan
         self._reading_noise = np.zeros(6)  # of the last sample
         self._recalled = 0  # ns: the stamp before the first sample
@@ -190,7 +190,7 @@ class OnlineEstimator:
         """Take other settings of the same model and coefficients; what is learnt stays."""
         self.config = config = config.with_nuisance
         self._task = self._module.problem(config)
-        self._begin_window()
+        self._update.begin(self._state)
         self.sampler.configure(config)
         self._centre(self._effect_values)
 
@@ -265,7 +265,7 @@ class OnlineEstimator:
     def flush(self) -> NDArray[np.void]:
         """The input has ended or stopped: use what still waits for a late topic."""
         info = self.take(self.sampler.flush())
-        if self._update and self._enabled:
+        if self._enabled:
             self._state = self._update.iterate(self._task, self._state)
         return info
 
@@ -296,7 +296,7 @@ class OnlineEstimator:
                 self._follow_excitation()
                 if len(self._about):
                     self._recentre()
-            self._recent.forget(self._last_t)
+            self._recent.forget(self._last_t, self.memory())
         if self.monitor is not None and self.sampler.commands is not None:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:
@@ -307,11 +307,8 @@ class OnlineEstimator:
         return info
 
     def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
-        """Fold samples (k,) into the state; RLS iterates its update at the times it has set."""
+        """Fold samples (k,) into the state, and iterate the update at the times it has set."""
         fold, task, update = self._module.fold, self._task, self._update
-        if not update:
-            self._state, info = fold(task, self._state, samples)
-            return info
         infos = []
         while len(samples):
             count = update.until_due(samples)
@@ -321,16 +318,12 @@ class OnlineEstimator:
             infos.append(info)
         return np.concatenate(infos) if len(infos) > 1 else infos[0]
 
-    def _begin_window(self) -> None:
-        if self._update:
-            self._update.begin(self._state)
-
     def next_record(self) -> None:
         """Another record follows: inputs begin anew, what is learnt stays."""
         self.sampler, self._settled = Sampler(self.config), math.nan
-        self._recent.clear()
-        self._begin_window()
+        self._update.begin(self._state)
         self._centre(self._effect_values)
+        self._begin_at(self.memory())
 
     @property
     def _effect_values(self) -> dict[str, float]:
@@ -364,7 +357,6 @@ class OnlineEstimator:
         outdated = np.maximum(_OUTDATED * unit, raw.std[own])
         moved = self._is_time & (np.abs(now - self._learnt_about) > outdated)
         if moved.any() and not at_once:
-            self._begin_with(self._origin)
             self._learn_again()
 
     def _learn_again(self) -> None:
@@ -373,19 +365,22 @@ class OnlineEstimator:
         Not while kernels are interpreted, when it would take minutes.
         """
         if interpreting():
+            self._begin_with(self._origin)
             return
-        sampler, samples = self._recent.again(
-            self.config, self._centre_config, self._origin.kinematics, self.sampler
+        memory, sampler, samples = self._recent.again(
+            self.config, self._centre_config, self._origin, self.sampler
         )
+        self._begin_with(memory)
         if len(samples) == 0:  # the messages before were forgotten
             return
         self.sampler, samples = sampler, after_reset(samples)
-        self._last_t = float(samples["t"][-1])
         while len(samples):
             count = int(np.sum(samples["t"] < samples["t"][0] + CENTRING_TIME))
             self._fold(samples[:count])
             self._window += sum(samples["dt"][:count].tolist())
+            self._last_t = float(samples["t"][count - 1])
             self._follow_excitation()
+            self._recent.forget(self._last_t, self.memory())
             samples = samples[count:]
         self._centred = self._last_t
 
@@ -442,7 +437,7 @@ class OnlineEstimator:
     def _begin_with(self, memory: Memory) -> None:
         """Know what is in the memory and nothing else."""
         self._state, self._centred = memory.state, math.nan
-        self._begin_window()
+        self._update.begin(self._state)
         self._learnt_about, self._settled = self._about, math.nan
         self._gained, self._window = memory.gained.copy(), memory.window.copy()
         self._variance, self._safe = memory.variance, memory.safe

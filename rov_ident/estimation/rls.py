@@ -100,6 +100,7 @@ from rov_ident.estimation.square_root import (
     stack,
     whiten,
 )
+from rov_ident.estimation.thrust_coordinates import jacobian_of, relative_thrust, values_of
 from rov_ident.estimation.wrench_residual import filtered_residual
 from rov_ident.model.equations import add_added_mass, momentum_columns
 
@@ -159,11 +160,9 @@ def problem(config: Config) -> Problem:
     factor, variable = own.forgetting_factor, own.forgetting == "variable"
     task = problem_of(config, _SETTINGS, gate=own.gate, forgetting_factor=factor, variable=variable)
     task.settings["walks"] = task.drift.any()
-    if (i := task.thrust) >= 0:
-        s0, upper = task.theta[task.estimated[i]], prior_of(config, True).upper[i]
-        task.highest[i] = min(task.highest[i], s0 / task.scale[i] * (1.0 - s0 / upper))
+    if task.thrust >= 0:
         # prior standard deviations of the coordinates
-        std = np.linalg.norm(np.linalg.inv(_jacobian(task, np.zeros(len(task.scale)))), axis=1)
+        std = np.linalg.norm(np.linalg.inv(jacobian_of(task, np.zeros(len(task.scale)))), axis=1)
         task.reach[:] = REACH * std
         task.highest[task.per_thrust] = np.minimum(-task.start, task.reach)[task.per_thrust]
         free = task.per_thrust & ~prior_of(config, True).negative
@@ -178,7 +177,7 @@ def init(task: Problem) -> State:
     scalars["free"], scalars["rho"] = n, 1.0
     root = np.eye(n, n + 1)
     # of the prior, a unit matrix for the coefficients themselves
-    root[:, :n] = np.linalg.qr(_jacobian(task, np.zeros(n)))[1]
+    root[:, :n] = np.linalg.qr(jacobian_of(task, np.zeros(n)))[1]
     return State(
         np.arange(n),
         root,
@@ -228,11 +227,11 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
     information = inverse @ inverse.T
     solution = (inverse @ state.root[:, n])[place]
-    unit = task.scale[:, None] * _jacobian(task, solution)
+    unit = task.scale[:, None] * jacobian_of(task, solution)
     covariance = calibrated(information, state.score)[np.ix_(place, place)]
     return Estimate(
         prior.names,
-        _values(task, solution),
+        values_of(task, solution),
         unit @ covariance @ unit.T,
         float(state.scalars["t"][0]),
     )
@@ -244,51 +243,18 @@ def solution_of(state: State) -> tuple[Array, Array]:
     return (inverse @ state.root[:, -1])[place], np.linalg.norm(inverse, axis=1)[place]
 
 
+def about_of(state: State) -> Array:
+    """The coordinates (n,) that the next row is taken about."""
+    about: Array = state.solution[np.argsort(state.order)]
+    return about
+
+
 def variance(task: Problem, state: State) -> Array:
     """Diagonal (n,) of the inverse information, in squared units: what excitation is judged by."""
     inverse = inverse_of(state.root)[np.argsort(state.order)]
-    root = _jacobian(task, inverse @ state.root[:, -1]) @ inverse
+    root = jacobian_of(task, inverse @ state.root[:, -1]) @ inverse
     variances: Array = task.scale**2 * (root**2).sum(axis=1)
     return variances
-
-
-# ------------------------------------------------------------------ coordinates
-#
-# With thrust, coefficients, rigid body and weight k times as large, the motion is the same. So rows
-# say little along the line through the origin of thrust scale and coefficients, and where that runs
-# depends on the coefficients: rows linear about some would claim, about others, to know the scale.
-# R is kept in coordinates in which all these lines are parallel. With rho the scale over its prior
-# mean, they are -1 / rho and coefficient / rho; where no scale is estimated, rho is 1.
-
-
-@inlined
-def _relative_thrust(task, deviation):
-    """rho, of the scaled deviation of the thrust scale."""
-    i = task.thrust
-    bounded = min(max(deviation, -REACH), task.highest[i])
-    return 1.0 / (1.0 - task.scale[i] / task.theta[task.estimated[i]] * bounded)
-
-
-def _values(task: Problem, solution: Array) -> Array:
-    """Coefficients (n,) in their units, of a solution (n,) in their order."""
-    values: Array = task.theta[task.estimated] + task.scale * solution
-    if task.thrust >= 0:
-        rho = _relative_thrust(task, solution[task.thrust])
-        values[task.per_thrust] *= rho
-        values[task.thrust] = rho * task.theta[task.estimated[task.thrust]]
-    return values
-
-
-def _jacobian(task: Problem, solution: Array) -> Array:
-    """Derivatives (n, n) of the coefficients, in prior deviations, with respect to coordinates."""
-    out, i, scaled = np.eye(len(task.scale)), task.thrust, task.per_thrust
-    if i >= 0:
-        values, rho = _values(task, solution), _relative_thrust(task, solution[i])
-        out[scaled] *= rho
-        step = rho * task.scale[i] / task.theta[task.estimated[i]]
-        out[scaled, i] = step * values[scaled] / task.scale[scaled]
-        out[i, i] = rho**2
-    return out
 
 
 def condition(task: Problem, state: State) -> float:
@@ -469,7 +435,7 @@ def _take_over(task, state, work):
     rho = 1.0
     for a in range(len(work.estimated)):
         if state.order[a] == task.thrust:
-            rho = _relative_thrust(task, state.deviation[a])
+            rho = relative_thrust(task, state.deviation[a])
     for a in range(len(work.estimated)):
         e = work.estimated[a]
         if state.order[a] == task.thrust:

@@ -55,7 +55,8 @@ class Problem(NamedTuple):
     scale: Array  # (n,) prior standard deviations
     start: Array  # (n,) prior means over those
     reach: Array  # (n,) scaled deviation that they are not off by, either way
-    highest: Array  # (n,) scaled deviation that the coefficients of RLS's observer do not exceed
+    highest: Array  # (n,) scaled deviation that the coefficients of RLS's observer do not exceed,
+    # and the thrust scale of neither estimator
     drift: Array  # (n,) variance density of the random walk of scaled parameters, 1/s
     rigid_body: Array  # (6, 6)
     restoring: Array  # (6, 3)
@@ -76,6 +77,11 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
     names, mean = prior.names, dict(zip(prior.names, prior.mean, strict=True))
     thrust = names.index(THRUST_SCALE) if mean.get(THRUST_SCALE, 0.0) > 0.0 else -1
     per_thrust = [thrust >= 0 and moves_with_thrust(name) for name in names]
+    highest = np.where(prior.negative, np.minimum(-start, REACH), REACH)
+    if thrust >= 0:  # of the coordinate, where the scale is at its bound (`thrust_coordinates`)
+        s0 = mean[THRUST_SCALE]
+        bound = start[thrust] * (1.0 - s0 / prior.upper[thrust])
+        highest[thrust] = min(highest[thrust], bound)
     absolute = [EFFECTS[effect].act is None for effect, _ in config.estimate_effects]
     return Problem(
         values,
@@ -86,7 +92,7 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         prior.std,
         start,
         np.full(len(start), REACH),
-        np.where(prior.negative, np.minimum(-start, REACH), REACH),
+        highest,
         drift_of(config, prior.names),
         body.mass_matrix,
         body.restoring,

@@ -1,8 +1,10 @@
 """Unscented Kalman filter over body velocities and coefficients: ``init``, ``step``, ``fold``.
 
 State ``x = [nu (6), xi (n)]`` with ``theta = scale xi``, the scale being the prior's standard
-deviation: linear, or early information would be reinterpreted whenever xi moves. Signs are for what
-leaves the filter (`physical`); inside, a sigma point's mass matrix is kept positive definite.
+deviation: linear, or early information would be reinterpreted whenever xi moves. Where the thrust
+scale is estimated, xi are the coordinates of `thrust_coordinates` for the same reason. Signs are
+for what leaves the filter (`physical`); inside, a sigma point's mass matrix is kept positive
+definite.
 
 Prediction: scaled sigma points (van der Merwe 2004; as in filterpy) through Runge-Kutta steps of
 the equations of motion, LANES points side by side. The coefficients do not move and the measurement
@@ -14,7 +16,8 @@ centre point: with e = mean - centre and W the weight of an outer point
 in which the huge central weight has cancelled exactly.
 
 Update: odometry and gyro measure nu with independent noise, so one component after another is the
-same as all at once; the covariance takes three of them together.
+same as all at once; the covariance takes three of them together. Samples that were folded with
+sigma points about poor coefficients are folded again, about better ones (``iterated_update``).
 
 Coefficients whose motion is not well above its noise are *considered*, not estimated (Schmidt
 1966): they stay what they are, their uncertainty is carried along. So are those of an axis, and a
@@ -64,6 +67,7 @@ from rov_ident.estimation.shared import (
     wrench_of,
 )
 from rov_ident.estimation.square_root import cholesky, cholesky_solve, multiply
+from rov_ident.estimation.thrust_coordinates import jacobian_of, relative_thrust, values_of
 from rov_ident.estimation.wrench_residual import filtered_residual
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import (
@@ -89,7 +93,13 @@ _ROOM = 1.5  # for innovation_monitor.watch ("Constants of the process noise" in
 # beta - alpha^2; gate, NIS from which the vehicle has changed; corner of the residual [rad/s]
 _SETTINGS = record(floats((), "spread weight centre gate changed corner"))
 # s; since innovations were summed up, since the coefficients walked
-_SCALARS = record([*floats((), "t since since_walk"), ("started", "?")])
+_SCALARS = record(
+    [
+        *floats((), "t since since_walk"),
+        ("started", "?"),
+        ("pinned", "?"),  # sigma points are taken about State.about
+    ]
+)
 
 
 class State(NamedTuple):
@@ -102,6 +112,7 @@ class State(NamedTuple):
     score: Array  # (n, n): covariance of the summed influence of the innovations, and of the prior
     lagged: Array  # (n,): that influence of late, under the lag window
     before: Array  # (n,): xi when it was last summed
+    about: Array  # (n,): xi that sigma points are taken about while it is pinned
     scalars: NDArray[np.void]  # (1,)
 
 
@@ -119,13 +130,18 @@ def problem(config: Config) -> Problem:
 def init(task: Problem) -> State:
     """Nothing learnt: the prior; the velocity is taken from the first measurement."""
     n = len(task.scale)
+    # of the prior, a unit matrix for the coefficients themselves
+    jacobian = jacobian_of(task, np.zeros(n))
+    p = np.eye(6 + n)
+    p[6:, 6:] = np.linalg.inv(jacobian.T @ jacobian)
     return State(
         np.concatenate([np.zeros(6), task.start]),
-        np.eye(6 + n),
+        p,
         np.zeros((4, 6)),
         first_monitor(task.process),
-        np.eye(n),
+        jacobian.T @ jacobian,
         np.zeros(n),
+        task.start.copy(),
         task.start.copy(),
         np.zeros(1, dtype=_SCALARS),
     )
@@ -136,6 +152,17 @@ def fold(task: Problem, state: State, samples: NDArray[np.void]) -> tuple[State,
     return folded(_fold, task, state, samples)
 
 
+def fold_about(
+    task: Problem, state: State, samples: NDArray[np.void], solution: Array
+) -> State | None:
+    """:func:`fold` with sigma points about one solution (n,); None if the velocities run away."""
+    pinned = state.scalars.copy()
+    pinned["pinned"] = True
+    state, info = fold(task, state._replace(about=solution.copy(), scalars=pinned), samples)
+    state.scalars["pinned"] = False
+    return None if (info["reason"] == UNPREDICTABLE).any() else state
+
+
 def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, NDArray[np.void]]:
     """One sample (1,) of SAMPLE; the next state and what happened (1,) of INFO."""
     assert len(sample) == 1
@@ -144,17 +171,30 @@ def step(task: Problem, state: State, sample: NDArray[np.void]) -> tuple[State, 
 
 def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     """Coefficients and covariance (n, n), calibrated for coloured residuals, in their own units."""
+    deviation = state.x[6:] - task.start
+    unit = task.scale[:, None] * jacobian_of(task, deviation)
     return Estimate(
         prior.names,
-        task.scale * state.x[6:],
-        calibrated(state.p[6:, 6:], state.score) * np.outer(task.scale, task.scale),
+        values_of(task, deviation),
+        unit @ calibrated(state.p[6:, 6:], state.score) @ unit.T,
         float(state.scalars["t"][0]),
     )
 
 
+def solution_of(state: State) -> tuple[Array, Array]:
+    """The coordinates and their standard deviations, both (n,)."""
+    return state.x[6:], np.sqrt(np.diag(state.p)[6:])
+
+
+def about_of(state: State) -> Array:
+    """The coordinates (n,) that the next sigma points are taken about."""
+    return state.x[6:]
+
+
 def variance(task: Problem, state: State) -> Array:
     """Variances (n,) of the filter, in squared units: what excitation is judged by."""
-    variances: Array = np.diag(state.p)[6:] * task.scale**2
+    unit = task.scale[:, None] * jacobian_of(task, state.x[6:] - task.start)
+    variances: Array = np.sum((unit @ state.p[6:, 6:]) * unit, axis=1)
     return variances
 
 
@@ -171,6 +211,7 @@ _SCRATCH = record(
         *floats((6, LANES), "nu h stage nu_dot total push"),
         *floats((6, 6, LANES), "mass inverse"),  # of the inverse the lower half
         *floats((EXTENDED_SIZE, LANES), "extended"),
+        *floats((LANES,), "rho"),
         ("centre_inverse", "f8", (6, 6)),
         # nu of the centre point, mean minus centre; wrench minus restoring in mid-interval, and its
         # slope; variance density of the wrench; nu as measured, its variance
@@ -185,7 +226,9 @@ _SCRATCH = record(
 )
 
 
-Work = namedtuple("Work", "p upper root moved cross gain block free moves noisy theta mean scratch")
+Work = namedtuple(
+    "Work", "p upper root moved cross gain block free moves noisy theta mean centre pull scratch"
+)
 """Scratch for all samples of a fold. Zeros fill the rows of matrices to a multiple of LANES."""
 
 
@@ -206,6 +249,8 @@ def _work(task, state):
         np.empty(6, dtype=np.bool_),
         np.empty((m, LANES)),
         np.empty((m, 1)),
+        np.empty(size),  # what sigma points are taken about
+        np.zeros(columns),  # P_xi^-1 (xi - what they are taken about)
         np.empty(1, dtype=_SCRATCH),  # in one record, whose parts the compiler knows apart
     )
     copy(state.p, work.p)
@@ -247,7 +292,8 @@ def _steps(task, state, work, samples, sides, infos):
         else:
             _guide(state.x, work, sample)
             _take_root(work, info)
-            _predict(task, state.x, work, sample, side)
+            _take_centre(state, work)
+            _predict(task, work.centre, work, sample, side)
             if not _collect(task, state, work, sample):
                 info.reason = UNPREDICTABLE
                 c.started = False
@@ -310,6 +356,32 @@ def _take_root(work, out):
 
 
 @inlined
+def _take_centre(state, work):
+    """work.centre, the velocities for the coefficients that it has: those of the estimate, or those
+    that are pinned."""
+    x, pull, n = state.x, work.pull, len(state.about)
+    for i in range(len(x)):
+        work.centre[i] = x[i]
+    for j in range(n):
+        pull[j] = 0.0
+    if not state.scalars[0].pinned:
+        return
+    matrix, upper, root = work.block[0], work.block[1], work.block[2]
+    for j in range(n):
+        for k in range(n):
+            matrix[j, k] = work.p[6 + j, 6 + k]
+    if not cholesky(matrix, upper, root):
+        return
+    for j in range(n):
+        work.centre[6 + j] = state.about[j]
+        pull[j] = x[6 + j] - state.about[j]
+    cholesky_solve(root, n, pull)
+    for i in range(6):
+        for j in range(n):
+            work.centre[i] -= work.p[i, 6 + j] * pull[j]
+
+
+@inlined
 def _predict(task, x, work, sample, side):
     """Move the sigma points to the sample's time: work.moved, and the centre's inverse mass."""
     s, spread, columns = work.scratch[0], task.settings[0].spread, work.root.shape[1]
@@ -351,6 +423,16 @@ def _spread(task, x, work, first, spread):
         e, scale, mean = task.estimated[j], task.scale[j], x[6 + j]
         for k in range(LANES):
             theta[e, k] = scale * (mean + spread * root[k])
+    if task.thrust >= 0:
+        at, rho = task.estimated[task.thrust], s.rho
+        for k in range(LANES):
+            deviation = theta[at, k] / task.scale[task.thrust] - task.start[task.thrust]
+            rho[k] = relative_thrust(task, deviation)
+            theta[at, k] = rho[k] * task.theta[at]
+        for j in range(len(task.scale)):
+            if task.per_thrust[j]:
+                for k in range(LANES):
+                    theta[task.estimated[j], k] *= rho[k]
     for i in range(6):
         for k in range(LANES):
             s.mass[i, i, k] = task.rigid_body[i, i]
@@ -456,6 +538,9 @@ def _collect(task, state, work, sample):
                 w += plus[i + 2, k] * root[j, k]
             p[i, j], p[i + 1, j], p[i + 2, j] = u, v, w
             p[j, i], p[j, i + 1], p[j, i + 2] = u, v, w
+    for i in range(6):  # from what they were taken about to the estimate
+        for j in range(size - 6):
+            x[i] += p[i, 6 + j] * work.pull[j]
     return True
 
 
@@ -710,8 +795,15 @@ def _walk(task, state, work, relearnt, elapsed):
 def _residual(task, state, work, sample, side, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     s, theta, mass = work.scratch[0], work.mean, work.scratch[0].one_mass
+    rho = 1.0
+    if task.thrust >= 0:
+        rho = relative_thrust(task, state.x[6 + task.thrust] - task.start[task.thrust])
     for j in range(len(task.scale)):
-        theta[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
+        value = task.scale[j] * state.x[6 + j]
+        theta[task.estimated[j], 0] = value * rho if task.per_thrust[j] else value
+    if task.thrust >= 0:
+        at = task.estimated[task.thrust]
+        theta[at, 0] = rho * task.theta[at]
     wrench_of(theta, sample, side, s.wrench)
     for i in range(6):
         for j in range(6):
