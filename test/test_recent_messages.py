@@ -55,3 +55,27 @@ def test_what_an_earlier_record_told_stays(kind, dived):
     estimator.follow(messages[: len(messages) // 10])
     estimator._learn_again()
     assert np.median(information(estimator) / known) > 0.95
+
+
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_what_was_told_before_a_pause_stays(kind, dived):
+    config, messages = dived
+    estimator = OnlineEstimator(config, kind)
+    estimator.follow(messages[: len(messages) // 2])
+    known = information(estimator)
+    estimator.enabled = False
+    estimator.enabled = True
+    estimator.follow(messages[len(messages) // 2 :])
+    estimator._learn_again()
+    assert np.median(information(estimator) / known) > 0.95
+
+
+def test_messages_of_a_clock_that_was_set_back_are_forgotten(dived):
+    """As where a bag is played in a loop: a later time of the first round is none before now."""
+    _, messages = dived
+    recent = recent_messages.RecentMessages()
+    for now in (*range(100), *range(50)):
+        recent.forget(float(now), memory=now)
+        recent.add(*messages[0])
+    assert len(recent._kept) == 50
+    assert max(t for t, _ in recent._known) < 50.0 and not recent._whole

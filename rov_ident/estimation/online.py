@@ -208,7 +208,7 @@ class OnlineEstimator:
     def enabled(self, value: bool) -> None:
         self._paused = self._paused or not value
         if value != self._enabled:
-            self._recent.clear()
+            self._begin_at(self.memory())
         self._enabled = value
 
     @property

@@ -43,9 +43,12 @@ class RecentMessages:
 
     def forget(self, now: float, memory: Any) -> None:
         """It is the time ``now`` [s] of samples, and ``memory`` is known; drop what came long
-        before."""
+        before, or by another clock, which was set back since."""
         self._now = now
-        if not self._known or abs(now - self._known[-1][0]) >= _APART:
+        if self._known and now < self._known[-1][0]:
+            self.clear()
+            self._whole = False
+        if not self._known or now - self._known[-1][0] >= _APART:
             self._known.append((now, memory))
         while self._kept and self._kept[0][0] < now - LOOK_BACK:
             self._kept.popleft()

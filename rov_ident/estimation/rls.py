@@ -100,7 +100,7 @@ from rov_ident.estimation.square_root import (
     stack,
     whiten,
 )
-from rov_ident.estimation.thrust_coordinates import jacobian_of, relative_thrust, values_of
+from rov_ident.estimation.thrust_coordinates import jacobian_of, take_thrust, values_of
 from rov_ident.estimation.wrench_residual import filtered_residual
 from rov_ident.model.equations import add_added_mass, momentum_columns
 
@@ -281,6 +281,7 @@ _SCRATCH = record(
         # what uncertain coefficients add to the variance of innovations, in the order of the rows;
         # the part of it that those add which are held, in this order and by axis
         ("spread", "f8", (3, 6)),
+        ("rho", "f8", (1,)),
     ]
 )
 
@@ -432,19 +433,10 @@ def _take_over(task, state, work):
     s = work.scratch[0]
     for j in range(len(task.theta)):
         work.one_theta[j, 0] = task.theta[j]
-    rho = 1.0
     for a in range(len(work.estimated)):
-        if state.order[a] == task.thrust:
-            rho = relative_thrust(task, state.deviation[a])
-    for a in range(len(work.estimated)):
-        e = work.estimated[a]
-        if state.order[a] == task.thrust:
-            work.one_theta[e, 0] *= rho
-        else:
-            work.one_theta[e, 0] += work.scale[a] * state.deviation[a]
-            if task.per_thrust[state.order[a]]:
-                work.one_theta[e, 0] *= rho
-    state.scalars[0].rho = rho
+        work.one_theta[work.estimated[a], 0] += work.scale[a] * state.deviation[a]
+    take_thrust(1, task, work.one_theta, s.rho)
+    state.scalars[0].rho = s.rho[0]
     for j in range(len(task.theta)):
         for k in range(LANES):
             work.theta[j, k] = work.one_theta[j, 0]

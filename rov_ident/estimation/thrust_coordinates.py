@@ -23,6 +23,24 @@ def relative_thrust(task, deviation):
     return 1.0 / (1.0 - task.scale[i] / task.theta[task.estimated[i]] * bounded)
 
 
+@inlined
+def take_thrust(lanes, task, theta, rho):
+    """theta (m, lanes) of ``theta0 + scale * deviation`` becomes that of the coefficients; rho
+    (lanes,)."""
+    for k in range(lanes):
+        rho[k] = 1.0
+    if task.thrust >= 0:
+        at = task.estimated[task.thrust]
+        for k in range(lanes):
+            deviation = (theta[at, k] - task.theta[at]) / task.scale[task.thrust]
+            rho[k] = relative_thrust(task, deviation)
+            theta[at, k] = rho[k] * task.theta[at]
+        for j in range(len(task.scale)):
+            if task.per_thrust[j]:
+                for k in range(lanes):
+                    theta[task.estimated[j], k] *= rho[k]
+
+
 def values_of(task: Problem, deviation: Array) -> Array:
     """Coefficients (n,) in their units, of coordinates (n,) as they deviate from the prior's."""
     values: Array = task.theta[task.estimated] + task.scale * deviation

@@ -67,7 +67,7 @@ from rov_ident.estimation.shared import (
     wrench_of,
 )
 from rov_ident.estimation.square_root import cholesky, cholesky_solve, multiply
-from rov_ident.estimation.thrust_coordinates import jacobian_of, relative_thrust, values_of
+from rov_ident.estimation.thrust_coordinates import jacobian_of, take_thrust, values_of
 from rov_ident.estimation.wrench_residual import filtered_residual
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import (
@@ -423,16 +423,7 @@ def _spread(task, x, work, first, spread):
         e, scale, mean = task.estimated[j], task.scale[j], x[6 + j]
         for k in range(LANES):
             theta[e, k] = scale * (mean + spread * root[k])
-    if task.thrust >= 0:
-        at, rho = task.estimated[task.thrust], s.rho
-        for k in range(LANES):
-            deviation = theta[at, k] / task.scale[task.thrust] - task.start[task.thrust]
-            rho[k] = relative_thrust(task, deviation)
-            theta[at, k] = rho[k] * task.theta[at]
-        for j in range(len(task.scale)):
-            if task.per_thrust[j]:
-                for k in range(LANES):
-                    theta[task.estimated[j], k] *= rho[k]
+    take_thrust(LANES, task, theta, s.rho)
     for i in range(6):
         for k in range(LANES):
             s.mass[i, i, k] = task.rigid_body[i, i]
@@ -795,15 +786,9 @@ def _walk(task, state, work, relearnt, elapsed):
 def _residual(task, state, work, sample, side, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     s, theta, mass = work.scratch[0], work.mean, work.scratch[0].one_mass
-    rho = 1.0
-    if task.thrust >= 0:
-        rho = relative_thrust(task, state.x[6 + task.thrust] - task.start[task.thrust])
     for j in range(len(task.scale)):
-        value = task.scale[j] * state.x[6 + j]
-        theta[task.estimated[j], 0] = value * rho if task.per_thrust[j] else value
-    if task.thrust >= 0:
-        at = task.estimated[task.thrust]
-        theta[at, 0] = rho * task.theta[at]
+        theta[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
+    take_thrust(1, task, theta, s.rho)
     wrench_of(theta, sample, side, s.wrench)
     for i in range(6):
         for j in range(6):
