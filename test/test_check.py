@@ -31,7 +31,8 @@ from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.batch_fit import fit_batch
-from rov_ident.offline.delays import Delay, Filtered, motion_behind_wrench
+from rov_ident.offline.delays import Delay, Filtered, filtered, motion_behind_wrench, samples_of
+from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.records import read_record
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -171,9 +172,25 @@ def test_a_wrench_that_stays_shows_no_inertia(checked):
     assert said.level == WARNING and "hardly changes" in said.text
 
 
+@pytest.mark.parametrize("rate", [20.0, 8.0, *more(10.0, 5.0, 4.0)])
+def test_a_delay_does_not_depend_on_the_rate_of_the_odometry(heavy, rate):
+    """Rows of slow odometry are further apart: a delay of 0.15 s read 0.11 at 8 Hz, 0.05 at 4."""
+    suite = sensors.Suite(odometry_rate=rate, imu_rate=0.0)
+    messages = [
+        (role, m._replace(stamp=m.stamp - 150_000_000) if role == WRENCH else m)
+        for _, role, m in sensors.dive(heavy, "steps", 90.0, suite, 3).messages
+    ]
+    rows = filtered(samples_of(gather(messages, heavy)), heavy)
+    # to first order in 0.15 s
+    assert motion_behind_wrench(rows).value == pytest.approx(0.14, abs=0.01)
+
+
 def test_a_wrench_that_holds_shows_no_delay():
     rows = Filtered(
-        np.random.default_rng(1).standard_normal((50, 6, 4)), np.ones((50, 6)), np.ones(6, bool)
+        np.arange(50.0),
+        np.random.default_rng(1).standard_normal((50, 6, 4)),
+        np.ones((50, 6)),
+        np.ones(6, bool),
     )
     assert np.isnan(motion_behind_wrench(rows).value)
 
@@ -511,6 +528,24 @@ def proposal(heavy, surge_only):
     return propose(heavy, surge_only, 15.0, Limits((4.0, 4.0, 1.5)))
 
 
+@pytest.mark.parametrize(
+    "effects",
+    [{"thruster_lag": {"time_constant": 0.5}}, {"thruster_gain": {"gain_X": 0.5, "gain_Y": 0.5}}],
+)
+def test_a_flight_goes_as_far_as_the_vehicle_does(heavy, effects):
+    """With what its thrusters make of commands: a lag overshoots, weak thrust goes less far."""
+    name = next(iter(effects))
+    config = configuration.from_parameters(
+        configuration.to_parameters(heavy) | {"effects": effects}
+    )
+    assert name in config.effects
+    manoeuvre = closed_loop_manoeuvres.library(Limits())[0]
+    flight = closed_loop_manoeuvres.fly(config, manoeuvre, 30.0, Limits())
+    dive = closed_loop_manoeuvres.dive(config, manoeuvre, 30.0, Limits(), sensors.Suite())
+    reach = np.abs(dive.truth.position).max(axis=0)
+    np.testing.assert_allclose(reach[0], flight.reach[0], rtol=0.05)
+
+
 def test_the_proposal_is_safe_and_shrinks_the_worst(heavy, proposal):
     before = {p.name: p.std for p in proposal.before}
     after = {p.name: p.std for p in proposal.after}
@@ -557,8 +592,10 @@ def test_what_is_promised_is_what_a_fit_then_states(tmp_path):
     n = len(shipped.estimate)
     driven = np.array([p.std for p in proposal.after])
     stated = fit.std[:n] / np.hypot(driven, proposal.beyond_driving)
-    # damping of zero is at its bound, and half of a normal distribution is narrower
-    assert stated[true.model.theta != 0.0].min() > 0.5 and stated.max() < 2.0
+    # damping of zero is at its bound, and half of a normal distribution is narrower; and what
+    # uncertain thrust makes of it depends on Munk moments, with added masses that are 30 % off
+    stated = stated[true.model.theta != 0.0]
+    assert stated.min() > 0.5 and stated.max() < 2.0
     error = (fit.values[:n] - true.model.theta) / driven
     assert np.sqrt(np.mean(error**2)) < 1.5
     assert "no driving tells" in proposal.sentence

@@ -18,7 +18,7 @@ from bench.simulators import sea
 from rov_ident import config as configuration
 from rov_ident.config.prior import prior_of
 from rov_ident.core.states import State
-from rov_ident.estimation.consistency import Consistency, consistency_of
+from rov_ident.estimation.consistency import Consistency, Test, consistency_of
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
@@ -68,6 +68,20 @@ def test_clean_dives_agree(seed, driving, kind):
     _, report = report_of("", driving, seed, kind)
     assert report.consistency.consistent, report.consistency.sentence
     assert State.CONVERGED in report.states
+
+
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
+def test_intervals_are_widened_by_the_worst_test_whenever_it_comes(seed):
+    """Not by one after the other."""
+    rng = np.random.default_rng(seed)
+    tests = [Test(f"test {i}", value, 1.0, "") for i, value in enumerate(rng.uniform(1.0, 9.0, 3))]
+    root = rng.standard_normal((4, 4))
+    covariance, prior, moved = root @ root.T, np.full(4, 1e3), np.zeros(4)
+    at_once = Consistency(tuple(tests)).widened(covariance, prior, moved)
+    for i in range(3):
+        known, now = Consistency(tuple(tests[:i])), Consistency(tuple(tests[: i + 1]))
+        covariance = now.widened(covariance, prior, moved, known.inflation)
+    np.testing.assert_allclose(covariance, at_once, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def fill(
     store.take_status(
         names[0],
         "model",
-        Status(1, "residual in surge follows |u|u: <b>drag</b> missing?", suspicion),
+        Status(1, "residual in surge follows |u| u: <b>drag</b> missing?", suspicion),
     )
 
 

@@ -312,6 +312,16 @@ def findings(verdict, effects=(), residual=()):
     )
 
 
+def test_a_velocity_that_was_not_measured_is_no_gain():
+    found = findings("retuned")
+    unmeasured = dataclasses.replace(
+        found,
+        baseline={"u": np.nan, **{n: x for n, x in found.baseline.items() if n != "u"}},
+        retuned={"u": np.nan, **{n: x for n, x in found.retuned.items() if n != "u"}},
+    )
+    assert "prediction of sway improves by 50 %" in told.verdict(unmeasured)
+
+
 def test_verdicts_in_words():
     lag = finding("thruster_lag", time_constant=(0.24, "s"))
     bias = finding("imu_bias", "kinematic", ax=(0.1, "m/s2"))
@@ -319,11 +329,11 @@ def test_verdicts_in_words():
     noise = Residual("N", "time", 0.314, 0.4)
     best = Residual("N", "pitch", None, 0.1, sure=False)
     assert told.verdict(findings("agrees")) == (
-        "The simulation agrees with the measurement: there is nothing to change."
+        "The simulation agrees with the measurement: nothing in these data asks for a change."
     )
     assert told.verdict(findings("retuned")) == (
-        "The structure of the simulation is right, its coefficients are off. "
-        "Retuned, the 10 s prediction of sway improves by 50 %."
+        "The coefficients of the simulation are off, and these data show nothing that its "
+        "structure lacks. Retuned, the 10 s prediction of sway improves by 50 %."
     )
     assert told.verdict(findings("explained", [lag])) == (
         "The simulation lacks thruster lag (time constant 0.24 s). "

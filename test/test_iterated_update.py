@@ -120,6 +120,20 @@ def test_a_window_is_folded_about_one_estimate_and_given_up(dived):
     assert most <= 1.1 * 30.0 / np.median(samples["dt"])
 
 
+def test_a_clock_that_is_set_back_begins_a_new_window(dived):
+    """Samples would gather until the old time comes again, and none be taken about better ones."""
+    estimator, samples, _ = dived
+    one = OnlineEstimator(estimator.config, estimator.kind)
+    part = samples[samples["t"] < samples["t"][0] + 20.0]
+    for start in (0.0, -3600.0):
+        moved = part.copy()
+        moved["t"] += start
+        moved["restart"][0] = True
+        one.take(moved)
+    kept = [t for held in one._update._samples for t in held["t"]]
+    assert not kept or max(kept) < 0.0
+
+
 def test_while_disabled_nothing_is_looked_back_on(dived, monkeypatch):
     estimator, samples, _ = dived
     one, looks = OnlineEstimator(estimator.config, estimator.kind), []

@@ -580,7 +580,7 @@ def test_a_simulation_that_lacks_something(live, heavy, tmp_path, estimator):
     tests = [f"{t.name}={t.value:.3g} (limit {t.limit:g})" for t in expected.consistency.tests]
     vehicle.until(lambda: all(test in vehicle.words() for test in tests))
 
-    missing = "residual in surge follows |u|u: quadratic damping"  # and, so soon, what is like it
+    missing = "residual in surge follows |u| u: quadratic damping"  # and, so soon, what is like it
     vehicle.until(lambda: missing in vehicle.words())
     status = next(
         status

@@ -172,6 +172,16 @@ def test_a_node_publishes_what_the_recursion_finds(steering, estimator):
     assert found.states[0].value == "stale"  # no wrench: the coefficients of the hull wait
 
 
+def test_a_clock_that_is_set_back_is_followed(steering):
+    """As of a bag that begins again: else nothing more would be taken, and K and T stay."""
+    vehicle = steering("rls", "rudder_joint")
+    for duration in (30.0, 10.0):
+        t, *motion = steered(0.3, 4.0, noise=1e-3, seed=3, duration=duration)
+        origin = played(vehicle, "rudder_joint", t, *motion)
+        end = origin + round(1e9 * t[-1])
+        vehicle.until(lambda end=end: from_diagnostics(vehicle.coefficients[-1]).stamp == end)
+
+
 def test_a_rudder_without_a_stamp_is_stamped_on_arrival(steering):
     vehicle = steering("rls", "")
     held = from_diagnostics(vehicle.coefficients[-1])

@@ -13,6 +13,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.jit import interpret, stop_interpreting
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH
 from rov_ident.core.states import Level, State
+from rov_ident.discrepancy.monitor import Monitor
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.estimation.physical import is_passive
 from rov_ident.sampling.sample import joined
@@ -339,6 +340,20 @@ def test_disabled_learns_nothing_and_goes_on_without_a_jolt(wrong, messages, kin
     a, b = publishable(estimator), publishable(gap)
     assert estimator.counts["sample: outlier"] <= gap.counts["sample: outlier"] + 3
     assert (np.abs(a.values - b.values) < 0.5 * b.std + 0.005 * np.abs(b.values)).all()
+
+
+@pytest.mark.parametrize("why", ["disabled", "no odometry"])
+def test_commands_are_not_hoarded_for_a_monitor_that_sees_no_samples(heavy, messages, why):
+    """A node may rest on deck for days."""
+    estimator = OnlineEstimator(heavy, "rls")
+    estimator.attach(Monitor(heavy))
+    estimator.enabled = why != "disabled"
+    for role, message in messages:
+        if why == "disabled" or role != ODOMETRY:
+            estimator.push(role, message)
+    assert estimator.counts[WRENCH] > 0 and len(estimator.sampler.commands) < 600
+    stamps = [m.stamp for role, m in messages if role == WRENCH]
+    assert len(stamps) > 1000
 
 
 def test_report_does_not_change_the_state(trained):

@@ -181,7 +181,7 @@ def in_order(state):
     r = state.root[:, :n][:, place]
     score = state.score[np.ix_(place, place)]
     free = np.arange(n) < state.scalars["free"][0]
-    return r, score, r.T @ state.root[:, n], (state.sensitivity * free)[:, place]
+    return r, score, r.T @ state.root[:, n], (state.sensitivity[:, :n] * free)[:, place]
 
 
 def test_constant_forgetting_is_the_textbook_formula(heavy, noisy):

@@ -236,6 +236,26 @@ def test_odometry_drops_out_and_returns(heavy):
     assert not samples["measured"][out].any()
 
 
+@pytest.mark.parametrize("begins", [False, True])
+def test_what_was_commanded_in_a_gap_of_the_odometry_acts_after_it(heavy, begins):
+    """Thrusters have followed it meanwhile, whether the odometry pauses or has yet to begin: they
+    had begun anew from the command before the gap."""
+    effects = heavy.effects | {"thruster_lag": {"time_constant": 0.3}}
+    sampler, late = Sampler(dataclasses.replace(heavy, effects=effects)), []
+    (first, *_) = (m for role, m in without_arrival(clean(heavy, 1.0)) if role == ODOMETRY)
+    for k in range(400):  # at 50 Hz; 40 N from 4 s on
+        t = SECOND + k * 20_000_000
+        push = np.array([40.0 if k >= 200 else 5.0, 0.0, 0.0])
+        made = [sampler.push(WRENCH, Wrench(t, "base_link_frd", push, np.zeros(3)))]
+        if k > 300 or (k < 150 and not begins):
+            noise = np.random.default_rng(k).normal(0.0, 1e-3, 3)  # what repeats is not measured
+            made.append(sampler.push(ODOMETRY, first._replace(stamp=t, linear=noise)))
+        late += [wrench for part in made for wrench in part["wrench"].tolist()]
+    after = [wrench[0] for wrench in late if wrench[0] > 5.1]
+    assert len(after) > 90
+    np.testing.assert_allclose(after, 40.0, rtol=0.01)
+
+
 @pytest.mark.parametrize("silent", [0.8, 3.0])
 def test_silent_wrench(heavy, silent):
     """Three demands later than the next one should have come there are no samples."""
@@ -512,6 +532,17 @@ def test_the_first_message_does_not_decide_the_frame(heavy, role, strays):
         _, sampler = taken(heavy, mixed)
         assert sampler.counts[NEW_FRAME] == (first == 0)
         assert sampler.counts[role] >= len(mine) - 2 * strays - 1
+
+
+def test_another_frame_takes_over_however_long_the_first_was_heard(heavy):
+    """A driver that comes back with another frame id after days is not refused for days."""
+    sampler, refused = Sampler(heavy), 0
+    for k in range(8000):
+        frame = "base_link" if k < 5000 else "base_link_frd"
+        sampler.push(WRENCH, Wrench(SECOND + k * 1_000_000, frame, np.ones(3), np.ones(3)))
+        refused = sum(n for name, n in sampler.counts.items() if "frame changed" in name)
+    assert 0 < refused < 2000
+    assert sampler.validation.frame_id(WRENCH) == "base_link_frd"
 
 
 def test_a_reset_takes_whatever_frame_comes(heavy):

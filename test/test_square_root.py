@@ -8,7 +8,7 @@ import pytest
 
 from rov_ident.estimation import square_root as kernels
 
-N, COLUMNS = 7, 32  # as square_root.columns_of(N)
+N, SIDES, COLUMNS = 7, 3, 32  # as square_root.columns_of(N, SIDES)
 
 
 def callable_from_python(kernel):
@@ -39,20 +39,24 @@ def padded(matrix):
 
 def rows_of(rng, count, size=12):
     out = np.zeros((size, COLUMNS))
-    out[:count, : N + 1] = rng.standard_normal((count, N + 1))
+    out[:count, : N + SIDES] = rng.standard_normal((count, N + SIDES))
     return out
 
 
 @pytest.fixture
 def root(rng):
-    """[R | z] (N, N + 1) of a well-conditioned problem."""
-    upper = np.triu(rng.standard_normal((N, N + 1)))
+    """[R | z | Z] (N, N + SIDES) of a well-conditioned problem."""
+    upper = np.triu(rng.standard_normal((N, N + SIDES)))
     upper[np.arange(N), np.arange(N)] = rng.uniform(1.0, 3.0, N)
     return upper
 
 
 def square(r):
-    return r[:N, : N + 1].T @ r[:N, : N + 1]
+    return r[:N, : N + SIDES].T @ r[:N, : N + SIDES]
+
+
+def solutions(r):
+    return np.linalg.solve(r[:N, :N], r[:N, N : N + SIDES])
 
 
 def score_of(rng):
@@ -73,7 +77,7 @@ def test_inverse_solution_and_norm(root):
 
 def test_rows_come_in_as_by_normal_equations(root, rng):
     work, rows = padded(root), rows_of(rng, 6)
-    wanted = square(root) + rows[:6, : N + 1].T @ rows[:6, : N + 1]
+    wanted = square(root) + rows[:6, : N + SIDES].T @ rows[:6, : N + SIDES]
     square_root.stack(work, rows, N, 6, 0, np.empty(work.shape[1]))
     np.testing.assert_allclose(np.tril(work[:N, :N], -1), 0.0, atol=1e-12)
     np.testing.assert_allclose(square(work)[:N], wanted[:N], rtol=1e-10)
@@ -106,38 +110,39 @@ def test_a_row_of_next_to_nothing_leaves_the_root_as_it_is(root, rng):
     work, rows = padded(root), rows_of(rng, 0)
     rows[0, :3] = 1e-155
     square_root.stack(work, rows, N, 6, 0, np.empty(work.shape[1]))
-    np.testing.assert_allclose(work[:N, : N + 1], root, rtol=1e-12)
+    np.testing.assert_allclose(work[:N, : N + SIDES], root, rtol=1e-12)
 
 
 def test_columns_in_another_order_hold_the_same_information(root, rng):
     work, place = padded(root), rng.permutation(N)
     rows, line = rows_of(rng, 0), np.empty(work.shape[1])
     square_root.reorder(work, place, np.zeros_like(work), rows, line)
-    order = [*place, N]
+    order = [*place, *range(N, N + SIDES)]
     np.testing.assert_allclose(square(work)[:N], square(root)[np.ix_(order, order)][:N], rtol=1e-9)
 
 
 def test_variance_is_added_to_what_is_marked(rng):
-    """P gains a share of the room to the prior, the solution stays, and so does the sandwich."""
-    root = np.triu(rng.uniform(1.0, 2.0, (N, N + 1)))
+    """P gains a share of the room to the prior, solutions stay, and so does the sandwich."""
+    root = np.triu(rng.uniform(1.0, 2.0, (N, N + SIDES)))
     root[np.arange(N), np.arange(N)] += 8.0
     work, inverse, score = padded(root), padded(np.linalg.inv(root[:, :N])), score_of(rng)
     marked = np.arange(N) % 2 == 0
-    x, p = np.linalg.solve(root[:, :N], root[:, N]), np.linalg.inv(root[:, :N].T @ root[:, :N])
+    p, before = np.linalg.inv(root[:, :N].T @ root[:, :N]), solutions(root)
     wide, share = padded(score), np.where(marked, rng.uniform(0.0, 0.2, N), 0.0)
-    square_root.add_variance(work, inverse, wide, np.zeros_like(work), x, share)
+    spare, line = np.zeros_like(work), np.empty((N, SIDES))
+    square_root.add_variance(work, inverse, wide, spare, line, share)
     added = np.diag(share * (1.0 - np.diag(p)))
     new = work[:N, :N]
     grown = np.linalg.inv(new.T @ new)
     np.testing.assert_allclose(grown, p + added, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.solve(new, work[:N, N]), x, rtol=1e-9)
+    np.testing.assert_allclose(solutions(work), before, rtol=1e-9)
     np.testing.assert_allclose(grown @ wide[:N, :N] @ grown, p @ score @ p + added, atol=1e-9)
 
 
 def test_forgetting_takes_information_only_where_the_rows_see_it(root, rng):
     work, rows, factor, count = padded(root), rows_of(rng, 0), 0.9, 3
     w = rows_of(rng, count, 6)
-    w[:count, N] = 0.0
+    w[:count, N:] = 0.0
     phi, score = w[:count, :N].copy(), score_of(rng)
     wide, none = padded(score), np.zeros_like(w)
     product, line = np.empty((6, 6)), np.empty(work.shape[1])
@@ -149,8 +154,7 @@ def test_forgetting_takes_information_only_where_the_rows_see_it(root, rng):
     np.testing.assert_allclose(new.T @ new, less, atol=1e-9)
     t = less @ np.linalg.inv(r.T @ r)
     np.testing.assert_allclose(wide[:N, :N], t @ score @ t.T, atol=1e-9)
-    before = np.linalg.solve(r, root[:, N])
-    np.testing.assert_allclose(np.linalg.solve(new, work[:N, N]), before, rtol=1e-7)
+    np.testing.assert_allclose(solutions(work), solutions(root), rtol=1e-7)
 
 
 def test_cholesky_root_of_a_covariance(rng):

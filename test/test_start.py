@@ -149,6 +149,39 @@ def test_mounting_by_any_tree(tmp_path, transforms, position, yaw):
         np.testing.assert_allclose(found["imu.rotation"], [0.0, 0.0, yaw], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("imu", "body", "position", "roll"),
+    [
+        ("base_link_frd", "base_link", [0.0, 0.0, 0.0], 0.0),
+        ("imu_link", "base_link_frd", [0.1, -0.2, -0.3], 0.0),
+        ("imu_link", "base_link", [0.1, -0.2, -0.3], 0.0),
+        ("imu_upside_down", "base_link", [0.1, -0.2, -0.3], np.pi),
+    ],
+)
+def test_frames_whose_name_says_their_axes(tmp_path, imu, body, position, roll):
+    """As mavros publishes base_link_frd: messages in it are forward-starboard-down already, and
+    turned once by its name and once more by the tree they would be upside down."""
+    over = (0.0, 1.0, 0.0, 0.0)
+    data = tree_of(
+        ("base_link", "base_link_frd", (0.0, 0.0, 0.0), over),
+        ("base_link", "imu_link", (0.1, 0.2, 0.3), LEVEL),
+        ("base_link", "imu_upside_down", (0.1, 0.2, 0.3), over),
+    )
+    with BagWriter(tmp_path / "tree.mcap") as bag:
+        bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, data)
+    found = sensor_placement(Bag(tmp_path / "tree.mcap"), {ODOMETRY: ("map", body), IMU: (imu, "")})
+    np.testing.assert_allclose(found["imu.position"], position, atol=1e-9)
+    np.testing.assert_allclose(np.cos(found["imu.rotation"]), np.cos([roll, 0.0, 0.0]), atol=1e-9)
+
+
+def test_a_first_message_that_is_damaged_is_passed_over(tmp_path, mavros):
+    with BagWriter(tmp_path / "cut.mcap") as bag:
+        for k, raw in enumerate(Bag(mavros).iter_raw(["/mavros/imu/data"])):
+            bag.write("/imu", raw.type_name, raw.log_time, raw.data[: 20 if k == 0 else None])
+    seen, _ = topics.survey(Bag(tmp_path / "cut.mcap"))
+    assert seen[IMU].frames[0] == "imu_link"
+
+
 @pytest.fixture
 def mounted(tmp_path, mavros, heavy):
     """A dive with that IMU, the tree in its bag; and the vehicle with the IMU in its place."""

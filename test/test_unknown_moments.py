@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import yaml
+from tiers import more
 
 import rov_ident as ri
 from bench.simulators import sea
@@ -46,6 +47,9 @@ def without_moments(messages, since=np.inf, rounding=0.0):
         yield arrival, role, message
 
 
+KINDS = ("rls", "ukf", "ml")
+
+
 @pytest.fixture
 def dive(tmp_path):
     def written(seed, since=np.inf):
@@ -58,8 +62,9 @@ def dive(tmp_path):
     return written
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("kind", ["rls", "ukf", "ml"])
+@pytest.mark.parametrize(
+    ("kind", "seed"), [*((k, 0) for k in KINDS), *more(*((k, 1) for k in KINDS))]
+)
 def test_what_turns_it_is_unknown(dive, kind, seed):
     """Forces are learnt, along the turns that were measured; of moments nothing is said."""
     vehicle, bag, file = dive(seed)
@@ -78,7 +83,9 @@ def test_what_turns_it_is_unknown(dive, kind, seed):
     # the UKF doubts its scale of the thrust, and with it all forces
     if kind != "ukf" and fit.consistency.consistent:
         known = [found[n][1] < 0.15 * abs(vehicle.theta[n]) for n in MOVING]
-        assert sum(known) >= len(MOVING) - 3, {n: found[n] for n in MOVING}
+        # not added mass that is little beside the mass, nor linear damping, for which Coriolis
+        # forces stand if the thrust of one axis is off
+        assert sum(known) >= len(MOVING) - 4, {n: found[n] for n in MOVING}
     assert not any("righting arm" in advice for advice in fit.advice)
     assert np.isnan(fit.rmse[3:]).all() and np.isfinite(fit.rmse[:3]).all()
 

@@ -1,5 +1,7 @@
 """A URDF into a configuration: one rigid body, in forward-starboard-down."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -129,6 +131,15 @@ BLOCK = """
     <hydrostatics><buoyancy value="159.91"/><center_of_buoyancy z="-0.01"/></hydrostatics>
   </hydrodynamics>
 </robot>"""
+
+
+def test_what_a_robot_does_not_say_stays_as_in_the_file(tmp_path):
+    """How well the vehicle is known, say."""
+    heavy = config.load(HEAVY)
+    stated = replace(heavy.vehicle_uncertainty, mass_std=0.05, cob_std=0.001)
+    base = replace(heavy, vehicle_uncertainty=stated)
+    found, _ = import_model(save(tmp_path / "r.urdf", ROBOT), base)
+    assert found.vehicle_uncertainty == stated
 
 
 @pytest.mark.parametrize("base", [None, HEAVY])

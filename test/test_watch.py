@@ -51,7 +51,7 @@ def test_what_is_missing_is_named(effect, axes):
     assert set(found[0].axes) <= set(axes)
     assert effect.replace("_", " ") in found[0].sentence
     if effect == "quadratic_damping":
-        plain = "residual in surge follows |u|u: quadratic damping missing?"
+        plain = "residual in surge follows |u| u: quadratic damping missing?"
         assert plain in [suspicion.sentence for suspicion in found]
     truth = case.effects[effect]
     # To first order: linear damping, which is estimated, has taken up some of the quadratic.
@@ -194,6 +194,17 @@ def test_windows_do_not_reach_across_gaps(heavy):
     again["restart"][0] = True
     window = watcher.take(again, [])
     assert window is not None and window[0]["t"][0] == 4.0
+
+
+def test_commands_are_not_hoarded_where_no_window_gets_full(heavy):
+    """Odometry at 1 Hz without an IMU: each sample is beyond a gap."""
+    watcher, row = Monitor(heavy), np.zeros(1, dtype=SAMPLE)
+    row["restart"] = True
+    for second in range(600):
+        row["t"] = second
+        demands = [(t, np.ones(6)) for t in second - 1.0 + np.arange(0.02, 1.01, 0.02)]
+        assert watcher.take(row.copy(), demands) is None and not demands
+    assert len(watcher._demands) < 100
 
 
 @pytest.mark.parametrize("told_first", [True, False])

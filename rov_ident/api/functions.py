@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from numbers import Real
 from pathlib import Path
@@ -17,6 +17,7 @@ from rov_ident.api.reading import File, Files, axes, existing, load, once, same_
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError, require
+from rov_ident.core.messages import DRIVE, WRENCH, Message
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.discrepancy.velocity_sensor import tests_of
@@ -196,12 +197,24 @@ def _message_tests(paths: Sequence[Path], config: Config, late: bool) -> list[Te
         bag = Bag(path)
         chosen = topics.select(bag, config)
         if has_velocity(bag, chosen, config):
-            first = itertools.islice(topics.messages(bag, chosen, config), _COMPARED)
-            streams = gather(first, config)
+            heard = _once_commanded(topics.messages(bag, chosen, config), chosen)
+            streams = gather(itertools.islice(heard, _COMPARED), config)
             for test in (*tests_of(streams, config), *delays.tests_of(streams, config, late)):
                 before = worst.get(test.name, test)
                 worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
     return list(worst.values())
+
+
+def _once_commanded(
+    messages: Iterable[tuple[str, Message]], chosen: Collection[str]
+) -> Iterator[tuple[str, Message]]:
+    """The messages of the ``chosen`` roles from where wrench and joints have begun, which a dive's
+    recording often does before."""
+    waited = {WRENCH, DRIVE} & set(chosen)
+    for role, message in messages:
+        waited.discard(role)
+        if not waited:
+            yield role, message
 
 
 def _with_table_notes(found: Fit, given: Config, table: Mapping[str, Any]) -> Fit:

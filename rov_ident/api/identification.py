@@ -271,7 +271,8 @@ def identify(
     used = [path for path, _ in checked if path != judge]
     start, explanation = given, None
     if not any(is_without_velocity(found.record.samples) for _, found in checked):
-        explanation = explain(used, config, judge, progress=say)
+        # with the mounting that any of the dives tells; else by the name of the file
+        explanation = explain(used, given if placed else config, judge, progress=say)
         extended = explanation.findings.verdict in ("explained", "unexplained")
         start = explanation.extended if extended else given
         explanation = _with_start_notes(explanation, extended)

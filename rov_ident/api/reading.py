@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,10 +56,19 @@ def once(paths: Sequence[Path]) -> tuple[list[Path], tuple[str, ...]]:
 
 
 def same_data(path: Path, others: Sequence[Path]) -> Path | None:
-    """Which of other files holds the same data, if any does."""
-    size = path.stat().st_size
-    of_size = [other for other in others if other.stat().st_size == size]
-    return next((other for other in of_size if Bag(other).sha256 == Bag(path).sha256), None)
+    """Which of other files holds the same data, if any does; None where it cannot be read."""
+    size = _size(path)
+    of_size = [other for other in others if _size(other) == size]
+    with suppress(UserError):  # who reads it says what is wrong with it
+        digest = Bag(path).sha256 if of_size else ""
+        return next((other for other in of_size if Bag(other).sha256 == digest), None)
+    return None
+
+
+def _size(path: Path) -> int:
+    """Of all files of a bag together [bytes]."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files)
 
 
 def existing(file: File) -> Path:

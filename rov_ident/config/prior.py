@@ -1,6 +1,5 @@
 """What is known before any data: values, standard deviations and bounds of what is estimated."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -166,8 +165,18 @@ def rigid_body_covariance(
     return _consider_covariance(sources, names, gain)
 
 
+def axis_std_of(config: Config, names: tuple[str, ...]) -> Array:
+    """Standard deviation by which the thrust of each axis may be off by itself, relative to it,
+    beside the scale of all: (6,), or (0,) where that scale is not among the ``names``."""
+    return np.full(6 if THRUST_SCALE in names else 0, ONE_AXIS * config.wrench.scale_std)
+
+
 def covariance_beyond_driving(
-    config: Config, names: tuple[str, ...], values: Array, gain: Array | None = None
+    config: Config,
+    names: tuple[str, ...],
+    values: Array,
+    gain: Array | None = None,
+    by_axis: Array | None = None,
 ) -> Array:
     """What no manoeuvre tells adds to the same, scales and errors of stamps: as driving does not
     reduce it, convergence is judged without it.
@@ -176,8 +185,13 @@ def covariance_beyond_driving(
     added and own, times k. So only the righting arm, and the thrust in roll and pitch, determine a
     scale of the thrust that is estimated, and an error of either scales all of these; and with them
     the centre of gravity, as a heel at rest tells how far it is to one side in shares of the arm.
-    The thrust of each other axis may be off by itself. And a velocity sensor that reads too much
-    makes the same forces belong to velocities and accelerations that are as much smaller.
+    And a velocity sensor that reads too much makes the same forces belong to velocities and
+    accelerations that are as much smaller.
+
+    The thrust of each axis may be off by itself. What q such errors do to the estimates, only the
+    data say: ``by_axis`` (n, q). About what acts along the axis is scaled; but inertias so scaled
+    are those of no body, and their Munk moments lead the linear damping of roll and yaw further
+    astray.
 
     Of the stamps see :func:`_of_stamps`.
     """
@@ -188,17 +202,15 @@ def covariance_beyond_driving(
     scaled = {n: v - own.get(n, 0.0) for n, v in _with_thrust(body, names, values).items()}
     sources = _of_stamps(config, names)
     if scaled:
-        by_axis = ONE_AXIS * config.wrench.scale_std
         # no more than is supposed of the scale: a body without an arm tells nothing of it
-        share = min(math.hypot(righting_arm_share(config), by_axis), config.wrench.scale_std)
+        share = min(righting_arm_share(config), config.wrench.scale_std)
         moved = {n: share * v for n, v in scaled.items()}
         moved |= {n: share * off for n, off in _off_centre(config, of_all).items()}
         sources.append(moved)
-        for row in ("X", "Y", "Zb", "N"):  # b: heave thrust balances `buoyancy.delta`, too
-            sources.append({n: by_axis * v for n, v in scaled.items() if n[0] in row})
     of_velocity = {n: _degree(n) * (v - masses.get(n, 0.0)) for n, v in of_all.items()}
     sources.append({n: config.odometry.scale_std * v for n, v in of_velocity.items()})
-    return _consider_covariance(sources, names, gain)
+    covariance = _consider_covariance(sources, names, gain)
+    return covariance if by_axis is None else covariance + by_axis @ by_axis.T
 
 
 def _of_stamps(config: Config, names: tuple[str, ...]) -> list[dict[str, float]]:

@@ -678,5 +678,10 @@ def _extended(h: Hypothesis, kept: Sequence[str], data: _Data, found: Sequence[F
     if chosen is not None:  # what was found is to be estimated live, too
         own = set(config.model.names) - set(config.estimate)
         names = tuple(n for n in extended.model.names if n not in own)
-        extended = dataclasses.replace(extended, estimate=names)
+        of_effects = tuple(
+            (effect, parameter)
+            for effect, parameter in extended.estimate_effects
+            if effect not in config.effects or (effect, parameter) in config.estimate_effects
+        )
+        extended = dataclasses.replace(extended, estimate=names, estimate_effects=of_effects)
     return extended

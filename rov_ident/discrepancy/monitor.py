@@ -7,8 +7,10 @@ where it passes a penalty that allows for the number of effects tried, and expla
 matters.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +44,7 @@ from rov_ident.discrepancy.live_windows import (
 from rov_ident.discrepancy.selection import VERY_STRONG, Scores, regressed, variance_inflation
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.compilation import any_vehicle
-from rov_ident.model.coefficients import ABSOLUTE, AXES, MOTIONS, NEGATIVE, ONE, VELOCITIES, parse
+from rov_ident.model.coefficients import AXES, MOTIONS, parse
 from rov_ident.sampling.sample import SAMPLE, joined
 
 FEWEST = 12  # windows, from which on their scatter is known to about 40 % (chi-squared)
@@ -291,21 +293,10 @@ def _dependence(key: Key) -> str:
     if section != COEFFICIENTS:
         return _FOLLOWS[EFFECTS[section].place]
     c = parse(name)
-    if c.is_added_mass:
-        return f"the acceleration in {MOTIONS[c.column]}"
-    right = _factor(c.right)
-    return right if c.left == ONE else f"{_factor(c.left)}{right}"
+    return f"the acceleration in {MOTIONS[c.column]}" if c.is_added_mass else c.formula
 
 
 _FOLLOWS = {"input": "the thrust", "wrench": "attitude, motion or heading", "motion": "the heading"}
-
-
-def _factor(place: int) -> str:
-    """An entry of the extended velocity [1, nu, |nu|, min(nu, 0)]."""
-    v = VELOCITIES[(place - 1) % 6]
-    if place >= NEGATIVE:
-        return f"min({v}, 0)"
-    return f"|{v}|" if place >= ABSOLUTE else v
 
 
 class Monitor:
@@ -347,16 +338,21 @@ class Monitor:
                 self._demands = _latest(self._demands, t)
         if not self._samples:
             self._begin = float(samples["t"][0])
+            self._keep_demands_from(self._begin)
         self._samples.append(samples)
         if t - self._begin < WINDOW:
             return None
         rows = joined(self._samples)
         told = np.array([[at, *wrench] for at, wrench in self._demands]).reshape(-1, 7)
-        # a window begins at the last sample of the one before, with the command that holds then
+        # a window begins at the last sample of the one before
         self._samples, self._begin = [rows[-1:]], t
-        first = max(int(np.searchsorted(told[:, 0], t, side="right")) - 1, 0)
-        self._demands = self._demands[first:]
+        self._keep_demands_from(t)
         return rows, told
+
+    def _keep_demands_from(self, t: float) -> None:
+        """Forget the commands before the one that holds at t [s]."""
+        first = bisect_right(self._demands, t, key=itemgetter(0)) - 1
+        self._demands = self._demands[max(first, 0) :]
 
     def look(
         self, window: tuple[NDArray[np.void], Array], values: Mapping[str, float], credible: bool

@@ -76,14 +76,17 @@ def listed(items: Sequence[str]) -> str:
 def verdict(findings: Findings) -> str:
     """The whole result in two or three sentences."""
     if findings.verdict == "agrees":
-        return "The simulation agrees with the measurement: there is nothing to change."
+        return (
+            "The simulation agrees with the measurement: nothing in these data asks for a change."
+        )
     if findings.verdict == "retuned":
         before = findings.baseline.items()
-        gains = {c: 1.0 - findings.retuned[c] / max(x, 1e-12) for c, x in before}
+        gains = {c: 1.0 - findings.retuned[c] / max(x, 1e-12) for c, x in before if np.isfinite(x)}
         best = max(gains, key=lambda c: gains[c])
         return (
-            "The structure of the simulation is right, its coefficients are off. Retuned, the "
-            f"{predicted(best)} improves by {100.0 * gains[best]:.0f} %."
+            "The coefficients of the simulation are off, and these data show nothing that its "
+            f"structure lacks. Retuned, the {predicted(best)} improves by "
+            f"{100.0 * gains[best]:.0f} %."
         )
     named = _named(findings.effects)
     left = "; ".join([*map(dependence, findings.residual), *findings.contradictions])
@@ -268,7 +271,9 @@ def _change(explanation: Explanation, fitted: Config | None) -> list[str]:
     new = configuration.to_parameters(fitted or explanation.extended)
     news = {k: new[k] for k in sorted(new, key=lambda k: k != "effects")}  # what is new first
     lines = _lines(old, news)
-    if (fitted is None and explanation.findings.verdict == "agrees") or not lines:
+    if not lines:
+        return [report.paragraph("Nothing. extended.yaml is the configuration that was given.")]
+    if fitted is None and explanation.findings.verdict == "agrees":
         nothing = "Nothing. extended.yaml holds the refitted coefficients, which predict no better."
         return [report.paragraph(nothing)]
     width = max((len(line) for line, _ in lines if not line.endswith("]")), default=0)

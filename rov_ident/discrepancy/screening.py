@@ -225,6 +225,8 @@ class Screening:
             both = score - PENALTY, white - PENALTY
             if selected.keys and (best is None or both > (best.score, best.white_score)):
                 found = dict(zip(selected.keys, selected.change.tolist(), strict=True))
+                if moments and found[keys[0]] == 0.0:
+                    continue  # at its bound: where it acts has no meaning
                 start = first_values({k: found[k] for k in keys if k in found})
                 there = dict(shape)
                 for p, m in zip(places, moments, strict=True):

@@ -39,7 +39,7 @@ from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, Rows, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
-from rov_ident.effects import EFFECTS, Values, heading_error, velocity_delay
+from rov_ident.effects import EFFECTS, Values, correct, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array, Indices
 from rov_ident.sampling.raw_streams import Streams, measured_at, orientation_at
@@ -141,7 +141,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
         r_then = quaternion_to_matrix(orientation_at(streams, at))
         read = Reading(as_read, *(interpolated(streams.t, x, at) for x in here[1:]))
         t = streams.t[inside]
-        y = (rotated(r_then, _undone(read, effects).linear) - inertial.velocity_at(at))[inside]
+        y = (rotated(r_then, correct(read, effects).linear) - inertial.velocity_at(at))[inside]
         columns = [
             rotated(r_then, interpolated(streams.t, m.linear, at))[inside]
             - inertial.integrated(s.specific_force, at)[inside]
@@ -192,16 +192,7 @@ def _corrected_readings(
     gyro_at = interpolated(streams.imu_t, gyro, streams.t) if _has_imu(streams) else nothing
     here = Reading(streams.nu[:, :3], streams.nu[:, 3:], gyro_at, nothing)
     there = Reading(np.zeros_like(gyro), rate, gyro, streams.specific_force @ mounting.T)
-    return _undone(here, effects), _undone(there, effects), rate
-
-
-def _undone(reading: Reading, effects: Values) -> Reading:
-    """A reading without what effects did to it."""
-    for name, values in reversed(list(effects.items())):
-        correct = EFFECTS[name].correct
-        if correct is not None:
-            reading = correct(reading, **values)
-    return reading
+    return correct(here, effects), correct(there, effects), rate
 
 
 def _in_place(streams: Streams, effects: Values) -> Streams:
@@ -456,7 +447,7 @@ def corrected(streams: Streams, effects: Values) -> Streams:
     """The streams as good sensors would have given them."""
     streams = _in_place(streams, effects)
     nothing = np.zeros_like(streams.nu[:, :3])
-    here = _undone(Reading(streams.nu[:, :3], streams.nu[:, 3:], nothing, nothing), effects)
+    here = correct(Reading(streams.nu[:, :3], streams.nu[:, 3:], nothing, nothing), effects)
     return dataclasses.replace(streams, nu=np.hstack([here.linear, here.angular]))
 
 

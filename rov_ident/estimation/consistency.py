@@ -82,14 +82,19 @@ class Consistency:
         """Whether any axis moved enough to test what the model leaves unexplained on it."""
         return any(test.name.startswith(_LEFT) for test in self.tests)
 
-    def widened(self, covariance: Array, prior: Array, moved: Array) -> Array:
+    @property
+    def inflation(self) -> float:
+        """How many times larger than stated errors may be: as the worst test says."""
+        return max([1.0, *(test.inflation for test in self.tests)])
+
+    def widened(self, covariance: Array, prior: Array, moved: Array, already: float = 1.0) -> Array:
         """The covariance (n, n) of an estimate with standard deviations (n,) of its ``prior``, from
         whose mean it has ``moved`` (n,).
 
-        Errors are taken to be as many times larger as the worst test says (:attr:`Test.inflation`);
+        Errors are taken to be larger by :attr:`inflation`, of which ``already`` is there before;
         but what the file says remains, within reach of what the data say against it.
         """
-        factor = max([1.0, *(test.inflation for test in self.tests)])
+        factor = max(self.inflation / already, 1.0)
         variance = np.diag(covariance)
         limit = np.maximum(prior, np.abs(moved)) ** 2
         return widened(covariance, np.maximum(variance, np.minimum(factor**2 * variance, limit)))

@@ -49,6 +49,7 @@ a sample is then wrong by is of second order in this."""
 # A time (a lag, a delay) does not act linearly: "Times" in docs/live.md has the study.
 _SETTLING_TIME = 5.0  # s; that samples are made with the same value of a time at least
 _LEARNT = 0.5  # prior standard deviations, below which an estimate of a time is followed
+_COMMANDS_KEPT = 10.0  # s; a choice: of commands, while there are no samples
 _OUTDATED = 0.05  # prior standard deviations; by less a time never counts as having moved
 EXCITATION_TIME = 20.0
 """s; the present excitation is that of this window and of the one before. A definition, published:
@@ -272,6 +273,7 @@ class OnlineEstimator:
     def take(self, samples: NDArray[np.void]) -> NDArray[np.void]:
         """Fold samples (k,) into the estimate unless disabled; INFO (k,)."""
         if len(samples) == 0 or not self._enabled:
+            self._forget_commands()
             return np.zeros(0, dtype=INFO)
         if samples["anew"].any():
             samples = after_reset(samples)
@@ -306,9 +308,17 @@ class OnlineEstimator:
                 self.monitor.look(window, report.by_name, credible)
         return info
 
+    def _forget_commands(self) -> None:
+        """Of those that the monitor has not taken, as there are no samples: all but the latest."""
+        commands = self.sampler.commands
+        if commands and commands[-1][0] - commands[0][0] > _COMMANDS_KEPT:
+            del commands[:-1]
+
     def _fold(self, samples: NDArray[np.void]) -> NDArray[np.void]:
         """Fold samples (k,) into the state, and iterate the update at the times it has set."""
         fold, task, update = self._module.fold, self._task, self._update
+        if samples["t"][0] < self._last_t:  # the clock was set back
+            update.begin(self._state)
         infos = []
         while len(samples):
             count = update.until_due(samples)
@@ -320,7 +330,9 @@ class OnlineEstimator:
 
     def next_record(self) -> None:
         """Another record follows: inputs begin anew, what is learnt stays."""
-        self.sampler, self._settled = Sampler(self.config), math.nan
+        before, self.sampler, self._settled = self.sampler, Sampler(self.config), math.nan
+        self.sampler.commands = before.commands
+        self.sampler.counts.update(before.counts)
         self._update.begin(self._state)
         self._centre(self._effect_values)
         self._begin_at(self.memory())
@@ -488,7 +500,9 @@ class OnlineEstimator:
         if not diverged:
             seconds = float(self._state.monitor["judged"].max())
             trim = attitude_covariance(self.config, raw.names, seconds, gain)
-            lasting = covariance_beyond_driving(self.config, raw.names, raw.values, gain)
+            lasting = covariance_beyond_driving(
+                self.config, raw.names, raw.values, gain, raw.by_axis
+            )
             covariance, beyond_driving = covariance + trim + lasting, np.diag(lasting)
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.

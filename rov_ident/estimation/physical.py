@@ -13,12 +13,17 @@ from rov_ident.model.scales import WORKING_SPEED
 
 @dataclass(frozen=True)
 class Estimate:
-    """Coefficients with their covariance (n, n), at ``t`` seconds."""
+    """Coefficients with their covariance (n, n), at ``t`` seconds.
+
+    ``by_axis`` (n, 6) is what they are wrong by if the thrust of one axis is off by its standard
+    deviation (`config.prior.axis_std_of`); (n, 0) where none is supposed, None: not known.
+    """
 
     names: tuple[str, ...]
     values: Array
     covariance: Array
     t: float
+    by_axis: Array | None = None
 
     @property
     def std(self) -> Array:

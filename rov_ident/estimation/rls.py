@@ -36,6 +36,9 @@ Constant forgetting, where it is asked for, touches only directions that the pre
 
 *Standard deviations* do not assume white innovations: the covariance of the accumulated score
 ``sum of phi' e / s`` (`shared.add_scatter`) stands between two inverse informations.
+
+*The thrust of single axes*, which may be off (`prior.ONE_AXIS`), is nobody's column, but a further
+right-hand side each: what the solution is wrong by if that thrust is off by its deviation.
 """
 
 from collections import namedtuple
@@ -85,7 +88,7 @@ from rov_ident.estimation.shared import (
     measure,
     problem_of,
     steps_of,
-    wrench_of,
+    thrust_of,
 )
 from rov_ident.estimation.square_root import (
     add_variance,
@@ -140,7 +143,8 @@ class State(NamedTuple):
     """All that the next step needs. Columns of coefficients are in the order of ``order``."""
 
     order: NDArray[np.int64]  # (n,): indices into Problem.estimated
-    # (n, n + 1): [R | z], R upper triangular, of the coordinates: scaled deviations from the prior
+    # (n, n + 1 + q): [R | z | Z], R upper triangular, of the coordinates: scaled deviations from
+    # the prior; Z of the thrust of q single axes
     root: Array
     score: Array  # (n, n): covariance of the accumulated score, the prior's included
     lagged: Array  # (n,): recent scores under the lag window
@@ -148,7 +152,7 @@ class State(NamedTuple):
     deviation: Array  # (n,): what the observer took over of it, within reason
     nu: Array  # (6,): velocities
     p: Array  # (6, 6): their covariance, the coefficients taken as known
-    sensitivity: Array  # (6, n): d nu / d deviation
+    sensitivity: Array  # (6, n + 1 + q): d nu / d deviation; nothing; d nu / d thrust of an axis
     monitor: NDArray[np.void]  # (6,) of MONITOR: of the innovations
     residual: Array  # (4, 6): filters of the published residual
     scalars: NDArray[np.void]  # (1,)
@@ -172,10 +176,10 @@ def problem(config: Config) -> Problem:
 
 def init(task: Problem) -> State:
     """Nothing learnt: the prior; the velocity is taken from the first measurement."""
-    n = len(task.scale)
+    n, columns = len(task.scale), len(task.scale) + 1 + len(task.axis_std)
     scalars = np.zeros(1, dtype=_SCALARS)
     scalars["free"], scalars["rho"] = n, 1.0
-    root = np.eye(n, n + 1)
+    root = np.eye(n, columns)
     # of the prior, a unit matrix for the coefficients themselves
     root[:, :n] = np.linalg.qr(jacobian_of(task, np.zeros(n)))[1]
     return State(
@@ -187,7 +191,7 @@ def init(task: Problem) -> State:
         np.zeros(n),
         np.zeros(6),
         np.zeros((6, 6)),
-        np.zeros((6, n)),
+        np.zeros((6, columns)),
         first_monitor(task.process),
         np.zeros((4, 6)),
         scalars,
@@ -209,7 +213,7 @@ def fold_about(
     deviation = np.clip(solution, -task.reach, task.highest)[state.order]
     pinned = state.scalars.copy()
     pinned["pinned"] = True
-    nu = state.nu + state.sensitivity @ (deviation - state.deviation)
+    nu = state.nu + state.sensitivity[:, : len(deviation)] @ (deviation - state.deviation)
     state, info = fold(task, state._replace(nu=nu, deviation=deviation, scalars=pinned), samples)
     state.scalars["pinned"] = False
     return None if (info["reason"] == UNPREDICTABLE).any() else state
@@ -226,21 +230,23 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
     n, place = len(task.scale), np.argsort(state.order)
     inverse = np.linalg.solve(state.root[:, :n], np.eye(n))
     information = inverse @ inverse.T
-    solution = (inverse @ state.root[:, n])[place]
-    unit = task.scale[:, None] * jacobian_of(task, solution)
+    solutions = (inverse @ state.root[:, n:])[place]
+    unit = task.scale[:, None] * jacobian_of(task, solutions[:, 0])
     covariance = calibrated(information, state.score)[np.ix_(place, place)]
     return Estimate(
         prior.names,
-        values_of(task, solution),
+        values_of(task, solutions[:, 0]),
         unit @ covariance @ unit.T,
         float(state.scalars["t"][0]),
+        unit @ solutions[:, 1:],
     )
 
 
 def solution_of(state: State) -> tuple[Array, Array]:
     """The coordinates and their standard deviations, both (n,) in the order of the coefficients."""
     place, inverse = np.argsort(state.order), inverse_of(state.root)
-    return (inverse @ state.root[:, -1])[place], np.linalg.norm(inverse, axis=1)[place]
+    solution = inverse @ state.root[:, len(inverse)]
+    return solution[place], np.linalg.norm(inverse, axis=1)[place]
 
 
 def about_of(state: State) -> Array:
@@ -252,7 +258,7 @@ def about_of(state: State) -> Array:
 def variance(task: Problem, state: State) -> Array:
     """Diagonal (n,) of the inverse information, in squared units: what excitation is judged by."""
     inverse = inverse_of(state.root)[np.argsort(state.order)]
-    root = jacobian_of(task, inverse @ state.root[:, -1]) @ inverse
+    root = jacobian_of(task, inverse @ state.root[:, len(inverse)]) @ inverse
     variances: Array = task.scale**2 * (root**2).sum(axis=1)
     return variances
 
@@ -288,7 +294,8 @@ _SCRATCH = record(
 Work = namedtuple(
     "Work",
     "theta one_theta estimated scale place moves moving noisy momentum of_rate of_motion change "
-    "gradient line sensitivity drive direct root inverse score spare rows basis lost scratch",
+    "gradient line sensitivity drive direct root inverse score spare rows basis lost solutions "
+    "scratch",
 )
 """Scratch for all samples of a fold."""
 
@@ -296,7 +303,8 @@ Work = namedtuple(
 @inlined
 def _work(task, state):
     n, m = len(task.scale), len(task.theta)
-    columns = columns_of(n)
+    sides = state.root.shape[1] - n
+    columns = columns_of(n, sides)
     work = Work(
         np.empty((m, LANES)),  # theta of the observer
         np.empty((m, 1)),
@@ -315,13 +323,14 @@ def _work(task, state):
         np.zeros((6, columns)),
         np.zeros((6, columns)),
         np.zeros((6, columns)),  # what a column adds to the measured velocity alone
-        np.zeros((n + 2, columns)),  # [R | z]
+        np.zeros((n + 2, columns)),  # [R | z | Z]
         np.zeros((n + 2, columns)),  # R^-1 when the observer last took over the coefficients
         np.zeros((n + 2, columns)),
         np.zeros((n + 2, columns)),
         np.zeros((12, columns)),  # what comes in, and what is forgotten
         np.zeros((6, columns)),  # orthonormal directions to forget in
         np.zeros((2, 6, columns)),  # work space of square_root.forget
+        np.empty((n, sides)),  # work space of square_root.add_variance
         np.empty(1, dtype=_SCRATCH),  # in one record, whose parts the compiler knows apart
     )
     copy(state.root, work.root)
@@ -391,12 +400,7 @@ def _take_sides(task, work, sample, side):
     """What acts, with the parameters of effects as they are; the columns of what they measure."""
     first = len(task.theta) - side.shape[1]
     s = work.scratch[0]
-    wrench_of(work.one_theta, sample, side, s.wrench)
-    for i in range(6):
-        s.thrust[i] = s.wrench[i] - sample.surroundings[i]
-        for j in range(side.shape[1]):
-            if task.absolute[j]:
-                s.thrust[i] -= side[i, j] * (work.one_theta[first + j, 0] - side[12, j])
+    thrust_of(task, work.one_theta, sample, side, s.wrench, s.thrust)
     if side.shape[1] > 0:
         for a in range(len(work.estimated)):
             j = work.estimated[a] - first
@@ -468,7 +472,7 @@ def _predict(task, state, work, sample, side):
         s.guide[i] = 0.0
         if guided and i >= 3:
             s.guide[i] = (sample.nu[i] - nu[i]) / sample.dt
-            for a in range(n):
+            for a in range(sensitivity.shape[1]):
                 sensitivity[i, a] = 0.0
             for j in range(6):
                 p[i, j] = p[j, i] = 0.0
@@ -496,6 +500,10 @@ def _predict(task, state, work, sample, side):
         drive_sides(len(task.theta) - side.shape[1], work.estimated, work.scale, side, work.drive)
         if task.thrust >= 0:
             _by_coordinates(task, state, work)
+        for axis in range(len(task.axis_std)):
+            for i in range(6):
+                work.drive[i, n + 1 + axis] = 0.0
+            work.drive[axis, n + 1 + axis] = task.axis_std[axis] * s.thrust[axis]
         advance(s.transition, sensitivity, s.into, work.drive, work.rows)
         advance_covariance(s.transition, noise, dt, p, s.product)
         for i in range(6):
@@ -692,7 +700,7 @@ def _learn(task, state, work, info):
         work.change[a] = share if suspect and work.moves[a] else 0.0
         if walks:
             work.change[a] = max(work.change[a], task.drift[state.order[a]] * c.since_walk)
-    add_variance(work.root, work.inverse, work.score, work.spare, state.solution, work.change)
+    add_variance(work.root, work.inverse, work.score, work.spare, work.solutions, work.change)
     if suspect:
         info.forgetting = 1.0 - share
     if walks:

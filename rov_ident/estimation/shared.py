@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import THRUST_SCALE, drift_of, moves_with_thrust, prior_of, theta_of
+from rov_ident.config.prior import (
+    THRUST_SCALE,
+    axis_std_of,
+    drift_of,
+    moves_with_thrust,
+    prior_of,
+    theta_of,
+)
 from rov_ident.core.jit import inlined, inner, lean, record
 from rov_ident.core.messages import Array
 from rov_ident.effects import EFFECTS, parameter
@@ -62,6 +69,7 @@ class Problem(NamedTuple):
     restoring: Array  # (6, 3)
     thrust: int  # index of thrust_scale.scale among the estimated; -1: it is not
     per_thrust: NDArray[np.bool_]  # (n,) what is proportional to the thrust in the same motion
+    axis_std: Array  # (6,) or (0,): `config.prior.axis_std_of`
     absolute: NDArray[np.bool_]  # (k,) parameters of effects that are none of the thrust
     scaled: NDArray[np.bool_]  # (k, 6) parameters of effects that are factors of these components
     lightest: Array  # (6,) least pivots of a mass matrix: no hull with added mass is touched
@@ -98,6 +106,7 @@ def problem_of(config: Config, record: np.dtype[np.void], **settings: Any) -> Pr
         body.restoring,
         thrust,
         np.array(per_thrust, dtype=bool),
+        axis_std_of(config, names),
         np.array(absolute, dtype=bool),
         factors_of(config),
         LIGHTEST * np.diag(np.linalg.cholesky(body.mass_matrix)) ** 2,
@@ -237,6 +246,18 @@ def wrench_of(theta, sample, side, wrench):
         wrench[i] = sample.wrench[i]
         for j in range(k):
             wrench[i] += side[i, j] * (theta[first + j, 0] - side[12, j])
+
+
+@inlined
+def thrust_of(task, theta, sample, side, wrench, thrust):
+    """wrench (6,) as :func:`wrench_of` has it, and what of it is thrust (6,)."""
+    first = len(theta) - side.shape[1]
+    wrench_of(theta, sample, side, wrench)
+    for i in range(6):
+        thrust[i] = wrench[i] - sample.surroundings[i]
+        for j in range(side.shape[1]):
+            if task.absolute[j]:
+                thrust[i] -= side[i, j] * (theta[first + j, 0] - side[12, j])
 
 
 @inlined

@@ -2,10 +2,12 @@
 
 RLS keeps the root ``R`` of its information ``A = R'R`` beside the right-hand side, ``[R | z]``, so
 that the estimate is the x of ``R x = z`` and the covariance is ``R^-1 R^-T`` (the square-root
-information filter: Bierman 1977, ch. V). The UKF keeps the covariance and needs its Cholesky root.
+information filter: Bierman 1977, ch. V). Further right-hand sides may stand behind z: all that is
+done here leaves the solution of each as it is. The UKF keeps the covariance and needs its Cholesky
+root.
 
-Matrices that are worked on have ``columns_of(n)`` columns and two rows more than n, filled with
-zeros: loops along a row then leave no remainder, and may take three rows at a time.
+Matrices that are worked on have ``columns_of(n, sides)`` columns and two rows more than n, filled
+with zeros: loops along a row then leave no remainder, and may take three rows at a time.
 """
 
 import numpy as np
@@ -17,9 +19,9 @@ _NOTHING = 1e-300  # a squared length whose inverse is hardly a number any more
 
 
 @inlined
-def columns_of(n):
-    """The columns of a matrix that holds [R | z] of n coefficients."""
-    return _WIDTH * ((n + 2) // _WIDTH + 1)
+def columns_of(n, sides):
+    """The columns of a matrix that holds R of n coefficients and so many right-hand sides."""
+    return _WIDTH * ((n + max(sides, 2) - 1) // _WIDTH + 1)
 
 
 # ---------------------------------------------------------------- the information's root
@@ -56,9 +58,9 @@ def solve(root, x):
 
 @kernel
 def inverse_of(root):
-    """R^-1 (n, n) of the root (n, n + 1) = [R | z]."""
+    """R^-1 (n, n) of the root (n, n + sides)."""
     n = len(root)
-    columns = columns_of(n)
+    columns = columns_of(n, root.shape[1] - n)
     padded, inverse = np.zeros((n + 2, columns)), np.zeros((n + 2, columns))
     copy(root, padded)
     invert(padded, inverse)
@@ -67,7 +69,7 @@ def inverse_of(root):
 
 @reordered
 def invert(root, inverse):
-    """inverse (n + 2, columns) = R^-1 by back substitution, root (n + 2, columns) = [R | z]."""
+    """inverse (n + 2, columns) = R^-1 by back substitution, of the root (n + 2, columns)."""
     n, columns = root.shape[0] - 2, root.shape[1]
     for a in range(n - 1, -1, -1):
         for k in range(columns):
@@ -157,18 +159,24 @@ def stack(root, rows, free, count, leaving, dot):
 
 
 @reordered
-def add_variance(root, inverse, score, spare, solution, share):
-    """P <- P + W for the covariance ``P = R^-1 R^-T``; the solution (n,) of R x = z stays.
+def add_variance(root, inverse, score, spare, solutions, share):
+    """P <- P + W for the covariance ``P = R^-1 R^-T``; the solutions of all sides stay.
 
     W is diagonal: of each coefficient a ``share`` (n,) of what its variance is short of 1, the
-    prior's. ``inverse`` is R^-1 on entry, ``spare`` work space, ``score`` the covariance S
-    of the accumulated score, with which the sandwich P S P grows by W, too.
+    prior's. ``inverse`` is R^-1 on entry, ``score`` the covariance S of the accumulated score, with
+    which the sandwich P S P grows by W, too. Work space: ``spare``, ``solutions`` (n, sides).
 
     ``[R^-1 W^1/2]`` is made triangular from the right by Householder reflections, row by row from
     the last (Golub and Van Loan 2013, sec. 5.2): the inverse of the new root.
     """
-    n, x, extra = len(solution), inverse, spare
-    columns = root.shape[1]
+    n, x, extra = len(share), inverse, spare
+    columns, sides = root.shape[1], solutions.shape[1]
+    for a in range(n):
+        for q in range(sides):
+            total = 0.0
+            for b in range(a, n):
+                total += x[a, b] * root[b, n + q]
+            solutions[a, q] = total
     # score: P S P
     _transpose(x, n, extra)
     multiply(x, extra, n, root)
@@ -204,10 +212,11 @@ def add_variance(root, inverse, score, spare, solution, share):
     multiply(extra, score, n, x)
     multiply(x, extra, n, score)
     for a in range(n):
-        total = 0.0
-        for b in range(a, n):
-            total += root[a, b] * solution[b]
-        root[a, n] = total
+        for q in range(sides):
+            total = 0.0
+            for b in range(a, n):
+                total += root[a, b] * solutions[b, q]
+            root[a, n + q] = total
 
 
 @reordered
@@ -263,11 +272,10 @@ def forget(root, score, w, count, factor, rows, basis, d, product, line):
         for k in range(columns):
             basis[b, k] *= f
             w[b, k] *= f
-        _combine(basis[b], root, n, rows[6 + b])  # with its part of z, so that the solution stays
+        _combine(basis[b], root, n, rows[6 + b])  # with its part of z, so that solutions stay
         _combine(w[b], score, n, d[b])
         for k in range(columns):
-            basis[b, k] = rows[6 + b, k]
-        basis[b, n] = 0.0
+            basis[b, k] = rows[6 + b, k] if k < n else 0.0
     v = basis
     for b in range(6):
         for e in range(6):
@@ -325,22 +333,22 @@ def _combine(weights, matrix, n, out):
 
 @inner
 def reorder(root, place, spare, rows, line):
-    """root, (n + 2, columns) = [R | z], of the same information with column a where place[a] was.
+    """root (n + 2, columns) of the same information with column a where place[a] was.
 
     The old rows, their columns permuted, are stacked below nothing, three at a time. Work space:
     spare (n + 2, columns), rows (12, columns), line (columns,).
     """
-    n = len(place)
+    n, columns = len(place), root.shape[1]
     copy(root, spare)
     for a in range(n):
-        for b in range(n + 1):
+        for b in range(columns):
             root[a, b] = 0.0
     for first in range(0, n, 3):
         for i in range(3):
             a = first + i
-            for b in range(n):
-                rows[i, b] = spare[a, place[b]] if a < n else 0.0
-            rows[i, n] = spare[a, n] if a < n else 0.0
+            for b in range(columns):
+                at = place[b] if b < n else b
+                rows[i, b] = spare[a, at] if a < n else 0.0
         stack(root, rows, n, 3, 0, line)
 
 

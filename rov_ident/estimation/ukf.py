@@ -27,6 +27,10 @@ prior's. (``ukf.random_walk`` lets them walk all the time.)
 
 *Standard deviations* do not assume white innovations: the covariance of their summed influence on
 the coefficients (`shared.add_scatter`) stands between two covariances of the filter.
+
+*The thrust of single axes*, which may be off (`prior.ONE_AXIS`), is no state. What the state is
+wrong by, if that thrust is off by its deviation, is carried along: it moves by the linear part of
+the prediction, less what the thrust itself does, and a measurement corrects it like the state.
 """
 
 from collections import namedtuple
@@ -64,6 +68,7 @@ from rov_ident.estimation.shared import (
     measure,
     problem_of,
     steps_of,
+    thrust_of,
     wrench_of,
 )
 from rov_ident.estimation.square_root import cholesky, cholesky_solve, multiply
@@ -113,6 +118,7 @@ class State(NamedTuple):
     lagged: Array  # (n,): that influence of late, under the lag window
     before: Array  # (n,): xi when it was last summed
     about: Array  # (n,): xi that sigma points are taken about while it is pinned
+    by_axis: Array  # (6 + n, q): what x is wrong by if the thrust of one of q axes is off
     scalars: NDArray[np.void]  # (1,)
 
 
@@ -143,6 +149,7 @@ def init(task: Problem) -> State:
         np.zeros(n),
         task.start.copy(),
         task.start.copy(),
+        np.zeros((6 + n, len(task.axis_std))),
         np.zeros(1, dtype=_SCALARS),
     )
 
@@ -178,6 +185,7 @@ def estimate(task: Problem, state: State, prior: Prior) -> Estimate:
         values_of(task, deviation),
         unit @ calibrated(state.p[6:, 6:], state.score) @ unit.T,
         float(state.scalars["t"][0]),
+        unit @ state.by_axis[6:],
     )
 
 
@@ -217,8 +225,7 @@ _SCRATCH = record(
         # slope; variance density of the wrench; nu as measured, its variance
         # nu_dot of components that are guided, zero for the others
         *floats((6,), "centre shift force slope strength z r guide"),
-        # of the estimate, for the residual
-        *floats((6,), "wrench"),
+        *floats((6,), "wrench thrust"),  # of the estimate
         *floats((6, 1), "one_nu one_h"),
         *floats((6, 6, 1), "one_mass"),
         *floats((EXTENDED_SIZE, 1), "one_extended"),
@@ -227,7 +234,8 @@ _SCRATCH = record(
 
 
 Work = namedtuple(
-    "Work", "p upper root moved cross gain block free moves noisy theta mean centre pull scratch"
+    "Work",
+    "p upper root moved cross gain block free moves noisy theta mean centre pull line scratch",
 )
 """Scratch for all samples of a fold. Zeros fill the rows of matrices to a multiple of LANES."""
 
@@ -251,6 +259,7 @@ def _work(task, state):
         np.empty((m, 1)),
         np.empty(size),  # what sigma points are taken about
         np.zeros(columns),  # P_xi^-1 (xi - what they are taken about)
+        np.empty(size),
         np.empty(1, dtype=_SCRATCH),  # in one record, whose parts the compiler knows apart
     )
     copy(state.p, work.p)
@@ -263,6 +272,7 @@ def _work(task, state):
         for j in range(6):
             for k in range(LANES):
                 mass[i, j, k] = task.rigid_body[i, j]
+    _take_mean(task, state, work)
     return work
 
 
@@ -290,7 +300,7 @@ def _steps(task, state, work, samples, sides, infos):
                 state.monitor[i].nis = 1.0
             info.reason = RESTARTED
         else:
-            _guide(state.x, work, sample)
+            _guide(state, work, sample)
             _take_root(work, info)
             _take_centre(state, work)
             _predict(task, work.centre, work, sample, side)
@@ -298,6 +308,7 @@ def _steps(task, state, work, samples, sides, infos):
                 info.reason = UNPREDICTABLE
                 c.started = False
                 continue
+            _move_by_axis(task, state, work, sample, side)
             inverse = work.scratch[0].centre_inverse
             excited(task, sample.moving, sample, state.monitor, inverse, work.noisy, work.moves)
             for i in range(len(state.x)):
@@ -315,6 +326,8 @@ def _restart(state, p, sample):
             p[i, j] = 0.0
             p[j, i] = 0.0
         state.x[i] = sample.nu[i]
+        for q in range(state.by_axis.shape[1]):
+            state.by_axis[i, q] = 0.0
         variance = sample.odometry_variance[i]
         p[i, i] = variance if variance < 1.0 else 1.0
         interrupt(state.monitor[i])
@@ -326,8 +339,9 @@ def _restart(state, p, sample):
 
 
 @inlined
-def _guide(x, work, sample):
+def _guide(state, work, sample):
     """Where nothing is known of the moments, rates are as good as known, and go as measured."""
+    x = state.x
     for i in range(6):
         work.scratch[0].guide[i] = 0.0
         if is_guided(sample) and i >= 3:
@@ -335,6 +349,8 @@ def _guide(x, work, sample):
             for j in range(len(x)):
                 work.p[i, j] = work.p[j, i] = 0.0
             work.p[i, i] = KNOWN
+            for q in range(state.by_axis.shape[1]):
+                state.by_axis[i, q] = 0.0
 
 
 @inlined
@@ -535,6 +551,27 @@ def _collect(task, state, work, sample):
     return True
 
 
+@reordered
+def _move_by_axis(task, state, work, sample, side):
+    """State.by_axis to the sample's time. With L the root of the covariance before, the sigma
+    points have left ``F L`` in the place of their velocities (:func:`_collect`)."""
+    s, by_axis, root = work.scratch[0], state.by_axis, work.root
+    moved, line = work.moved[0], work.line
+    thrust_of(task, work.mean, sample, side, s.wrench, s.thrust)
+    for axis in range(by_axis.shape[1]):
+        wrong = sample.dt * task.axis_std[axis] * s.thrust[axis]
+        for i in range(len(line)):
+            total = by_axis[i, axis]
+            for j in range(i):
+                total -= root[i, j] * line[j]
+            line[i] = total / root[i, i]
+        for i in range(6):
+            total = -wrong * s.centre_inverse[i, axis]
+            for j in range(len(line)):
+                total += moved[i, j] * line[j]
+            by_axis[i, axis] = total
+
+
 # ---------------------------------------------------------------- update
 
 
@@ -578,9 +615,9 @@ def _update(task, state, work, sample, side, out):
         if outlier:
             out.reason = GATED
         elif noisy:
-            _absorb_beside_noise(task, x, work, side, first)
+            _absorb_beside_noise(task, state, work, side, first)
         else:
-            _absorb(task, x, work, side, first)
+            _absorb(task, state, work, side, first)
     if anew:
         _restart(state, p, sample)
 
@@ -611,14 +648,27 @@ def _predicted_measurement(task, x, p, side, i):
     return predicted, spread
 
 
+@inlined
+def _correct_by_axis(task, by_axis, side, i, gain, share):
+    """State.by_axis after a measurement of velocity i, with the gain (6 + n,) times ``share``."""
+    last = len(by_axis) - side.shape[1]
+    for q in range(by_axis.shape[1]):
+        wrong = by_axis[i, q]
+        for j in range(side.shape[1]):
+            wrong += side[6 + i, j] * task.scale[last - 6 + j] * by_axis[last + j, q]
+        wrong *= share
+        for j in range(len(by_axis)):
+            by_axis[j, q] -= gain[j] * wrong
+
+
 @reordered
-def _absorb(task, x, work, side, first):
+def _absorb(task, state, work, side, first):
     """Take in three measured velocities, from ``first`` on, one after the other.
 
     With w the covariance with the innovation over its standard deviation, p loses w w', but for the
     block of the states that are only considered: they tell nothing of one another.
     """
-    p, cross, gain, free = work.p, work.cross, work.gain, work.free
+    x, p, cross, gain, free = state.x, work.p, work.cross, work.gain, work.free
     s, size, columns = work.scratch[0], p.shape[0], p.shape[1]
     last = len(task.scale) - side.shape[1]  # so many coefficients, then parameters of effects
     for c in range(3):
@@ -647,6 +697,7 @@ def _absorb(task, x, work, side, first):
             gain[c, k] = cross[c, k] * free[k]
         for j in range(size):
             x[j] += gain[c, j] * innovation
+        _correct_by_axis(task, state.by_axis, side, i, gain[c], f)
     for i in range(size):
         w = cross if free[i] != 0.0 else gain
         f, g, h = cross[0, i], cross[1, i], cross[2, i]
@@ -655,7 +706,7 @@ def _absorb(task, x, work, side, first):
 
 
 @reordered
-def _absorb_beside_noise(task, x, work, side, first):
+def _absorb_beside_noise(task, state, work, side, first):
     """The same where noise of the wrench's reading is too large on some axis, which holds the scale
     of the thrust.
 
@@ -665,7 +716,7 @@ def _absorb_beside_noise(task, x, work, side, first):
     axes. For a gain k that is not the best, and w the covariance with the innovation of variance v,
     p loses ``k w' + w k' - v k k'`` (Joseph's form).
     """
-    p, w, k, free = work.p, work.cross[0], work.gain[0], work.free
+    x, p, w, k, free = state.x, work.p, work.cross[0], work.gain[0], work.free
     s, size = work.scratch[0], p.shape[0]
     last, scale = size - side.shape[1], 6 + task.thrust
     given = task.thrust >= 0 and free[scale] == 0.0
@@ -685,6 +736,7 @@ def _absorb_beside_noise(task, x, work, side, first):
                 k[last + j] = 0.0
         for a in range(size):
             x[a] += k[a] * (s.z[i] - predicted)
+        _correct_by_axis(task, state.by_axis, side, i, k, 1.0)
         for a in range(size):
             for b in range(a + 1):
                 p[a, b] -= k[a] * w[b] + w[a] * k[b] - v * k[a] * k[b]
@@ -782,13 +834,19 @@ def _walk(task, state, work, relearnt, elapsed):
 # ---------------------------------------------------------------- residual
 
 
+@inner
+def _take_mean(task, state, work):
+    """work.mean (m, 1): all coefficients, of the present estimate."""
+    for j in range(len(task.scale)):
+        work.mean[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
+    take_thrust(1, task, work.mean, work.scratch[0].rho)
+
+
 @inlined
 def _residual(task, state, work, sample, side, out):
     """Wrench, measured minus model at the present mean, low-passed like the RLS regression."""
     s, theta, mass = work.scratch[0], work.mean, work.scratch[0].one_mass
-    for j in range(len(task.scale)):
-        theta[task.estimated[j], 0] = task.scale[j] * state.x[6 + j]
-    take_thrust(1, task, theta, s.rho)
+    _take_mean(task, state, work)
     wrench_of(theta, sample, side, s.wrench)
     for i in range(6):
         for j in range(6):

@@ -14,7 +14,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix, wrap_angle
-from rov_ident.effects import compiled
+from rov_ident.effects import act, compiled, memory
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import WORKING_SPEED, authority
 from rov_ident.simulation.open_loop import simulate
@@ -95,6 +95,7 @@ def fly(config: Config, manoeuvre: AlternatingTargets, duration: float, limits: 
     damping = 2.0 * np.diag(model.mass_matrix) * _STIFFNESS
     waves = _multisine(duration)
     nu, position, orientation = np.zeros(6), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    of_thrusters = memory()
     times = np.arange(0.0, duration, CONTROL)
     demand, reach, tilt = np.zeros((len(times), 6)), np.zeros(3), 0.0
     grid = np.linspace(0.0, CONTROL, 6)
@@ -108,8 +109,10 @@ def fly(config: Config, manoeuvre: AlternatingTargets, duration: float, limits: 
         wrench = gain * off - damping * nu - model.body.restoring @ r[2]
         wrench[3:5] = bound[3:5] * np.array(manoeuvre.torque) * waves[:, k]
         demand[k] = np.clip(wrench, -bound, bound)
+        acting = demand[k].copy()
+        act(effects, of_thrusters, float(t), CONTROL, acting)
         run = simulate(
-            model, grid, np.tile(demand[k], (len(grid), 1)), nu, position, orientation,
+            model, grid, np.tile(acting, (len(grid), 1)), nu, position, orientation,
             effects=effects,
         )  # fmt: skip
         nu, position, orientation = run.nu[-1], run.position[-1], run.orientation[-1]

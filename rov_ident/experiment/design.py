@@ -10,12 +10,13 @@ estimated beside the coefficients, and what no driving tells is left out of the 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.config.prior import (
+    axis_std_of,
     covariance_beyond_driving,
     first_centre,
     gain_of,
@@ -32,9 +33,9 @@ from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Flig
 from rov_ident.experiment.data_quality import Prospect, prospects
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.coefficients import parse
-from rov_ident.model.equations import Array, Model
+from rov_ident.model.equations import Array
 from rov_ident.offline.archive import Archive, total
-from rov_ident.offline.maximum_likelihood import LIKELY, Noise, assumed, one_pass
+from rov_ident.offline.maximum_likelihood import LIKELY, NO_ROWS, assumed, one_pass
 from rov_ident.offline.newton import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
@@ -58,8 +59,7 @@ _OTHERS = 0.05  # weight of the mean over all coefficients, which decides where 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A safe manoeuvre and the information (n, n) that it is predicted to add, about the
-    coefficients and what is estimated beside them."""
+    """A safe manoeuvre and the information that it is predicted to add (:func:`information_of`)."""
 
     manoeuvre: AlternatingTargets
     flight: Flight
@@ -183,8 +183,7 @@ def propose(
         )
     velocity = bags is None or not any(bags.each(is_without_velocity))
     about = supposed(config, velocity)
-    n = len(prior_of(about, effects=True).names)
-    now = information_of(bags.reread(about, True), about) if bags else np.zeros((n, n))
+    now = information_of(bags.reread(about, True), about) if bags else _no_information(about)
     before = known_after(about, now)
     # what a standard deviation is compared with: the value, or a share of what matters
     prior = prior_of(config)
@@ -238,34 +237,45 @@ def supposed(config: Config, velocity: bool = True) -> Config:
     return config.with_values(first_centre(config))
 
 
-def _model(about: Config) -> tuple[Model, NDArray[np.int64], Noise, None, float, Array]:
-    """The arguments of :func:`one_pass` for what is `supposed`."""
-    estimated = prior_of(about, effects=True).estimated
-    effects = theta_of(about)[len(about.model.theta) :]
-    return about.dynamics, estimated, assumed(about, LIKELY), None, np.inf, effects
+def _model(about: Config) -> tuple[Any, ...]:
+    """The arguments of :func:`one_pass` for what is `supposed`, and the thrust of each axis."""
+    prior = prior_of(about, effects=True)
+    effects, axis_std = theta_of(about)[len(about.model.theta) :], axis_std_of(about, prior.names)
+    noise = assumed(about, LIKELY)
+    return about.dynamics, prior.estimated, noise, None, np.inf, effects, NO_ROWS, axis_std
+
+
+def _no_information(about: Config) -> Array:
+    names = prior_of(about, effects=True).names
+    size = len(names) + len(axis_std_of(about, names))
+    return np.zeros((size, size))
 
 
 def information_of(bags: Archive, about: Config) -> Array:
-    """Information (n, n) in the motion of bags that were read by what is `supposed`."""
+    """Information (n + q, n + q) in the motion of bags that were read by what is `supposed`: about
+    all that is estimated, then about q errors of the thrust of single axes, which are not."""
     return total(bags.each(one_pass, *_model(about))).information
 
 
 def covariance_of(about: Config, information: Array) -> Array:
-    """The covariance (n, n) after information (n, n) beside the prior, of all that is estimated."""
-    return inverse_of(information + np.diag(prior_of(about, effects=True).std ** -2.0))
+    """The covariance (n, n) after such information beside the prior, of all that is estimated."""
+    std = prior_of(about, effects=True).std
+    return inverse_of(information[: len(std), : len(std)] + np.diag(std**-2.0))
 
 
 def known_after(about: Config, information: Array) -> tuple[Prospect, ...]:
-    """How well each coefficient is known after information (n, n), whatever the rest may be."""
+    """How well each coefficient is known after such information, whatever the rest may be."""
     std = np.sqrt(np.diag(covariance_of(about, information)))
     return prospects(about, std[: len(about.estimate)])
 
 
 def _not_by_driving(about: Config, information: Array) -> tuple[float, ...]:
-    """The standard deviations that a fit adds, for each coefficient, after information (n, n)."""
+    """The standard deviations that a fit adds, for each coefficient, after such information."""
     prior, covariance = prior_of(about, effects=True), covariance_of(about, information)
     with_data = prior.names, prior.mean, gain_of(covariance, prior.std)
-    added = rigid_body_covariance(about, *with_data) + covariance_beyond_driving(about, *with_data)
+    by_axis = covariance @ information[: len(covariance), len(covariance) :]
+    added = rigid_body_covariance(about, *with_data)
+    added += covariance_beyond_driving(about, *with_data, by_axis)
     std: list[float] = np.sqrt(np.diag(added)).tolist()
     return tuple(std[: len(about.estimate)])
 

@@ -396,7 +396,7 @@ class _Log:
 
     def take_degrees(self, names: Sequence[str]) -> None:
         """Convert columns that hold degrees. Raises UserError for one that is no angle or rate."""
-        for name in names:
+        for name in dict.fromkeys(names):
             if name not in self.data or name not in _IN_RADIANS:
                 raise UserError(f"--degrees {name}: the log has no such column of angles or rates")
             self.data[name] = np.radians(self.data[name])

@@ -10,7 +10,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import (
-    FLIP_BODY,
+    body_is_frd,
     quaternion_multiply,
     quaternion_normalise,
     quaternion_to_euler,
@@ -59,7 +59,8 @@ def sensor_placement(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Arra
     is left out.
 
     ``frames`` as `first_frames` gives them. The body frame is that of the odometry (its child), or
-    `base_link`; the tree has its axes forward, left, up.
+    `base_link`. Frames of the tree have their axes forward, left, up, or as their name says
+    (`base_link_frd`): messages in them do, too.
     """
     parents = _tree(bag)
 
@@ -79,19 +80,26 @@ def sensor_placement(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Arra
         (root, origin, attitude), (other, p, q) = below_root(frame), below_root(body)
         if root != other or root in parents:
             return None
-        back = q * [1.0, -1.0, -1.0, -1.0]
-        return quaternion_to_matrix(back) @ (origin - p), quaternion_multiply(back, attitude)
+        to_core, from_sensor = _to_frd(body), _to_frd(frame)  # half turns: each its own inverse
+        back = quaternion_multiply(to_core, q * [1.0, -1.0, -1.0, -1.0])
+        turned = quaternion_multiply(quaternion_multiply(back, attitude), from_sensor)
+        return quaternion_to_matrix(back) @ (origin - p), turned
 
     motion, child = frames.get(ODOMETRY, ("", ""))
     found: dict[str, Array] = {}
     if not parents:
         return found
     if IMU in frames and (at := placed(frames[IMU][0], child or "base_link")):
-        found["imu.position"] = FLIP_BODY * at[0]
-        found["imu.rotation"] = FLIP_BODY * quaternion_to_euler(at[1])
+        found["imu.position"] = at[0]
+        found["imu.rotation"] = quaternion_to_euler(at[1])
     if motion and not child and (at := placed(motion, "base_link")):
-        found["odometry.position"] = FLIP_BODY * at[0]
+        found["odometry.position"] = at[0]
     return found
+
+
+def _to_frd(frame: str) -> Array:
+    """The turn (4,) from the axes of a frame to forward-starboard-down."""
+    return np.array([1.0, 0.0, 0.0, 0.0] if body_is_frd(frame) else [0.0, 1.0, 0.0, 0.0])
 
 
 def _tree(bag: Bag) -> dict[str, tuple[str, Array, Array]]:

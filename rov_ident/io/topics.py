@@ -487,8 +487,9 @@ def _source_of(bag: Bag, topic: str, kind: str) -> Seen:
     for raw in bag.iter_raw([topic]):
         times.append(raw.log_time)
         if first is None:
-            first = cdr.DECODERS[_full_name(kind)](raw.data)
-    span = max(times) - min(times)
+            with suppress(ValueError):
+                first = cdr.DECODERS[_full_name(kind)](raw.data)
+    span = max(times, default=0) - min(times, default=0)
     frames = getattr(first, "frame_id", ""), getattr(first, "child_frame_id", "")
     return Seen(topic, kind, 1e9 * (len(times) - 1) / span if span else 0.0, frames)
 

@@ -87,7 +87,7 @@ class Coefficient:
 
     ``row`` is the axis (0..5). For added mass ``column`` is the velocity it multiplies and
     ``left = right = -1``; otherwise the term is ``extended[left] * extended[right]``. ``right`` is
-    a velocity, or an input.
+    a velocity, or an input. ``formula`` is what the coefficient multiplies.
     """
 
     name: str
@@ -97,6 +97,7 @@ class Coefficient:
     right: int
     unit: str
     meaning: str
+    formula: str
 
     @property
     def is_added_mass(self) -> bool:
@@ -174,7 +175,7 @@ def parse(name: str) -> Coefficient:
     if match["dot"]:
         unit = ("kg", "kg m", "kg m2")[(row >= 3) + (first >= 3)]
         meaning = f"added mass: {axis} per d{b}/dt"
-        return Coefficient(name, row, first, -1, -1, unit, meaning)
+        return Coefficient(name, row, first, -1, -1, unit, meaning, f"d{b}/dt")
     if match["abs"]:
         second, c = VELOCITIES.index(match["abs"]), match["abs"]
         if first == second:
@@ -204,7 +205,7 @@ def parse(name: str) -> Coefficient:
         formula = formula.removesuffix(b) + f"min({b}, 0)"
     meaning = f"{'linear damping' if left == ONE else 'quadratic term'}: {axis} = {name} {formula}"
     order = [first] if left == ONE else [first, second]
-    return Coefficient(name, row, first, left, right, _unit(force, order), meaning)
+    return Coefficient(name, row, first, left, right, _unit(force, order), meaning, formula)
 
 
 @cache
@@ -222,7 +223,7 @@ def parse_input(name: str) -> Coefficient | None:
             "nn": (ONE, n + 1, "|n| n", f"{force} s2"),
         }.get(match["propeller"], (PLAIN, n, "u n", f"{force} s2/m"))
         meaning = f"propeller: {side} {axis} = {name} {formula}, n in revolutions a second"
-        return Coefficient(name, row, -1, left, right, unit, meaning)
+        return Coefficient(name, row, -1, left, right, unit, meaning, formula)
     fin, square = match["fin"], match["square"] is not None
     even = square and fin in _FIN_EVEN.get(axis, "")
     own = INPUT + 3 * INPUT_LETTERS.index(fin)
@@ -234,10 +235,11 @@ def parse_input(name: str) -> Coefficient | None:
     }[match["speed"]]
     right = own + (0 if not square else 2 if even else 1)
     angle = f"d{fin}" if not square else f"d{fin}^2" if even else f"|d{fin}| d{fin}"
+    formula = f"{factor}{angle}"
     radians = "rad2" if square else "rad"
     unit = f"{force} {above}".strip() + (f"/({below} {radians})" if below else f"/{radians}")
-    meaning = f"fin ({_FIN_NAMES[fin]}): {side} {axis} = {name} {factor}{angle}"
-    return Coefficient(name, row, -1, left, right, unit, meaning)
+    meaning = f"fin ({_FIN_NAMES[fin]}): {side} {axis} = {name} {formula}"
+    return Coefficient(name, row, -1, left, right, unit, meaning, formula)
 
 
 def input_catalogue() -> list[Coefficient]:

@@ -226,7 +226,8 @@ class EstimatorNode(GuardedNode):
             messages = tuple(f"disabled: {text}" for text in messages)
         shown = replace(report, messages=messages, states=states)
         if self._nomoto:
-            shown = report = self._nomoto.beside(shown)
+            silent = self._inputs.is_missing(ODOMETRY, self._config.timeout)
+            shown = report = self._nomoto.beside(shown, silent and not self._waiting)
         pairs = np.stack([report.values, report.std], axis=1)
         columns = " ".join(report.names)
         self._covariance.publish(to_matrix(report.names, columns, report.covariance))

@@ -50,9 +50,18 @@ class NomotoInput:
         """A message of the odometry, in the axes of its topic."""
         if isinstance(message, Odometry):
             core: Any = to_core(message, self._config.frames)
+            if self._is_set_back(core.stamp, self._heard):
+                self._headings.clear()
+                self._rudder.clear()
+                self._heard = self._stamp = 0
             self._headings.append((core.stamp, float(quaternion_to_euler(core.orientation)[2])))
             self._heard = max(self._heard, core.stamp)
             self._advance()
+
+    @staticmethod
+    def _is_set_back(stamp: int, before: int) -> bool:
+        """Whether a clock was set back between two stamps [ns]: a bag that begins again, say."""
+        return stamp < before - GAP * 1e9
 
     def _joints(self, message: JointState) -> None:
         names = list(message.name)
@@ -65,6 +74,8 @@ class NomotoInput:
         self._take_rudder(self._node.get_clock().now().nanoseconds, float(message.data))
 
     def _take_rudder(self, stamp: int, angle: float) -> None:
+        if self._rudder and self._is_set_back(stamp, self._rudder[-1][0]):
+            self._rudder.clear()
         if not self._rudder or stamp > self._rudder[-1][0]:
             self._rudder.append((stamp, angle))
             self._advance()
@@ -85,8 +96,8 @@ class NomotoInput:
             self._estimator.push(1e-9 * (at - self._origin), heading, turned)
             self._stamp = at
 
-    def beside(self, report: Report) -> Report:
-        """The report with K and T behind the coefficients."""
+    def beside(self, report: Report, silent: bool) -> Report:
+        """The report with K and T behind the coefficients. ``silent``: headings have stopped."""
         found = self._estimator.result
         values = np.zeros(2) if found is None else found.values
         covariance = np.diag(_UNKNOWN**2) if found is None else found.covariance
@@ -97,8 +108,9 @@ class NomotoInput:
             text, state = f"held: no rudder on {topic}", State.HELD
         elif found is None:
             text, state = "held: the rudder has not yet turned the vehicle enough", State.HELD
-        elif self._heard - self._stamp > GAP * 1e9:
-            text, state = "stale: no rudder to the latest headings", State.STALE
+        elif silent or self._heard - self._stamp > GAP * 1e9:
+            why = "no heading comes" if silent else "no rudder to the latest headings"
+            text, state = f"stale: {why}", State.STALE
         elif all(map(is_known, values, std, (0.0, 0.0))):
             text, state = "converged", State.CONVERGED
         n = len(report.names)

@@ -9,6 +9,7 @@ import contextlib
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from itertools import count, repeat
@@ -32,6 +33,7 @@ Samples = NDArray[np.void]
 Mapper = Callable[..., list[Any]]
 """``mapper(function, *arguments)``: [function(samples, *arguments)] of every bag, in order."""
 Sums = TypeVar("Sums", bound=tuple[Any, ...])
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,8 @@ def opened(
             def read(config: Config, columns: bool) -> Iterator[Outcome]:
                 k = next(readings)
                 files = [Path(folder) / f"{k}-{i}.npy" for i in range(len(paths))]
-                return reported(pool.map(_stored, paths, repeat(config), repeat(columns), files))
+                stored = pool.map(_stored, paths, repeat(config), repeat(columns), files)
+                return reported(_finished(stored))
 
             yield Archive(read(config, False), partial(_by_processes, pool), read)
     else:
@@ -212,7 +215,18 @@ def _of_stored(file: _File, function: Callable[..., Any], arguments: tuple[Any, 
 def _by_processes(
     pool: ProcessPoolExecutor, files: Sequence[_File], function: Callable[..., Any], *arguments: Any
 ) -> list[Any]:
-    return list(pool.map(_of_stored, files, repeat(function), repeat(arguments)))
+    return list(_finished(pool.map(_of_stored, files, repeat(function), repeat(arguments))))
+
+
+def _finished(results: Iterable[_Result]) -> Iterator[_Result]:
+    """The results of processes. UserError if one of these was killed."""
+    try:
+        yield from results
+    except BrokenProcessPool as error:
+        raise UserError(
+            "a process that worked on the bags was killed, perhaps as memory was short: use fewer "
+            "at a time (--jobs)"
+        ) from error
 
 
 # ------------------------------------------------------------------ Dask

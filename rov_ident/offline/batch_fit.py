@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.config.prior import (
+    ONE_AXIS,
     Prior,
     attitude_covariance,
     covariance_beyond_driving,
@@ -38,7 +39,7 @@ from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
 from rov_ident.sampling.records import HORIZON, UNITS, numbers
-from rov_ident.sampling.sample import free_axes, parts, thrust_axes
+from rov_ident.sampling.sample import free_axes, thrust_axes
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
 
 KINDS = ("ls", "iv", "ml")
@@ -295,7 +296,7 @@ def _stage(
         )
         names = prior.names
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
-        asked = likelihood.asked
+        asked, by_axis = likelihood.asked, likelihood.by_axis
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         unexplained[:2] = np.nan if unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
@@ -307,13 +308,12 @@ def _stage(
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
     covariance = covariance + rigid_body_covariance(config, names, found, gain)
-    seconds = float(sum(archive.each(_seconds)))
-    covariance = covariance + attitude_covariance(config, names, seconds, gain)
-    beyond_driving = covariance_beyond_driving(config, names, found, gain)
+    covariance = covariance + attitude_covariance(config, names, archive.duration, gain)
     if kind != "ml":  # least squares takes the configured thrust for the true one
         unexplained[free] = (solution.lasting / authority(config.dynamics))[free]
         of_thrust = config.wrench.scale_std * solution.by_thrust
-        beyond_driving = beyond_driving + np.outer(of_thrust, of_thrust)
+        by_axis = np.column_stack([of_thrust.sum(axis=1), ONE_AXIS * of_thrust])
+    beyond_driving = covariance_beyond_driving(config, names, found, gain, by_axis)
     if unmeasured:
         # What moments and tilt suggest of these is in the values; the intervals are the prior's.
         impossible = [n for n, c in _coefficients(config).items() if is_impossible(c)]
@@ -485,11 +485,6 @@ def predicted_information(
 def _mean_square_wrench(samples: Samples) -> Array:
     """(6,) over the samples."""
     return np.mean(samples["wrench"] ** 2, axis=0)
-
-
-def _seconds(samples: Samples) -> float:
-    samples, _ = parts(samples)
-    return float(np.sum(samples["dt"]))
 
 
 def _velocity_range(samples: Samples) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from rov_ident.effects import EFFECTS
 from rov_ident.estimation.consistency import Test
 from rov_ident.model.scales import authority
 from rov_ident.offline.batch_fit import AT_REST
-from rov_ident.offline.filtered_regression import filtered_rows, regression
+from rov_ident.offline.filtered_regression import filtered_rows, regression, spacing_of
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.raw_streams import Streams, measured_at
@@ -33,6 +33,7 @@ MATTERS = 0.02  # s; 5 % of the time constant of a small vehicle, so about 5 % o
 SURELY = 5.0  # standard deviations: these are of the noise alone, and clean dives reach 4.5
 _EXACT = 0.01  # s; more than outliers and what a model lacks have made of it: 7 ms in the worst of
 # 45 simulated dives with exact stamps, while 15 ms of a wrong clock made 17
+_GAP = 1.5  # times the usual distance of rows; across more no slope is taken
 _FEWEST_ROWS = 20  # of filtered wrench and motion; about as many as there are coefficients
 
 
@@ -62,16 +63,17 @@ NO_DELAY = Delay(np.nan, np.nan)
 
 @dataclass(frozen=True)
 class Filtered:
-    """Filtered wrench (K, 6), motion ``phi`` (K, 6, n + 1) = [Phi y] of the same regression, and
-    which axes are ``driven`` (6,)."""
+    """Filtered wrench (K, 6), motion ``phi`` (K, 6, n + 1) = [Phi y] of the same regression, at t
+    (K,) s, and which axes are ``driven`` (6,)."""
 
+    t: Array
     phi: Array
     wrench: Array
     driven: NDArray[np.bool_]
 
     def part(self, which: slice) -> "Filtered":
         """The same of some rows."""
-        return Filtered(self.phi[which], self.wrench[which], self.driven)
+        return Filtered(self.t[which], self.phi[which], self.wrench[which], self.driven)
 
 
 def ahead_of_wrench(ahead: float) -> str:
@@ -128,14 +130,14 @@ def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
     still = samples.copy()
     for name in ("nu", "down", "down_slope"):
         still[name] = 0.0
-    phi = filtered_rows(task, samples, PERIOD)
-    wrench = filtered_rows(task, still, PERIOD)[:, :, -1]
+    phi, t = filtered_rows(task, samples, PERIOD)
+    wrench = filtered_rows(task, still, PERIOD)[0][:, :, -1]
     if len(phi) < _FEWEST_ROWS or len(phi) != len(wrench):
         return None
     size = np.sqrt(np.mean(wrench**2, axis=0))
     if is_without_velocity(samples):  # forces drive what is simulated itself
         size[:3] = 0.0
-    return Filtered(phi, wrench, size > AT_REST * authority(config.dynamics))
+    return Filtered(t, phi, wrench, size > AT_REST * authority(config.dynamics))
 
 
 def samples_of(streams: Streams) -> NDArray[np.void]:
@@ -174,8 +176,10 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
     """The coefficients are refitted along with it: tau(t - d) is tau - d tau', so the derivative of
     the wrench is one more column, and the delay its factor."""
     phi, wrench, driven = rows.phi, rows.wrench, rows.driven
-    slope = np.gradient(wrench, PERIOD, axis=0)
-    table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)[1:-1]
+    slope, spacing = np.gradient(wrench, rows.t, axis=0), spacing_of(rows.t)
+    inside = np.maximum(np.diff(rows.t)[1:], np.diff(rows.t)[:-1]) < _GAP * spacing
+    table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)
+    table = table[1:-1][inside]
     n = table.shape[2] - 1
     if not slope[:, driven].any() or len(table) < 5 * n:  # a wrench that holds shows no time
         return NO_DELAY
@@ -188,7 +192,7 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
         left = table[:, :, n] - table[:, :, :n] @ x
         weight = np.where(driven, 1.0 / np.maximum(np.mean(left**2, axis=0), 1e-12), 0.0)
     # rows closer than the filter's memory repeat each other
-    variance = scaled_inverse(normal)[-1, -1] * 2.0 / (_CORNER * PERIOD)
+    variance = scaled_inverse(normal)[-1, -1] * 2.0 / (_CORNER * spacing)
     return Delay(float(x[-1]), float(np.sqrt(variance)))
 
 

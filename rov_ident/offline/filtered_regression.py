@@ -51,14 +51,25 @@ def regression(config: Config, corner: float = 3.0) -> Regression:
     )
 
 
-def filtered_rows(task: Regression, samples: NDArray[np.void], period: float) -> Array:
-    """[Phi y] (K, 6, n + 1) of samples (k,) of SAMPLE, one each ``period`` s; gaps begin anew."""
+def filtered_rows(
+    task: Regression, samples: NDArray[np.void], period: float
+) -> tuple[Array, Array]:
+    """[Phi y] (K, 6, n + 1) of samples (k,) of SAMPLE, and their times (K,) [s]: each at the first
+    sample ``period`` s after the one before, so further apart where samples are. Gaps begin anew.
+    """
     out = np.empty((int(samples["dt"].sum() / period) + 2, 6, len(task.scale) + 1))
-    return out[: _rows(task, samples, period, out)]
+    t = np.empty(len(out))
+    used = _rows(task, samples, period, out, t)
+    return out[:used], t[:used]
+
+
+def spacing_of(t: Array) -> float:
+    """Seconds between rows at t (K,), without gaps; of less than two NaN."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else np.nan
 
 
 @kernel
-def _rows(task, samples, period, out):
+def _rows(task, samples, period, out, times):
     n, m = len(task.scale), len(task.theta)
     momentum, force, p = np.empty((6, m)), np.empty((6, m)), np.empty(6)
     extended = np.empty((EXTENDED_SIZE, 1))
@@ -95,6 +106,7 @@ def _rows(task, samples, period, out):
                 for j in range(n):
                     out[used, i, j] = -y[i, j]
                 out[used, i, n] = y[i, n]
+            times[used] = sample.t
             used += 1
             since = 0.0
     return used

@@ -111,8 +111,8 @@ class Fit(Shown, Result):
         at = [prior.names.index(name) for name in self.names]
         mean, std = prior.mean[at], prior.std[at]
         consistency = replace(self.consistency, tests=(*self.consistency.tests, *tests))
-        further = Consistency(tuple(tests))
-        covariance = further.widened(self.covariance, std, self.values - mean)
+        already = self.consistency.inflation
+        covariance = consistency.widened(self.covariance, std, self.values - mean, already)
         return replace(
             self,
             consistency=consistency,
@@ -269,6 +269,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
             estimator.follow(inputs.messages(bag, inputs.select(bag, config), config))
         else:
             estimator.take(record.samples)
+            estimator.flush()
     report = estimator.report()
     assert report.consistency is not None and report.beyond_driving is not None
     own = np.sqrt(np.maximum(report.std**2 - report.beyond_driving, 0.0))

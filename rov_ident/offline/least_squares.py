@@ -39,11 +39,12 @@ from rov_ident.estimation.shared import LAG
 from rov_ident.model.equations import Array, Model
 from rov_ident.model.scales import authority
 from rov_ident.offline.archive import Mapper, Samples, total
-from rov_ident.offline.filtered_regression import Regression, filtered_rows, regression
+from rov_ident.offline.filtered_regression import Regression, filtered_rows, regression, spacing_of
 from rov_ident.sampling.records import HORIZON, beside_odometry, predicted
 from rov_ident.sampling.sample import free_axes, parts
 
-PERIOD = 0.1  # s between rows: a third of the filter's time constant, so that none is missed
+PERIOD = 0.1  # s between rows, where samples are as close: a third of the filter's time constant,
+# so that none is missed
 _BLOCK = 2.0 * LAG  # s; of rows left out together: the area of the lag window of rls and ukf
 _FEWEST = 5  # blocks: of a shorter bag they are shorter
 _LASTING = 1.0  # s, as of a force that the other estimators call unexplained; three time constants
@@ -56,13 +57,15 @@ _KNOWN = 3.0  # information over that of the prior at which a direction counts a
 
 
 class Moments(NamedTuple):
-    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,).
+    """Sums of ``[Z y]' [Phi y]`` axis by axis, (6, n + 1, n + 1), over so many ``rows`` (6,), which
+    stand for so many ``seconds`` (6,).
 
     In prior standard deviations about the prior's mean.
     """
 
     sums: Array
     rows: Array
+    seconds: Array
 
 
 class Residuals(NamedTuple):
@@ -70,9 +73,9 @@ class Residuals(NamedTuple):
 
     ``scatter`` (n, n): covariance of the accumulated ``sum w Z' e``, correlation in time included,
     such that the covariance of the values is that of the jackknife (:func:`_scatter`);
-    ``of_thrust`` (n,): ``sum w Z' F[thrust]``; ``products`` (6,): of residuals a second apart,
-    summed over so many ``pairs`` (6,). Their mean is the power of what lasts, to which noise adds
-    nothing.
+    ``of_thrust`` (n, 6): ``sum w Z' F[thrust]`` by axis; ``products`` (6,): of residuals a second
+    apart, summed over so many ``pairs`` (6,). Their mean is the power of what lasts, to which noise
+    adds nothing.
     """
 
     scatter: Array
@@ -95,8 +98,8 @@ class Solution:
 
     ``information`` (n, n) is the weighted Phi' Phi in prior standard deviations, neighbours in time
     counting once; ``noise`` (6,) the residual's standard deviation by axis [N, N m], and
-    ``lasting`` (6,) that of the part which lasts a second. ``by_thrust`` (n,): by how much the
-    values change with the scale of all thrust, per 1.
+    ``lasting`` (6,) that of the part which lasts a second. ``by_thrust`` (n, 6): by how much the
+    values change with the thrust of each axis, per 1.
     """
 
     values: Array
@@ -127,7 +130,6 @@ def solve(
     task = regression(config)
     batch = Batch(task, compiled(config.effects))
     prior: Array = np.eye(len(task.scale)) * precision
-    repeats = 2.0 / (task.corner * PERIOD)
     forces = authority(config.dynamics)
     on_axis = _inertia_of(task)
 
@@ -153,6 +155,8 @@ def solve(
 
     say("least squares")
     moments = total(each(moments_of, batch))
+    spacing = moments.seconds[0] / moments.rows[0] if moments.rows[0] else PERIOD
+    repeats = 2.0 / (task.corner * spacing)  # neighbours within the filter's memory are alike
     # ordinary: forces and moments in units of their own size, else a metre would decide
     ordinary = np.where(free, 1.0 / (0.03 * forces) ** 2, 0.0)
     known = np.sqrt(sum(each(known_squares, batch)) / np.maximum(moments.rows, 1.0))
@@ -193,7 +197,7 @@ def solve(
         information,
         noise,
         np.sqrt(np.maximum(left.products, 0.0) / np.maximum(left.pairs, 1.0)),
-        task.scale * by_thrust,
+        task.scale[:, None] * by_thrust,
         int(moments.rows[free].sum()),
     )
 
@@ -203,8 +207,9 @@ def solve(
 
 def moments_of(samples: Samples, batch: Batch) -> Moments:
     """The sums of one bag's samples (k,) of SAMPLE."""
-    phi, z, good = _rows_and_instruments(samples, batch)
-    return Moments(np.einsum("kai,kaj->aij", z, phi), np.full(6, float(good.sum())))
+    phi, z, good, spacing = _rows_and_instruments(samples, batch)
+    rows = np.full(6, float(good.sum()))
+    return Moments(np.einsum("kai,kaj->aij", z, phi), rows, spacing * rows)
 
 
 def known_squares(samples: Samples, batch: Batch) -> Array:
@@ -213,7 +218,7 @@ def known_squares(samples: Samples, batch: Batch) -> Array:
     theta = batch.task.theta.copy()
     theta[batch.task.estimated] = 0.0
     task = batch.task._replace(theta=theta, rigid_body=np.zeros((6, 6)))
-    known = filtered_rows(task, beside_odometry(parts(samples)[0]), PERIOD)[:, :, -1]
+    known = filtered_rows(task, beside_odometry(parts(samples)[0]), PERIOD)[0][:, :, -1]
     squares: Array = np.sum(known[np.isfinite(known).all(axis=1)] ** 2, axis=0)
     return squares
 
@@ -231,25 +236,29 @@ def residuals_of(
 ) -> Residuals:
     """What one bag's residuals ``e = y - Phi x`` tell; ``inverse`` (n, n) is that of the normal
     matrix of all bags."""
-    phi, z, good = _rows_and_instruments(samples, batch)
-    error, lag = phi[:, :, -1] - phi[:, :, :-1] @ x, round(_LASTING / PERIOD)
+    phi, z, good, spacing = _rows_and_instruments(samples, batch)
+    error, lag = phi[:, :, -1] - phi[:, :, :-1] @ x, max(round(_LASTING / spacing), 1)
     left = z[:, :, :-1] * weight[:, None]
     doubled = samples.copy()
     for part, other in (("wrench", "surroundings"), ("wrench_slope", "surroundings_slope")):
         doubled[part] += samples[part] - samples[other]
     twice = _rows_and_instruments(doubled, batch._replace(instruments=None))[0]
     return Residuals(
-        _scatter(error, left, phi[:, :, :-1], inverse),
-        np.einsum("ka,kai->i", twice[:, :, -1] - phi[:, :, -1], left),
+        _scatter(error, left, phi[:, :, :-1], inverse, spacing),
+        np.einsum("ka,kai->ia", twice[:, :, -1] - phi[:, :, -1], left),
         np.sum(error[:-lag] * error[lag:], axis=0),
         np.full(6, float(np.sum(good[:-lag] & good[lag:]))),
     )
 
 
-def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """[Phi y] and [Z y] (K, 6, n + 1), and which rows (K,) are known; of all others they are 0."""
+def _rows_and_instruments(
+    samples: Samples, batch: Batch
+) -> tuple[Array, Array, NDArray[np.bool_], float]:
+    """[Phi y] and [Z y] (K, 6, n + 1), which rows (K,) are known; of all others they are 0; and how
+    far rows are apart [s]."""
     samples = beside_odometry(parts(samples)[0])
-    z = phi = filtered_rows(batch.task, samples, PERIOD)
+    phi, t = filtered_rows(batch.task, samples, PERIOD)
+    z, spacing = phi, spacing_of(t) if len(t) > 1 else PERIOD
     if batch.instruments is not None:  # along the motion that the model says, through the water
         nu = predicted(batch.instruments, samples, np.inf, effects=batch.effects)
         if not np.isfinite(nu).all():
@@ -257,16 +266,16 @@ def _rows_and_instruments(samples: Samples, batch: Batch) -> tuple[Array, Array,
         simulated = samples.copy()
         simulated["nu"] = nu
         simulated["nu"][:, :3] -= samples["water"]
-        z = filtered_rows(batch.task, simulated, PERIOD)
+        z = filtered_rows(batch.task, simulated, PERIOD)[0]
         z[:, :, -1] = phi[:, :, -1]
     unknown = ~free_axes(samples)
     z[:, unknown] = phi[:, unknown] = 0.0
     good = np.asarray(np.isfinite(z).all(axis=(1, 2)), dtype=bool)
     z[~good] = phi[~good] = 0.0
-    return phi, z, good
+    return phi, z, good, spacing
 
 
-def _scatter(error: Array, left: Array, phi: Array, inverse: Array) -> Array:
+def _scatter(error: Array, left: Array, phi: Array, inverse: Array, spacing: float) -> Array:
     """Covariance (n, n) of ``sum left' error`` over rows (K, 6), for that of the values to be the
     jackknife's: the squares of what they change by where a block of rows is left out.
 
@@ -275,7 +284,7 @@ def _scatter(error: Array, left: Array, phi: Array, inverse: Array) -> Array:
     leaves no residual: by residuals as they are, the interval would be too narrow (Bell and
     McCaffrey 2002; MacKinnon, Nielsen and Webb 2023).
     """
-    count, one = max(_FEWEST, round(len(error) * PERIOD / _BLOCK)), np.eye(len(inverse))
+    count, one = max(_FEWEST, round(len(error) * spacing / _BLOCK)), np.eye(len(inverse))
     edges = np.linspace(0, len(error), count + 1).astype(int)
     scores = []
     for a, b in pairwise(edges):

@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
-from rov_ident.config.prior import prior_of
+from rov_ident.config.prior import axis_std_of, prior_of
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.linalg import sandwich, widened
 from rov_ident.core.progress import Progress, silent
@@ -85,7 +85,7 @@ _NEAR = 0.05  # squared standard deviations of noise levels from the most likely
 _SMALLEST = 1e-4  # floor of the process noise over the axis's working wrench: as good as none
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
 _NONE = np.zeros(0)
-_NO_ROWS = np.zeros((3, 0, 6))
+NO_ROWS = np.zeros((3, 0, 6))
 LIKELY = 3e-3  # a choice: the same before a fit of the noise, stated in docs/offline.md
 
 
@@ -168,14 +168,16 @@ def one_pass(
     free: NDArray[np.bool_] | None = None,
     gate: float = np.inf,
     effects: Array = _NONE,
-    out: Array = _NO_ROWS,
+    out: Array = NO_ROWS,
+    axis_std: Array = _NONE,
 ) -> Pass:
     """The likelihood of samples (k,) of SAMPLE at the model's values, with its derivatives.
 
     ``estimated`` (n,) are indices into theta, behind which come the values (p,) of parameters of
     ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
     measurement, and those of which no wrench is known. ``out`` (3, k, 6), unless it is empty, is
-    filled with :class:`Innovations`.
+    filled with :class:`Innovations`. ``axis_std`` (6,), unless it is empty: standard deviations of
+    the thrust of each axis, relative to it. Then these are six more parameters behind the others.
     """
     known = free_axes(samples)
     free = known if free is None else free & known
@@ -185,6 +187,11 @@ def one_pass(
     elif noise.untaught.any():
         sides = sides.copy()
         sides[:, :6][:, noise.untaught.T] = 0.0
+    if len(axis_std):
+        errors, axes = np.zeros((len(samples), 13, 6)), np.arange(6)
+        errors[:, axes, axes] = axis_std * (samples["wrench"] - samples["surroundings"])
+        estimated = np.append(estimated, len(model.theta) + len(effects) + axes)
+        effects, sides = np.append(effects, np.zeros(6)), np.concatenate([sides, errors], axis=2)
     mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
     inverse, at = np.zeros((6, 6)), np.ix_(free, free)
     inverse[at] = np.linalg.inv(mass[at])
@@ -326,6 +333,8 @@ class Likelihood:
     ``bound`` (n, n) is the Cramer-Rao bound, prior included; ``total`` the sums of the last pass.
     ``lasting`` (6,) is the power of innovations added up over a second in motion: 1 is expected,
     NaN where it is not known.
+    ``by_axis`` (n, 6): what the values are wrong by if the thrust of one axis is off by its
+    standard deviation (`config.prior.axis_std_of`); (n, 0) where none is supposed.
     ``held`` (n,): what kept its prior, as the axes ``noisy`` (6,) would teach it noise of the
     wrench's reading: their coefficients, and factors of the thrust there. Other parameters of
     thrusters are learnt from the other axes (a lag would smooth the noise away).
@@ -338,6 +347,7 @@ class Likelihood:
     noise: Noise
     total: Pass
     lasting: Array
+    by_axis: Array
     held: NDArray[np.bool_]
     noisy: NDArray[np.bool_]
     iterations: int
@@ -429,11 +439,16 @@ def maximise(
     known = seconds > JUDGED_TIME
     lasting = np.where(known, power / np.where(known, seconds, 1.0), np.nan)
     slope, curvature = derivatives(theta, at)
-    asked, ours = theta.copy(), np.ix_(~held, ~held)
-    asked[~held] += inverse_of(curvature[ours]) @ slope[~held]
+    asked, inverse = theta.copy(), inverse_of(curvature[np.ix_(~held, ~held)])
+    asked[~held] += inverse @ slope[~held]
+    axis_std, n = axis_std_of(config, prior.names), len(theta)
+    beside = model_at(theta), estimated, noise, free, gate, theta[~own], NO_ROWS, axis_std
+    errors = total(each(one_pass, *beside)).information[:n, n:]
+    by_axis = np.zeros_like(errors)
+    by_axis[~held] = inverse @ errors[~held]
     bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
     return Likelihood(
-        theta, asked, covariance, bound, noise, at, lasting, held, noisy, steps, converged
+        theta, asked, covariance, bound, noise, at, lasting, by_axis, held, noisy, steps, converged
     )
 
 

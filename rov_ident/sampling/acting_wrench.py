@@ -105,6 +105,7 @@ class ActingWrench:
 
     def clear(self) -> None:
         self._command: _Command | None = None  # the one that is held
+        self._until = np.nan  # s; so far it has gone through the effects
         self.memory = memory()  # of the input effects
         self._from_rest: _FromRest | None = None
         self._around = np.zeros(6)  # the surroundings' wrench at the last sample
@@ -142,9 +143,12 @@ class ActingWrench:
             if self._command is None:
                 start = now = max(command.t, start)
                 self._from_rest = _FromRest(self._effects, command) if self._has_inputs else None
-            elif command.t > now:
-                pieces.append((now, command.t, *self._act(self._command, now, command.t)))
-                now = command.t
+                self._until = command.t
+            else:
+                self._catch_up(min(start, command.t))
+                if command.t > now:
+                    pieces.append((now, command.t, *self._act(self._command, now, command.t)))
+                    now = command.t
             self._command = command
             if commands is not None:
                 commands.append((command.t, command.wrench))
@@ -155,6 +159,7 @@ class ActingWrench:
             if self._jacobians is not None:
                 self._jacobians.forget()
             return None
+        self._catch_up(start)
         acting, doubt = self._act(held, now, end)
         if not pieces:
             return MeanWrench(acting, _ZERO, doubt)
@@ -166,6 +171,13 @@ class ActingWrench:
             moment = 12.0 * share * (0.5 * (begin + stop) - middle) / length**2
             _add_piece(share, moment, wrench, doubt, *total)
         return total
+
+    def _catch_up(self, t: float) -> None:
+        """Have the held command act to t [s], in a gap that no sample covers."""
+        if self._command is not None and self._until < t:
+            self._act(self._command, self._until, t)
+            if self._jacobians is not None:
+                self._jacobians.begin_interval()
 
     def _next(self, end: float, queue: deque[Waiting], despiker: Despiker) -> _Command | None:
         """The next command before ``end`` [s]; if it was dropped, an estimate of it."""
@@ -196,6 +208,7 @@ class ActingWrench:
         """The wrench (6,) that acts in the mean from ``begin`` to ``end`` by a held command, and
         its doubt (6,)."""
         wrench, doubt, dt = command.wrench.copy(), command.doubt, end - begin
+        self._until = end
         if self._has_inputs:
             act(self._effects, self.memory, begin, dt, wrench)
         if self._from_rest is not None:

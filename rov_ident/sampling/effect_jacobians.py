@@ -202,6 +202,10 @@ class EffectJacobians:
         for k, (i, *_) in enumerate(self._steers):
             low, high = (_force(self._motion, sample, inputs) for inputs in self._steered[k, :, 0])
             sides[:6, i] = (low - high) / self._width[i]
+        self.begin_interval()
+
+    def begin_interval(self) -> None:
+        """What acted so far is in a sample, or before all of them."""
         self._impulse[:] = 0.0
         self._time = 0.0
 

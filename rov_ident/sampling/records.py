@@ -1,7 +1,7 @@
 """A bag as the estimators see it: its samples, and what had to be refused."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.messages import Array
+from rov_ident.core.messages import Array, Message
 from rov_ident.core.progress import Progress, silent
 from rov_ident.effects import Acting
 from rov_ident.io import topics as inputs
@@ -63,14 +63,9 @@ def read_record(
     topics = inputs.select(bag, config)
     measured = has_velocity(bag, topics, config)
     sampler = Sampler(config if columns else config.with_effects_held, measured)
-    parts: list[NDArray[np.void]] = []
     unusable: Counter[str] = Counter()
-    for role, message in inputs.messages(bag, topics, config, unusable, say):
-        part = sampler.push(role, message)
-        if len(part):
-            parts.append(part)
-    parts.append(sampler.flush())
-    samples = after_reset(joined(parts))
+    messages = inputs.messages(bag, topics, config, unusable, say)
+    samples = after_reset(joined([*sampled(sampler, messages)]))
     counts = sampler.counts + unusable
     notes = inputs.doubts(bag, topics, config)
     refused = counts.copy()
@@ -195,10 +190,19 @@ def numbers(values: Array) -> dict[str, float | None]:
     return {n: None if np.isnan(v) else v for n, v in zip(VELOCITIES, values.tolist(), strict=True)}
 
 
-def samples_of(config: Config, run: Dive, velocity: bool = True) -> Iterator[np.ndarray]:
+def samples_of(config: Config, run: Dive, velocity: bool = True) -> Iterator[NDArray[np.void]]:
     """The samples (k,) of a dive as an estimator configured so would see them, with or without its
     linear velocities."""
-    sampler = Sampler(config, velocity)
-    for _, role, message in run.messages:
-        yield sampler.push(role, message)
+    messages = ((role, message) for _, role, message in run.messages)
+    return sampled(Sampler(config, velocity), messages)
+
+
+def sampled(
+    sampler: Sampler, messages: Iterable[tuple[str, Message]]
+) -> Iterator[NDArray[np.void]]:
+    """What a sampler makes of all messages, in parts (k,); the last may be empty."""
+    for role, message in messages:
+        part = sampler.push(role, message)
+        if len(part):
+            yield part
     yield sampler.flush()

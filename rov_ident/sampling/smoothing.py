@@ -56,7 +56,8 @@ def _smooth(part: NDArray[np.void]) -> None:
     off = rotation_vector(quaternion_multiply(part["attitude"][seen], conjugate))
     steps = np.diff(off, axis=0)
     noise = 0.5 * float(robust_std(steps, axis=None)) ** 2 + 1e-12
-    walk = np.add.reduceat(rate_variance * part["dt"] ** 2, seen)[:-1] + 1e-12
+    grown = rate_variance * part["dt"] ** 2  # each over the step that ends there
+    walk = np.add.reduceat(grown[1 : seen[-1] + 1], seen[:-1]) + 1e-12
     error, best = off, np.inf
     for factor in _FACTORS:
         level, cost = _local_level(off, noise, factor * walk)

@@ -26,6 +26,7 @@ _LARGEST_STEP_BACK = 1.0  # s behind that of its own, may be of another clock: t
 # reordered, or lost for a while together, stay well within both
 _AGREEMENT = 1.0  # s; two stamps out of line that are so close to one another are of one new clock
 CLOCK_STEP = 0.1  # s; ntpd steps clocks by 0.128 s and more, systemd by 0.4 s, and slews by less
+_MOST_VOTES = 1000  # messages, some seconds: as long another frame id is refused, at most
 _REASONS = 100  # so many names of refusals are kept, so that a log cannot be flooded with them
 _GRID = 1e-4  # m/s; drivers that round velocities round to no finer grid than this
 _OFF_GRID = 0.01  # of a grid step; single precision of 10 m/s is that near
@@ -96,7 +97,7 @@ class Validation:
             frames = (message.frame_id, message.child_frame_id)
         held = self._frame_ids.get(role)
         if held == frames:
-            self._votes[role] += 1
+            self._votes[role] = min(self._votes[role] + 1, _MOST_VOTES)
             return ""
         if frames[-1].rsplit("/", 1)[-1] in _WORLD_FRAMES:
             return f"frame {_printable(frames[-1:])} is a world frame, body axes are needed"

@@ -18,9 +18,6 @@ def write(config: Config) -> Written:
     model, body = config.dynamics, config.dynamics.body
     values = config.model.values
     linear = [c for c in model.coefficients if c.left == ONE and not (c.is_one_sided or c.inputs)]
-    damping = np.zeros((6, 6))
-    for c in linear:
-        damping[c.row, c.velocity] = -values[c.name]
     held = {c.name for c in linear} | {c.name for c in model.coefficients if c.is_added_mass}
     lost = lost_terms(model.coefficients, held | set(DIAGONAL["quadratic"]))
     lost += lost_besides(config)
@@ -34,7 +31,7 @@ def write(config: Config) -> Written:
         "rb": [[x] for x in body.cob],
         "MRB": body.mass_matrix,
         "MA": model.added_mass,
-        "D": damping,
+        "D": model.damping_matrix(np.zeros(6)),
         "Dn": np.diag(-np.array(diagonal(values, "quadratic"))),
     }
     lines = [

@@ -74,7 +74,7 @@ def read(text: str, base: Config | None = None) -> Read:
         if coefficients:
             parameters["coefficients"] = coefficients
     name = base.name if base else robot.get("name") or "vehicle"
-    parameters["vehicle"] = vehicle_section(name, body)
+    parameters["vehicle"] = parameters.get("vehicle", {}) | vehicle_section(name, body)
     if links:
         _mount(parameters, places, notes)
         _thrusters(parameters, joints, places, notes)
