@@ -177,7 +177,8 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
     the wrench is one more column, and the delay its factor."""
     phi, wrench, driven = rows.phi, rows.wrench, rows.driven
     slope, spacing = np.gradient(wrench, rows.t, axis=0), spacing_of(rows.t)
-    inside = np.maximum(np.diff(rows.t)[1:], np.diff(rows.t)[:-1]) < _GAP * spacing
+    steps = np.abs(np.diff(rows.t))  # a clock may have been set back
+    inside = np.maximum(steps[1:], steps[:-1]) < _GAP * spacing
     table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)
     table = table[1:-1][inside]
     n = table.shape[2] - 1
