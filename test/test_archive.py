@@ -1,6 +1,8 @@
 """Many bags as one fit: in one process, in several, on Dask; and bags that cannot be read."""
 
 import json
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -81,6 +83,24 @@ def test_dask_gives_the_same(paths, off, alone):
     pytest.importorskip("distributed", reason="the extra dask is not installed")
     with archive.opened(paths, off, jobs=2, dask="local") as bags:
         same(fit_batch(bags, off, "ls"), alone["ls"])
+
+
+def killed(samples):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_killed_process_is_said(paths, off):
+    with archive.opened(paths, off, jobs=2) as bags, pytest.raises(UserError, match="was killed"):
+        bags.each(killed)
+
+
+def test_a_killed_worker_of_dask_is_said(paths, off):
+    pytest.importorskip("distributed", reason="the extra dask is not installed")
+    with (
+        archive.opened(paths[:1], off, jobs=1, dask="local") as bags,
+        pytest.raises(UserError, match="was killed"),
+    ):
+        bags.each(killed)
 
 
 def test_no_scheduler_is_said(paths, off):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tiers import more
 
+from rov_ident.api import functions
 from rov_ident.api.functions import fit
 from rov_ident.config import from_parameters, to_parameters
 from rov_ident.core.errors import UserError
@@ -263,3 +264,14 @@ def test_a_velocity_sensor_that_pose_and_imu_contradict_is_told(folder, heavy, e
     failed = {test.name for test in scaled.consistency.tests if not test.passed}
     assert "velocity sensor: velocity_scale" in failed
     assert "velocity sensor: sensor_misalignment" not in failed
+
+
+def test_sensors_are_compared_from_the_first_command_on(folder, heavy, monkeypatch):
+    """A recording may begin long before it."""
+    monkeypatch.setattr(functions, "_COMPARED", 2000)
+    messages = sensors.dive(heavy, duration=40.0, seed=1).messages
+    begin = messages[0][0] + 20 * 10**9
+    late = [m for m in messages if m[1] != "wrench" or m[0] > begin]
+    write_messages(folder / "late.mcap", late)
+    tests = fit(folder / "late.mcap", heavy, "rls").consistency.tests
+    assert any(test.name.startswith("velocity sensor") for test in tests)

@@ -57,6 +57,19 @@ def test_what_an_earlier_record_told_stays(kind, dived):
     assert np.median(information(estimator) / known) > 0.95
 
 
+def test_counts_and_commands_go_on_with_another_record(dived):
+    config, messages = dived
+    part = messages[: len(messages) // 10]
+    estimator = OnlineEstimator(config, "rls")
+    estimator.sampler.commands = []
+    estimator.follow(part)
+    first, commands = estimator.counts, len(estimator.sampler.commands)
+    estimator.next_record()
+    assert estimator.counts == first
+    estimator.follow(part)
+    assert estimator.counts == first + first and len(estimator.sampler.commands) == 2 * commands
+
+
 @pytest.mark.parametrize("kind", ["rls", "ukf"])
 def test_what_was_told_before_a_pause_stays(kind, dived):
     config, messages = dived

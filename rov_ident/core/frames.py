@@ -223,21 +223,24 @@ def _change_axes(
         turn_world = defaults.world != "ned" and isinstance(message, Imu)
     if not (turn_body or turn_world):
         return message
-    turned = {}
-    if turn_body:
-        turned = {name: getattr(message, name) * FLIP_BODY for name in _IN_BODY[type(message)]}
-    if isinstance(message, Odometry | Imu):
-        turned["orientation"] = turns[turn_body, turn_world].dot(message.orientation)
-    if isinstance(message, Odometry) and turn_world:
-        turned["position"] = FLIP_WORLD.dot(message.position)
-    return cast(AnyMessage, message._replace(**turned))
+    flip, turn = _FLIPS[turn_body], turns[turn_body, turn_world]
+    # Not _replace, which takes longer than all of the arithmetic.
+    turned: Odometry | Imu | Wrench
+    if isinstance(message, Odometry):
+        stamp, frame_id, child, p, q, v, w, variance = message
+        p = FLIP_WORLD.dot(p) if turn_world else p
+        turned = Odometry(stamp, frame_id, child, p, turn.dot(q), v * flip, w * flip, variance)
+    elif isinstance(message, Imu):
+        stamp, frame_id, q, w, f, *variances = message
+        turned = Imu(stamp, frame_id, turn.dot(q), w * flip, f * flip, *variances)
+    else:
+        turned = Wrench(
+            message.stamp, message.frame_id, message.force * flip, message.torque * flip
+        )
+    return cast(AnyMessage, turned)
 
 
-_IN_BODY = {
-    Odometry: ("linear", "angular"),
-    Imu: ("angular_velocity", "linear_acceleration"),
-    Wrench: ("force", "torque"),
-}
+_FLIPS = np.ones(3), FLIP_BODY
 
 
 def _quaternion_turn(turn_body: bool, turn_world: bool) -> Array:

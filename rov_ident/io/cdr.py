@@ -34,7 +34,9 @@ ROLE_TYPES = {"odom": ODOMETRY_TYPE, "imu": IMU_TYPE, "wrench": WRENCH_TYPE, "in
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian, no options
 _STAMP = struct.Struct("<iI")
+_HEADER = struct.Struct("<iII")  # a stamp, and the length of the frame id
 _LENGTH = struct.Struct("<I")
+_FLOAT = np.dtype("<f8")
 
 
 class _Layout(NamedTuple):
@@ -62,6 +64,8 @@ _POSE_WITH_COVARIANCE = _Layout(43, _POSE.kept)
 class _Fields:
     """The fields of a message, one after the other. Raises ValueError where the bytes end."""
 
+    __slots__ = ("_at", "_data")
+
     def __init__(self, data: bytes) -> None:
         if data[:2] != _ENCAPSULATION[:2]:
             header = bytes(data[:4]).hex()
@@ -76,28 +80,33 @@ class _Fields:
             raise ValueError(f"{len(self._data)} bytes end within {what}")
         return start
 
-    def stamp(self) -> int:
-        """In ns."""
-        seconds, nanoseconds = _STAMP.unpack_from(self._data, self._pass(4, 2, "the stamp"))
+    def header(self) -> tuple[int, str]:
+        """Stamp [ns] and frame id of the std_msgs/Header with which a message begins."""
+        start = self._pass(4, 3, "the header")
+        seconds, nanoseconds, length = _HEADER.unpack_from(self._data, start)
         if nanoseconds >= SECOND:
             raise ValueError(f"{nanoseconds} nanoseconds are no part of a second")
-        return int(seconds * SECOND + nanoseconds)
+        return seconds * SECOND + nanoseconds, self._text(length)
 
     def length(self) -> int:
-        return int(_LENGTH.unpack_from(self._data, self._pass(4, 1, "a length"))[0])
+        return _LENGTH.unpack_from(self._data, self._pass(4, 1, "a length"))[0]
 
     def string(self) -> str:
-        length = self.length()
+        return self._text(self.length())
+
+    def _text(self, length: int) -> str:
         start = self._pass(1, length, f"a string of {length}")
-        return str(self._data[start : start + length], "utf-8").rstrip("\0")
+        return str(self._data[start : self._at], "utf-8").rstrip("\0")
 
     def numbers(self, kind: str, count: int) -> Array:
         """The next numbers of NumPy's ``kind`` as float64 (count,)."""
-        start = self._pass(int(kind[-1]), count, f"{count} numbers")
+        start = self._pass(int(kind[-1]), count, "numbers")
         return np.frombuffer(self._data, kind, count, start).astype(float, copy=False)
 
     def kept(self, layout: _Layout) -> Array:
-        numbers = self.numbers("<f8", layout.size)
+        numbers = np.frombuffer(
+            self._data, _FLOAT, layout.size, self._pass(8, layout.size, "numbers")
+        )
         kept = numbers.take(layout.kept)
         for first, size, to in layout.covariances:
             covariance = numbers[first : first + size * size]
@@ -134,9 +143,8 @@ def independent(covariance: Array) -> Array:
 def decode_odometry(data: bytes) -> Odometry:
     """A nav_msgs/msg/Odometry."""
     fields = _Fields(data)
-    stamp, frame_id, child_frame_id = fields.stamp(), fields.string(), fields.string()
-    n = fields.kept(_ODOMETRY)
-    return Odometry(stamp, frame_id, child_frame_id, n[:3], n[3:7], n[7:10], n[10:13], n[13:])
+    header, child_frame_id, n = fields.header(), fields.string(), fields.kept(_ODOMETRY)
+    return Odometry(*header, child_frame_id, n[:3], n[3:7], n[7:10], n[10:13], n[13:])
 
 
 def decode_imu(data: bytes) -> Imu:
@@ -145,15 +153,15 @@ def decode_imu(data: bytes) -> Imu:
     A first variance of -1 says that the driver does not measure that quantity; it is passed on.
     """
     fields = _Fields(data)
-    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(_IMU)
-    return Imu(stamp, frame_id, n[:4], n[4:7], n[7:10], n[10:13], n[13:])
+    header, n = fields.header(), fields.kept(_IMU)
+    return Imu(*header, n[:4], n[4:7], n[7:10], n[10:13], n[13:])
 
 
 def decode_wrench(data: bytes) -> Wrench:
     """A geometry_msgs/msg/WrenchStamped."""
     fields = _Fields(data)
-    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(_WRENCH)
-    return Wrench(stamp, frame_id, n[:3], n[3:])
+    header, n = fields.header(), fields.kept(_WRENCH)
+    return Wrench(*header, n[:3], n[3:])
 
 
 def decode_bare_wrench(data: bytes) -> Wrench:
@@ -165,15 +173,15 @@ def decode_bare_wrench(data: bytes) -> Wrench:
 def decode_twist(data: bytes, layout: _Layout = _TWIST) -> Twist:
     """A geometry_msgs/msg/TwistStamped, or TwistWithCovarianceStamped with that layout."""
     fields = _Fields(data)
-    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(layout)
-    return Twist(stamp, frame_id, n[:3], n[3:6], n[6:] if len(n) > 6 else np.zeros(6))
+    header, n = fields.header(), fields.kept(layout)
+    return Twist(*header, n[:3], n[3:6], n[6:] if len(n) > 6 else np.zeros(6))
 
 
 def decode_pose(data: bytes, layout: _Layout = _POSE) -> Pose:
     """A geometry_msgs/msg/PoseStamped, or PoseWithCovarianceStamped with that layout."""
     fields = _Fields(data)
-    stamp, frame_id, n = fields.stamp(), fields.string(), fields.kept(layout)
-    return Pose(stamp, frame_id, n[:3], n[3:7])
+    header, n = fields.header(), fields.kept(layout)
+    return Pose(*header, n[:3], n[3:7])
 
 
 def decode_joint_state(data: bytes) -> Commands:
@@ -190,16 +198,16 @@ def decode_joints(data: bytes) -> Joints:
 def _joints(data: bytes) -> tuple[Joints, _Fields]:
     """A sensor_msgs/msg/JointState, and its fields from the efforts on."""
     fields = _Fields(data)
-    stamp, frame_id = fields.stamp(), fields.string()
+    header = fields.header()
     names = tuple(fields.string() for _ in range(fields.length()))
     position, velocity = fields.sequence("<f8"), fields.sequence("<f8")
-    return Joints(stamp, frame_id, names, position, velocity), fields
+    return Joints(*header, names, position, velocity), fields
 
 
 def decode_channels(data: bytes) -> Commands:
     """A mavros_msgs/msg/RCOut: header and uint16[]."""
     fields = _Fields(data)
-    stamp, _ = fields.stamp(), fields.string()
+    stamp, _ = fields.header()
     return Commands(stamp, fields.sequence("<u2"))
 
 
@@ -215,7 +223,7 @@ def decode_multi_array(data: bytes, kind: str) -> Commands:
 def decode_voltage(data: bytes) -> float:
     """The voltage [V] of a sensor_msgs/msg/BatteryState."""
     fields = _Fields(data)
-    fields.stamp(), fields.string()
+    fields.header()
     return float(fields.numbers("<f4", 1)[0])
 
 

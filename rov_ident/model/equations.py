@@ -84,7 +84,9 @@ class RigidBody:
     def mass_matrix(self) -> Array:
         """M_RB (6, 6) about the body origin (Fossen 2021, eq. 3.49)."""
         m, s = self.mass, skew(self.cog)
-        return np.block([[m * np.eye(3), -m * s], [m * s, self.inertia - m * s @ s]])
+        out = m * np.eye(6)  # not np.block, which takes ten times as long
+        out[:3, 3:], out[3:, :3], out[3:, 3:] = -m * s, m * s, self.inertia - m * s @ s
+        return out
 
     @cached_property
     def restoring(self) -> Array:

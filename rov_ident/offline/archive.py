@@ -223,10 +223,13 @@ def _finished(results: Iterable[_Result]) -> Iterator[_Result]:
     try:
         yield from results
     except BrokenProcessPool as error:
-        raise UserError(
-            "a process that worked on the bags was killed, perhaps as memory was short: use fewer "
-            "at a time (--jobs)"
-        ) from error
+        raise UserError(_KILLED) from error
+
+
+_KILLED = (
+    "a process that worked on the bags was killed, perhaps as memory was short: use fewer at a "
+    "time (--jobs)"
+)
 
 
 # ------------------------------------------------------------------ Dask
@@ -263,7 +266,7 @@ def _on_dask(
     n = len(paths)
     read = client.map(_outcome, list(paths), [config] * n, [columns] * n, pure=False)
     for whole, alone in zip(read, client.map(_bag_alone, read, pure=False), strict=True):
-        bag = alone.result()
+        (bag,) = _gathered(client, [alone])
         yield (
             bag if isinstance(bag, str) else (bag, client.submit(itemgetter(1), whole, pure=False))
         )
@@ -272,4 +275,15 @@ def _on_dask(
 def _by_dask(
     client: Any, samples: Sequence[Any], function: Callable[..., Any], *arguments: Any
 ) -> list[Any]:
-    return client.gather([client.submit(function, s, *arguments, pure=False) for s in samples])
+    futures = [client.submit(function, s, *arguments, pure=False) for s in samples]
+    return _gathered(client, futures)
+
+
+def _gathered(client: Any, futures: Sequence[Any]) -> list[Any]:
+    """The results on a cluster. UserError if a process of it was killed time and again."""
+    from distributed import KilledWorker
+
+    try:
+        return client.gather(futures)
+    except KilledWorker as error:
+        raise UserError(_KILLED) from error

@@ -350,10 +350,16 @@ def _fill(
         nu_dot = _measured_acceleration(motion, sample, acceleration, lacking, rate)
         down = sample.down - 0.5 * sample.dt * sample.down_slope  # as the estimators take it
         for b in range(len(motion.bodies)):
-            change = motion.of_restoring[b] @ down - motion.of_mass[b] @ nu_dot
-            change -= coriolis(motion.of_mass[b] @ sample.nu, sample.nu)
+            j, momentum = motion.bodies[b], np.zeros(6)
             for i in range(6):
-                sides[i, motion.bodies[b]] = change[i]
+                for a in range(3):
+                    sides[i, j] += motion.of_restoring[b, i, a] * down[a]
+                for a in range(6):
+                    sides[i, j] -= motion.of_mass[b, i, a] * nu_dot[a]
+                    momentum[i] += motion.of_mass[b, i, a] * sample.nu[a]
+            change = coriolis(momentum, sample.nu)
+            for i in range(6):
+                sides[i, j] -= change[i]
     # without an IMU a late velocity looks like thrust that comes early, whatever delays it
     if motion.latency >= 0 and np.isfinite(sample.gyro[0]):
         v_dot = _follow(motion, sample, followed)

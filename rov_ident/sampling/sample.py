@@ -123,8 +123,9 @@ def parts(samples: NDArray[np.void]) -> tuple[NDArray[np.void], Array]:
     """
     if samples.dtype == SAMPLE:
         return samples, NO_SIDES
-    size = (samples.dtype.itemsize - SAMPLE.itemsize) // 104
-    rows = np.ascontiguousarray(samples).view(np.uint8).reshape(len(samples), -1)
-    plain = np.ascontiguousarray(rows[:, : SAMPLE.itemsize]).view(SAMPLE)[:, 0]
-    sides = np.ascontiguousarray(rows[:, SAMPLE.itemsize :]).view(np.float64)
-    return plain, sides.reshape(len(samples), 13, size)
+    first, count, whole = SAMPLE.itemsize, len(samples), np.ascontiguousarray(samples)
+    size = (samples.dtype.itemsize - first) // 104
+    # np.ndarray and not view, which looks through all fields of a record
+    rows = np.ndarray((count, samples.dtype.itemsize), np.uint8, whole)
+    plain, sides = np.ascontiguousarray(rows[:, :first]), np.ascontiguousarray(rows[:, first:])
+    return np.ndarray((count,), SAMPLE, plain), np.ndarray((count, 13, size), np.float64, sides)
