@@ -4,6 +4,8 @@ An error of the model, or a disagreement of two sensors, lasts longer than noise
 over a second, and is lost in a single innovation.
 """
 
+import numpy as np
+
 from rov_ident.core.jit import inlined
 
 SUM_TIME = 1.0  # s; over which innovations are added up ("Constants of the process noise")
@@ -13,6 +15,15 @@ JUDGED_TIME = 20.0  # s; after which it is known: chance then takes its root bey
 BY_CHANCE = 1.25
 """Root of the power that chance reaches in one dive of a thousand (table in docs/live.md)."""
 _MOST = 100.0  # 10 sigma: a sum counts for no more, or one error would weigh for minutes
+
+
+@inlined
+def summed_up(summed, expected, since, innovation):
+    """The fading sum of normalised innovations and its variance, if they are white, after one more,
+    ``since`` seconds after the one before; and the share of older ones that is left."""
+    keep = np.exp(-since / SUM_TIME)
+    counted = min(max(innovation, -LARGEST), LARGEST)
+    return keep * summed + counted, keep * keep * expected + 1.0, keep
 
 
 @inlined

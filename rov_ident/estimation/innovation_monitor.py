@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.core.jit import inlined, record
-from rov_ident.core.whiteness import BY_CHANCE, LARGEST, SUM_TIME, averaged
+from rov_ident.core.whiteness import BY_CHANCE, LARGEST, averaged, summed_up
 
 # "Constants of the process noise" and "Forgetting" are tables of docs/choices.md.
 FIRST_TIME, TIME = 1.0, 20.0  # s; twice the power doubles the density: at first, later (same table)
@@ -91,11 +91,9 @@ def watch(m, process, i, room, moving, own, gate, innovation, considered):
     blend = min(m.since / min(m.seen + NIS_TIME, LEVEL_TIME), 1.0)
     m.usual += blend * (counted - m.usual)
     if moving:
-        keep = np.exp(-m.since / SUM_TIME)
         m.seen += m.since
         m.driven += m.since if own else 0.0
-        m.summed = keep * m.summed + min(max(innovation, -LARGEST), LARGEST)
-        m.expected = keep * keep * m.expected + 1.0
+        m.summed, m.expected, keep = summed_up(m.summed, m.expected, m.since, innovation)
         m.lasting = keep * m.lasting + considered
         expected = m.expected + m.lasting * m.lasting
         if m.seen > TIME and m.driven > _LESSON:

@@ -44,7 +44,7 @@ from rov_ident.config.prior import axis_std_of, prior_of
 from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.linalg import sandwich, widened
 from rov_ident.core.progress import Progress, silent
-from rov_ident.core.whiteness import JUDGED_TIME, LARGEST, SUM_TIME
+from rov_ident.core.whiteness import JUDGED_TIME, summed_up
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.observer import (
     LANES,
@@ -633,9 +633,7 @@ def _add_power(e, lasting, samples, out):
             if samples[k].restart or not moving:
                 summed, expected, since, roll, pitch = 0.0, 0.0, 0.0, 0.0, 0.0
             elif np.isfinite(e[k, i]):
-                keep = np.exp(-since / SUM_TIME)
-                summed = keep * summed + min(max(e[k, i], -LARGEST), LARGEST)
-                expected = keep * keep * expected + 1.0
+                summed, expected, keep = summed_up(summed, expected, since, e[k, i])
                 roll = keep * roll + lasting[0, k, i]
                 pitch = keep * pitch + lasting[1, k, i]
                 out[0, i] += since
