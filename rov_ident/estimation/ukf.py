@@ -382,19 +382,25 @@ def _take_centre(state, work):
         pull[j] = 0.0
     if not state.scalars[0].pinned:
         return
-    matrix, upper, root = work.block[0], work.block[1], work.block[2]
-    for j in range(n):
-        for k in range(n):
-            matrix[j, k] = work.p[6 + j, 6 + k]
-    if not cholesky(matrix, upper, root):
+    if not _take_block_root(work, n):
         return
     for j in range(n):
         work.centre[6 + j] = state.about[j]
         pull[j] = x[6 + j] - state.about[j]
-    cholesky_solve(root, n, pull)
+    cholesky_solve(work.block[2], n, pull)
     for i in range(6):
         for j in range(n):
             work.centre[i] -= work.p[i, 6 + j] * pull[j]
+
+
+@inlined
+def _take_block_root(work, n):
+    """work.block[2], the root of the covariance of the coefficients (n, n), which is copied to
+    work.block[0]; False where it has none."""
+    for j in range(n):
+        for k in range(n):
+            work.block[0, j, k] = work.p[6 + j, 6 + k]
+    return cholesky(work.block[0], work.block[1], work.block[2])
 
 
 @inlined
@@ -635,28 +641,32 @@ def _given_held(task, p, free, side, i, spread, least):
 
 
 @inlined
+def _seen(task, side, i, x):
+    """What the measurement of velocity i is of x (6 + n,), effects on it included."""
+    seen, scale = x[i], len(task.scale) - side.shape[1]
+    for j in range(side.shape[1]):
+        seen += side[6 + i, j] * task.scale[scale + j] * x[6 + scale + j]
+    return seen
+
+
+@inlined
 def _predicted_measurement(task, x, p, side, i):
     """The predicted measurement of velocity i, effects on it included, and its variance."""
-    predicted, spread, k = x[i], p[i, i], side.shape[1]
+    spread, k = p[i, i], side.shape[1]
     first, scale = len(x) - k, len(task.scale) - k
     for j in range(k):
         f = side[6 + i, j] * task.scale[scale + j]
-        predicted += f * x[first + j]
         spread += 2.0 * f * p[i, first + j]
         for l in range(k):
             spread += f * side[6 + i, l] * task.scale[scale + l] * p[first + j, first + l]
-    return predicted, spread
+    return _seen(task, side, i, x), spread
 
 
 @inlined
 def _correct_by_axis(task, by_axis, side, i, gain, share):
     """State.by_axis after a measurement of velocity i, with the gain (6 + n,) times ``share``."""
-    last = len(by_axis) - side.shape[1]
     for q in range(by_axis.shape[1]):
-        wrong = by_axis[i, q]
-        for j in range(side.shape[1]):
-            wrong += side[6 + i, j] * task.scale[last - 6 + j] * by_axis[last + j, q]
-        wrong *= share
+        wrong = share * _seen(task, side, i, by_axis[:, q])
         for j in range(len(by_axis)):
             by_axis[j, q] -= gain[j] * wrong
 
@@ -680,18 +690,11 @@ def _absorb(task, state, work, side, first):
             for k in range(columns):
                 cross[c, k] += f * p[6 + last + j, k]
         for b in range(c):
-            f = cross[b, i]
-            for j in range(side.shape[1]):
-                f += side[6 + i, j] * task.scale[last + j] * cross[b, 6 + last + j]
+            f = _seen(task, side, i, cross[b])
             for k in range(columns):
                 cross[c, k] -= f * cross[b, k]
-        total, predicted = cross[c, i], x[i]
-        for j in range(side.shape[1]):
-            f = side[6 + i, j] * task.scale[last + j]
-            total += f * cross[c, 6 + last + j]
-            predicted += f * x[6 + last + j]
-        f = 1.0 / np.sqrt(total + s.r[i])
-        innovation = f * (s.z[i] - predicted)
+        f = 1.0 / np.sqrt(_seen(task, side, i, cross[c]) + s.r[i])
+        innovation = f * (s.z[i] - _seen(task, side, i, x))
         for k in range(columns):
             cross[c, k] *= f
             gain[c, k] = cross[c, k] * free[k]
@@ -724,9 +727,7 @@ def _absorb_beside_noise(task, state, work, side, first):
         predicted, v = _predicted_measurement(task, x, p, side, i)
         v += s.r[i]
         for a in range(size):
-            w[a] = p[i, a]
-            for j in range(side.shape[1]):
-                w[a] += side[6 + i, j] * task.scale[last - 6 + j] * p[last + j, a]
+            w[a] = _seen(task, side, i, p[:, a])
         share = w[scale] / p[scale, scale] if given else 0.0
         left = v - share * w[scale] if given else v
         for a in range(size):
@@ -768,18 +769,13 @@ def _end_period(task, state, work, dt):
 @reordered
 def _sum_up(state, work, since):
     """With ``change = P g``, g is what innovations have added to the information's right side."""
-    n, p = len(state.before), work.p
-    matrix, upper, root = work.block[0], work.block[1], work.block[2]
-    for j in range(n):
-        for k in range(n):
-            matrix[j, k] = p[6 + j, 6 + k]
-    if not cholesky(matrix, upper, root):
+    n, g = len(state.before), work.gain[0]
+    if not _take_block_root(work, n):
         return
-    g = work.gain[0]
     for j in range(n):
         g[j] = state.x[6 + j] - state.before[j]
         state.before[j] = state.x[6 + j]
-    cholesky_solve(root, n, g)
+    cholesky_solve(work.block[2], n, g)
     add_scatter(g, np.exp(-since / LAG), state.score, state.lagged)
 
 
@@ -791,9 +787,8 @@ def _walk(task, state, work, relearnt, elapsed):
 
     Hence with ``W = P_new^-1 G``, ``S_new = (1 - W) S (1 - W)' + W P_new^-1``.
     """
-    n, p = len(state.before), work.p
-    matrix, upper, root = work.block[0], work.block[1], work.block[2]
-    grown, most = work.cross[0], 0.0
+    n, p, grown, most = len(state.before), work.p, work.cross[0], 0.0
+    matrix, inverse, root = work.block[0], work.block[1], work.block[2]
     for j in range(n):
         share = max(task.drift[j] * elapsed, relearnt)
         grown[j] = share * max(1.0 - p[6 + j, 6 + j], 0.0)
@@ -802,11 +797,9 @@ def _walk(task, state, work, relearnt, elapsed):
         return
     for j in range(n):
         p[6 + j, 6 + j] += grown[j]
-        for k in range(n):
-            matrix[j, k] = p[6 + j, 6 + k]
-    if not cholesky(matrix, upper, root):
+    if not _take_block_root(work, n):
         return
-    inverse, score, lagged = upper, state.score, state.lagged
+    score, lagged = state.score, state.lagged
     for j in range(n):
         for k in range(n):
             inverse[j, k] = 1.0 if j == k else 0.0
