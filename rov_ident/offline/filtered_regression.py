@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
 from rov_ident.core.jit import inlined, kernel
-from rov_ident.estimation.wrench_residual import first_order
+from rov_ident.estimation.wrench_residual import first_order, of_wrench, two_stages
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import Array, Structure, columns, coriolis_of, extend_inputs
 
@@ -74,38 +74,23 @@ def _rows(task, samples, period, out, times):
     momentum, force, p = np.empty((6, m)), np.empty((6, m)), np.empty(6)
     extended = np.empty((EXTENDED_SIZE, 1))
     now, rate = np.empty((6, n + 1)), np.empty((6, n + 1))  # P, and w P - H
-    x, y, u, last = (
-        np.zeros((6, n + 1)), np.zeros((6, n + 1)), np.zeros((6, n + 1)), np.zeros((6, n + 1)),
-    )  # fmt: skip
-    w, used, started, since = task.corner, 0, False, 0.0
+    filters, w, used, started, since = np.zeros((6, 4, n + 1)), task.corner, 0, False, 0.0
     for k in range(len(samples)):
         sample = samples[k]
         _regress(task, sample, momentum, force, extended, p, now, rate)
-        if sample.restart or not started or not sample.dt > 0.0:
-            started, since = True, 0.0
-            for i in range(6):
-                for j in range(n + 1):
-                    x[i, j], y[i, j] = w * now[i, j], 0.0
-                    u[i, j], last[i, j] = rate[i, j], now[i, j]
-            continue
-        dt = sample.dt
-        a, b0, b1 = first_order(w, dt)
+        restarted = sample.restart or not started or not sample.dt > 0.0
+        response = first_order(w, sample.dt)
         for i in range(6):
-            # the wrench goes in a line from sample to sample, but jumps there
-            wrench = (1.0 - a) * sample.wrench[i] + 0.5 * dt * (b1 - b0) * sample.wrench_slope[i]
+            wrench = of_wrench(response, sample.dt, sample.wrench[i], sample.wrench_slope[i])
             for j in range(n + 1):
-                before = x[i, j] - w * last[i, j]
-                x[i, j] = a * x[i, j] + b0 * u[i, j] + b1 * rate[i, j]
-                if j == n:
-                    x[i, j] += wrench
-                y[i, j] = a * y[i, j] + b0 * before + b1 * (x[i, j] - w * now[i, j])
-                u[i, j], last[i, j] = rate[i, j], now[i, j]
-        since += dt
+                known = wrench if j == n else 0.0
+                two_stages(filters[i], j, w, response, restarted, rate[i, j], now[i, j], known)
+        started, since = True, 0.0 if restarted else since + sample.dt
         if since >= period - 1e-6:
             for i in range(6):
                 for j in range(n):
-                    out[used, i, j] = -y[i, j]
-                out[used, i, n] = y[i, n]
+                    out[used, i, j] = -filters[i, 1, j]
+                out[used, i, n] = filters[i, 1, n]
             times[used] = sample.t
             used += 1
             since = 0.0
