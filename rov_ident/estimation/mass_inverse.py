@@ -22,6 +22,14 @@ def _put(m, i, j, k, f, a):
 
 
 @inlined
+def _raise_diagonal(m, i, k, more):
+    """Add ``more`` (3,) to the diagonal of the block at i, i."""
+    m[i, i, k], m[i + 1, i + 1, k], m[i + 2, i + 2, k] = (
+        m[i, i, k] + more[0], m[i + 1, i + 1, k] + more[1], m[i + 2, i + 2, k] + more[2],
+    )  # fmt: skip
+
+
+@inlined
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -89,12 +97,8 @@ def invert_mass(lanes, m, lightest, inverse):
         _put(inverse, 0, 0, k, 1.0, _plus(a, 1.0, u, v))
         _put(inverse, 3, 0, k, -1.0, _transposed(u))
         _put(inverse, 3, 3, k, 1.0, s)
-        m[0, 0, k], m[1, 1, k], m[2, 2, k] = (
-            m[0, 0, k] + more[0], m[1, 1, k] + more[1], m[2, 2, k] + more[2],
-        )  # fmt: skip
-        m[3, 3, k], m[4, 4, k], m[5, 5, k] = (
-            m[3, 3, k] + yet_more[0], m[4, 4, k] + yet_more[1], m[5, 5, k] + yet_more[2],
-        )  # fmt: skip
+        _raise_diagonal(m, 0, k, more)
+        _raise_diagonal(m, 3, k, yet_more)
 
 
 @inlined
@@ -107,6 +111,4 @@ def invert_translation(lanes, m, lightest, inverse):
         _put(inverse, 0, 0, k, 1.0, a)
         _put(inverse, 3, 0, k, 1.0, none)
         _put(inverse, 3, 3, k, 1.0, none)
-        m[0, 0, k], m[1, 1, k], m[2, 2, k] = (
-            m[0, 0, k] + more[0], m[1, 1, k] + more[1], m[2, 2, k] + more[2],
-        )  # fmt: skip
+        _raise_diagonal(m, 0, k, more)
