@@ -64,6 +64,7 @@ class Settings:
     what the configuration says of the coefficients counts as one more measurement. ``weighted``:
     least squares weighs each axis by its residual. ``process``: maximum likelihood allows for
     errors of the wrench. ``readings``: at most so often bags are read for parameters of effects.
+    ``unmeasured``: no bag has a linear velocity, which :func:`fit_batch` finds out.
     """
 
     stages: tuple[tuple[str, ...], ...] = ()
@@ -71,6 +72,7 @@ class Settings:
     weighted: bool = True
     process: bool = True
     readings: int = 4
+    unmeasured: bool = False
 
 
 class _Stage(NamedTuple):
@@ -99,10 +101,7 @@ def fit_batch(
     Raises UserError if a channel has no coefficient to estimate, or the configured model cannot be
     simulated.
     """
-    settings = settings or Settings()
-    unmeasured = any(archive.each(is_without_velocity))
-    if unmeasured:
-        config, settings = _without_velocity(archive, config, kind, settings)
+    config, settings = _as_measured(archive, config, kind, settings or Settings())
     say("open loop, as configured")
     read, given = archive, config
     before = open_loop(read, given)
@@ -138,7 +137,7 @@ def fit_batch(
     std = np.sqrt(np.diag(covariance)) if kind == "ml" else None
     consistency = consistency_of(config, prior, asked, unexplained, lasting, sensors, std)
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
-    if unmeasured:
+    if settings.unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
         driven = float(np.max((forces / authority(config.dynamics))[:2]))
         rest = Test("surge and sway at rest", driven, AT_REST, DRIVEN_UNSEEN)
@@ -173,12 +172,15 @@ def fit_batch(
     )
 
 
-def _without_velocity(
+def _as_measured(
     archive: Archive, config: Config, kind: str, settings: Settings
 ) -> tuple[Config, Settings]:
-    """Configuration and settings for bags without linear velocity. Raises UserError where another
-    fit than all channels by maximum likelihood is asked for, or only some of the bags lack it."""
+    """Configuration and settings, of bags without linear velocity those for such. Raises UserError
+    where another fit of these than all channels by maximum likelihood is asked for, or only some of
+    the bags lack it."""
     unmeasured = [bag for bag, so in zip(archive.bags, archive.each(is_without_velocity)) if so]
+    if not unmeasured:
+        return config, settings
     if kind != "ml" or settings.stages:
         raise refusal(unmeasured[0].path.name)
     if len(unmeasured) < len(archive.bags):
@@ -189,7 +191,7 @@ def _without_velocity(
     # of a horizontal current nothing shows, and no velocity is late or scaled
     odometry = replace(config.odometry, latency_std=0.0, scale_std=0.0)
     config = replace(config, current_std=0.0, odometry=odometry)
-    return config, replace(settings, readings=2 * settings.readings)
+    return config, replace(settings, readings=2 * settings.readings, unmeasured=True)
 
 
 def _relinearised(
@@ -255,8 +257,7 @@ def _stage(
     def of_stage(what: str, share: float | None = None) -> None:
         say(f"{name}: {what}" if settings.stages else what, share)
 
-    unmeasured = any(archive.each(is_without_velocity))
-    if unmeasured:  # as far as it is simulated, the motion tells least squares nothing
+    if settings.unmeasured:  # as far as it is simulated, the motion tells least squares nothing
         scale = np.outer(coefficients.std, coefficients.std)
         information = scale * predicted_information(archive, config.with_effects_held, free)
         least = Estimate(names, coefficients.mean, np.diag(coefficients.std**2), 0.0)
@@ -298,7 +299,7 @@ def _stage(
         found, covariance, noise = likelihood.values, likelihood.covariance, likelihood.noise
         asked, by_axis = likelihood.asked, likelihood.by_axis
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
-        unexplained[:2] = np.nan if unmeasured else unexplained[:2]
+        unexplained[:2] = np.nan if settings.unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
         more |= _numbers_of(likelihood, names, free)
         if likelihood.held.any():
@@ -314,7 +315,7 @@ def _stage(
         of_thrust = config.wrench.scale_std * solution.by_thrust
         by_axis = np.column_stack([of_thrust.sum(axis=1), ONE_AXIS * of_thrust])
     beyond_driving = covariance_beyond_driving(config, names, found, gain, by_axis)
-    if unmeasured:
+    if settings.unmeasured:
         # What moments and tilt suggest of these is in the values; the intervals are the prior's.
         impossible = [n for n, c in _coefficients(config).items() if is_impossible(c)]
         for i in (names.index(n) for n in impossible):
