@@ -12,7 +12,8 @@ from tiers import more
 from bench.simulators import hidden
 from bench.studies.watch import said
 from rov_ident.core.messages import Array
-from rov_ident.discrepancy.live_windows import MEMORY, WINDOW, is_watched
+from rov_ident.discrepancy.held_out import WINDOW
+from rov_ident.discrepancy.live_windows import MEMORY, is_watched
 from rov_ident.discrepancy.monitor import ALARM, Monitor, penalty, suspicions
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.online import OnlineEstimator

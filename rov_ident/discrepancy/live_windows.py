@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.config.prior import typical
 from rov_ident.core.messages import Array
+from rov_ident.discrepancy.held_out import WINDOW
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     Hypothesis,
@@ -31,7 +32,7 @@ from rov_ident.discrepancy.hypothesis import (
 )
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.multiple_shooting import Motion
-from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.discrepancy.windowed_problem import FEWEST, WindowedProblem
 from rov_ident.discrepancy.wrench_smoothing import Known, Reading, Smoothed, matters, smoothed
 from rov_ident.effects import EFFECTS
 from rov_ident.effects.base import Effect
@@ -40,11 +41,9 @@ from rov_ident.model.equations import Model
 from rov_ident.model.scales import authority
 from rov_ident.sampling.raw_streams import Streams
 
-WINDOW = 5.0  # s; as long as those that `explain` fits
 MEMORY = 36  # windows: three minutes, the length of a bag of the study (docs/explain-bench.md)
 
 _SPACING = 0.045  # s; closer measurements (above 20 Hz) add cost, hardly information
-_FEWEST = 8  # measurements in a window, as in `windowed_problem`
 _NOISE_TIME = 60.0  # s; over which the size of the residual is followed: twelve windows
 
 
@@ -231,7 +230,7 @@ def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
         if samples["t"][i] - last >= _SPACING:
             kept.append(i)
             last = samples["t"][i]
-    if len(kept) < _FEWEST or len(demands) == 0:
+    if len(kept) < FEWEST or len(demands) == 0:
         return None
     t, orientation, nu, water = (samples[n][kept] for n in ("t", "orientation", "nu", "water"))
     nu[:, :3] += water

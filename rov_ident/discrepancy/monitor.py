@@ -20,6 +20,7 @@ from rov_ident.config import Config
 from rov_ident.core.jit import Compiler
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.core.messages import Array
+from rov_ident.discrepancy.held_out import WINDOW
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     Key,
@@ -31,17 +32,9 @@ from rov_ident.discrepancy.hypothesis import (
     unit_of,
 )
 from rov_ident.discrepancy.linearisation import LinearProblem
-from rov_ident.discrepancy.live_windows import (
-    WINDOW,
-    State,
-    Sums,
-    Task,
-    Window,
-    init,
-    step,
-    task_of,
-)
+from rov_ident.discrepancy.live_windows import State, Sums, Task, Window, init, step, task_of
 from rov_ident.discrepancy.selection import VERY_STRONG, Scores, regressed, variance_inflation
+from rov_ident.discrepancy.windowed_problem import MAX_GAP
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.compilation import any_vehicle
 from rov_ident.model.coefficients import AXES, MOTIONS, parse
@@ -63,7 +56,6 @@ _AXIS_SHARE = 0.3  # of the squared wrench on the strongest axis: acts on this o
 _MOST = 3  # effects named at once: the rest shows when these are in the model
 _FITTED = 12  # units that are scored in full; effort
 _COLLINEAR = 1e-4  # smallest eigenvalue of what the base leaves of a unit: four digits
-_GAP = 0.5  # s without samples: no window reaches across (`windowed_problem`)
 
 
 @dataclass(frozen=True)
@@ -331,7 +323,7 @@ class Monitor:
             # a lone outlier restarts the estimator's observer, but breaks no window
             steps = np.diff(samples["t"], prepend=self._samples[-1]["t"][-1])
             back = np.flatnonzero(steps < 0.0)
-            if len(back) or not (steps[samples["restart"]] <= _GAP).all():
+            if len(back) or not (steps[samples["restart"]] <= MAX_GAP).all():
                 self._samples.clear()
             if len(back):  # a bag that starts again, say: what was before is of another time
                 samples = samples[back[-1] :]

@@ -40,8 +40,8 @@ from rov_ident.sampling.raw_streams import Streams, orientation_at
 from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
-_MAX_GAP = 0.5  # s without odometry: no window reaches across; stated in the error message below
-_FEWEST = 8  # odometry messages in a window: the initial velocity takes one
+MAX_GAP = 0.5  # s without odometry: no window reaches across; stated in the error message below
+FEWEST = 8  # odometry messages in a window: the initial velocity takes one
 ONSET_STEP = 0.2  # s; of the difference quotient: several messages, as thrust acts in steps
 _AMPLITUDE_STEP = 0.05  # typical sizes; the same for an input effect, whose thrust has kinks
 _SMALL_STEP = 1e-3  # typical sizes; the same where the wrench is smooth
@@ -117,14 +117,14 @@ class WindowedProblem:
         first, last = [], []
         for begin, end in spans:
             inside = np.flatnonzero((t >= begin) & (t < end))
-            for run in np.split(inside, np.flatnonzero(np.diff(t[inside]) > _MAX_GAP) + 1):
-                if len(run) >= _FEWEST:
+            for run in np.split(inside, np.flatnonzero(np.diff(t[inside]) > MAX_GAP) + 1):
+                if len(run) >= FEWEST:
                     first.append(at[run[0]])
                     last.append(at[run[-1]])
         if not first:
             raise UserError(
-                f"odometry with a wrench comes nowhere for {_FEWEST} messages without a gap of "
-                f"more than {_MAX_GAP} s where it is needed: record it at 4 Hz or more, in a "
+                f"odometry with a wrench comes nowhere for {FEWEST} messages without a gap of "
+                f"more than {MAX_GAP} s where it is needed: record it at 4 Hz or more, in a "
                 "longer bag"
             )
         self.first, self.last = np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
@@ -496,7 +496,7 @@ def _driven(streams: Streams, nodes: Array) -> tuple[Array, Array]:
 def _subdivided(t: Array, longest: float) -> Array:
     """The instants t and as many between that no step is longer than ``longest``, gaps aside."""
     length = np.diff(t)
-    count = np.where(length > _MAX_GAP, 1, np.ceil(length / longest - 1e-6)).astype(int)
+    count = np.where(length > MAX_GAP, 1, np.ceil(length / longest - 1e-6)).astype(int)
     count = np.maximum(count, 1)
     at = np.repeat(np.arange(len(length)), count)
     part = np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)
