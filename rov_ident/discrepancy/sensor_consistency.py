@@ -112,7 +112,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
     streams = _in_place(streams, effects)
     here, there, rate = _corrected_readings(streams, config, effects)
     r = quaternion_to_matrix(streams.orientation)
-    inertial = _DeadReckoning(streams, config, there, rate) if _has_imu(streams) else None
+    inertial = _DeadReckoning(streams, config, there, rate) if has_imu(streams) else None
 
     # A regressor made of the very readings that it explains shares their noise: what the velocity
     # sensor's errors are made of is taken from the other sensors where there are any.
@@ -177,7 +177,8 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
     ]
 
 
-def _has_imu(streams: Streams) -> bool:
+def has_imu(streams: Streams) -> bool:
+    """Whether there are enough messages of the IMU to say anything."""
     return len(streams.imu_t) > _FEWEST_IMU
 
 
@@ -189,7 +190,7 @@ def _corrected_readings(
     mounting = config.imu.to_body
     gyro, nothing = streams.gyro @ mounting.T, np.zeros_like(streams.nu[:, 3:])
     rate = interpolated(streams.t, streams.nu[:, 3:], streams.imu_t)
-    gyro_at = interpolated(streams.imu_t, gyro, streams.t) if _has_imu(streams) else nothing
+    gyro_at = interpolated(streams.imu_t, gyro, streams.t) if has_imu(streams) else nothing
     here = Reading(streams.nu[:, :3], streams.nu[:, 3:], gyro_at, nothing)
     there = Reading(np.zeros_like(gyro), rate, gyro, streams.specific_force @ mounting.T)
     return correct(here, effects), correct(there, effects), rate

@@ -13,7 +13,7 @@ from rov_ident.offline.delays import MATTERS, surely_behind_imu
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams
 
-_MOUNTED = 0.02  # rad: about as well as a mounting is measured by hand
+MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
 _SCALED = 0.02  # half of what fresh water in place of the sea makes of the speed of sound
 
 
@@ -39,7 +39,7 @@ def tests_of(streams: Streams, config: Config) -> list[Test]:
     tests = []
     for name, sensors, harmless, told in (
         ("velocity_scale", streams, scaled, "reads wrong by a factor, unless a filter does"),
-        ("sensor_misalignment", alone, _MOUNTED, "is turned against the IMU"),
+        ("sensor_misalignment", alone, MOUNTED, "is turned against the IMU"),
     ):
         if name in config.effects:
             continue

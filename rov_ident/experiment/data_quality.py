@@ -21,7 +21,7 @@ from rov_ident.core.linalg import interpolated
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONVERGED, IDENTIFIABLE, State, of_fit
 from rov_ident.discrepancy.sensor_consistency import comparisons, search
-from rov_ident.discrepancy.velocity_sensor import tests_of
+from rov_ident.discrepancy.velocity_sensor import MOUNTED, tests_of
 from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
 from rov_ident.io import topics as inputs
@@ -41,7 +41,6 @@ from rov_ident.sampling.without_velocity import blanked, is_without_velocity
 
 _VERDICTS = {State.CONVERGED: "well", State.CONVERGING: "roughly"}
 _ONE_WAY = 0.25  # of the larger of the velocities either way: driven in one direction only
-_MOUNTED = 0.02  # m, rad: about as well as a mounting is measured by hand
 _THIN = 1.02  # a flat plate has 1; the rest is for rounded numbers
 _HALF = 2.0  # times the variance that is said of a velocity: half of its noise is not
 _MATTERS = 0.1  # prior standard deviations: 1.5 % of thrust, 0.02 s, 0.03 m/s
@@ -231,7 +230,7 @@ def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Rem
             apart = quaternion_angle(*(quaternion_from_euler(*angles) for angles in vectors))
         else:
             apart = np.abs(vector - configured).max()
-        if apart > _MOUNTED:
+        if apart > MOUNTED:
             bag, file = ([round(float(x), 3) + 0.0 for x in v] for v in (vector, configured))
             yield Remark(
                 key, WARNING,

@@ -14,6 +14,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix, rotated, turns
 from rov_ident.core.linalg import integral
 from rov_ident.core.messages import Array
+from rov_ident.discrepancy.sensor_consistency import has_imu
 from rov_ident.model.coefficients import MOTIONS
 from rov_ident.offline import delays
 from rov_ident.offline.delays import Delay
@@ -24,7 +25,6 @@ from rov_ident.sampling.without_velocity import is_without_velocity
 
 GOOD, WARNING, BAD = "good", "warning", "bad"
 _SLOW = 5.0  # Hz; two messages in the time constant of a small vehicle (0.4 s) are the least
-_FEWEST_IMU = 8  # messages of the IMU; fewer say nothing of axes
 _UPWARD = 0.9  # g; mean specific force upward; a sign or an axis that is wrong gives 0.7 or less
 _SIDEWAYS = 0.2  # g; mean specific force along the horizon: 11 deg of mounting
 _POSE = "pose against velocity"
@@ -97,7 +97,7 @@ def _axes_remarks(streams: Streams, config: Config) -> list[Remark]:
         text += "check vehicle.frame (frd: z down, flu: z up), vehicle.cob and vehicle.cog"
         remarks.append(Remark("vehicle.frame", BAD, text))
     r = quaternion_to_matrix(streams.orientation)
-    if len(streams.imu_t) > _FEWEST_IMU:
+    if has_imu(streams):
         attitude = r[np.clip(np.searchsorted(streams.t, streams.imu_t), 0, len(r) - 1)]
         force = np.einsum("kij,jl,kl->ki", attitude, config.imu.to_body, streams.specific_force)
         mean = np.median(force, axis=0)
