@@ -145,3 +145,25 @@ def test_while_disabled_nothing_is_looked_back_on(dived, monkeypatch):
     one.enabled = True
     one.flush()
     assert len(looks) == 1
+
+
+def test_what_walks_is_no_reason_to_look_back(dived):
+    """A current is where it is now, and has not been there all the time."""
+    estimator, samples, _ = dived
+    task, module = estimator._task, estimator._module
+    window = samples[samples["t"] > samples["t"][-1] - 15.0]
+    before = module.init(task)
+    update = iterated_update.IteratedUpdate(module, before)
+    update.until_due(window)
+    state, _ = module.fold(task, before, window)
+    update._samples.append(window)
+    solution, std = module.solution_of(state)
+    walks = task.drift * (window["t"][-1] - window["t"][0]) > std**2
+    assert walks.any() and not walks.all()
+    looks = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "fold_about", lambda *_: looks.append(True))
+        for moved in (walks, ~walks):
+            update._about = solution + np.where(moved, 3.0 * std, 0.0)
+            assert update.iterate(task, state) is state
+            assert bool(looks) == (not moved[walks].any())
