@@ -56,6 +56,7 @@ from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import mean_inflation
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.scales import authority, semi_axes
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.simulation import virtual_sensors
@@ -565,6 +566,21 @@ def test_a_fit_takes_no_more_data_than_it_needs():
     assert set(some) <= set(hour) and len(some) == pytest.approx(120, abs=2)
     assert some[0] == hour[0] and some[-1][1] > 3500.0
     assert thinned(hour[:100]) == hour[:100]
+    for duration in range(601, 3601):  # whole seconds, of which some had one span too many
+        spans = windows(0.0, float(duration))
+        some = thinned(spans)
+        assert sorted(set(some)) == some and len(some) == pytest.approx(120, abs=2)
+
+
+def test_the_first_window_knows_the_commands_before_it(dive):
+    """A lag goes on from them, as in windows that others come before."""
+    messages, config = dive
+    streams = gather(messages, config)
+    lagged = {"thruster_lag": {"time_constant": 0.5}}
+    alone = WindowedProblem(streams, [(20.0, 25.0)])
+    last = WindowedProblem(streams, [(0.0, 20.0), (20.0, 25.0)])
+    here, there = alone.thrust(lagged), last.thrust(lagged)
+    np.testing.assert_allclose(here, there[:, -here.shape[1] :], rtol=0.0, atol=1e-9)
 
 
 # ------------------------------------------------------------------ the study itself

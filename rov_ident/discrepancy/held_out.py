@@ -74,7 +74,8 @@ def thinned(spans: Spans) -> Spans:
     every = sum(end - begin for begin, end in spans) / _ENOUGH
     if every <= 1.0:
         return spans
-    return [spans[int(i)] for i in np.arange(0.0, len(spans), every)]
+    count = round(len(spans) / every)
+    return [spans[i * len(spans) // count] for i in range(count)]
 
 
 class Judge:

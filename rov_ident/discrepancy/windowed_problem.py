@@ -91,8 +91,9 @@ class WindowedProblem:
         keep &= within(spans, streams.t)
         t = streams.t[keep]
         nodes = _subdivided(t, streams.max_step)
+        # from the first command on: lag and delay remember those before the first window
         pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
-        pieces = pieces[(pieces >= nodes[0]) & (pieces <= nodes[-1])]
+        pieces = pieces[pieces <= nodes[-1]]
         held = self._held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
         self.reading_std = resting_noise(streams.demand)
         self.orientation, self.guided = orientation_at(streams, nodes), streams.guided
