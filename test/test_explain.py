@@ -58,7 +58,7 @@ from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import mean_inflation
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.scales import authority, semi_axes
-from rov_ident.sampling.raw_streams import gather
+from rov_ident.sampling.raw_streams import gather, joined
 from rov_ident.simulation import virtual_sensors
 
 STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
@@ -581,6 +581,20 @@ def test_the_first_window_knows_the_commands_before_it(dive):
     last = WindowedProblem(streams, [(0.0, 20.0), (20.0, 25.0)])
     here, there = alone.thrust(lagged), last.thrust(lagged)
     np.testing.assert_allclose(here, there[:, -here.shape[1] :], rtol=0.0, atol=1e-9)
+
+
+def test_a_record_knows_nothing_of_the_commands_of_another(dive):
+    """Nor is it simulated, before its own first command, with their last one."""
+    messages, config = dive
+    late = [(r, m) for r, m in messages if r != "wrench" or m.stamp > messages[0][1].stamp + 10**9]
+    first, second = gather(messages, config), gather(late, config)
+    both, begins = joined([first, second])
+    lagged = {"thruster_lag": {"time_constant": 0.5}}
+    alone = WindowedProblem(second, [(0.0, 25.0)])
+    beside = WindowedProblem(both, [(begins[1], begins[1] + 25.0)])
+    assert alone.steps.t[0] > 1.0
+    np.testing.assert_allclose(beside.steps.t - begins[1], alone.steps.t, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(beside.thrust(lagged), alone.thrust(lagged), rtol=0.0, atol=1e-6)
 
 
 # ------------------------------------------------------------------ the study itself

@@ -116,11 +116,11 @@ class Judge:
         if not self._sensors:
             return error
         measured, none = self.problem.measured, np.zeros_like(error[:, :3])
-        measured, simulated = (
+        recorded, simulated = (
             sense(Reading(x[:, :3], x[:, 3:], none, none), self._sensors)
             for x in (measured, measured - error)
         )
-        return np.hstack([measured.linear - simulated.linear, error[:, 3:]])
+        return np.hstack([recorded.linear - simulated.linear, error[:, 3:]])
 
     def rmse(self, h: Simulated) -> dict[str, float]:
         square = self.squares(h).sum(axis=0) / self._weight.sum(axis=0)

@@ -46,6 +46,7 @@ class Steps(NamedTuple):
     position: Array  # (K, 3) m, in the world, as measured there
     piece_t: Array  # (J + 1,) s
     demand: Array  # (J, 6)
+    anew: NDArray[np.bool_]  # (J,): the first of a recording; what acted before is not known
     piece: Indices  # (K,)
     inputs: Array  # (K, 4): mean of INPUTS over each step
     given: Array  # (K, 6) accelerations that guided axes are measured to have, else 0; or (0, 6)
@@ -96,7 +97,7 @@ def thrust(steps: Steps, acting: Acting) -> Array:
     wrench = steps.demand
     if acting.inputs.any():
         wrench = wrench.copy()
-        _thrust(acting, memory(), steps.piece_t, wrench)
+        _thrust(acting, memory(), steps.piece_t, steps.anew, wrench)
     out = np.zeros((2, len(steps.piece), 6))
     _means(steps.piece_t, wrench, steps.t, steps.piece, out)
     return out
@@ -155,8 +156,10 @@ def wrenches(eq: Equations, steps: Steps, thrust: Array, motion: Motion) -> Arra
 
 
 @released
-def _thrust(acting, state, t, wrench):
+def _thrust(acting, state, t, anew, wrench):
     for k in range(len(wrench)):
+        if anew[k]:
+            state[:] = 0.0
         act(acting, state, t[k], t[k + 1] - t[k], wrench[k])
 
 

@@ -87,8 +87,9 @@ class WindowedProblem:
         """``spans``: from and to [s] of each window. UserError if there is not enough odometry in
         any."""
         self.streams = streams
-        keep = (streams.t >= streams.demand_t[0]) & np.isfinite(streams.nu).all(axis=1)
-        keep &= within(spans, streams.t)
+        ends, begins = streams.recordings
+        keep = np.isfinite(streams.nu).all(axis=1) & within(spans, streams.t)
+        keep &= streams.t >= begins[np.searchsorted(ends, streams.t)]
         t = streams.t[keep]
         nodes = _subdivided(t, streams.max_step)
         # from the first command on: lag and delay remember those before the first window
@@ -110,6 +111,7 @@ class WindowedProblem:
             interpolated(streams.t, streams.position, middle),
             pieces,
             streams.demand[held],
+            np.isin(pieces[:-1], begins),
             np.searchsorted(pieces, nodes[:-1]),
             means,
             given,
@@ -130,10 +132,10 @@ class WindowedProblem:
             )
         self.first, self.last = np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
         window = np.searchsorted(self.first, at, side="right") - 1
-        inside = (window >= 0) & (at <= self.last[np.maximum(window, 0)])
-        self.nodes, self.window = at[inside], window[inside]
-        self.measured = streams.nu[keep][inside]
-        self.times = t[inside]
+        in_window = (window >= 0) & (at <= self.last[np.maximum(window, 0)])
+        self.nodes, self.window = at[in_window], window[in_window]
+        self.measured = streams.nu[keep][in_window]
+        self.times = t[in_window]
         self.patterns: dict[Key, Array] = {}
         self._moves = 0  # through all windows
         self._stopped = False

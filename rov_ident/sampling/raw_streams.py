@@ -116,6 +116,15 @@ class Streams:
     def duration(self) -> float:
         return float(self.t[-1])
 
+    @property
+    def recordings(self) -> tuple[Array, Array]:
+        """Times [s] of each recording: its last odometry (R,) and its first command (R,), infinite
+        where it has none."""
+        ends = np.append(self.t[:-1][np.diff(self.t) >= PAUSE], self.t[-1])
+        # a microsecond for rounding
+        first = np.searchsorted(self.demand_t, np.append(-np.inf, ends[:-1] + PAUSE - 1e-6))
+        return ends, np.append(self.demand_t, np.inf)[first]
+
 
 def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
     """Arrays from messages as they are on the wire; what cannot be used is left out.
