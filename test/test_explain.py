@@ -58,7 +58,7 @@ from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import mean_inflation
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.scales import authority, semi_axes
-from rov_ident.sampling.raw_streams import gather, joined
+from rov_ident.sampling.raw_streams import gather, inspected, joined
 from rov_ident.simulation import virtual_sensors
 
 STRENGTH = 0.5  # of what is drawn: far above the weakest that are found
@@ -173,6 +173,7 @@ def test_velocities_that_never_change_are_no_missing_moment():
     """A record in the plane holds zeros for heave, roll and pitch: what turns it is known."""
     streams = streams_of(draw(3, conditions=PLACES["a minute"]))
     streams.nu[:, 2:5] = 0.0
+    streams = inspected(streams)
     assert list(streams.guided) == [False, False, True, True, True, False]
     (note,) = _of_guided(streams)
     assert note.endswith("left as they are: w, p, q")

@@ -44,7 +44,7 @@ from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.offline import delays
-from rov_ident.sampling.raw_streams import Streams, gather, orientation_at
+from rov_ident.sampling.raw_streams import Streams, gather, inspected, orientation_at
 
 
 def streams_of(case, driving, seed, seconds=60.0, draw=None):
@@ -208,7 +208,7 @@ def turning(bias=(0.0, 0.0, 0.0), late=0.0, noise=1.0, seconds=60.0):
     streams = Streams(
         t[k], none, attitude, nu, empty, three, three, t[k], np.ones((len(k), 6)), empty, four
     )
-    return streams, rate[k]
+    return inspected(streams), rate[k]
 
 
 @pytest.mark.parametrize("bias", [(0.02, -0.01, 0.015), (0.0, 0.0, 0.005)])
@@ -333,11 +333,11 @@ def test_a_position_is_reckoned_along_the_right_heading():
 
 
 @pytest.mark.study
-def test_nothing_is_sure_where_position_and_thrust_contradict_each_other(monkeypatch):
+def test_nothing_is_sure_where_position_and_thrust_contradict_each_other():
     """The position is reckoned along the heading that drifts, and shows it to be right."""
     sea = {"heading_drift": 0.01, "dead_reckoned": True}
     _, streams, config = streams_of("", "pilot", 0, 150.0, lambda *_: sea)
-    monkeypatch.setattr(Streams, "is_reckoned", False)
+    streams = dataclasses.replace(streams, posed=~streams.posed, is_reckoned=False)
     findings = explain([streams], config).findings
     assert "or the heading drifts" in " ".join(findings.notes)
     assert not any(f.separable for f in findings.effects)
@@ -376,7 +376,7 @@ def test_rates_in_the_plane_are_those_of_the_heading(late):
     nu = np.zeros_like(streams.nu)
     nu[:, 5] = np.interp(t - late, t, rate) + rng.normal(0.0, 0.004, len(t))
     level = quaternion_from_euler(0.0, 0.0, heading)
-    streams = dataclasses.replace(streams, orientation=level, nu=nu)
+    streams = inspected(dataclasses.replace(streams, orientation=level, nu=nu))
     notes = rates_and_attitude.agreed(streams, a_configuration()).streams.notes
     assert len(notes) == (late > 0.0)
     assert all("0.2 s late" in note for note in notes)
@@ -397,9 +397,9 @@ def test_a_position_that_is_reckoned_from_the_velocities_says_nothing_of_them():
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
     nu = np.hstack([v, np.zeros_like(v)])
     streams = dataclasses.replace(streams, t=t, position=way, orientation=level, nu=nu)
-    assert streams.has_pose
+    assert inspected(streams).has_pose
     reckoned = np.cumsum(0.05 * v, axis=0)
-    assert not dataclasses.replace(streams, position=reckoned).has_pose
+    assert not inspected(dataclasses.replace(streams, position=reckoned)).has_pose
 
 
 @pytest.mark.parametrize("seed", [0, *more(1, 2)])
@@ -410,10 +410,10 @@ def test_a_position_that_is_held_between_fixes_is_no_pose(seed):
     first = np.searchsorted(fix, np.unique(fix))
     held = streams.position[first][fix - fix[0]]
     held[:, 2] = streams.position[:, 2]  # depth has a sensor of its own
-    assert not dataclasses.replace(streams, position=held).has_pose
+    assert not inspected(dataclasses.replace(streams, position=held)).has_pose
     for grid in (0.01, 0.1):
         rounded = np.round(streams.position / grid) * grid
-        assert dataclasses.replace(streams, position=rounded).has_pose
+        assert inspected(dataclasses.replace(streams, position=rounded)).has_pose
 
 
 def test_what_is_found_beside_a_refuted_correction_is_not_sure():
@@ -491,7 +491,7 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
         scaled = streams.nu * np.repeat([factor, 1.0], 3)
         to_world = quaternion_to_matrix(streams.orientation)
         way = integral(streams.t, np.einsum("kij,kj->ki", to_world, scaled[:, :3]))
-        reckoned = dataclasses.replace(streams, nu=scaled, position=way)
+        reckoned = inspected(dataclasses.replace(streams, nu=scaled, position=way))
         tests = {test.name: test.passed for test in velocity_sensor.tests_of(reckoned, config)}
         assert tests["velocity sensor: velocity_scale"] is passes, factor
     quiet = streams.nu * np.repeat([0.03, 1.0], 3)  # near the noise, which makes a factor too small
@@ -788,7 +788,7 @@ def test_an_imu_elsewhere_is_no_velocity_sensor_elsewhere(seed):
 
 def test_where_nothing_thrusts_no_thrust_depends_on_another():
     _, streams, config = streams_of("clean", "pilot", 0, 40.0)
-    still = dataclasses.replace(streams, demand=np.zeros_like(streams.demand))
+    still = inspected(dataclasses.replace(streams, demand=np.zeros_like(streams.demand)))
     search = Search(still, config, split(still.duration)[0])
     assert search.patterns.interplay(search.start()) is None
 

@@ -9,7 +9,7 @@ from tiers import more
 from bench import HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition, sensor_consistency
-from rov_ident.discrepancy.explain import explain
+from rov_ident.discrepancy.explain import _beside_given, explain
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.held_out import Judge, blocks, split, windows
 from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, precision
@@ -18,7 +18,7 @@ from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
-from rov_ident.sampling.raw_streams import gather, joined
+from rov_ident.sampling.raw_streams import gather, inspected, joined
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
 TODAY = configuration.load(HEAVY)
@@ -31,6 +31,94 @@ def record(seed, duration=40.0, suite=LEAN, **effects):
     true = configuration.from_parameters(document)
     messages = dive(true, "steps", duration, suite, seed).messages
     return gather(((role, message) for _, role, message in messages), TODAY)
+
+
+def both(name, values, config=TODAY):
+    """A configuration with more in one of its sections."""
+    document = configuration.to_parameters(config)
+    return configuration.from_parameters(document | {name: {**document.get(name, {}), **values}})
+
+
+@pytest.mark.parametrize("imu", [50.0, *more(0.0)])
+def test_what_the_file_says_of_the_sensors_is_taken_off(imu):
+    """The arm of a sensor that the file has was named once more, surely."""
+    config = both("odometry", {"position": [0.5, 0.2, -0.1]})
+    sensors = {
+        "velocity_scale": {"scale": 1.1},
+        "sensor_misalignment": {"roll": 0.0, "pitch": 0.0, "yaw": 0.1},
+    }
+    if imu:
+        sensors["imu_bias"] = {"gx": 0.02, "gy": 0.0, "gz": 0.0, "ax": 0.0, "ay": 0.1, "az": 0.0}
+    config = both("effects", sensors, config)
+    run = dive(config, "steps", 60.0, Suite(odometry_rate=10.0, imu_rate=imu), 1)
+    messages = [(role, message) for _, role, message in run.messages]
+    read = gather(messages, config)
+    spans = windows(0.0, read.duration)
+    assert sensor_consistency.search(read, config, spans)[0] == {}
+    as_read = sensor_consistency.search(gather(messages, TODAY), TODAY, spans)[0]
+    assert {"velocity_scale", "sensor_misalignment", "sensor_lever_arm"} <= as_read.keys()
+
+
+def test_what_is_found_is_written_beside_what_the_file_has():
+    config = both("effects", {"velocity_scale": {"scale": 1.1}, "velocity_latency": {"delay": 0.1}})
+    assert _beside_given(config, "velocity_scale", {"scale": 1.02}) == {"scale": 1.1 * 1.02}
+    late = _beside_given(config, "velocity_latency", {"delay": 0.05})
+    assert late == {"delay": pytest.approx(0.15)}
+    assert _beside_given(config, "heading_offset", {"yaw": 0.2}) == {"yaw": 0.2}
+
+
+def test_velocities_that_were_not_measured_stay_as_they_are():
+    """What holds zeros is taken as measured, and not turned, by a sensor that sits elsewhere."""
+    config = both("odometry", {"position": [0.5, 0.2, -0.1]})
+    run = dive(config, "steps", 20.0, LEAN, 1)
+    flat = [
+        (r, m._replace(linear=m.linear * [1.0, 1.0, 0.0]) if r == "odom" else m)
+        for _, r, m in run.messages
+    ]
+    read = gather(flat, config)
+    assert list(read.guided) == [False, False, True, False, False, False]
+    assert not read.nu[:, 2].any() and read.nu[:, :2].all()
+
+
+@pytest.mark.parametrize("seed", [1, *more(2, 3)])
+def test_a_record_without_a_pose_says_nothing_of_the_velocities(seed):
+    """Its position, which never moved, made coriolis of a velocity scale, surely."""
+    bags = [record(s, velocity_scale={"scale": 1.05}) for s in (seed, seed + 10)]
+    still = np.zeros_like(bags[1].position)
+    bags[1] = inspected(dataclasses.replace(bags[1], position=still))
+    streams, begins = joined(bags)
+    assert list(streams.posed) == [True] * len(bags[0].t) + [False] * len(bags[1].t)
+    spans = [(a + b, a + c) for a in begins for b, c in windows(0.0, 39.0)]
+    found, std = sensor_consistency.search(streams, TODAY, spans)
+    assert list(found) == ["velocity_scale"]
+    assert abs(found["velocity_scale"]["scale"] - 1.05) < 3.5 * std["velocity_scale", "scale"]
+    gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
+    value = {"scale": Value(1.05, 0.001, "1")}
+    told = Finding("velocity_scale", (), value, None, gain, True, None, (), "")
+    (told,) = repetition.of_sensors(bags, TODAY, [told], [0.0, 0.0])
+    assert told.repetition.same and np.isinf(told.repetition.records[1]["scale"].std)
+
+
+def test_a_record_without_moments_or_heave_lacks_them_for_all():
+    bags = [record(1), record(2)]
+    forces = bags[1].demand * [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    flat = bags[1].nu * [1.0, 1.0, 0.0, 1.0, 1.0, 1.0]
+    bags[1] = inspected(dataclasses.replace(bags[1], demand=forces, nu=flat))
+    assert list(joined(bags)[0].guided) == [False, False] + [True] * 4
+
+
+@pytest.mark.parametrize("seed", [4, *more(1, 2, 3, 5, 6)])
+def test_what_is_taken_up_within_a_held_out_block_leaves_nothing(seed):
+    """Its block, of which no fit knows when it begins, does not count: much was said to be left."""
+    rng = np.random.default_rng(seed)
+    begin, end = split(120.0)[1][1]
+    onset = rng.uniform(begin + 1.0, end - 1.0)
+    payload = {"mass_wet": 1.0, "x": 0.1, "y": 0.0, "z": 0.1, "onset": onset}
+    findings = explain([record(seed, 120.0, payload=payload)], TODAY).findings
+    first, *others = findings.effects
+    assert first.effect == "payload" and first.onset_s == pytest.approx(onset, abs=0.3)
+    assert not any(f.separable for f in others)
+    assert not any("left" in note for note in findings.notes)
 
 
 def fitted_to_each(bags, effect, parameters):

@@ -1,6 +1,7 @@
 """An effect of a package that is installed beside this one: searched, estimated and simulated like
 ours; nothing comes from the current folder."""
 
+import dataclasses
 import json
 import os
 import re
@@ -8,11 +9,18 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from bench import ROOT
+from rov_ident.discrepancy.held_out import windows
+from rov_ident.discrepancy.hypothesis import Hypothesis
+from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.effects import EFFECTS
+from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.effects.checks import faults
+from rov_ident.sampling.raw_streams import gather
+from rov_ident.simulation.virtual_sensors import Suite, dive
 
 PAGE = (ROOT / "docs" / "own-effects.md").read_text()
 
@@ -84,6 +92,31 @@ def test_it_is_simulated_estimated_and_searched(installed):
 
 
 LIST = "from rov_ident.effects import EFFECTS; print('propeller_reaction' in EFFECTS)"
+
+
+@pytest.mark.parametrize("null", [0.0, 1.0])
+def test_what_changes_the_rigid_body_need_not_add_to_it(null, monkeypatch, heavy):
+    """A factor of the mass, which does nothing at one, was fitted as if at zero."""
+
+    def body(base, factor):
+        return dataclasses.replace(base, mass=base.mass * (factor + 1.0 - null))
+
+    parameter = EffectParameter("factor", "1", "of the mass", null, null - 0.5, null + 1.0, 0.1)
+    flooded = Effect(
+        place="wrench", summary="It took in water.", source="none", manoeuvre="none",
+        name="flooded", parameters=(parameter,), body=body,
+    )  # fmt: skip
+    monkeypatch.setitem(EFFECTS, "flooded", flooded)
+    lean = Suite(odometry_rate=10.0, imu_rate=0.0)
+    messages = dive(heavy, "steps", 20.0, lean, 1).messages
+    streams = gather(((role, message) for _, role, message in messages), heavy)
+    problem = WindowedProblem(streams, windows(0.0, 20.0))
+    key = ("flooded", "factor")
+    h = Hypothesis(heavy, {key: null})
+    motion = problem.motion(h, problem.measured_starts())
+    column = problem.columns(h, motion, [key])[:, :, 0]
+    mass = problem.of_rigid_body(heavy.model.body, motion)[:, :, 0]
+    np.testing.assert_allclose(column, heavy.model.body.mass * mass, atol=1e-6 * abs(mass).max())
 
 
 def test_nothing_is_taken_from_the_current_folder(installed):

@@ -43,7 +43,6 @@ from bench.simulators import fossen, hidden
 from bench.simulators.hidden import NESTED, SENSOR_EFFECTS, UNKNOWN, UNOBSERVABLE, Case, Conditions
 from rov_ident import config as configuration
 from rov_ident.discrepancy import explain as engine
-from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.findings import sensor_findings
 from rov_ident.discrepancy.held_out import Judge, gain_of, split
 from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Key
@@ -56,7 +55,7 @@ from rov_ident.effects import EFFECTS
 from rov_ident.io import cdr
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.model.coefficients import VELOCITIES
-from rov_ident.sampling.raw_streams import Streams, gather
+from rov_ident.sampling.raw_streams import Streams, corrected, gather
 
 MEDIUM, WEAK, ANY = (0.4, 0.8), (0.1, 0.4), (0.0005, 0.4)
 SEEDS = 6  # tried for a bag until one can be brought to its strength
@@ -220,7 +219,7 @@ def true_gains(case: Case, streams: Streams) -> list[float]:
         data = Data(streams, to_fit, streams, held, case.config)
         choice = data.fitted(sensors, frozenset())
         gains |= {f.effect: _certain(f.gain) for f in sensor_findings(data, choice)}
-        streams = sensor_consistency.corrected(streams, choice.sensors)
+        streams = corrected(streams, choice.sensors)
     others = [n for n in case.effects if n not in SENSOR_EFFECTS]
     if others:
         search, judge = Search(streams, case.config, to_fit), Judge(WindowedProblem(streams, held))

@@ -211,7 +211,7 @@ def _scored(problem: WindowedProblem, now: Fitted) -> list[Shape]:
     """Functions by what polynomials instead of them would take off the squared residuals, less two
     for each column (Akaike 1974), the best first."""
     line = now.linearisation
-    has_pose, free = problem.streams.has_pose, ~problem.guided
+    has_pose, free = problem.streams.posed.all(), ~problem.guided
     own = {v: _values(problem, now, v, 0) for v in range(1, THRUST) if has_pose or not (
         NORTH <= v < THRUST
     )}  # fmt: skip

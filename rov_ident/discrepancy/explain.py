@@ -21,9 +21,9 @@ from rov_ident.discrepancy import (
     rates_and_attitude,
     repetition,
     sensor_choice,
-    sensor_consistency,
 )
 from rov_ident.discrepancy.findings import (
+    beginnings,
     changes,
     finding,
     is_left,
@@ -51,19 +51,20 @@ from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_ons
 from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Value, Verdict
 from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
-from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Simulated, Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, Values, with_trait
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.raw_streams import Streams, joined
+from rov_ident.sampling.raw_streams import Streams, corrected, joined
 from rov_ident.sampling.sample import NO_MOMENT
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
 _NEAR_NOISE = 3.0  # times what noise makes of a prediction: coefficients are not exact, either
 _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
+_NEAR_ONSET = 2.0  # s; as far apart as the onsets that the search tries
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
@@ -85,6 +86,7 @@ _OF_THIS_DIVE = (
     "{} may belong to this dive alone: take it out of the extended configuration to simulate "
     "another, or explain several dives together"
 )
+_BESIDE_GIVEN = "what is told of {} is beside what the configuration has of it"
 _ONE_VALUE = "the records differ in {}: the extended configuration has one value for all"
 _FILTERED = (
     "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
@@ -180,9 +182,12 @@ def explain(
     search, start = _with_reading(Search(data.streams, config, thinned(data.to_fit)), data.to_fit)
     retuned, model, residual = _searched(search, start, say)
     say("judging on held-out data", 0.9)
-    likeliest = model.final.hypothesis
-    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, likeliest)
+    likeliest, begun = model.final.hypothesis, beginnings(model.final)
+    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, likeliest, begun)
     _judge_effects(search, judge, retuned, model, data)
+    if begun and begun != beginnings(model.final):
+        begun = beginnings(model.final)
+        judge = Judge(judge.problem, data.sensors, likeliest, begun)
     _add_term(search, judge, retuned, model)
     of_sensors = list(data.findings)
     if search.config is not config:
@@ -203,11 +208,14 @@ def explain(
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
     given = Hypothesis(config, {})
     problem = WindowedProblem(data.recorded.judged, data.to_judge)
-    as_recorded = Judge(problem, likeliest=likeliest)
+    as_recorded = Judge(problem, likeliest=likeliest, left_out=begun)
     final = _without_minor_noise(shared.judged, data, of_sensors)
     written = extension.kept(
         extension.AsGiven(judge, as_recorded.summed(given)),
-        extension.AsGiven(Judge(judge.problem, data.sensors), Judge(problem).summed(given)),
+        extension.AsGiven(
+            Judge(judge.problem, data.sensors, left_out=begun),
+            Judge(problem, left_out=begun).summed(given),
+        ),
         final,
     )
     if written.model is None:
@@ -240,6 +248,8 @@ def explain(
     notes += [_OWN_DELAYS] if data.delays else []
     notes += shared.notes
     passing = [name for name in with_trait("dive") if name in best.effects]
+    known = [name for name in data.sensors if name in config.effects]
+    notes += [_BESIDE_GIVEN.format(" and ".join(known))] if known else []
     notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
     notes += [_FILTERED] if data.late else []
     notes += data.clocks.notes
@@ -346,9 +356,9 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     sensors = {f.effect: choice.sensors[f.effect] for f in findings if is_practical(f.gain)}
     return _Data(
         bags,
-        sensor_consistency.corrected(streams, sensors),
+        corrected(streams, sensors),
         to_fit,
-        sensor_consistency.corrected(judged, sensors),
+        corrected(judged, sensors),
         to_judge,
         recorded,
         headings,
@@ -432,7 +442,7 @@ def _gaining(
     best = rests[0]
     for rest in rests[1:]:
         best = rest if judge.better(rest, best) else best
-    gain = judge.gain(best, after, None, found.axes)
+    gain = judge.gain(best, after, found.axes)
     words = found.sentence.replace(improved(found.gain), improved(gain))
     return dataclasses.replace(found, gain=gain, sentence=words)
 
@@ -651,7 +661,9 @@ def _with_all_data(streams: Streams, final: Fitted) -> tuple[Fitted, list[str]]:
     """The extended model fitted to all of the data, and notes."""
     halves = [s for a, b in blocks(streams) for s in windows(a, b)]
     last = fit(WindowedProblem(streams, thinned(halves)), final.hypothesis)
-    return with_best_onsets(last or final), [] if last is not None else [_ONLY_FITTED]
+    notes = [] if last is not None else [_ONLY_FITTED]
+    last = with_best_onsets(last or final)
+    return with_best_onsets(last, around=_NEAR_ONSET, every=ONSET_STEP), notes
 
 
 def _without_minor_noise(h: Hypothesis, data: _Data, found: Sequence[Finding]) -> Hypothesis:
@@ -661,11 +673,22 @@ def _without_minor_noise(h: Hypothesis, data: _Data, found: Sequence[Finding]) -
     return sensor_choice.with_noise(h, data.recorded.config.effects.get(NOISE, {}))
 
 
+def _beside_given(config: Config, effect: str, found: Mapping[str, float]) -> dict[str, float]:
+    """The parameters of an effect on a sensor with what was ``found`` beside those that the file
+    has, which were taken off the data before: what is added adds up, factors multiply."""
+    given = config.effects.get(effect, {})
+    nulls = {p.name: p.null for p in EFFECTS[effect].parameters}
+    return {
+        n: given.get(n, null) * found[n] / null if null else given.get(n, null) + found[n]
+        for n, null in nulls.items()
+    }
+
+
 def _extended(h: Hypothesis, kept: Sequence[str], data: _Data, found: Sequence[Finding]) -> Config:
     """The configuration of a hypothesis with what was found; the rows of the axes ``kept`` are as
     in the file. A heading that each bag has of its own is in none."""
     h = _without_minor_noise(extension.without_rows(h, kept), data, found)
-    sensors = {n: dict(v) for n, v in data.sensors.items()}
+    sensors = {n: _beside_given(h.config, n, v) for n, v in data.sensors.items()}
     if any(data.headings):
         sensors.pop(HEADING, None)
     config = h.config

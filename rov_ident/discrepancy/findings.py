@@ -18,6 +18,7 @@ from rov_ident.discrepancy.hypothesis import (
     at_bound,
     bounds,
     effect_of,
+    onsets,
     role_of,
     unit_of,
 )
@@ -61,15 +62,12 @@ def finding(
     one, and against its rivals."""
     keys = search.keys_of(final, name)
     parameters = parameters_of(final, keys)
-    onset, except_for = parameters.get("onset"), None
-    if onset is not None:  # where it begins, between two windows, nothing can be predicted
-        except_for = onset.value - 2.0 * onset.std, onset.value + 2.0 * onset.std
     axes = _axes(search, final, keys)
     without = trial.rest.hypothesis
-    if judge.better(retuned.hypothesis, without, except_for):  # the best model without it
+    if judge.better(retuned.hypothesis, without):  # the best model without it
         without = retuned.hypothesis
-    gain = judge.gain(without, final.hypothesis, except_for, axes)
-    alternatives, separable = _alternatives(search, judge, final, name, trial, except_for)
+    gain = judge.gain(without, final.hypothesis, axes)
+    alternatives, separable = _alternatives(search, judge, final, name, trial)
     if name in with_trait("neglecting") and may_be_noise(trial.rest, axes):
         alternatives, separable = (*alternatives, Alternative(NOISE, _EQUAL)), False
     stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
@@ -81,6 +79,12 @@ def finding(
         alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
     found = in_words(name, axes, parameters, gain, alternatives)
     return found if separable else unsure(found)
+
+
+def beginnings(final: Fitted) -> Spans:
+    """From and to [s] of when something in a model may begin, within two standard deviations."""
+    values = [(final.hypothesis.values[k], onset_std(final, k)) for k in onsets(final.hypothesis)]
+    return [(onset - 2.0 * std, onset + 2.0 * std) for onset, std in values]
 
 
 def in_words(
@@ -120,12 +124,7 @@ def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bo
 
 
 def _alternatives(
-    search: Search,
-    judge: Judge,
-    final: Fitted,
-    name: str,
-    trial: Trial,
-    except_for: tuple[float, float] | None,
+    search: Search, judge: Judge, final: Fitted, name: str, trial: Trial
 ) -> tuple[tuple[Alternative, ...], bool]:
     """The rivals, the closest first, and whether the effect can be told from all of them; where it
     cannot, only those that it cannot be told from."""
@@ -147,7 +146,7 @@ def _alternatives(
             close = with_arm(fitted) - with_arm(final) < VERY_STRONG
         # a rival with parameters beyond this effect's own predicts better by chance alone
         larger = EFFECTS[name].within == rival if name in EFFECTS else False
-        if close or (not larger and judge.better(fitted.hypothesis, final.hypothesis, except_for)):
+        if close or (not larger and judge.better(fitted.hypothesis, final.hypothesis)):
             separable = False
             why = _EQUAL
         else:
@@ -331,7 +330,7 @@ def noise_finding(judge: Judge, final: Fitted, given: Config, std: Mapping[str, 
     axes = tuple(p.axis for p in EFFECTS[name].parameters if p.name in parameters)
     without = with_noise(h, given.effects.get(name, {}))
     rest = refit(without, final.linearisation)
-    gain = judge.gain(without if rest is None else rest.hypothesis, h, None, axes)
+    gain = judge.gain(without if rest is None else rest.hypothesis, h, axes)
     return in_words(name, axes, parameters, gain)
 
 

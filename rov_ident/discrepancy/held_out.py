@@ -86,14 +86,19 @@ class Judge:
         problem: WindowedProblem,
         sensors: Values | None = None,
         likeliest: Hypothesis | None = None,
+        left_out: Sequence[tuple[float, float]] = (),
     ) -> None:
         """``sensors``: the effects that were taken off the data, which are judged as recorded.
 
         ``likeliest``: a model that says how the noise of each window's first state grows. Squared
         errors then count in inverse proportion to the variance that noise gives them, of any model
         alike, and as much as ever where that is the noise of the velocity itself. Where a vehicle
-        is not stable, they would tell how each window began, and nothing of a model."""
+        is not stable, they would tell how each window began, and nothing of a model.
+
+        ``left_out``: when something begins, from and to [s]. From then on nothing can be predicted
+        to the end of the window, which does not count."""
         self.problem, self._sensors = problem, sensors or {}
+        self._counts = self._counted(left_out)
         self._guided, self.free = problem.guided, ~problem.guided  # axes (6,)
         self._limit = _FAILED * problem.measured.std(axis=0) + 1e-9
         std = np.maximum(problem.noise_std()[3:], _LEAST_NOISE * problem.measured.std(axis=0))
@@ -101,13 +106,14 @@ class Judge:
         if likeliest is not None:
             grown = problem.variance_of_errors(likeliest)
             self._weight = self._noise / (self._noise + grown)
-        chunk = (problem.times / CHUNK).astype(int)
-        self._number, self._chunk = np.unique(chunk, return_inverse=True)
+        self._weight = self._weight[self._counts]
+        chunk = (problem.times[self._counts] / CHUNK).astype(int)
+        self._chunk = np.unique(chunk, return_inverse=True)[1]
 
     def squares(self, h: Simulated) -> Array:
-        """Squared errors (N, 6) as they count; a simulation that fails is as far off as the motion
-        is large."""
-        error = np.abs(self._as_recorded(self.problem.errors(h)))
+        """Squared errors (N, 6) that count, and as they count; a simulation that fails is as far
+        off as the motion is large."""
+        error = np.abs(self._as_recorded(self.problem.errors(h)))[self._counts]
         capped: Array = np.where(error < self._limit, error, self._limit) ** 2
         return self._weight * capped
 
@@ -132,20 +138,13 @@ class Judge:
         out: Array = np.sqrt(self._noise / self._weight.mean(axis=0))
         return out
 
-    def gain(
-        self,
-        before: Simulated,
-        after: Simulated,
-        except_for: tuple[float, float] | None = None,
-        axes: Sequence[str] = (),
-    ) -> Gain:
-        """Of the component that gains most, of those that surely gain if any do. Windows that reach
-        into the time ``except_for`` do not count. Where none surely gains, those of the ``axes`` on
-        which an effect acts are looked at alone, as an interval for six components is wide, and
-        then all of these together: a lag moves each a little."""
-        free, use = np.flatnonzero(~self._guided), self._used(except_for)
-        a, b = (self.summed(h)[use] for h in (before, after))
-        count = self._weight[use[self._chunk]].sum(axis=0)
+    def gain(self, before: Simulated, after: Simulated, axes: Sequence[str] = ()) -> Gain:
+        """Of the component that gains most, of those that surely gain if any do. Where none surely
+        gains, those of the ``axes`` on which an effect acts are looked at alone, as an interval for
+        six components is wide, and then all of these together: a lag moves each a little."""
+        free = np.flatnonzero(self.free)
+        a, b = (self.summed(h) for h in (before, after))
+        count = self._weight.sum(axis=0)
         own = np.array([i for i in free if AXES[i] in axes], dtype=int)
         sets = [of for of in (free, own) if len(of)]
         gains = [gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count[of]) for of in sets]
@@ -154,21 +153,17 @@ class Judge:
             found = replace(found, together=together(a[:, own], b[:, own]))
         return found
 
-    def _used(self, except_for: tuple[float, float] | None) -> NDArray[np.bool_]:
-        """Which chunks count."""
-        e, use = self.problem, np.ones(len(self._number), dtype=bool)
-        if except_for is not None:
-            begin, end = e.steps.t[e.first], e.steps.t[e.last]
-            out = (end > except_for[0]) & (begin < except_for[1])
-            use[self._chunk[out[e.window]]] = False
-        return use if use.any() else ~use
+    def _counted(self, left_out: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
+        """Which errors (N,) count: all where else none would."""
+        e, out = self.problem, np.zeros(len(self.problem.times), dtype=bool)
+        begins = e.steps.t[e.first][e.window]
+        for begin, end in left_out:
+            out |= (e.times >= begin) & (begins < end)
+        return out if out.all() else ~out
 
-    def better(
-        self, rival: Simulated, h: Simulated, except_for: tuple[float, float] | None = None
-    ) -> bool:
+    def better(self, rival: Simulated, h: Simulated) -> bool:
         """Whether a rival predicts better, all velocities taken together."""
-        free, use = ~self._guided, self._used(except_for)
-        a, b = (self.summed(x)[np.ix_(use, free)].sum(axis=0) for x in (rival, h))
+        a, b = (self.summed(x)[:, self.free].sum(axis=0) for x in (rival, h))
         return bool(log_ratio(a, b).sum() < 0.0)
 
     def surely_better(self, rival: Simulated, h: Simulated) -> bool:

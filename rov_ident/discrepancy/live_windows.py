@@ -39,7 +39,7 @@ from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import parse
 from rov_ident.model.equations import Model
 from rov_ident.model.scales import authority
-from rov_ident.sampling.raw_streams import Streams
+from rov_ident.sampling.raw_streams import Streams, inspected
 
 MEMORY = 36  # windows: three minutes, the length of a bag of the study (docs/explain-bench.md)
 
@@ -155,7 +155,8 @@ def step(
         return state
     names = [n if section == COEFFICIENTS else f"{section}.{n}" for section, n in task.base]
     h = Hypothesis(task.config, {k: values[n] for k, n in zip(task.base, names, strict=True)})
-    reading = state.reading.after(streams.demand, task.config.wrench.relative_std)
+    new = np.searchsorted(streams.demand_t, streams.t[0], side="right") - 1
+    reading = state.reading.after(streams.demand[max(new, 0) :], task.config.wrench.relative_std)
     problem.reading_std = reading.std
     plain = linearise(problem, h, problem.measured_starts(), state.noise)
     if plain is None:
@@ -238,6 +239,7 @@ def _streams(samples: NDArray[np.void], demands: Array) -> Streams | None:
     held = demands[:, 0].copy(), demands[:, 1:].copy()
     driven = samples["inputs"][:, 1]
     times = samples["t"].copy() if driven.any() else np.zeros(0)
-    return Streams(
+    read = Streams(
         t, unknown, orientation, nu, np.zeros(0), none, none, *held, times, driven[: len(times)]
     )
+    return inspected(read)

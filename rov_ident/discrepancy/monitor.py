@@ -330,7 +330,7 @@ class Monitor:
                 self._demands = _latest(self._demands, t)
         if not self._samples:
             self._begin = float(samples["t"][0])
-            self._keep_demands_from(self._begin)
+            self._keep_demands_from(self._begin - WINDOW)
         self._samples.append(samples)
         if t - self._begin < WINDOW:
             return None
@@ -338,7 +338,7 @@ class Monitor:
         told = np.array([[at, *wrench] for at, wrench in self._demands]).reshape(-1, 7)
         # a window begins at the last sample of the one before
         self._samples, self._begin = [rows[-1:]], t
-        self._keep_demands_from(t)
+        self._keep_demands_from(t - WINDOW)  # a lag remembers those before the window
         return rows, told
 
     def _keep_demands_from(self, t: float) -> None:

@@ -45,7 +45,7 @@ _NOISE_SETTLED = 0.05  # ... the relative change of it that ends them: far below
 FIRST_NOISE = 0.02  # m/s and rad/s, before the first estimate of it; its size hardly matters
 _ONSET_RANGE = 14.0  # s to either side in which a better onset is looked for: a window and a
 # held-out block beside it (5 + 10 s) may hide it
-_ONSET_TRIALS = 7  # to either side, every 2 s: as far apart as two onsets look alike
+_ONSET_EVERY = 2.0  # s: as far apart as two onsets look alike to the search
 _ONSET_RSS = 4.0  # scaled squared residuals: likelihood-ratio interval of two standard deviations
 _ONSET_UNKNOWN = 30.0  # s; an onset less certain than that is not known at all
 _UNPREDICTED = 2.0  # simulated over predicted squared residuals: beyond it linearity has failed
@@ -352,14 +352,20 @@ def solve_bounded(normal: Array, slope: Array, lower: Array, upper: Array) -> Ar
     return change
 
 
-def with_best_onsets(fitted: Fitted, keys: Container[Key] | None = None) -> Fitted:
-    """The same with the best onset near by, of all effects or of these parameters: between two
-    windows no gradient tells how to move it."""
+def with_best_onsets(
+    fitted: Fitted,
+    keys: Container[Key] | None = None,
+    around: float = _ONSET_RANGE,
+    every: float = _ONSET_EVERY,
+) -> Fitted:
+    """The same with the best onset near by, of all effects or of these parameters, ``every`` so
+    many seconds ``around`` it: between two windows no gradient tells how to move it."""
     for key in onsets(fitted.hypothesis):
         if keys is not None and key not in keys:
             continue
         now = fitted.hypothesis.values[key]
-        near = now + np.arange(-_ONSET_RANGE, _ONSET_RANGE + 0.1, _ONSET_RANGE / _ONSET_TRIALS)
+        trials = round(around / every)
+        near = now + every * np.arange(-trials, trials + 1)
         rss = [_rss_at(fitted, key, float(max(onset, 0.0))) for onset in near]
         best = int(np.argmin(rss))
         if rss[best] < _rss_at(fitted, key, now):

@@ -110,7 +110,7 @@ class PatternSearch:
         streams, steps = self._problem.streams, self._problem.steps
         middle = 0.5 * (steps.t[1:] + steps.t[:-1])
         position = None
-        if streams.has_pose:
+        if streams.posed.all():
             position = interpolated(streams.t, streams.position, middle)
         found = list(_smooth(steps, position, now.linearisation.motion.middle))
         for axis in range(6):

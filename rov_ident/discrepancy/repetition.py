@@ -27,7 +27,7 @@ from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import Values
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import NORMAL
-from rov_ident.sampling.raw_streams import Streams
+from rov_ident.sampling.raw_streams import Streams, corrected
 
 _LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
 
@@ -132,7 +132,8 @@ def of_sensors(
     for f in found:
         values = [
             {
-                name: Value(at[f.effect][name], std.get((f.effect, name), np.inf), v.unit)
+                # zero: this record's sensors tell nothing of it
+                name: Value(at[f.effect][name], std.get((f.effect, name)) or np.inf, v.unit)
                 for name, v in f.parameters.items()
             }
             for at, std in each
@@ -161,9 +162,7 @@ def turned(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list
     apart = [float(np.angle(np.exp(1j * (v.value - yaw[0].value)))) for v in yaw]
     if _agree([dataclasses.replace(v, value=a) for v, a in zip(yaw, apart, strict=True)]):
         return list(bags), none
-    return [
-        sensor_consistency.corrected(bag, {HEADING: {"yaw": y}}) for bag, y in zip(bags, apart)
-    ], apart
+    return [corrected(bag, {HEADING: {"yaw": y}}) for bag, y in zip(bags, apart)], apart
 
 
 def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list[Value]]:
@@ -182,7 +181,7 @@ def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], lis
     if _agree(late):
         return list(bags), []
     off = [{LATENCY: {"delay": v.value}} for v in late]
-    return [sensor_consistency.corrected(b, of) for b, of in zip(bags, off, strict=True)], late
+    return [corrected(b, of) for b, of in zip(bags, off, strict=True)], late
 
 
 def late_finding(

@@ -28,7 +28,7 @@ from rov_ident.effects import EFFECTS, Values
 from rov_ident.effects.base import a_reading
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
-from rov_ident.sampling.raw_streams import Streams
+from rov_ident.sampling.raw_streams import Streams, corrected
 from rov_ident.sampling.wrench_scatter import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
@@ -74,9 +74,7 @@ class Data:
         model fitted to corrected data, on those of the ``axes`` that are simulated; None where it
         cannot be. A current is allowed for: what turns the velocities turns it, too, and a model
         without it would choose what makes least of it."""
-        streams, judged = (
-            sensor_consistency.corrected(s, sensors) for s in (self.streams, self.judged)
-        )
+        streams, judged = (corrected(s, sensors) for s in (self.streams, self.judged))
         fitted = Search(streams, self.config, thinned(self.spans)).start()
         if fitted is None:
             return None

@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from rov_ident.config import Config
 from rov_ident.core.frames import (
     acceleration_of_arm,
-    quaternion_from_euler,
-    quaternion_multiply,
     quaternion_to_matrix,
     rotated,
     velocity_of_arm,
@@ -39,10 +37,10 @@ from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, Rows, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
-from rov_ident.effects import EFFECTS, Values, correct, heading_error, velocity_delay
+from rov_ident.effects import EFFECTS, Values, correct, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.equations import Array, Indices
-from rov_ident.sampling.raw_streams import Streams, measured_at, orientation_at
+from rov_ident.sampling.raw_streams import Streams, in_place, measured_at, orientation_at
 
 # Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
 # which the white noise is nothing, about a factor of three apart.
@@ -106,10 +104,9 @@ def _keys() -> tuple[Key, ...]:
 def comparisons(streams: Streams, config: Config, effects: Values) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
     keys = sensor_parameters()
-    if not streams.has_pose:  # nor has it one because it is corrected
-        streams = dataclasses.replace(streams, position=np.zeros_like(streams.position))
     as_read = streams.nu[:, :3]
-    streams = _in_place(streams, effects)
+    streams = in_place(streams, effects)
+    posed = streams.posed
     here, there, rate = _corrected_readings(streams, config, effects)
     r = quaternion_to_matrix(streams.orientation)
     inertial = _DeadReckoning(streams, config, there, rate) if has_imu(streams) else None
@@ -129,8 +126,8 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
     none = [np.zeros_like(here.linear)] * len(TIMING)
     if streams.has_pose:
         way, *ways = (integral(streams.t, rotated(r, m.linear)) for m in (here, *moved))
-        y, columns = streams.position - way, [-w for w in ways]
-        made.append(("pose", streams.t, y, [*columns, *none]))
+        y, *columns = (x[posed] for x in (streams.position - way, *(-w for w in ways), *none))
+        made.append(("pose", streams.t[posed], y, columns))
     if inertial is not None:
         down = inertial.rotation[:, 2]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
@@ -158,10 +155,11 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
                 ).velocity_at(at)
                 for by in (-_CLOCK, _CLOCK)
             )
-            clock = (early - late) / (2.0 * _CLOCK)
+            clock = posed[:, None] * (early - late) / (2.0 * _CLOCK)
         arms = none[:3]
         if streams.has_pose:
             turned_then = interpolated(streams.t, gyrating, at)
+            turned_then[~posed] = 0.0  # it takes a pose to tell
             arms = [-rotated(r_then, velocity_of_arm(turned_then, axis)) for axis in np.eye(3)]
         columns += [c[inside] for c in (*arms, clock)]
         made.append(("imu", t, y, columns))
@@ -194,18 +192,6 @@ def _corrected_readings(
     here = Reading(streams.nu[:, :3], streams.nu[:, 3:], gyro_at, nothing)
     there = Reading(np.zeros_like(gyro), rate, gyro, streams.specific_force @ mounting.T)
     return correct(here, effects), correct(there, effects), rate
-
-
-def _in_place(streams: Streams, effects: Values) -> Streams:
-    """The odometry with velocities of the time of its stamp (the last ones are held) and an
-    attitude against the world."""
-    delay, yaw = velocity_delay(effects), heading_error(effects)
-    nu, orientation = streams.nu.copy(), streams.orientation
-    if delay:
-        nu[:, :3] = interpolated(streams.t, streams.nu[:, :3], streams.t + delay)
-    if yaw:
-        orientation = quaternion_multiply(quaternion_from_euler(0.0, 0.0, -yaw), orientation)
-    return dataclasses.replace(streams, nu=nu, orientation=orientation)
 
 
 def _unit_change(reading: Reading, key: Key, t: Array, down: Array) -> Reading:
@@ -253,12 +239,13 @@ def _velocity(streams: Streams, r: Array, measured: Array, inertial: Array | Non
     t, width = streams.t, _STEADY if inertial is None else _DRIFT
     inertial = np.zeros_like(measured) if inertial is None else inertial
     in_world = rotated(r, measured)
-    order, step = int(streams.has_pose), float(np.median(np.diff(t)))
+    step = float(np.median(np.diff(t)))
     out = np.empty_like(measured)
     for piece in _pieces(t, width):
         own = inertial[piece] - inertial[piece][0]  # what it drifted by before is nothing here
+        order = int(streams.posed[piece].all())
         way = streams.position[piece] - integral(t[piece], own)
-        drifted = way if streams.has_pose else in_world[piece] - own
+        drifted = way if order else in_world[piece] - own
         even = t[piece][0] + step * np.arange(1 + round((t[piece][-1] - t[piece][0]) / step))
         rows = _smoothed(interpolated(t[piece], drifted, even), width / step, order)
         out[piece] = own + interpolated(even, rows / step**order, t[piece])
@@ -442,14 +429,6 @@ def common_squares(
     last = max(map(len, sums))
     out = np.stack([np.pad(s, ((0, last - len(s)), (0, 0))) for s in sums], axis=2)
     return out[out[:, -1].any(axis=1)]
-
-
-def corrected(streams: Streams, effects: Values) -> Streams:
-    """The streams as good sensors would have given them."""
-    streams = _in_place(streams, effects)
-    nothing = np.zeros_like(streams.nu[:, :3])
-    here = correct(Reading(streams.nu[:, :3], streams.nu[:, 3:], nothing, nothing), effects)
-    return dataclasses.replace(streams, nu=np.hstack([here.linear, here.angular]))
 
 
 def _shown_by_a_fit(

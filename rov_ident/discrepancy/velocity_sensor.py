@@ -35,7 +35,7 @@ def tests_of(streams: Streams, config: Config) -> list[Test]:
         return []
     power = max(float(np.sum(np.var(streams.nu[:, :3], axis=0))), 1e-12)
     scaled = _SCALED + 3.0 * config.odometry.linear_std**2 / power
-    alone = dataclasses.replace(streams, position=np.zeros_like(streams.position))
+    alone = dataclasses.replace(streams, posed=np.zeros_like(streams.posed))
     tests = []
     for name, sensors, harmless, told in (
         ("velocity_scale", streams, scaled, "reads wrong by a factor, unless a filter does"),

@@ -32,7 +32,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     wrenches,
 )
 from rov_ident.discrepancy.reading_noise import SMALL, draws
-from rov_ident.effects import EFFECTS, Values, compiled, steered
+from rov_ident.effects import EFFECTS, Values, compiled, rigid_body, steered
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import INERTIA, Array, Model, RigidBody
@@ -319,7 +319,7 @@ class WindowedProblem:
         after: Values,
     ) -> Array:  # fmt: skip
         """Change (K, 6) of the wrench where an effect has other parameters."""
-        now, moved = h.effects.get(effect.name) or h.nulls(effect.name), after[effect.name]
+        now = h.effects.get(effect.name) or h.nulls(effect.name)
         before = {**h.effects, effect.name: now}
         change: Array
         if effect.act is not None:
@@ -329,9 +329,9 @@ class WindowedProblem:
             made = [h.model.input_wrench(nu, self.driven(e).inputs) for e in (before, after)]
             change = made[1] - made[0]
         elif effect.body is not None:
-            base = h.model.body
-            there = effect.body(base, **{k: moved[k] - now[k] for k in now})
-            change = _of_body(there, motion, self.steps) - _of_body(base, motion, self.steps)
+            bodies = [rigid_body(h.config.model.body, e) for e in (before, after)]
+            was, there = (_of_body(body, motion, self.steps) for body in bodies)
+            change = there - was
         else:
             change = self._wrenches(h, after, motion) - self._wrenches(h, before, motion)
         return change

@@ -6,7 +6,7 @@ contradicts another shows only before that.
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,19 @@ from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.core.frames import quaternion_multiply, quaternion_to_matrix, rotated, to_core
+from rov_ident.core.frames import (
+    quaternion_from_euler,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    rotated,
+    to_core,
+    velocity_of_arm,
+)
+from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
 from rov_ident.core.noise import robust_std, second_differences
+from rov_ident.effects import Values, correct, heading_error, velocity_delay
+from rov_ident.effects.base import Reading
 from rov_ident.model.coefficients import AXES, INPUTS, VELOCITIES
 from rov_ident.model.scales import authority
 from rov_ident.sampling.acting_wrench import holds_moment
@@ -43,9 +53,15 @@ class Streams:
     IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
     wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; dropped ones are estimated.
     fins and shafts: ``inputs_t`` (I,), inputs (I, 4) of INPUTS, straight from each to the next.
-    ``has_pose`` tells whether the positions say anything beside the velocities; ``notes`` say what
-    was left out. ``rates_std`` (3,) [rad/s]: a bias of the angular velocities is none beyond that.
-    ``max_step`` [s]: no longer may a simulation's be, for drag to stop no motion within it.
+    ``notes`` say what was left out. ``rates_std`` (3,) [rad/s]: a bias of the angular velocities is
+    none beyond that. ``max_step`` [s]: no longer may a simulation's be, for drag to stop no motion
+    within it.
+
+    What only a record as it was read tells (:func:`inspected`): ``posed`` (N,), where positions say
+    anything beside the velocities; ``is_reckoned``, whether they are the sum of these;
+    ``unmeasured`` (6,), velocities that never change, as a record in the plane holds zeros for the
+    rest; ``is_turned``, whether it is known what turns the vehicle: the wrench holds a moment, or
+    fins move.
     """
 
     t: Array
@@ -62,35 +78,15 @@ class Streams:
     notes: tuple[str, ...] = ()
     rates_std: Array = field(default_factory=lambda: np.zeros(3))
     max_step: float = MAX_STEP
+    posed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    is_reckoned: bool = False
+    unmeasured: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
+    is_turned: bool = True
 
     @property
     def has_pose(self) -> bool:
-        moved = bool(np.ptp(self.position, axis=0).max() > 0.0)
-        return moved and not self.is_reckoned and not self.is_held
-
-    @property
-    def is_held(self) -> bool:
-        """Whether the horizontal position is that of a slower sensor, such as an acoustic fix, and
-        held in between: most messages repeat it, while the vehicle moves on by more than a grid to
-        which positions are rounded. Held, it says that the vehicle rests."""
-        step = np.abs(np.diff(self.position[:, :2], axis=0))
-        fixed = np.flatnonzero(step.any(axis=1))
-        if not 1 < len(fixed) < 0.5 * len(step):
-            return False
-        way = np.append(0.0, np.cumsum(np.hypot(*self.nu[1:, :2].T) * np.diff(self.t)))
-        return bool(np.median(np.diff(way[fixed])) > 3.0 * step[step > 0.0].min())
-
-    @property
-    def is_reckoned(self) -> bool:
-        """Whether the position is dead reckoning, the sum of the velocities along the attitude with
-        their noise: it agrees with them whatever is wrong. Depth may still be measured."""
-        v = rotated(quaternion_to_matrix(self.orientation), self.nu[:, :3])[:, :2]
-        dt = np.diff(self.t)[:, None]
-        step = np.diff(self.position[:, :2], axis=0)
-        noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(dt)
-        rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
-        left = [np.median(np.abs(step - dt * rule), axis=0) for rule in rules]
-        return bool((np.min(left, axis=0) < _RECKONED * noise).all())
+        """Whether any position is ``posed``."""
+        return bool(self.posed.any())
 
     @property
     def guided(self) -> NDArray[np.bool_]:
@@ -100,17 +96,6 @@ class Streams:
         """
         unknown: NDArray[np.bool_] = np.repeat([False, not self.is_turned], 3)
         return unknown | self.unmeasured
-
-    @property
-    def is_turned(self) -> bool:
-        """Whether it is known what turns the vehicle: the wrench holds a moment, or fins move."""
-        return bool(holds_moment(np.abs(self.demand).max(axis=0)) or self.inputs[:, :3].any())
-
-    @property
-    def unmeasured(self) -> NDArray[np.bool_]:
-        """Velocities (6,) that never change: a record in the plane holds zeros for the rest."""
-        never: NDArray[np.bool_] = np.nanmax(self.nu, axis=0) == np.nanmin(self.nu, axis=0)
-        return never
 
     @property
     def duration(self) -> float:
@@ -127,7 +112,8 @@ class Streams:
 
 
 def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
-    """Arrays from messages as they are on the wire; what cannot be used is left out.
+    """Arrays from messages as they are on the wire; what cannot be used is left out, and what the
+    configuration says of the sensors is taken off.
 
     Raises UserError if odometry or wrench are missing.
     """
@@ -140,7 +126,7 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
             raise UserError(f"the bag holds no usable {name} messages")
     measured = np.array([measured_values(m) for _, m in imu]).reshape(-1, 6)
     nu = np.array([np.concatenate([m.linear, m.angular]) for _, m in odometry])
-    return Streams(
+    read = Streams(
         np.array([t for t, _ in odometry]),
         np.array([m.position for _, m in odometry]),
         _continuous(np.array([m.orientation for _, m in odometry])),
@@ -155,6 +141,81 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
         tuple(f"left out: {reason}" for reason in describe(counts)),
         max_step=_max_step(config, nu),
     )
+    return _as_configured(inspected(read), config)
+
+
+def inspected(read: Streams) -> Streams:
+    """The streams of one record with what they tell as they were read."""
+    moved = bool(np.ptp(read.position, axis=0).max() > 0.0)
+    reckoned = moved and _is_reckoned(read)
+    moments = np.abs(read.demand).max(axis=0)
+    return replace(
+        read,
+        posed=np.full(len(read.t), moved and not reckoned and not _is_held(read)),
+        is_reckoned=reckoned,
+        unmeasured=np.nanmax(read.nu, axis=0) == np.nanmin(read.nu, axis=0),
+        is_turned=bool(holds_moment(moments) or read.inputs[:, :3].any()),
+    )
+
+
+def _is_held(read: Streams) -> bool:
+    """Whether the horizontal position is that of a slower sensor, such as an acoustic fix, and
+    held in between: most messages repeat it, while the vehicle moves on by more than a grid to
+    which positions are rounded. Held, it says that the vehicle rests."""
+    step = np.abs(np.diff(read.position[:, :2], axis=0))
+    fixed = np.flatnonzero(step.any(axis=1))
+    if not 1 < len(fixed) < 0.5 * len(step):
+        return False
+    way = np.append(0.0, np.cumsum(np.hypot(*read.nu[1:, :2].T) * np.diff(read.t)))
+    return bool(np.median(np.diff(way[fixed])) > 3.0 * step[step > 0.0].min())
+
+
+def _is_reckoned(read: Streams) -> bool:
+    """Whether the position is dead reckoning, the sum of the velocities along the attitude with
+    their noise: it agrees with them whatever is wrong. Depth may still be measured."""
+    if len(read.t) < 3:
+        return False
+    v = rotated(quaternion_to_matrix(read.orientation), read.nu[:, :3])[:, :2]
+    dt = np.diff(read.t)[:, None]
+    step = np.diff(read.position[:, :2], axis=0)
+    noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(dt)
+    rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
+    left = [np.median(np.abs(step - dt * rule), axis=0) for rule in rules]
+    return bool((np.min(left, axis=0) < _RECKONED * noise).all())
+
+
+def _as_configured(read: Streams, config: Config) -> Streams:
+    """The streams with what the configuration says of the sensors taken off, as the estimators take
+    it off samples: what is found of sensors is beside that."""
+    body, none = config.imu.to_body, np.zeros_like(read.gyro)
+    imu = Reading(none, none, read.gyro @ body.T, read.specific_force @ body.T)
+    imu = correct(imu, config.effects)
+    out = corrected(read, config.effects)
+    nu = out.nu.copy()
+    nu[:, :3] -= velocity_of_arm(nu[:, 3:], config.odometry.position)
+    nu = np.where(read.unmeasured, read.nu, nu)
+    return replace(out, nu=nu, gyro=imu.gyro @ body, specific_force=imu.specific_force @ body)
+
+
+def corrected(streams: Streams, effects: Values) -> Streams:
+    """The streams as good sensors would have given them; velocities that were not measured stay."""
+    there = in_place(streams, effects)
+    nothing = np.zeros_like(there.nu[:, :3])
+    here = correct(Reading(there.nu[:, :3], there.nu[:, 3:], nothing, nothing), effects)
+    nu = np.where(streams.unmeasured, streams.nu, np.hstack([here.linear, here.angular]))
+    return replace(there, nu=nu)
+
+
+def in_place(streams: Streams, effects: Values) -> Streams:
+    """The odometry with velocities of the time of its stamp (the last ones are held) and an
+    attitude against the world."""
+    delay, yaw = velocity_delay(effects), heading_error(effects)
+    nu, orientation = streams.nu.copy(), streams.orientation
+    if delay:
+        nu[:, :3] = interpolated(streams.t, streams.nu[:, :3], streams.t + delay)
+    if yaw:
+        orientation = quaternion_multiply(quaternion_from_euler(0.0, 0.0, -yaw), orientation)
+    return replace(streams, nu=nu, orientation=orientation)
 
 
 def _max_step(config: Config, nu: Array) -> float:
@@ -182,10 +243,15 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
         "notes": tuple(note for bag in bags for note in bag.notes),
         "rates_std": np.max([bag.rates_std for bag in bags], axis=0),
         "max_step": min(bag.max_step for bag in bags),
+        "is_reckoned": any(bag.is_reckoned for bag in bags),
+        "unmeasured": np.any([bag.unmeasured for bag in bags], axis=0),
+        "is_turned": all(bag.is_turned for bag in bags),
     }
     for name in (f.name for f in fields(Streams) if f.name not in both):
-        shifts = begins if name.endswith("_t") or name == "t" else [0.0] * len(bags)
-        both[name] = np.concatenate([getattr(b, name) + s for b, s in zip(bags, shifts)])
+        each = [getattr(bag, name) for bag in bags]
+        if name == "t" or name.endswith("_t"):
+            each = [t + begin for t, begin in zip(each, begins, strict=True)]
+        both[name] = np.concatenate(each)
     return Streams(**both), begins
 
 
