@@ -162,7 +162,7 @@ def test_rotation_is_as_measured_where_no_moment_is_known():
     case = draw(3, ("quadratic_damping",), STRENGTH, conditions=PLACES["a minute"])
     streams = streams_of(case)
     streams.demand[:, 3:] = 0.0
-    findings = explain([streams], case.config).findings
+    findings = explain([inspected(streams)], case.config).findings
     assert any("never holds a moment" in note for note in findings.notes)
     for rmse in (findings.retuned, findings.extended):
         assert math.isfinite(rmse["u"]) and all(math.isnan(rmse[c]) for c in "pqr")

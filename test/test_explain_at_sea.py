@@ -435,7 +435,7 @@ def test_a_pause_of_one_sensor_is_no_bias_of_the_other(seed):
     draw = np.random.default_rng(seed)
     begins, lasts = draw.uniform(10.0, 80.0, 4), draw.uniform(1.0, 7.0, 4)
     for clock, *others in (
-        ("t", "position", "orientation", "nu"),
+        ("t", "position", "orientation", "nu", "posed"),
         ("imu_t", "gyro", "specific_force"),
     ):
         t = getattr(streams, clock)

@@ -249,6 +249,20 @@ def test_a_delay_of_one_record_is_not_averaged():
     assert none == [] and same[0] is bags[1]
 
 
+def test_delays_apart_by_less_than_a_reading_are_the_same(monkeypatch):
+    """Within an interval of the IMU nothing is known of how velocities went on."""
+    imu = Suite(odometry_rate=10.0, imu_rate=50.0)
+    bags = [record(seed, 20.0, imu) for seed in (1, 2)]
+    for apart, said in ((0.01, False), (0.06, True)):
+        delays = [0.0, 0.0, apart, apart]  # each is looked for, and then fitted
+
+        def search(*_, of=delays):
+            return {"velocity_latency": {"delay": of.pop(0)}}, {("velocity_latency", "delay"): 1e-4}
+
+        monkeypatch.setattr(sensor_consistency, "search", search)
+        assert bool(repetition.in_time(bags, TODAY)[1]) == said
+
+
 def test_where_one_record_ends_and_the_next_begins_the_sensors_show_nothing():
     """The position begins anew there: taken for a velocity it made a delay of milliseconds, and
     standard deviations a fifth as large as those of the records together."""

@@ -177,7 +177,10 @@ def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], lis
         found, _ = sensor_consistency.search(bag, config, spans)
         names = [*(n for n in found if n != LATENCY), LATENCY]
         found, std = sensor_consistency.search(bag, config, spans, names)
-        late.append(Value(found[LATENCY]["delay"], std[LATENCY, "delay"], "s"))
+        # of two readings nobody knows when between them a velocity was what it is
+        interval = float(np.median(np.diff(bag.imu_t if len(bag.imu_t) > 1 else bag.t)))
+        own = float(np.hypot(std[LATENCY, "delay"], interval / np.sqrt(12.0)))
+        late.append(Value(found[LATENCY]["delay"], own, "s"))
     if _agree(late):
         return list(bags), []
     off = [{LATENCY: {"delay": v.value}} for v in late]
