@@ -10,7 +10,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, to_core
 from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Odometry, Wrench
-from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_reader import SUFFIXES, Bag
 from rov_ident.io.csv_table import CsvTable, read_csv
 from rov_ident.io.topics import POSE, USUAL, messages, select
 
@@ -103,14 +103,14 @@ class Zigzag:
 
 
 def read(path: Path, config: Config | None = None) -> Zigzag:
-    """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
+    """A run from a bag (a file or a rosbag2 directory) or else a CSV file.
 
     ``config`` says which types and axes a bag has that are not the usual ones.
 
     Raises UserError if it cannot be read, lacks a column or topic, or is in other units than it
     says.
     """
-    is_bag = path.is_dir() or path.suffix == ".mcap"
+    is_bag = path.is_dir() or path.suffix in SUFFIXES
     return from_bag(path, config) if is_bag else from_csv(path)
 
 
@@ -205,12 +205,17 @@ def from_bag(path: Path, config: Config | None = None) -> Zigzag:
     (t, heading), (at, steering) = (np.array(rows[k]).reshape(-1, 2).T for k in (ODOMETRY, WRENCH))
     t, first = np.unique(t, return_index=True)
     at, once = np.unique(at, return_index=True)
-    if len(t) < 2 or len(at) < 1:
-        raise UserError(f"{path} has too few messages of heading or rudder: record a longer run")
     heading = np.unwrap(heading[first])
+    known_rudder = t >= at.min(initial=np.inf)  # before, nobody knows the rudder
+    t, heading = t[known_rudder], heading[known_rudder]
+    if len(t) < 2:
+        raise UserError(
+            f"{path} has too few headings after the first message of the rudder: record a longer "
+            "run, and stamp both by one clock"
+        )
     # Heading and input on the instants of either, so that a step of the input keeps its time.
     both = np.unique(np.concatenate([t, at[(at > t[0]) & (at < t[-1])]]))
-    index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)
+    index = np.searchsorted(at, both, side="right") - 1
     known = np.full(len(both), np.nan)
     known[np.searchsorted(both, t)] = heading
     return Zigzag(
