@@ -570,6 +570,26 @@ def test_headings_before_the_first_message_of_the_rudder_tell_nothing(short, tmp
         read(as_mcap(tmp_path / "early.mcap", early))
 
 
+def test_what_holds_between_the_messages_of_a_rudder_is_asked(tmp_path):
+    """Counted as held, T is at least half a step of 0.2 s too short."""
+    fine = simulated(0.5, 4.0, 0.1, noise=0.0035)
+    path = as_mcap(tmp_path / "a.mcap", recorded(every(fine, 0.2)))
+    measured = nomoto.fit([read(path, measured=True)])
+    assert abs(measured.value("T") - 4.0) < 3.0 * measured.std[measured.names.index("T")]
+    assert not any("--measured" in note for note in measured.notes)
+    held = nomoto.fit([read(path)])
+    assert held.value("T") < 3.9
+    assert any("give --measured" in note for note in held.notes)
+
+
+def test_doubts_about_a_bag_are_said(short, tmp_path, capsys):
+    rows = [*recorded(short)]
+    rows += [("/truth", *row[1:]) for row in rows if row[0] == "/odom"]
+    path = as_mcap(tmp_path / "two.mcap", rows)
+    assert main(["nomoto", str(path), "--order", "1"]) == 0
+    assert "topics.odom chooses another of its type: /truth" in capsys.readouterr().err
+
+
 def test_bag_of_other_types(short, tmp_path):
     """The configuration says the types, as to the other commands."""
     zeros = np.zeros(3)

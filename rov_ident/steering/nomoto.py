@@ -75,7 +75,7 @@ def fit(
     errors = [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
     measured = np.concatenate(errors)
     notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted, nonlinear)]
-    notes += _doubtful_times(model, runs)
+    notes += [*_doubtful_times(model, runs), *(note for run in runs for note in run.notes)]
     return dataclasses.replace(
         model,
         rmse=rmse(measured),
