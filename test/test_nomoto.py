@@ -590,6 +590,21 @@ def test_doubts_about_a_bag_are_said(short, tmp_path, capsys):
     assert "topics.odom chooses another of its type: /truth" in capsys.readouterr().err
 
 
+def test_a_run_with_a_pause_counts_as_two():
+    """Rows lost while the zigzag goes on. Simulated through, they made a K of -0.02."""
+    whole = every(simulated(0.5, 4.0, 0.35, duration=80.0, noise=0.0035), 0.2)
+    lost = (whole.t > 25.0) & (whole.t < 45.0)
+    model = nomoto.fit([whole[~lost]])
+    assert abs(model.value("K") - 0.5) < 0.005 and abs(model.value("T") - 4.0) < 0.05
+    assert any("pauses" in note for note in model.notes)
+    assert nomoto_model.predict(model, whole[~lost])[1] == pytest.approx(0.0035, rel=0.2)
+    few = (whole.t > 2.0) & (whole.t < 77.0)  # no 20 headings on either side
+    with pytest.raises(UserError, match="record it without pauses"):
+        nomoto.fit([whole[~few]])
+    rare = replace(whole, t=100.0 * whole.t)  # of a ship; no pause
+    assert rare.parts == [slice(0, len(rare.t))]
+
+
 def test_bag_of_other_types(short, tmp_path):
     """The configuration says the types, as to the other commands."""
     zeros = np.zeros(3)

@@ -1,6 +1,7 @@
 """Records of steering: heading and rudder over time, from a CSV file or a bag."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ from rov_ident.io.bag_reader import SUFFIXES, Bag
 from rov_ident.io.csv_table import CsvTable, read_csv
 from rov_ident.io.topics import POSE, USUAL, doubts, messages, select
 
+FEWEST = 20  # headings of a run: three for each of six parameters, and the first state
+GAP = 3.0  # s without a sample, after which the motion before is unknown
+_GAP_ROWS = 3.0  # of the usual distance: rows of a ship may be further apart than that
 _RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
 _TURNED = 2.5 * np.pi  # a heading beyond it counts turns, or is in degrees
@@ -47,6 +51,33 @@ class Zigzag:
     def step(self) -> float:
         """Median time between two headings [s]."""
         return float(np.median(np.diff(self.t[self.known])))
+
+    @property
+    def parts(self) -> list[slice]:
+        """The rows between pauses, in which nobody knows what the rudder did: those with enough
+        headings, which move on from a first state of their own.
+
+        Raises UserError if there is none.
+        """
+        apart = np.diff(self.t)
+        pauses = np.flatnonzero(apart > max(GAP, _GAP_ROWS * float(np.median(apart)))) + 1
+        if not len(pauses):
+            return [slice(0, len(self.t))]
+        ends = [0, *pauses.tolist(), len(self.t)]
+        found = [
+            slice(*rows) for rows in pairwise(ends) if self.known[slice(*rows)].sum() >= FEWEST
+        ]
+        if not found:
+            raise UserError(
+                f"{self.name} pauses so often that no {FEWEST} headings follow on each other: "
+                "record it without pauses"
+            )
+        return found
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_]) -> "Zigzag":
+        """These rows as a run."""
+        t, heading, rudder = self.t[rows], self.heading[rows], self.rudder[rows]
+        return replace(self, t=t, heading=heading, rudder=rudder)
 
     @property
     def reversals(self) -> NDArray[np.intp]:
@@ -215,10 +246,9 @@ def from_bag(path: Path, config: Config | None = None, measured: bool = False) -
     steering = steering[once]
     measured = measured and bool(steered)
     # Nobody knows the rudder before its first message, nor a measured angle after its last one.
-    steered_by = (t >= at.min(initial=np.inf)) & (
-        t <= (at.max(initial=0.0) if measured else np.inf)
-    )
-    t, heading = t[steered_by], heading[steered_by]
+    end = at.max(initial=-np.inf) if measured else np.inf
+    inside = (t >= at.min(initial=np.inf)) & (t <= end)
+    t, heading = t[inside], heading[inside]
     if len(t) < 2:
         raise UserError(
             f"{path} has too few headings after the first message of the rudder: record a longer "
