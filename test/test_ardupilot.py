@@ -212,6 +212,17 @@ def test_a_telemetry_log(tmp_path, dive, offset):
     assert np.all(np.abs(found.values - reference.values) < 0.3 * reference.std)
 
 
+def test_rates_are_those_that_come_more_often(tmp_path, dive):
+    """By default, RAW_IMU comes at 2 Hz, ATTITUDE with its rates at 10 Hz."""
+    slow = [row for k, row in enumerate(dive) if row[1] != IMU or k % 50 == 0]
+    path = telemetry(tmp_path / "slow.tlog", slow)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    rates = [m.angular for _, role, m in dive if role == ODOMETRY]
+    found = [m.angular for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    assert report.odometry == len(rates)
+    np.testing.assert_allclose(found, rates, atol=1e-6)
+
+
 def test_the_command(tmp_path, dive, capsys):
     config.dump(configured(**GEOMETRY), tmp_path / "c.yaml")
     path = str(dataflash(tmp_path / "log.BIN", rows_of(dive)))

@@ -2,7 +2,8 @@
 (`.tlog`) here, PX4's (`.ulg`) in `px4_log`.
 
 Velocity and position are the EKF's (`XKF1`, `LOCAL_POSITION_NED`), the attitude is its quaternion
-or what the autopilot reports, rates and specific force are the first IMU's. The pulses to the
+or what the autopilot reports, rates and specific force are the first IMU's; but the rates are those
+of `ATTITUDE` where these come more often. The pulses to the
 thrusters (`RCOU`, `SERVO_OUTPUT_RAW`) become a wrench by the configuration's `thrusters`, at the
 battery's measured voltage. Axes are forward-starboard-down and north-east-down, stamps count from
 the autopilot's start, plus a second. Attitude and rates are interpolated to the velocity's times.
@@ -110,7 +111,7 @@ class Log:
         self.motion = _Track()  # velocity 3 [m/s], position 3 [m], NED
         self.attitude = _Track()  # w x y z
         self.angles = _Track()  # roll, pitch, yaw [rad]: where there is no quaternion
-        self.rates = _Track()  # body [rad/s]: where there is no IMU
+        self.rates = _Track()  # body [rad/s], beside the attitude
         self.imu = _Track()  # gyro 3 [rad/s], specific force 3 [m/s2], body
         self.outputs = _Track()  # pulses [us]
         self.voltage = _Track()  # V
@@ -132,6 +133,11 @@ class Log:
         """Whether the vehicle is, at t [us]; so it is taken to be where the log does not say."""
         i = bisect_right(self.armed.t, t) - 1
         return i < 0 or bool(self.armed.rows[i][0])
+
+    @property
+    def denser_rates(self) -> _Track:
+        """Rates (the first three numbers): the IMU's or those beside the attitude, if more."""
+        return max(self.imu, self.rates, key=len)
 
     @property
     def battery(self) -> list[float]:
@@ -194,7 +200,7 @@ def import_log(
         ("motion", log.motion),
         ("outputs", log.outputs),
         ("attitude", log.attitude or log.angles),
-        ("rates", log.imu if len(log.imu) >= 2 else log.rates),
+        ("rates", log.denser_rates),
     ):
         if len(track) < 2:
             raise UserError(f"{path} holds no {log.words[name]}: {log.words['advice']}")
@@ -311,7 +317,7 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
     else:
         times, quaternions = log.angles.t, quaternion_from_euler(*np.array(log.angles.rows).T)
         notes.append("no quaternion of the EKF: the attitude is the autopilot's angles")
-    rates = log.imu if len(log.imu) >= 2 else log.rates
+    rates = log.denser_rates
     rate_t, rate = np.array(rates.t, dtype=float), np.array(rates.rows)[:, :3]
     lost = 0
     for t, row in zip(log.motion.t, log.motion.rows, strict=True):
