@@ -223,6 +223,17 @@ def test_rates_are_those_that_come_more_often(tmp_path, dive):
     np.testing.assert_allclose(found, rates, atol=1e-6)
 
 
+def test_no_rates_are_made_up_in_a_pause_of_the_imu(tmp_path, dive):
+    """Half a second and more: as of the attitude."""
+    paused = [row for row in rows_of(dive) if not (row[0] == 3 and 4_000_000 < row[1] < 6_000_000)]
+    path = dataflash(tmp_path / "log.bin", paused)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    stamps = [m.stamp for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    assert not any(5_000_000_000 < stamp < 7_000_000_000 for stamp in stamps)
+    lost = sum(role == ODOMETRY for _, role, _ in dive) - len(stamps)
+    assert f"{lost} velocities without attitude or rates around them" in report.notes[-1]
+
+
 def test_the_command(tmp_path, dive, capsys):
     config.dump(configured(**GEOMETRY), tmp_path / "c.yaml")
     path = str(dataflash(tmp_path / "log.BIN", rows_of(dive)))

@@ -55,7 +55,7 @@ _MAGIC = b"\xa3\x95"  # of every record of a dataflash log
 _START = 1_000_000  # us
 _END = LAST_STAMP // 1000 - _START  # us; a stamp holds no more
 _WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
-_LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
+_LONGEST_GAP = 500_000  # us; attitudes and rates further apart are not interpolated
 LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
 _OUTPUTS = 16  # of SERVO_OUTPUT_RAW and RCOU
 _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
@@ -208,7 +208,7 @@ def import_log(
     with np.errstate(all="ignore"):  # a quaternion of zeros: left out below
         odometry = list(_odometry(log, notes))
     if not odometry:
-        raise UserError(f"{path} has no attitude at the times of its velocity: log both")
+        raise UserError(f"{path} has no attitude and rates around its velocity: log all three")
     messages += odometry
     if len(log.armed):
         driven = [row for row in messages if log.is_armed(row[0] // 1000 - _START)]
@@ -322,7 +322,7 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
     lost = 0
     for t, row in zip(log.motion.t, log.motion.rows, strict=True):
         attitude = _attitude_at(t, times, quaternions)
-        if attitude is None or not rate_t[0] <= t <= rate_t[-1]:
+        if attitude is None or _in_gap(t, rates.t):
             lost += 1
             continue
         linear = quaternion_to_matrix(attitude).T @ np.array(row[:3])
@@ -335,12 +335,20 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
         notes.append(f"{lost} velocities without attitude or rates around them are left out")
 
 
-def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
+def _in_gap(t: int, times: list[int]) -> bool:
+    """Whether nothing is known at t [us], as the times around it are too far apart."""
     i = bisect_right(times, t)
     if i and times[i - 1] == t:
-        return quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
-    if i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP:
+        return False
+    return i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP
+
+
+def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
+    if _in_gap(t, times):
         return None
+    i = bisect_right(times, t)
+    if times[i - 1] == t:
+        return quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
     share = (t - times[i - 1]) / (times[i] - times[i - 1])
     between = quaternion_between(quaternions[i - 1], quaternions[i], share)
     return between / np.linalg.norm(between)
