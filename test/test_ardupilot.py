@@ -267,6 +267,36 @@ def test_what_is_missing_is_named(tmp_path, dive):
     assert report.notes[0] == "no voltage of the battery: taken as 16 V (thrusters.voltage)"
 
 
+@pytest.mark.parametrize("odd", [9.5, 18.5])
+def test_one_voltage_that_no_battery_has(tmp_path, dive, odd):
+    """The one before goes on; a battery that always has it needs another curve."""
+    rows, settings = list(rows_of(dive)), configured(**GEOMETRY)
+    rows.insert(1000, (5, rows[1000][1], 0, odd, odd))
+    report = import_log(dataflash(tmp_path / "l.bin", rows), tmp_path / "odd.mcap", settings)
+    assert report.notes == (
+        f"battery from {VOLTAGE} to {VOLTAGE} V, as measured",
+        "the T200 has no curve for 1 of the voltages: the one before is taken",
+    )
+    import_log(dataflash(tmp_path / "l.bin", rows_of(dive)), tmp_path / "o.mcap", settings)
+    wrenches = [
+        [m for role, m in messages_in(tmp_path / name) if role == WRENCH]
+        for name in ("odd.mcap", "o.mcap")
+    ]
+    np.testing.assert_equal(*wrenches)
+    always = [*rows[:1], *((5, t, 0, odd, odd) for t in range(1, 5)), *rows[1:]]
+    with pytest.raises(UserError, match=f"or the battery of a log, is {odd} V, but the curve"):
+        import_log(dataflash(tmp_path / "l.bin", always), tmp_path / "x.mcap", settings)
+
+
+def test_the_battery_that_is_measured(tmp_path, dive):
+    """The first instance may be a monitor to which nothing is connected."""
+    rows = [(*r[:3], *2 * [0.0 if r[2] == 0 else 14.0]) if r[0] == 5 else r for r in rows_of(dive)]
+    report = import_log(
+        dataflash(tmp_path / "log.bin", rows), tmp_path / "log.mcap", configured(**GEOMETRY)
+    )
+    assert report.notes == ("battery from 14.0 to 14.0 V, as measured",)
+
+
 @pytest.mark.parametrize("name", ["log.bin", "log.tlog", "log.log"])
 @pytest.mark.parametrize("data", [b"", b"\xa3\x95\x80", b"nothing of the kind" * 99, bytes(4000)])
 def test_what_is_no_log_is_refused(tmp_path, capfd, name, data):

@@ -20,7 +20,7 @@ import itertools
 import os
 import sys
 from bisect import bisect_right
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,7 +46,7 @@ from rov_ident.core.messages import (
     fault,
 )
 from rov_ident.io.write_messages import write_messages
-from rov_ident.model.thruster_allocation import PWM, Allocator, check, matrix
+from rov_ident.model.thruster_allocation import PWM, Allocator, check, knows, matrix
 
 SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
 
@@ -204,7 +204,7 @@ def import_log(
     ):
         if len(track) < 2:
             raise UserError(f"{path} holds no {log.words[name]}: {log.words['advice']}")
-    messages = [*_wrenches(log, allocator, config.thrusters.voltage, notes), *_inertial(log)]
+    messages = [*_wrenches(log, allocator, config.thrusters, notes), *_inertial(log)]
     with np.errstate(all="ignore"):  # a quaternion of zeros: left out below
         odometry = list(_odometry(log, notes))
     if not odometry:
@@ -284,18 +284,24 @@ def _ns(t: int) -> int:
     return 1000 * (t + _START)
 
 
-def _wrenches(log: Log, allocator: Allocator, usual: float, notes: list[str]) -> list[_Row]:
-    """The wrench of every change of the outputs, at the voltage last measured before it."""
-    volts, good = [row[0] for row in log.voltage.rows], log.battery
-    known = bool(good)
+def _wrenches(log: Log, allocator: Allocator, given: Thrusters, notes: list[str]) -> list[_Row]:
+    """The wrench of every change of the outputs, at the voltage last measured before it for which
+    the T200 has a curve."""
+    measured = [(t, v) for t, (v,) in zip(log.voltage.t, log.voltage.rows) if v >= LEAST_VOLTAGE]
+    known = [row for row in measured if knows(row[1])]
+    if 2 * len(known) < len(measured):  # another battery: the allocator refuses it
+        known = measured
     if known:
-        notes.append(f"battery from {min(good):.1f} to {max(good):.1f} V, as measured")
+        volts = [v for _, v in known]
+        notes.append(f"battery from {min(volts):.1f} to {max(volts):.1f} V, as measured")
     else:
-        notes.append(f"no voltage of the battery: taken as {usual:g} V (thrusters.voltage)")
+        notes.append(f"no voltage of the battery: taken as {given.voltage:g} V (thrusters.voltage)")
+    if (odd := len(measured) - len(known)) and not given.curve_pwm:
+        notes.append(f"the T200 has no curve for {odd} of the voltages: the one before is taken")
+    times = [t for t, _ in known]
     rows: list[_Row] = []
     for t, pulses in zip(log.outputs.t, log.outputs.rows, strict=True):
-        i = max(bisect_right(log.voltage.t, t) - 1, 0) if known else 0
-        voltage = volts[i] if known and volts[i] >= LEAST_VOLTAGE else usual
+        voltage = known[max(bisect_right(times, t) - 1, 0)][1] if known else given.voltage
         try:
             tau = allocator.wrench(pulses, voltage)
         except ValueError as error:
@@ -418,6 +424,7 @@ def _messages_of(reader: Any, kinds: list[str], progress: Callable[[float], None
 def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
     kinds = ["XKF1", "NKF1", "XKQ", "XKQ1", "NKQ", "NKQ1", "ATT", "IMU", "RCOU", "BAT", "CURR"]
     kinds += ["PARM", "ARM", "EV"]
+    batteries: defaultdict[tuple[str, int], _Track] = defaultdict(_Track)
     for m in _messages_of(reader, kinds, progress):
         kind, t = m.get_type(), int(m.TimeUS)
         if kind == "PARM":
@@ -430,8 +437,13 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
                     log.armed.add(0, float(not state))  # it is the change that is logged
                 log.armed.add(t, float(state))
             continue
-        # Several EKF cores, IMUs and batteries log under one name: the first counts.
-        if any(getattr(m, name, 0) for name in ("C", "I", "Inst", "Instance")):
+        # Several EKF cores, IMUs and batteries log under one name: the first counts, of batteries
+        # the first that is measured.
+        number = max(int(getattr(m, name, 0)) for name in ("C", "I", "Inst", "Instance"))
+        if kind in ("BAT", "CURR"):
+            batteries[kind, number].add(t, float(m.Volt))
+            continue
+        if number:
             continue
         if kind in ("XKF1", "NKF1"):
             log.motion.add(t, m.VN, m.VE, m.VD, m.PN, m.PE, m.PD)
@@ -444,8 +456,9 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
         elif kind == "RCOU":
             names = [n for n in m.get_fieldnames() if n.lower().startswith("c") and n[-1].isdigit()]
             log.outputs.add(t, *(float(getattr(m, name)) for name in names))
-        else:
-            log.voltage.add(t, float(m.Volt))
+    for _, battery in sorted(batteries.items()):
+        if not log.battery:
+            log.voltage = battery
 
 
 def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
