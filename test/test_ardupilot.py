@@ -32,21 +32,21 @@ SIZES = {**dict(zip("BbHhIifdQq", "BbHhIifdQq", strict=True)), "c": "h", "C": "H
          "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
 
 
-def structure(kind):
-    return struct.Struct("<" + "".join(SIZES[c] for c in FORMATS[kind][1]))
+def structure(kind, kinds=FORMATS):
+    return struct.Struct("<" + "".join(SIZES[c] for c in kinds[kind][1]))
 
 
-def record(kind, *values):
-    return bytes([0xA3, 0x95, kind]) + structure(kind).pack(*values)
+def record(kind, *values, kinds=FORMATS):
+    return bytes([0xA3, 0x95, kind]) + structure(kind, kinds).pack(*values)
 
 
 def dataflash(path, rows, kinds=FORMATS):
     """A log of (type, *values); the formats of ``kinds`` are declared first."""
     head = [
-        record(128, kind, 3 + structure(kind).size, *(text.encode() for text in FORMATS[kind]))
+        record(128, kind, 3 + structure(kind, kinds).size, *(text.encode() for text in kinds[kind]))
         for kind in kinds
     ]
-    path.write_bytes(b"".join(head + [record(*row) for row in rows]))
+    path.write_bytes(b"".join(head + [record(*row, kinds=kinds) for row in rows]))
     return path
 
 
@@ -265,6 +265,26 @@ def test_what_is_missing_is_named(tmp_path, dive):
     unmeasured = dataflash(tmp_path / "log.bin", [row for row in rows if row[0] != 5])
     report = import_log(unmeasured, tmp_path / "out.mcap", settings)
     assert report.notes[0] == "no voltage of the battery: taken as 16 V (thrusters.voltage)"
+
+
+@pytest.mark.parametrize(("flown_by", "speed"), [(None, 1.0), (3.0, 1.0), (2.0, 2.0)])
+def test_two_filters_side_by_side(tmp_path, dive, flown_by, speed):
+    """EKF2 here says twice the velocity of EKF3; the parameter tells which one flies."""
+    formats = {**FORMATS, 7: ("NKF1", *FORMATS[1][1:]), 8: ("PARM", "QNf", "TimeUS,Name,Value")}
+    rows = []
+    for row in rows_of(dive):
+        rows.append(row)
+        if row[0] == 1 and row[2] == 0:
+            rows.append((7, row[1] + 50, *row[2:6], *(2.0 * v for v in row[6:9]), *row[9:]))
+    if flown_by:
+        rows.append((8, 1, b"AHRS_EKF_TYPE", flown_by))
+    path = dataflash(tmp_path / "log.bin", rows, formats)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    true = [np.linalg.norm(m.linear) for _, role, m in dive if role == ODOMETRY]
+    odometry = [m for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    assert report.odometry == len(odometry) >= len(true) - 1
+    found = [np.linalg.norm(m.linear) for m in odometry]
+    np.testing.assert_allclose(found, speed * np.array(true[: len(found)]), atol=1e-5)
 
 
 @pytest.mark.parametrize("odd", [9.5, 18.5])

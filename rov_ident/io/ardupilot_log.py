@@ -425,6 +425,7 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
     kinds = ["XKF1", "NKF1", "XKQ", "XKQ1", "NKQ", "NKQ1", "ATT", "IMU", "RCOU", "BAT", "CURR"]
     kinds += ["PARM", "ARM", "EV"]
     batteries: defaultdict[tuple[str, int], _Track] = defaultdict(_Track)
+    motion, attitude = {"X": _Track(), "N": _Track()}, {"X": _Track(), "N": _Track()}
     for m in _messages_of(reader, kinds, progress):
         kind, t = m.get_type(), int(m.TimeUS)
         if kind == "PARM":
@@ -446,9 +447,9 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
         if number:
             continue
         if kind in ("XKF1", "NKF1"):
-            log.motion.add(t, m.VN, m.VE, m.VD, m.PN, m.PE, m.PD)
+            motion[kind[0]].add(t, m.VN, m.VE, m.VD, m.PN, m.PE, m.PD)
         elif kind in ("XKQ", "XKQ1", "NKQ", "NKQ1"):
-            log.attitude.add(t, m.Q1, m.Q2, m.Q3, m.Q4)
+            attitude[kind[0]].add(t, m.Q1, m.Q2, m.Q3, m.Q4)
         elif kind == "ATT":
             log.angles.add(t, *np.radians([m.Roll, m.Pitch, m.Yaw]).tolist())
         elif kind == "IMU":
@@ -456,6 +457,10 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
         elif kind == "RCOU":
             names = [n for n in m.get_fieldnames() if n.lower().startswith("c") and n[-1].isdigit()]
             log.outputs.add(t, *(float(getattr(m, name)) for name in names))
+    # EKF3 and EKF2 may run side by side; the vehicle flies by one of them, by default EKF3.
+    used, other = "NX" if log.parameters.get("AHRS_EKF_TYPE") == 2.0 else "XN"
+    log.motion = motion[used] or motion[other]
+    log.attitude = attitude[used] or attitude[other]
     for _, battery in sorted(batteries.items()):
         if not log.battery:
             log.voltage = battery
