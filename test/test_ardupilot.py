@@ -512,8 +512,11 @@ def test_pulses_are_those_of_px4s_mixer(tmp_path, dive, case):
     assert_close(found, expected(tmp_path / "direct.mcap", dive), 1e-3)
 
 
-def test_a_motor_without_an_output_is_said(tmp_path, dive):
-    report, _ = imported(tmp_path, ulog(tmp_path / "log.ulg", dive, rotors()))
+@pytest.mark.parametrize("parameters", [rotors(), {"CA_ROTOR_COUNT": 0}])
+def test_a_motor_without_an_output_is_said(tmp_path, dive, parameters):
+    """A count of zero is one that is not told."""
+    path = ulog(tmp_path / "log.ulg", dive, parameters)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
     assert "no PWM outputs of the motors" in report.notes[0]
 
 
