@@ -234,6 +234,19 @@ def test_no_rates_are_made_up_in_a_pause_of_the_imu(tmp_path, dive):
     assert f"{lost} velocities without attitude or rates around them" in report.notes[-1]
 
 
+def test_an_autopilot_that_starts_again(tmp_path, dive):
+    """The dive after its restart is the longer one, and is not mixed with what was before."""
+    first = telemetry(tmp_path / "first.tlog", dive[: len(dive) // 3]).read_bytes()
+    path = telemetry(tmp_path / "dive.tlog", dive)
+    settings = configured(**GEOMETRY)
+    alone = import_log(path, tmp_path / "alone.mcap", settings)
+    path.write_bytes(first + path.read_bytes())
+    report = import_log(path, tmp_path / "log.mcap", settings)
+    assert report.odometry == alone.odometry and report.duration == alone.duration
+    assert any("the autopilot started 2 times" in note for note in report.notes)
+    assert (tmp_path / "log.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+
+
 def test_the_command(tmp_path, dive, capsys):
     config.dump(configured(**GEOMETRY), tmp_path / "c.yaml")
     path = str(dataflash(tmp_path / "log.BIN", rows_of(dive)))

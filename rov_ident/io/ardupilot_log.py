@@ -62,6 +62,8 @@ _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
 _MOTOR_1 = 33  # of SERVOn_FUNCTION
 _SAFETY_ARMED = 128  # of base_mode in HEARTBEAT
 _GROUND_STATION = 255  # its system in MAVLink, by convention
+_AUTOPILOT = 1  # its component
+_DISORDER = 1_000_000  # us; what comes later than that by radio has been sent after a new start
 _EVENTS = {10: True, 11: False}  # of EV: armed, disarmed
 _ALIGNED = 0.7  # cosine; thrusters of one frame differ by 45 degrees and more from each other
 
@@ -383,7 +385,7 @@ def read_log(path: Path, progress: Callable[[float], None] = lambda share: None)
                     raise ValueError("it does not begin like one")
             if kind == ".tlog":
                 with contextlib.closing(mavutil.mavlink_connection(str(path))) as reader:
-                    _telemetry(reader, log, progress)
+                    log = _telemetry(reader, progress)
             else:
                 read = DFReader.DFReader_text if kind == ".log" else DFReader.DFReader_binary
                 with _silenced_stderr():
@@ -466,7 +468,10 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
             log.voltage = battery
 
 
-def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
+def _telemetry(reader: Any, progress: Callable[[float], None]) -> Log:
+    """The log of the longest time from one start of the autopilot to the next."""
+    log = Log()
+    starts = [log]
     kinds = ["ATTITUDE", "LOCAL_POSITION_NED", "RAW_IMU", "SERVO_OUTPUT_RAW", "SYS_STATUS"]
     kinds += ["PARAM_VALUE", "HEARTBEAT"]
     vehicle: int | None = None
@@ -475,21 +480,24 @@ def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None
         if m.get_srcSystem() == _GROUND_STATION:
             continue
         vehicle = m.get_srcSystem() if vehicle is None else vehicle
-        if m.get_srcSystem() != vehicle:
-            continue  # another vehicle
+        if m.get_srcSystem() != vehicle or m.get_srcComponent() != _AUTOPILOT:
+            continue  # another vehicle, or a camera on the same
         kind = m.get_type()
         if kind == "PARAM_VALUE":
             log.parameters[m.param_id] = float(m.param_value)
             continue
         if kind in ("ATTITUDE", "LOCAL_POSITION_NED"):
-            now = 1000 * int(m.time_boot_ms)
+            before, now = now, 1000 * int(m.time_boot_ms)
+            if before is not None and now < before - _DISORDER:
+                log = Log()
+                log.parameters = starts[0].parameters
+                starts.append(log)
         if now is None:
             continue
         if kind == "HEARTBEAT":
-            if m.get_srcComponent() == 1:  # the autopilot, not a camera on the same vehicle
-                state = bool(m.base_mode & _SAFETY_ARMED)
-                if not log.armed or bool(log.armed.rows[-1][0]) != state:
-                    log.armed.add(now if log.armed else 0, float(state))
+            state = bool(m.base_mode & _SAFETY_ARMED)
+            if not log.armed or bool(log.armed.rows[-1][0]) != state:
+                log.armed.add(now if log.armed else 0, float(state))
         elif kind == "ATTITUDE":
             log.angles.add(now, m.roll, m.pitch, m.yaw)
             log.rates.add(now, m.rollspeed, m.pitchspeed, m.yawspeed)
@@ -506,3 +514,10 @@ def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None
             log.outputs.add(t, *(float(getattr(m, name, 0)) for name in names))
         elif kind == "SYS_STATUS" and m.voltage_battery not in (0, 65535):
             log.voltage.add(now, 1e-3 * m.voltage_battery)
+    longest = max(starts, key=lambda each: len(each.motion))
+    if len(starts) > 1:
+        longest.notes.append(
+            f"the autopilot started {len(starts)} times: what is longest is taken; split the log "
+            "to import the rest"
+        )
+    return longest
