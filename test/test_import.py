@@ -296,6 +296,7 @@ def with_cell(columns, heading, row, text):
         (with_cell(table(BASE), "w", 3, "1,2"), r"line 5: 14 cells under 13 headings"),
         (with_cell(table(BASE), "t_s", 3, "0.2"), r"line 5: t_s is 0\.2 as in the row before"),
         (with_cell(table(BASE, step=100.0), "u", 0, "0"), "must be in seconds"),
+        (with_cell(table(BASE, step=5.0), "u", 0, "0"), "must be in seconds"),  # ms at 200 Hz
         (with_cell(table([*BASE, *EULER], pitch=30.0), "u", 0, "0"), "line 2: pitch is 30.*rad"),
         (
             with_cell(table([*BASE, *EULER], yaw=5.7 * np.arange(20), r=1.0), "u", 0, "0"),

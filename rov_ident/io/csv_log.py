@@ -45,7 +45,7 @@ _DRIVEN = (*_FINS, "rpm")
 NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION, *_DRIVEN)
 
 _FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
-_LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
+_LONGEST_STEP = 0.5  # s; as nothing is interpolated across more, rows further apart tell nothing
 _IN_RADIANS = (*_VELOCITIES[3:], *_ANGLES, *_FINS)
 _LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
 _WRAP_JUMP = 1.0  # rad within one row, and back in the next: no vehicle does that
@@ -391,7 +391,7 @@ class _Log:
         if np.median(steps) > _LONGEST_STEP or time[-1] - min(0.0, time[0]) > 2**31 - 2:
             raise UserError(
                 f"{self.place(0)}: {heading} has steps of {np.median(steps):g} and ends at "
-                f"{time[-1]:g}; it must be in seconds."
+                f"{time[-1]:g}; it must be in seconds, with steps of {_LONGEST_STEP} at most."
             )
 
     def take_degrees(self, names: Sequence[str]) -> None:
