@@ -32,21 +32,21 @@ SIZES = {**dict(zip("BbHhIifdQq", "BbHhIifdQq", strict=True)), "c": "h", "C": "H
          "n": "4s", "N": "16s", "Z": "64s"}  # fmt: skip
 
 
-def structure(kind):
-    return struct.Struct("<" + "".join(SIZES[c] for c in FORMATS[kind][1]))
+def structure(kind, kinds=FORMATS):
+    return struct.Struct("<" + "".join(SIZES[c] for c in kinds[kind][1]))
 
 
-def record(kind, *values):
-    return bytes([0xA3, 0x95, kind]) + structure(kind).pack(*values)
+def record(kind, *values, kinds=FORMATS):
+    return bytes([0xA3, 0x95, kind]) + structure(kind, kinds).pack(*values)
 
 
 def dataflash(path, rows, kinds=FORMATS):
     """A log of (type, *values); the formats of ``kinds`` are declared first."""
     head = [
-        record(128, kind, 3 + structure(kind).size, *(text.encode() for text in FORMATS[kind]))
+        record(128, kind, 3 + structure(kind, kinds).size, *(text.encode() for text in kinds[kind]))
         for kind in kinds
     ]
-    path.write_bytes(b"".join(head + [record(*row) for row in rows]))
+    path.write_bytes(b"".join(head + [record(*row, kinds=kinds) for row in rows]))
     return path
 
 
@@ -212,6 +212,41 @@ def test_a_telemetry_log(tmp_path, dive, offset):
     assert np.all(np.abs(found.values - reference.values) < 0.3 * reference.std)
 
 
+def test_rates_are_those_that_come_more_often(tmp_path, dive):
+    """By default, RAW_IMU comes at 2 Hz, ATTITUDE with its rates at 10 Hz."""
+    slow = [row for k, row in enumerate(dive) if row[1] != IMU or k % 50 == 0]
+    path = telemetry(tmp_path / "slow.tlog", slow)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    rates = [m.angular for _, role, m in dive if role == ODOMETRY]
+    found = [m.angular for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    assert report.odometry == len(rates)
+    np.testing.assert_allclose(found, rates, atol=1e-6)
+
+
+def test_no_rates_are_made_up_in_a_pause_of_the_imu(tmp_path, dive):
+    """Half a second and more: as of the attitude."""
+    paused = [row for row in rows_of(dive) if not (row[0] == 3 and 4_000_000 < row[1] < 6_000_000)]
+    path = dataflash(tmp_path / "log.bin", paused)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    stamps = [m.stamp for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    assert not any(5_000_000_000 < stamp < 7_000_000_000 for stamp in stamps)
+    lost = sum(role == ODOMETRY for _, role, _ in dive) - len(stamps)
+    assert f"{lost} velocities without attitude or rates around them" in report.notes[-1]
+
+
+def test_an_autopilot_that_starts_again(tmp_path, dive):
+    """The dive after its restart is the longer one, and is not mixed with what was before."""
+    first = telemetry(tmp_path / "first.tlog", dive[: len(dive) // 3]).read_bytes()
+    path = telemetry(tmp_path / "dive.tlog", dive)
+    settings = configured(**GEOMETRY)
+    alone = import_log(path, tmp_path / "alone.mcap", settings)
+    path.write_bytes(first + path.read_bytes())
+    report = import_log(path, tmp_path / "log.mcap", settings)
+    assert report.odometry == alone.odometry and report.duration == alone.duration
+    assert any("the autopilot started 2 times" in note for note in report.notes)
+    assert (tmp_path / "log.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+
+
 def test_the_command(tmp_path, dive, capsys):
     config.dump(configured(**GEOMETRY), tmp_path / "c.yaml")
     path = str(dataflash(tmp_path / "log.BIN", rows_of(dive)))
@@ -243,6 +278,56 @@ def test_what_is_missing_is_named(tmp_path, dive):
     unmeasured = dataflash(tmp_path / "log.bin", [row for row in rows if row[0] != 5])
     report = import_log(unmeasured, tmp_path / "out.mcap", settings)
     assert report.notes[0] == "no voltage of the battery: taken as 16 V (thrusters.voltage)"
+
+
+@pytest.mark.parametrize(("flown_by", "speed"), [(None, 1.0), (3.0, 1.0), (2.0, 2.0)])
+def test_two_filters_side_by_side(tmp_path, dive, flown_by, speed):
+    """EKF2 here says twice the velocity of EKF3; the parameter tells which one flies."""
+    formats = {**FORMATS, 7: ("NKF1", *FORMATS[1][1:]), 8: ("PARM", "QNf", "TimeUS,Name,Value")}
+    rows = []
+    for row in rows_of(dive):
+        rows.append(row)
+        if row[0] == 1 and row[2] == 0:
+            rows.append((7, row[1] + 50, *row[2:6], *(2.0 * v for v in row[6:9]), *row[9:]))
+    if flown_by:
+        rows.append((8, 1, b"AHRS_EKF_TYPE", flown_by))
+    path = dataflash(tmp_path / "log.bin", rows, formats)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
+    true = [np.linalg.norm(m.linear) for _, role, m in dive if role == ODOMETRY]
+    odometry = [m for role, m in messages_in(tmp_path / "log.mcap") if role == ODOMETRY]
+    assert report.odometry == len(odometry) >= len(true) - 1
+    found = [np.linalg.norm(m.linear) for m in odometry]
+    np.testing.assert_allclose(found, speed * np.array(true[: len(found)]), atol=1e-5)
+
+
+@pytest.mark.parametrize("odd", [9.5, 18.5])
+def test_one_voltage_that_no_battery_has(tmp_path, dive, odd):
+    """The one before goes on; a battery that always has it needs another curve."""
+    rows, settings = list(rows_of(dive)), configured(**GEOMETRY)
+    rows.insert(1000, (5, rows[1000][1], 0, odd, odd))
+    report = import_log(dataflash(tmp_path / "l.bin", rows), tmp_path / "odd.mcap", settings)
+    assert report.notes == (
+        f"battery from {VOLTAGE} to {VOLTAGE} V, as measured",
+        "the T200 has no curve for 1 of the voltages: the one before is taken",
+    )
+    import_log(dataflash(tmp_path / "l.bin", rows_of(dive)), tmp_path / "o.mcap", settings)
+    wrenches = [
+        [m for role, m in messages_in(tmp_path / name) if role == WRENCH]
+        for name in ("odd.mcap", "o.mcap")
+    ]
+    np.testing.assert_equal(*wrenches)
+    always = [*rows[:1], *((5, t, 0, odd, odd) for t in range(1, 5)), *rows[1:]]
+    with pytest.raises(UserError, match=f"or the battery of a log, is {odd} V, but the curve"):
+        import_log(dataflash(tmp_path / "l.bin", always), tmp_path / "x.mcap", settings)
+
+
+def test_the_battery_that_is_measured(tmp_path, dive):
+    """The first instance may be a monitor to which nothing is connected."""
+    rows = [(*r[:3], *2 * [0.0 if r[2] == 0 else 14.0]) if r[0] == 5 else r for r in rows_of(dive)]
+    report = import_log(
+        dataflash(tmp_path / "log.bin", rows), tmp_path / "log.mcap", configured(**GEOMETRY)
+    )
+    assert report.notes == ("battery from 14.0 to 14.0 V, as measured",)
 
 
 @pytest.mark.parametrize("name", ["log.bin", "log.tlog", "log.log"])
@@ -440,8 +525,11 @@ def test_pulses_are_those_of_px4s_mixer(tmp_path, dive, case):
     assert_close(found, expected(tmp_path / "direct.mcap", dive), 1e-3)
 
 
-def test_a_motor_without_an_output_is_said(tmp_path, dive):
-    report, _ = imported(tmp_path, ulog(tmp_path / "log.ulg", dive, rotors()))
+@pytest.mark.parametrize("parameters", [rotors(), {"CA_ROTOR_COUNT": 0}])
+def test_a_motor_without_an_output_is_said(tmp_path, dive, parameters):
+    """A count of zero is one that is not told."""
+    path = ulog(tmp_path / "log.ulg", dive, parameters)
+    report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
     assert "no PWM outputs of the motors" in report.notes[0]
 
 

@@ -387,20 +387,48 @@ def test_a_bag_of_ros_1(tmp_path):
     assert {m.topic for m in bag.iter_raw(["/imu/data"])} == {"/imu/data"}
 
 
+def test_split_bags_of_ros_1_with_a_topic_in_the_first_alone(tmp_path):
+    """As a latched /tf_static is: the second file does not know it."""
+    rows, folder = list(entries(40)), tmp_path / "dive"
+    folder.mkdir()
+    write_ros1(folder / "dive_0.bag", rows[:60])
+    write_ros1(folder / "dive_1.bag", [row for row in rows[60:] if row[0] != "/imu/data"])
+    bag = Bag(folder)
+    for topic in bag.topics:
+        read = list(bag.iter_raw([topic]))
+        assert {raw.topic for raw in read} == {topic}
+        assert len(read) == bag.topics[topic].message_count
+    assert not list(bag.iter_raw([]))
+
+
+def from_ros1(path, kind, fields, *values):
+    """What a bag of ROS 1 with one message, its header stamped 5 s and 6 ns, gives."""
+    header, ros1 = "std_msgs/msg/Header", get_typestore(Stores.EMPTY)
+    ros1.register({header: get_typestore(Stores.ROS1_NOETIC).fielddefs[header]})
+    ros1.register(get_types_from_msg(f"std_msgs/Header header\n{fields}", kind))
+    stamp = ros1.types["builtin_interfaces/msg/Time"](sec=5, nanosec=6)
+    message = ros1.types[kind](ros1.types[header](seq=3, stamp=stamp, frame_id=""), *values)
+    with Ros1Writer(path) as writer:
+        topic = writer.add_connection("/topic", kind, typestore=ros1)
+        writer.write(topic, 1, bytes(ros1.serialize_ros1(message, kind)))
+    (raw,) = Bag(path).iter_raw()
+    return raw.data
+
+
 def test_types_of_ros_1_that_ros_2_does_not_ship(tmp_path):
     """As mavros publishes its outputs: the bag itself says what they are."""
-    kind, ros1 = "mavros_msgs/msg/RCOut", get_typestore(Stores.ROS1_NOETIC)
-    ros1.register(get_types_from_msg("std_msgs/Header header\nuint16[] channels\n", kind))
-    header = ros1.types["std_msgs/msg/Header"](
-        seq=3, stamp=ros1.types["builtin_interfaces/msg/Time"](sec=5, nanosec=6), frame_id=""
-    )
-    message = ros1.types[kind](header=header, channels=np.array([1500, 1600], np.uint16))
-    with Ros1Writer(tmp_path / "rc.bag") as writer:
-        topic = writer.add_connection("/mavros/rc/out", kind, typestore=ros1)
-        writer.write(topic, 1, bytes(ros1.serialize_ros1(message, kind)))
-    (raw,) = Bag(tmp_path / "rc.bag").iter_raw()
-    stamp, values = cdr.decode_channels(raw.data)
+    channels = np.array([1500, 1600], np.uint16)
+    data = from_ros1(tmp_path / "rc.bag", "mavros_msgs/msg/RCOut", "uint16[] channels\n", channels)
+    stamp, values = cdr.decode_channels(data)
     assert stamp == 5_000_000_006 and values.tolist() == [1500.0, 1600.0]
+
+
+def test_a_type_that_had_other_fields_in_ros_1(tmp_path):
+    """BatteryState had no temperature before Noetic."""
+    fields = "float32 voltage\nfloat32 current\nfloat32[] cell_voltage\nstring location\n"
+    values = 15.5, -3.0, np.full(4, 3.875, np.float32), "hull"
+    data = from_ros1(tmp_path / "old.bag", "sensor_msgs/msg/BatteryState", fields, *values)
+    assert cdr.decode_voltage(data) == 15.5
 
 
 # --- wrong files ----------------------------------------------------------------------------

@@ -126,6 +126,26 @@ def test_angles_that_the_log_lacks_follow_the_rates(tmp_path, out, given):
     assert (np.sqrt(np.mean(error**2, axis=1)) < 0.4 * np.std(angles[:2], axis=1)).all()
 
 
+@pytest.mark.parametrize("name", ["roll", "pitch"])
+def test_small_angles_in_degrees_are_seen_by_the_rates(tmp_path, out, name):
+    """A tilt of 3 degrees is less than a radian: a number that could be one."""
+    rng, t = np.random.default_rng(3), 0.05 * np.arange(1200)
+    tilt = 0.05 * np.sin(0.9 * t)
+    rate = 0.045 * np.cos(0.9 * t) + 0.003 + rng.normal(0.0, 0.005, len(t))
+    columns = table([*BASE, *EULER], len(t), 0.05, **{"p" if name == "roll" else "q": rate})
+    columns[name] = tilt + rng.normal(0.0, 0.005, len(t))
+    path = save(tmp_path / "log.csv", columns)
+    import_csv([path], out)
+    columns[name] = np.degrees(columns[name])
+    save(path, columns)
+    with pytest.raises(UserError, match=f"{name} changes as the rates do in degrees"):
+        import_csv([path], tmp_path / "no.mcap")
+    import_csv([path], tmp_path / "yes.mcap", degrees=[name])
+    assert (tmp_path / "yes.mcap").exists()
+    columns |= {"p": 0.0 * t, "q": 0.0 * t}  # rates that were not measured tell nothing
+    import_csv([save(path, columns)], out)
+
+
 def test_a_gyro_that_drifts_far_tells_no_roll_and_pitch(tmp_path, out):
     """Its bias of 5 mrad/s would have turned the vehicle by 1.5 rad in five minutes."""
     columns = table(BASE, 3000, 0.1, p=0.005 + 0.05 * np.cos(0.3 * np.arange(3000)))
@@ -296,6 +316,7 @@ def with_cell(columns, heading, row, text):
         (with_cell(table(BASE), "w", 3, "1,2"), r"line 5: 14 cells under 13 headings"),
         (with_cell(table(BASE), "t_s", 3, "0.2"), r"line 5: t_s is 0\.2 as in the row before"),
         (with_cell(table(BASE, step=100.0), "u", 0, "0"), "must be in seconds"),
+        (with_cell(table(BASE, step=5.0), "u", 0, "0"), "must be in seconds"),  # ms at 200 Hz
         (with_cell(table([*BASE, *EULER], pitch=30.0), "u", 0, "0"), "line 2: pitch is 30.*rad"),
         (
             with_cell(table([*BASE, *EULER], yaw=5.7 * np.arange(20), r=1.0), "u", 0, "0"),

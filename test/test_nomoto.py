@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from test_bags import write_ros1
 from test_inputs import twist_and_pose, with_twist
 from test_inputs import write as write_rows
 from tiers import more
@@ -532,23 +533,76 @@ def test_heading_across_the_wrap(short, tmp_path):
     np.testing.assert_allclose(run.heading - run.heading[0], short.heading, atol=1e-7)
 
 
-def test_bag_with_a_rudder_topic(short, tmp_path):
-    path = tmp_path / "run.mcap"
+def recorded(run):
+    """The messages (topic, type, stamp, bytes) of a bag of this run, with a rudder topic."""
     zeros = np.zeros(3)
+    for t, heading, rudder in zip(run.t, run.heading, run.rudder):
+        stamp = 1_000_000_000 + round(1e9 * t)
+        yield "/rudder", "std_msgs/msg/Float64", stamp, struct.pack("<4Bd", 0, 1, 0, 0, rudder)
+        pose = quaternion_from_euler(0.0, 0.0, heading)
+        odometry = Odometry(
+            stamp, "world_ned", "base_link_frd", zeros, pose, zeros, zeros, np.zeros(6)
+        )
+        yield "/odom", ODOMETRY_TYPE, stamp, encode(odometry)
+
+
+def as_mcap(path, rows):
     with BagWriter(path) as writer:
-        for t, heading, rudder in zip(short.t, short.heading, short.rudder):
-            stamp = 1_000_000_000 + round(1e9 * t)
-            cdr = struct.pack("<4Bd", 0, 1, 0, 0, rudder)
-            writer.write("/rudder", "std_msgs/msg/Float64", stamp, cdr)
-            pose = quaternion_from_euler(0.0, 0.0, heading)
-            odometry = Odometry(
-                stamp, "world_ned", "base_link_frd", zeros, pose, zeros, zeros, np.zeros(6)
-            )
-            writer.write("/odom", ODOMETRY_TYPE, stamp, encode(odometry))
-    run = read(path)
+        for topic, kind, stamp, data in rows:
+            writer.write(topic, kind, stamp, data)
+    return path
+
+
+@pytest.mark.parametrize(("name", "write_bag"), [("a.mcap", as_mcap), ("a.bag", write_ros1)])
+def test_bag_with_a_rudder_topic(name, write_bag, short, tmp_path):
+    run = read(write_bag(tmp_path / name, recorded(short)))
     np.testing.assert_allclose(run.heading, short.heading, atol=1e-9)
     np.testing.assert_allclose(run.rudder, short.rudder)
     assert run.unit == "rad" and run.held
+
+
+def test_headings_before_the_first_message_of_the_rudder_tell_nothing(short, tmp_path):
+    late = [row for row in recorded(short) if row[0] == "/odom" or row[2] >= 21_000_000_000]
+    run = read(as_mcap(tmp_path / "late.mcap", late))
+    np.testing.assert_allclose(run.rudder, short.rudder[short.t >= 20.0])
+    early = [row for row in recorded(short) if row[0] == "/odom" or row[2] >= 101_000_000_000]
+    with pytest.raises(UserError, match="too few headings after the first message of the rudder"):
+        read(as_mcap(tmp_path / "early.mcap", early))
+
+
+def test_what_holds_between_the_messages_of_a_rudder_is_asked(tmp_path):
+    """Counted as held, T is at least half a step of 0.2 s too short."""
+    fine = simulated(0.5, 4.0, 0.1, noise=0.0035)
+    path = as_mcap(tmp_path / "a.mcap", recorded(every(fine, 0.2)))
+    measured = nomoto.fit([read(path, measured=True)])
+    assert abs(measured.value("T") - 4.0) < 3.0 * measured.std[measured.names.index("T")]
+    assert not any("--measured" in note for note in measured.notes)
+    held = nomoto.fit([read(path)])
+    assert held.value("T") < 3.9
+    assert any("give --measured" in note for note in held.notes)
+
+
+def test_doubts_about_a_bag_are_said(short, tmp_path, capsys):
+    rows = [*recorded(short)]
+    rows += [("/truth", *row[1:]) for row in rows if row[0] == "/odom"]
+    path = as_mcap(tmp_path / "two.mcap", rows)
+    assert main(["nomoto", str(path), "--order", "1"]) == 0
+    assert "topics.odom chooses another of its type: /truth" in capsys.readouterr().err
+
+
+def test_a_run_with_a_pause_counts_as_two():
+    """Rows lost while the zigzag goes on. Simulated through, they made a K of -0.02."""
+    whole = every(simulated(0.5, 4.0, 0.35, duration=80.0, noise=0.0035), 0.2)
+    lost = (whole.t > 25.0) & (whole.t < 45.0)
+    model = nomoto.fit([whole[~lost]])
+    assert abs(model.value("K") - 0.5) < 0.005 and abs(model.value("T") - 4.0) < 0.05
+    assert any("pauses" in note for note in model.notes)
+    assert nomoto_model.predict(model, whole[~lost])[1] == pytest.approx(0.0035, rel=0.2)
+    few = (whole.t > 2.0) & (whole.t < 77.0)  # no 20 headings on either side
+    with pytest.raises(UserError, match="record it without pauses"):
+        nomoto.fit([whole[~few]])
+    rare = replace(whole, t=100.0 * whole.t)  # of a ship; no pause
+    assert rare.parts == [slice(0, len(rare.t))]
 
 
 def test_bag_of_other_types(short, tmp_path):

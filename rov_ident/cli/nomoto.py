@@ -20,6 +20,11 @@ def add(commands: Commands) -> None:
         "--config", type=Path, help="says the types, topics and axes of a bag (inputs, frames)"
     )
     nomoto.add_argument(
+        "--measured", action="store_true",
+        help="the rudder of a bag is a measured angle, linear between its messages (default: a "
+        "command, held until the next one)",
+    )  # fmt: skip
+    nomoto.add_argument(
         "--order", choices=("auto", "1", "2"), default="auto",
         help="of the model (auto: what predicts parts of the runs left out)",
     )  # fmt: skip
@@ -44,8 +49,9 @@ def _nomoto(options: argparse.Namespace) -> None:
     from rov_ident.steering import nomoto, nomoto_model, zigzag
 
     config = configuration.load(options.config) if options.config else None
-    runs = [zigzag.read(path, config) for path in options.files]
-    judge = zigzag.read(options.validate, config) if options.validate else None
+    measured = options.measured
+    runs = [zigzag.read(path, config, measured) for path in options.files]
+    judge = zigzag.read(options.validate, config, measured) if options.validate else None
     with progress(options) as tell:
         tell("fitting")
         model = nomoto.fit(
@@ -67,7 +73,7 @@ def _nomoto(options: argparse.Namespace) -> None:
         OUT.print(f"on {judge.name} {validation:.4g} rad ({math.degrees(validation):.3g} deg)")
     for order, error in model.cross_validation.items():
         OUT.print(f"parts left out, predicted with order {order}: {math.degrees(error):.3g} deg")
-    say(*model.notes)
+    say(*model.notes, *(judge.notes if judge else ()))
     if judge and diverges:
         raise UserError(
             f"the prediction of {judge.name} diverges: its RMSE is larger than all that the "

@@ -2,7 +2,8 @@
 (`.tlog`) here, PX4's (`.ulg`) in `px4_log`.
 
 Velocity and position are the EKF's (`XKF1`, `LOCAL_POSITION_NED`), the attitude is its quaternion
-or what the autopilot reports, rates and specific force are the first IMU's. The pulses to the
+or what the autopilot reports, rates and specific force are the first IMU's; but the rates are those
+of `ATTITUDE` where these come more often. The pulses to the
 thrusters (`RCOU`, `SERVO_OUTPUT_RAW`) become a wrench by the configuration's `thrusters`, at the
 battery's measured voltage. Axes are forward-starboard-down and north-east-down, stamps count from
 the autopilot's start, plus a second. Attitude and rates are interpolated to the velocity's times.
@@ -19,7 +20,7 @@ import itertools
 import os
 import sys
 from bisect import bisect_right
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +46,7 @@ from rov_ident.core.messages import (
     fault,
 )
 from rov_ident.io.write_messages import write_messages
-from rov_ident.model.thruster_allocation import PWM, Allocator, check, matrix
+from rov_ident.model.thruster_allocation import PWM, Allocator, check, knows, matrix
 
 SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
 
@@ -54,13 +55,15 @@ _MAGIC = b"\xa3\x95"  # of every record of a dataflash log
 _START = 1_000_000  # us
 _END = LAST_STAMP // 1000 - _START  # us; a stamp holds no more
 _WRAP = 1 << 32  # us; of the clock in SERVO_OUTPUT_RAW
-_LONGEST_GAP = 500_000  # us; attitudes further apart are not interpolated
+_LONGEST_GAP = 500_000  # us; attitudes and rates further apart are not interpolated
 LEAST_VOLTAGE = 5.0  # V; below it the battery is not measured, or the vehicle is on USB
 _OUTPUTS = 16  # of SERVO_OUTPUT_RAW and RCOU
 _STANDARD_GRAVITY = 9.80665  # m/s2; what ArduPilot divides by
 _MOTOR_1 = 33  # of SERVOn_FUNCTION
 _SAFETY_ARMED = 128  # of base_mode in HEARTBEAT
 _GROUND_STATION = 255  # its system in MAVLink, by convention
+_AUTOPILOT = 1  # its component
+_DISORDER = 1_000_000  # us; what comes later than that by radio has been sent after a new start
 _EVENTS = {10: True, 11: False}  # of EV: armed, disarmed
 _ALIGNED = 0.7  # cosine; thrusters of one frame differ by 45 degrees and more from each other
 
@@ -110,7 +113,7 @@ class Log:
         self.motion = _Track()  # velocity 3 [m/s], position 3 [m], NED
         self.attitude = _Track()  # w x y z
         self.angles = _Track()  # roll, pitch, yaw [rad]: where there is no quaternion
-        self.rates = _Track()  # body [rad/s]: where there is no IMU
+        self.rates = _Track()  # body [rad/s], beside the attitude
         self.imu = _Track()  # gyro 3 [rad/s], specific force 3 [m/s2], body
         self.outputs = _Track()  # pulses [us]
         self.voltage = _Track()  # V
@@ -132,6 +135,11 @@ class Log:
         """Whether the vehicle is, at t [us]; so it is taken to be where the log does not say."""
         i = bisect_right(self.armed.t, t) - 1
         return i < 0 or bool(self.armed.rows[i][0])
+
+    @property
+    def denser_rates(self) -> _Track:
+        """Rates (the first three numbers): the IMU's or those beside the attitude, if more."""
+        return max(self.imu, self.rates, key=len)
 
     @property
     def battery(self) -> list[float]:
@@ -194,15 +202,15 @@ def import_log(
         ("motion", log.motion),
         ("outputs", log.outputs),
         ("attitude", log.attitude or log.angles),
-        ("rates", log.imu if len(log.imu) >= 2 else log.rates),
+        ("rates", log.denser_rates),
     ):
         if len(track) < 2:
             raise UserError(f"{path} holds no {log.words[name]}: {log.words['advice']}")
-    messages = [*_wrenches(log, allocator, config.thrusters.voltage, notes), *_inertial(log)]
+    messages = [*_wrenches(log, allocator, config.thrusters, notes), *_inertial(log)]
     with np.errstate(all="ignore"):  # a quaternion of zeros: left out below
         odometry = list(_odometry(log, notes))
     if not odometry:
-        raise UserError(f"{path} has no attitude at the times of its velocity: log both")
+        raise UserError(f"{path} has no attitude and rates around its velocity: log all three")
     messages += odometry
     if len(log.armed):
         driven = [row for row in messages if log.is_armed(row[0] // 1000 - _START)]
@@ -278,18 +286,24 @@ def _ns(t: int) -> int:
     return 1000 * (t + _START)
 
 
-def _wrenches(log: Log, allocator: Allocator, usual: float, notes: list[str]) -> list[_Row]:
-    """The wrench of every change of the outputs, at the voltage last measured before it."""
-    volts, good = [row[0] for row in log.voltage.rows], log.battery
-    known = bool(good)
+def _wrenches(log: Log, allocator: Allocator, given: Thrusters, notes: list[str]) -> list[_Row]:
+    """The wrench of every change of the outputs, at the voltage last measured before it for which
+    the T200 has a curve."""
+    measured = [(t, v) for t, (v,) in zip(log.voltage.t, log.voltage.rows) if v >= LEAST_VOLTAGE]
+    known = [row for row in measured if knows(row[1])]
+    if 2 * len(known) < len(measured):  # another battery: the allocator refuses it
+        known = measured
     if known:
-        notes.append(f"battery from {min(good):.1f} to {max(good):.1f} V, as measured")
+        volts = [v for _, v in known]
+        notes.append(f"battery from {min(volts):.1f} to {max(volts):.1f} V, as measured")
     else:
-        notes.append(f"no voltage of the battery: taken as {usual:g} V (thrusters.voltage)")
+        notes.append(f"no voltage of the battery: taken as {given.voltage:g} V (thrusters.voltage)")
+    if (odd := len(measured) - len(known)) and not given.curve_pwm:
+        notes.append(f"the T200 has no curve for {odd} of the voltages: the one before is taken")
+    times = [t for t, _ in known]
     rows: list[_Row] = []
     for t, pulses in zip(log.outputs.t, log.outputs.rows, strict=True):
-        i = max(bisect_right(log.voltage.t, t) - 1, 0) if known else 0
-        voltage = volts[i] if known and volts[i] >= LEAST_VOLTAGE else usual
+        voltage = known[max(bisect_right(times, t) - 1, 0)][1] if known else given.voltage
         try:
             tau = allocator.wrench(pulses, voltage)
         except ValueError as error:
@@ -311,12 +325,12 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
     else:
         times, quaternions = log.angles.t, quaternion_from_euler(*np.array(log.angles.rows).T)
         notes.append("no quaternion of the EKF: the attitude is the autopilot's angles")
-    rates = log.imu if len(log.imu) >= 2 else log.rates
+    rates = log.denser_rates
     rate_t, rate = np.array(rates.t, dtype=float), np.array(rates.rows)[:, :3]
     lost = 0
     for t, row in zip(log.motion.t, log.motion.rows, strict=True):
         attitude = _attitude_at(t, times, quaternions)
-        if attitude is None or not rate_t[0] <= t <= rate_t[-1]:
+        if attitude is None or _in_gap(t, rates.t):
             lost += 1
             continue
         linear = quaternion_to_matrix(attitude).T @ np.array(row[:3])
@@ -329,12 +343,20 @@ def _odometry(log: Log, notes: list[str]) -> Iterator[_Row]:
         notes.append(f"{lost} velocities without attitude or rates around them are left out")
 
 
-def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
+def _in_gap(t: int, times: list[int]) -> bool:
+    """Whether nothing is known at t [us], as the times around it are too far apart."""
     i = bisect_right(times, t)
     if i and times[i - 1] == t:
-        return quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
-    if i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP:
+        return False
+    return i == 0 or i == len(times) or times[i] - times[i - 1] > _LONGEST_GAP
+
+
+def _attitude_at(t: int, times: list[int], quaternions: Array) -> Array | None:
+    if _in_gap(t, times):
         return None
+    i = bisect_right(times, t)
+    if times[i - 1] == t:
+        return quaternions[i - 1] / np.linalg.norm(quaternions[i - 1])
     share = (t - times[i - 1]) / (times[i] - times[i - 1])
     between = quaternion_between(quaternions[i - 1], quaternions[i], share)
     return between / np.linalg.norm(between)
@@ -363,7 +385,7 @@ def read_log(path: Path, progress: Callable[[float], None] = lambda share: None)
                     raise ValueError("it does not begin like one")
             if kind == ".tlog":
                 with contextlib.closing(mavutil.mavlink_connection(str(path))) as reader:
-                    _telemetry(reader, log, progress)
+                    log = _telemetry(reader, progress)
             else:
                 read = DFReader.DFReader_text if kind == ".log" else DFReader.DFReader_binary
                 with _silenced_stderr():
@@ -404,6 +426,8 @@ def _messages_of(reader: Any, kinds: list[str], progress: Callable[[float], None
 def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
     kinds = ["XKF1", "NKF1", "XKQ", "XKQ1", "NKQ", "NKQ1", "ATT", "IMU", "RCOU", "BAT", "CURR"]
     kinds += ["PARM", "ARM", "EV"]
+    batteries: defaultdict[tuple[str, int], _Track] = defaultdict(_Track)
+    motion, attitude = {"X": _Track(), "N": _Track()}, {"X": _Track(), "N": _Track()}
     for m in _messages_of(reader, kinds, progress):
         kind, t = m.get_type(), int(m.TimeUS)
         if kind == "PARM":
@@ -416,13 +440,18 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
                     log.armed.add(0, float(not state))  # it is the change that is logged
                 log.armed.add(t, float(state))
             continue
-        # Several EKF cores, IMUs and batteries log under one name: the first counts.
-        if any(getattr(m, name, 0) for name in ("C", "I", "Inst", "Instance")):
+        # Several EKF cores, IMUs and batteries log under one name: the first counts, of batteries
+        # the first that is measured.
+        number = max(int(getattr(m, name, 0)) for name in ("C", "I", "Inst", "Instance"))
+        if kind in ("BAT", "CURR"):
+            batteries[kind, number].add(t, float(m.Volt))
+            continue
+        if number:
             continue
         if kind in ("XKF1", "NKF1"):
-            log.motion.add(t, m.VN, m.VE, m.VD, m.PN, m.PE, m.PD)
+            motion[kind[0]].add(t, m.VN, m.VE, m.VD, m.PN, m.PE, m.PD)
         elif kind in ("XKQ", "XKQ1", "NKQ", "NKQ1"):
-            log.attitude.add(t, m.Q1, m.Q2, m.Q3, m.Q4)
+            attitude[kind[0]].add(t, m.Q1, m.Q2, m.Q3, m.Q4)
         elif kind == "ATT":
             log.angles.add(t, *np.radians([m.Roll, m.Pitch, m.Yaw]).tolist())
         elif kind == "IMU":
@@ -430,11 +459,19 @@ def _dataflash(reader: Any, log: Log, progress: Callable[[float], None]) -> None
         elif kind == "RCOU":
             names = [n for n in m.get_fieldnames() if n.lower().startswith("c") and n[-1].isdigit()]
             log.outputs.add(t, *(float(getattr(m, name)) for name in names))
-        else:
-            log.voltage.add(t, float(m.Volt))
+    # EKF3 and EKF2 may run side by side; the vehicle flies by one of them, by default EKF3.
+    used, other = "NX" if log.parameters.get("AHRS_EKF_TYPE") == 2.0 else "XN"
+    log.motion = motion[used] or motion[other]
+    log.attitude = attitude[used] or attitude[other]
+    for _, battery in sorted(batteries.items()):
+        if not log.battery:
+            log.voltage = battery
 
 
-def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None:
+def _telemetry(reader: Any, progress: Callable[[float], None]) -> Log:
+    """The log of the longest time from one start of the autopilot to the next."""
+    log = Log()
+    starts = [log]
     kinds = ["ATTITUDE", "LOCAL_POSITION_NED", "RAW_IMU", "SERVO_OUTPUT_RAW", "SYS_STATUS"]
     kinds += ["PARAM_VALUE", "HEARTBEAT"]
     vehicle: int | None = None
@@ -443,21 +480,24 @@ def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None
         if m.get_srcSystem() == _GROUND_STATION:
             continue
         vehicle = m.get_srcSystem() if vehicle is None else vehicle
-        if m.get_srcSystem() != vehicle:
-            continue  # another vehicle
+        if m.get_srcSystem() != vehicle or m.get_srcComponent() != _AUTOPILOT:
+            continue  # another vehicle, or a camera on the same
         kind = m.get_type()
         if kind == "PARAM_VALUE":
             log.parameters[m.param_id] = float(m.param_value)
             continue
         if kind in ("ATTITUDE", "LOCAL_POSITION_NED"):
-            now = 1000 * int(m.time_boot_ms)
+            before, now = now, 1000 * int(m.time_boot_ms)
+            if before is not None and now < before - _DISORDER:
+                log = Log()
+                log.parameters = starts[0].parameters
+                starts.append(log)
         if now is None:
             continue
         if kind == "HEARTBEAT":
-            if m.get_srcComponent() == 1:  # the autopilot, not a camera on the same vehicle
-                state = bool(m.base_mode & _SAFETY_ARMED)
-                if not log.armed or bool(log.armed.rows[-1][0]) != state:
-                    log.armed.add(now if log.armed else 0, float(state))
+            state = bool(m.base_mode & _SAFETY_ARMED)
+            if not log.armed or bool(log.armed.rows[-1][0]) != state:
+                log.armed.add(now if log.armed else 0, float(state))
         elif kind == "ATTITUDE":
             log.angles.add(now, m.roll, m.pitch, m.yaw)
             log.rates.add(now, m.rollspeed, m.pitchspeed, m.yawspeed)
@@ -474,3 +514,10 @@ def _telemetry(reader: Any, log: Log, progress: Callable[[float], None]) -> None
             log.outputs.add(t, *(float(getattr(m, name, 0)) for name in names))
         elif kind == "SYS_STATUS" and m.voltage_battery not in (0, 65535):
             log.voltage.add(now, 1e-3 * m.voltage_battery)
+    longest = max(starts, key=lambda each: len(each.motion))
+    if len(starts) > 1:
+        longest.notes.append(
+            f"the autopilot started {len(starts)} times: what is longest is taken; split the log "
+            "to import the rest"
+        )
+    return longest

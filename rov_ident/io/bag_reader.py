@@ -37,6 +37,9 @@ from rov_ident.core.files import open_input
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.other_bags import OtherFile, Ros1File, SqliteFile
 
+SUFFIXES = (".mcap", ".db3", ".bag")
+"""Of the files of a bag."""
+
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _RUN_LENGTH = 4096  # messages outside chunks that make one block
@@ -228,8 +231,7 @@ def _files_of_directory(path: Path) -> list[Path]:
                 f"`rosbags-convert --src {path} --dst NEW`, and give NEW"
             )
     else:  # its writer was killed
-        patterns = ("*.mcap", "*.db3", "*.bag")
-        found = (sorted(path.glob(pattern), key=_natural_order) for pattern in patterns)
+        found = (sorted(path.glob(f"*{suffix}"), key=_natural_order) for suffix in SUFFIXES)
         files = next(filter(None, found), [])
     if not files:
         raise UserError(f"{path} holds no .mcap file, .db3 or .bag: give a bag or its directory.")

@@ -45,9 +45,10 @@ _DRIVEN = (*_FINS, "rpm")
 NAMES = (*_REQUIRED, *_POSITIONS, *_ANGLES, *_QUATERNION, *_DRIVEN)
 
 _FRAME_IDS = {"frd": ("world_ned", "base_link_frd"), "flu": ("odom", "base_link")}
-_LONGEST_STEP = 10.0  # s; a median step beyond it is no log of a dive but another unit
+_LONGEST_STEP = 0.5  # s; as nothing is interpolated across more, rows further apart tell nothing
 _IN_RADIANS = (*_VELOCITIES[3:], *_ANGLES, *_FINS)
 _LARGEST_FIN = 1.6  # rad; no fin turns further than across the flow: beyond it are degrees
+_CLEARLY = 0.5  # of the squares: degrees agree with the rates only where these explain the angle
 _WRAP_JUMP = 1.0  # rad within one row, and back in the next: no vehicle does that
 
 Prepare = Callable[
@@ -105,6 +106,7 @@ def import_csv(
     log.check_time()
     log.take_degrees(degrees)
     log.check_angles()
+    log.check_tilt()
     notes = log.prepare(prepare) if prepare else []
     if log.left_out:
         notes.insert(0, f"columns left out (--map names them): {', '.join(log.left_out)}")
@@ -264,13 +266,18 @@ def _tilt(t: Array, angular: Array) -> dict[str, Array]:
     turns = frames.quaternion_from_rotation_vector(np.diff(integral(t, angular), axis=0))
     attitudes = np.array([*accumulate(turns, frames.quaternion_multiply, initial=_LEVEL)])
     down = frames.quaternion_to_matrix(attitudes)[:, :2, 2]  # north and east of the body's z
-    line = np.vander(t, 2)
-    north, east = (line @ np.linalg.lstsq(line, down)[0]).T
+    north, east = (down - _off_the_line(t, down)).T
     if max(np.ptp(north), np.ptp(east)) > _DRIFTED:
         return {}
     back = frames.quaternion_from_rotation_vector(np.column_stack([east, -north, 0.0 * t]))
     euler = frames.quaternion_to_euler(frames.quaternion_multiply(back, attitudes))
     return {"roll": euler[:, 0], "pitch": euler[:, 1]}
+
+
+def _off_the_line(t: Array, x: Array) -> Array:
+    """Columns x (n, k) without their mean and drift over the times t (n,) [s]."""
+    line = np.vander(t, 2)
+    return x - line @ np.linalg.lstsq(line, x)[0]
 
 
 def _jumps_back(quaternion: Array) -> NDArray[np.bool_]:
@@ -391,7 +398,7 @@ class _Log:
         if np.median(steps) > _LONGEST_STEP or time[-1] - min(0.0, time[0]) > 2**31 - 2:
             raise UserError(
                 f"{self.place(0)}: {heading} has steps of {np.median(steps):g} and ends at "
-                f"{time[-1]:g}; it must be in seconds."
+                f"{time[-1]:g}; it must be in seconds, with steps of {_LONGEST_STEP} at most."
             )
 
     def take_degrees(self, names: Sequence[str]) -> None:
@@ -422,6 +429,22 @@ class _Log:
                 raise UserError(
                     f"{self.place(large[0])}: {self.headings[name]} is {angle[large[0]]:g}, which "
                     "looks like degrees: convert it to rad, or name it in --degrees."
+                )
+
+    def check_tilt(self) -> None:
+        """Refuses roll and pitch that are too small to look like degrees, but agree with the rates
+        only as such."""
+        t = self.data["t_s"] - self.data["t_s"][0]
+        tilt = [name for name in ("roll", "pitch") if name in self.data]
+        with np.errstate(all="ignore"):  # what is absurdly large is refused later
+            turned = _tilt(t, self.matrix(_VELOCITIES[3:])) if tilt else {}
+        for name in tilt if turned else ():
+            given, rates = _off_the_line(t, np.column_stack([self.data[name], turned[name]])).T
+            radians, degrees = (np.sum((given - x) ** 2) for x in (rates, np.degrees(rates)))
+            if degrees < _CLEARLY * radians:
+                raise UserError(
+                    f"{self.place(0)}: {self.headings[name]} changes as the rates do in degrees: "
+                    "convert it to rad, or name it in --degrees."
                 )
 
 

@@ -75,13 +75,18 @@ class SqliteFile(OtherFile):
 
 
 class Ros1File(OtherFile):
-    """A `.bag` of ROS 1, whose messages rosbags writes anew as ROS 2 would."""
+    """A `.bag` of ROS 1, whose messages rosbags writes anew as ROS 2 would.
+
+    A type has the fields that the bag states: those of BatteryState differ between releases.
+    """
 
     def _open(self) -> None:
         from rosbags.rosbag1 import Reader
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        self._store: Any = get_typestore(Stores.ROS2_JAZZY)
+        header = "std_msgs/msg/Header"  # only in ROS 1 it has a sequence number
+        self._store: Any = get_typestore(Stores.EMPTY)
+        self._store.register({header: get_typestore(Stores.ROS2_JAZZY).fielddefs[header]})
         self._reader = Reader(self.path)
         self._reader.open()
         for each in self._reader.connections:
@@ -93,5 +98,7 @@ class Ros1File(OtherFile):
 
     def _rows(self, channels: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
         chosen = [c for c in self._reader.connections if c.id in channels]
+        if not chosen:  # rosbags would take it for all
+            return
         for each, time, raw in self._reader.messages(chosen):
             yield each.id, time, bytes(self._store.ros1_to_cdr(raw, each.msgtype))

@@ -95,7 +95,7 @@ def _fill(log: Log, topics: dict[str, Any]) -> None:
     for t, state in rows("vehicle_status", ["arming_state"]).tolist():
         log.armed.add(int(t) if log.armed else 0, float(state == _ARMED))
     if motors := topics.get("actuator_motors"):
-        n = int(log.parameters.get("CA_ROTOR_COUNT", 12))
+        n = int(log.parameters.get("CA_ROTOR_COUNT", 0)) or 12  # 0: the geometry is not told
         controls = np.column_stack([motors[f"control[{i}]"] for i in range(n)]).astype(float)
         always = np.full(len(controls), (1 << n) - 1)
         controls = _commands(log, controls, motors.get("reversible_flags", always))

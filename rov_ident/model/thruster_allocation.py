@@ -55,8 +55,9 @@ def t200(voltage: float) -> Array:
     known = sorted(CURVES)
     if not knows(voltage):
         raise UserError(
-            f"thrusters.voltage is {voltage:g} V, but the curve of the T200 is known from "
-            f"{known[0]:g} to {known[-1]:g} V: give thrusters.curve_pwm and thrusters.curve_force"
+            f"thrusters.voltage, or the battery of a log, is {voltage:g} V, but the curve of the "
+            f"T200 is known from {known[0]:g} to {known[-1]:g} V: give thrusters.curve_pwm and "
+            "thrusters.curve_force"
         )
     after = max(1, int(np.searchsorted(known, voltage)))
     low, high = known[after - 1], known[after]

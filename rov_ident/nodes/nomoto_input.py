@@ -17,7 +17,8 @@ from rov_ident.estimation.online import Report
 from rov_ident.nodes.common import GuardedNode
 from rov_ident.nodes.conversions import from_time
 from rov_ident.reports.result import NORMAL
-from rov_ident.steering.nomoto_recursive import GAP, RecursiveNomoto
+from rov_ident.steering.nomoto_recursive import RecursiveNomoto
+from rov_ident.steering.zigzag import GAP
 
 NAMES, UNITS = ("nomoto.K", "nomoto.T"), ("1/s", "s")
 _UNKNOWN = np.array([10.0, 1000.0])  # std of K [1/s] and T [s] before any data: a choice, very wide

@@ -20,11 +20,10 @@ from rov_ident.steering.nomoto_equation_error import equation_error
 from rov_ident.steering.nomoto_filter import unscented
 from rov_ident.steering.nomoto_model import Nomoto, Structure, predict, rmse
 from rov_ident.steering.nomoto_output_error import descend, output_error
-from rov_ident.steering.zigzag import Zigzag
+from rov_ident.steering.zigzag import FEWEST, Zigzag
 
 METHODS = ("oe", "fd", "iv", "rls", "ukf")
 ORDERS = (1, 2)
-_MIN_SAMPLES = 20  # headings: three for each of six parameters, and the first state
 _BIASED = 1.5  # times the least RMSE; data of the model itself leave 1.0
 _COLOURED = 0.3  # between neighbours; white noise of 100 rows exceeds it one time in 700
 _PARTS = 6  # a choice: of each run in cross-validation, of which four are left out in turn
@@ -38,7 +37,7 @@ def fit(
     interpolate: str = "none",
     step: float | None = None,
 ) -> Nomoto:
-    """One model for all runs.
+    """One model for all runs; after a pause a run begins anew (:attr:`Zigzag.parts`).
 
     ``order`` is 1, 2 or `auto`: the second where it predicts parts of the runs left out of its fit
     better than the first (:func:`cross_validated`). ``interpolate`` densifies sparse headings
@@ -60,9 +59,10 @@ def fit(
                 f"{run.name} has an input in {run.unit}, but {runs[0].name} in {runs[0].unit}: fit "
                 "runs of one kind together"
             )
-    used = [run.cornered() for run in runs]
+    parts = [run[rows] for run in runs for rows in run.parts]
+    used = [run.cornered() for run in parts]
     if interpolate != "none":
-        used = [dense(run, interpolate, step) for run in runs]
+        used = [dense(run, interpolate, step) for run in parts]
     if isinstance(order, str):
         model = cross_validated(used, nonlinear)
     else:
@@ -72,10 +72,16 @@ def fit(
         model = unscented(used, model)
     elif method != "oe":
         model = equation_error(used, model, method)
-    errors = [run.heading - predict(model, run, u)[0] for run, u in zip(runs, used)]
+    errors = [run.heading - predict(model, run, u)[0] for run, u in zip(parts, used)]
     measured = np.concatenate(errors)
     notes = [_stability(model), *model.notes, *_remarks(model, errors, fitted, nonlinear)]
-    notes += _doubtful_times(model, runs)
+    notes += _doubtful_times(model, parts)
+    notes += [
+        f"{run.name} pauses: what the rudder did meanwhile is unknown, so the motion begins anew"
+        for run in runs
+        if run.parts != [slice(0, len(run.t))]
+    ]
+    notes += [note for run in runs for note in run.notes]
     return dataclasses.replace(
         model,
         rmse=rmse(measured),
@@ -228,9 +234,9 @@ def check(run: Zigzag) -> None:
     Raises UserError: too few headings, or a rudder or heading that never moves.
     """
     known = run.heading[run.known]
-    if len(known) < _MIN_SAMPLES:
+    if len(known) < FEWEST:
         raise UserError(
-            f"{run.name} has {len(known)} headings, but a fit needs at least {_MIN_SAMPLES}: "
+            f"{run.name} has {len(known)} headings, but a fit needs at least {FEWEST}: "
             "give a longer run"
         )
     for name, values in (("rudder", run.rudder), ("heading", known)):

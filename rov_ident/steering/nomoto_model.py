@@ -234,7 +234,8 @@ def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[A
     """The heading (n,) that the model predicts for a run, its first state fitted; and the RMSE.
 
     ``rudder`` is the same run with more rows, if there is one. As in the fit, a rudder that jumps
-    has the instants of its jumps fitted, each within its step.
+    has the instants of its jumps fitted, each within its step, and the motion begins anew after a
+    pause; NaN where too little is known between two of them.
 
     Raises UserError if the run has another kind of input than those of the fit.
     """
@@ -243,6 +244,14 @@ def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[A
             f"{run.name} has an input in {run.unit}, but the model was fitted to one in "
             f"{model.unit}: validate on a run of the same kind"
         )
+    heading = np.full(len(run.t), np.nan)
+    for rows in run.parts:
+        heading[rows] = _predict_part(model, run[rows], rudder)
+    return heading, rmse(run.heading - heading)
+
+
+def _predict_part(model: Nomoto, run: Zigzag, rudder: Zigzag | None) -> Array:
+    """The heading (n,) of a run without a pause, see :func:`predict`."""
     fine = run.cornered()
     if rudder is not None:
         both = np.union1d(rudder.t, run.t)
@@ -253,9 +262,7 @@ def predict(model: Nomoto, run: Zigzag, rudder: Zigzag | None = None) -> tuple[A
         )
     first, shares = first_state(model.structure, model.theta, fine)
     heading = respond(model.structure, model.theta, fine, first, shares)
-    if len(fine.t) > len(run.t):
-        heading = heading[np.searchsorted(fine.t, run.t)]
-    return heading, rmse(run.heading - heading)
+    return heading[np.searchsorted(fine.t, run.t)] if len(fine.t) > len(run.t) else heading
 
 
 def rmse(error: Array) -> float:

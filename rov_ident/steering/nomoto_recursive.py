@@ -21,9 +21,9 @@ import numpy as np
 from rov_ident.core.messages import Array
 from rov_ident.steering.nomoto_filter import Filter, heading_noise
 from rov_ident.steering.nomoto_model import Structure
+from rov_ident.steering.zigzag import GAP
 
 STEP = 0.1  # s between the samples used: a tenth of the least T in docs/nomoto.md
-GAP = 3.0  # s without a sample, after which the motion before is unknown
 _CORNERS = 0.01 * 4.0 ** np.arange(6)  # rad/s: T from a tanker's to less than a second
 _MATCH = 2.0  # of c T: on measured zigzags, K and T are those of output error from about 1 to 5
 _REACH = math.log(3.0)  # either side, more than half of the distance between two corners

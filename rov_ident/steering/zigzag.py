@@ -1,6 +1,7 @@
 """Records of steering: heading and rudder over time, from a CSV file or a bag."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,13 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, to_core
 from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Odometry, Wrench
-from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_reader import SUFFIXES, Bag
 from rov_ident.io.csv_table import CsvTable, read_csv
-from rov_ident.io.topics import POSE, USUAL, messages, select
+from rov_ident.io.topics import POSE, USUAL, doubts, messages, select
 
+FEWEST = 20  # headings of a run: three for each of six parameters, and the first state
+GAP = 3.0  # s without a sample, after which the motion before is unknown
+_GAP_ROWS = 3.0  # of the usual distance: rows of a ship may be further apart than that
 _RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
 _TURNED = 2.5 * np.pi  # a heading beyond it counts turns, or is in degrees
@@ -26,7 +30,8 @@ _RARE, _LONG = 5.0, 6 * 3600.0  # s between rows, s in all: zigzags take half an
 class Zigzag:
     """A run: t (n,) [s] increasing, heading (n,) [rad] unwrapped, NaN where not known, rudder (n,)
     [rad]; ``unit`` is that of the rudder (`rad`, or `N m` for a yaw moment in its stead).
-    ``held``: the rudder is known to stay as it is from one row to the next."""
+    ``held``: the rudder is known to stay as it is from one row to the next. ``notes`` say in words
+    what was assumed of the file, or is missing from it."""
 
     name: str
     t: Array
@@ -35,6 +40,7 @@ class Zigzag:
     unit: str = "rad"
     held: bool = False
     sha256: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -45,6 +51,33 @@ class Zigzag:
     def step(self) -> float:
         """Median time between two headings [s]."""
         return float(np.median(np.diff(self.t[self.known])))
+
+    @property
+    def parts(self) -> list[slice]:
+        """The rows between pauses, in which nobody knows what the rudder did: those with enough
+        headings, which move on from a first state of their own.
+
+        Raises UserError if there is none.
+        """
+        apart = np.diff(self.t)
+        pauses = np.flatnonzero(apart > max(GAP, _GAP_ROWS * float(np.median(apart)))) + 1
+        if not len(pauses):
+            return [slice(0, len(self.t))]
+        ends = [0, *pauses.tolist(), len(self.t)]
+        found = [
+            slice(*rows) for rows in pairwise(ends) if self.known[slice(*rows)].sum() >= FEWEST
+        ]
+        if not found:
+            raise UserError(
+                f"{self.name} pauses so often that no {FEWEST} headings follow on each other: "
+                "record it without pauses"
+            )
+        return found
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_]) -> "Zigzag":
+        """These rows as a run."""
+        t, heading, rudder = self.t[rows], self.heading[rows], self.rudder[rows]
+        return replace(self, t=t, heading=heading, rudder=rudder)
 
     @property
     def reversals(self) -> NDArray[np.intp]:
@@ -102,16 +135,17 @@ class Zigzag:
         )
 
 
-def read(path: Path, config: Config | None = None) -> Zigzag:
-    """A run from a bag (`.mcap` or a rosbag2 directory) or else a CSV file.
+def read(path: Path, config: Config | None = None, measured: bool = False) -> Zigzag:
+    """A run from a bag (a file or a rosbag2 directory) or else a CSV file.
 
-    ``config`` says which types and axes a bag has that are not the usual ones.
+    ``config`` says which types and axes a bag has that are not the usual ones, ``measured`` that
+    its rudder is a measured angle.
 
     Raises UserError if it cannot be read, lacks a column or topic, or is in other units than it
     says.
     """
-    is_bag = path.is_dir() or path.suffix == ".mcap"
-    return from_bag(path, config) if is_bag else from_csv(path)
+    is_bag = path.is_dir() or path.suffix in SUFFIXES
+    return from_bag(path, config, measured) if is_bag else from_csv(path)
 
 
 def from_csv(path: Path) -> Zigzag:
@@ -172,9 +206,12 @@ def _angle(table: CsvTable, name: str, blank: bool) -> Array:
     return np.radians(values)
 
 
-def from_bag(path: Path, config: Config | None = None) -> Zigzag:
+def from_bag(path: Path, config: Config | None = None, measured: bool = False) -> Zigzag:
     """Heading of the odometry; the rudder from a std_msgs/Float64 (or 32) topic [rad] whose name
-    ends in `rudder`, stamped as recorded, or without one the yaw moment of the thruster wrench."""
+    ends in `rudder`, stamped as recorded, or without one the yaw moment of the thruster wrench.
+
+    A command is held until the next one. A rudder that is ``measured`` is linear in between.
+    """
     bag = Bag(path)
     steered = [
         name
@@ -205,15 +242,31 @@ def from_bag(path: Path, config: Config | None = None) -> Zigzag:
     (t, heading), (at, steering) = (np.array(rows[k]).reshape(-1, 2).T for k in (ODOMETRY, WRENCH))
     t, first = np.unique(t, return_index=True)
     at, once = np.unique(at, return_index=True)
-    if len(t) < 2 or len(at) < 1:
-        raise UserError(f"{path} has too few messages of heading or rudder: record a longer run")
     heading = np.unwrap(heading[first])
+    steering = steering[once]
+    measured = measured and bool(steered)
+    # Nobody knows the rudder before its first message, nor a measured angle after its last one.
+    end = at.max(initial=-np.inf) if measured else np.inf
+    inside = (t >= at.min(initial=np.inf)) & (t <= end)
+    t, heading = t[inside], heading[inside]
+    if len(t) < 2:
+        raise UserError(
+            f"{path} has too few headings after the first message of the rudder: record a longer "
+            "run, and stamp both by one clock"
+        )
+    notes = [*doubts(bag, chosen, config), *filter(None, [bag.damage])]
+    if steered and not measured:
+        notes.append(
+            f"{path.name}: {steered[0]} counts as a command, held until the next one: if it is a "
+            "measured angle, give --measured, or T comes out too short"
+        )
     # Heading and input on the instants of either, so that a step of the input keeps its time.
     both = np.unique(np.concatenate([t, at[(at > t[0]) & (at < t[-1])]]))
-    index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)
+    index = np.searchsorted(at, both, side="right") - 1
     known = np.full(len(both), np.nan)
     known[np.searchsorted(both, t)] = heading
     return Zigzag(
-        path.name, both - t[0], known, steering[once][index], "rad" if steered else "N m", True,
-        bag.sha256,
+        path.name, both - t[0], known,
+        np.interp(both, at, steering) if measured else steering[index],
+        "rad" if steered else "N m", not measured, bag.sha256, tuple(notes),
     )  # fmt: skip
