@@ -22,6 +22,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import DRIVE
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
+from rov_ident.model.equations import build
 from rov_ident.offline.coast_down import Run, _simulated, fit_coast_downs
 from rov_ident.sampling import preprocess
 
@@ -219,6 +220,12 @@ def test_coast_down_on_the_command_line(heavy_path, tmp_path, capsys):
     assert told["speed_rmse_mps"] == found.rmse
     assert [bag["file"] for bag in told["provenance"]["bags"]] == ["run0.csv", "run1.csv"]
     assert config.load(saved).value("X_uu") == found.value("X_uu")
+    values = {name: x for name, x in heavy.model.values.items() if name != "X_u"}
+    config.dump(heavy.with_model(build(heavy.model.body, values)), tmp_path / "lacking.yaml")
+    lacking = ["--config", str(tmp_path / "lacking.yaml")]
+    assert main(["coast-down", *common[:-2], *lacking, "--save", str(saved)]) == 0
+    for name in ("X_u", "X_uu"):  # together they are the drag of the runs
+        assert config.load(saved).value(name) == found.value(name)
     thrust = 28.0 * (mass - heavy.value("X_udot")) / (MASS - TRUE["X_udot"])
     arguments = [*common, "--json", str(result), "--bollard", "20", str(thrust)]
     assert main(["coast-down", *arguments]) == 0

@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
+from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.io.csv_table import read_csv
-from rov_ident.model.equations import Array
+from rov_ident.model.equations import Array, build
 from rov_ident.reports.result import Result, as_json
 
 _UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
@@ -138,6 +139,16 @@ def fit_coast_downs(
         covariance=jacobian @ covariance @ jacobian.T,
         rmse=float(np.sqrt(np.mean(left**2))),
     )
+
+
+def configured(config: Config, found: CoastDown) -> Config:
+    """The configuration with X_u, X_uu and X_udot as found, also where it lacks them: one of the
+    two drags alone is not that of the runs.
+
+    Raises UserError if the values make no passive hull.
+    """
+    hull = {name: found.value(name) for name in ("X_u", "X_uu", "X_udot")}
+    return config.with_model(build(config.model.body, {**config.model.values, **hull}))
 
 
 def _check(runs: Sequence[Run]) -> None:
