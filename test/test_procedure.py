@@ -218,6 +218,7 @@ def test_coast_down_on_the_command_line(heavy_path, tmp_path, capsys):
     found = fit_coast_downs(runs, mass, added_mass=heavy.value("X_udot"))
     assert told["coefficients"] == found.entries()
     assert told["speed_rmse_mps"] == found.rmse
+    assert told["coefficients"]["k2"]["unit"] == "N/n2"  # of whatever the column counts
     assert [bag["file"] for bag in told["provenance"]["bags"]] == ["run0.csv", "run1.csv"]
     assert config.load(saved).value("X_uu") == found.value("X_uu")
     values = {name: x for name, x in heavy.model.values.items() if name != "X_u"}

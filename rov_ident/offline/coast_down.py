@@ -26,7 +26,7 @@ from rov_ident.io.csv_table import read_csv
 from rov_ident.model.equations import Array, build
 from rov_ident.reports.result import Result, as_json
 
-_UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
+_UNITS = {"k1": "N/n", "k2": "N/n2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class CoastDown(Result):
-    """k1 and k2 are per shaft speed in 1/s or its unit; ``rmse`` [m/s] of the simulated speed."""
+    """k1 and k2 are per shaft speed n in the unit of the runs; ``rmse`` [m/s] of the simulated
+    speed."""
 
     rmse: float
 
