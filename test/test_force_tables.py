@@ -195,6 +195,20 @@ def test_flow_angles_of_either_sign(tmp_path, side):
     np.testing.assert_allclose(other.nu[:, 1], -speed * np.sin(beta), atol=1e-9)
 
 
+def test_rates_over_speed_and_length(tmp_path):
+    """As r' = r L / U, under its own heading or another; not as rad/s, and not passed over."""
+    speed, r = (a.ravel() for a in np.meshgrid([0.5, 1.0, 1.5], [-0.4, -0.2, 0.0, 0.2, 0.4]))
+    columns = {"U_mps": speed, "r'": 2.0 * r / speed, "N'": -r / (500.0 * speed * 8.0)}
+    path = write(tmp_path / "t.csv", columns)
+    scale = force_tables.parse_nondimensional("rho=1000,L=2")
+    table = force_tables.read_table(path, nondimensional=scale)
+    np.testing.assert_allclose(table.nu[:, 5], r, atol=1e-9)
+    with pytest.raises(UserError, match="r' looks non-dimensional: give --nondimensional"):
+        force_tables.read_table(path, {"N": "N'"})
+    with pytest.raises(UserError, match="but r is read in rad/s: map it to r'"):
+        force_tables.read_table(path, {"r": "r'"}, scale)
+
+
 def test_radius_x_tail_and_comments(tmp_path):
     speed = np.tile([0.5, 1.0, 1.5, 2.0], 6)
     radius = np.repeat([np.inf, 5.0, 10.0, -5.0, -10.0, 20.0], 4)
