@@ -195,6 +195,18 @@ def test_flow_angles_of_either_sign(tmp_path, side):
     np.testing.assert_allclose(other.nu[:, 1], -speed * np.sin(beta), atol=1e-9)
 
 
+def test_drift_on_a_rotating_arm(tmp_path):
+    """Bow in, drift and turning go together, and the force of turning outweighs that of drift."""
+    beta, rate = np.array([[0, 2, 4, 6, 8, 10, 4, 8], [0, 2, 4, 6, 8, 10, 2, 4]])
+    speed, beta, r = 1.5 + 0.0 * beta, np.radians(beta), 0.1 * rate
+    u, v = speed * np.cos(beta), speed * np.sin(beta)
+    y = -28.6 * u * v + 12.0 * u * r
+    columns = {"U_mps": speed, "beta_rad": beta, "r": r, "Y": y, "N": -10.0 * u * v - 4.0 * u * r}
+    table = force_tables.read_table(write(tmp_path / "t.csv", columns))
+    np.testing.assert_allclose(table.nu[:, 1], v, atol=1e-9)
+    assert not table.notes
+
+
 def test_rates_over_speed_and_length(tmp_path):
     """As r' = r L / U, under its own heading or another; not as rad/s, and not passed over."""
     speed, r = (a.ravel() for a in np.meshgrid([0.5, 1.0, 1.5], [-0.4, -0.2, 0.0, 0.2, 0.4]))

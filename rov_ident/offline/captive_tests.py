@@ -159,7 +159,7 @@ def read_table(
             f"{path}: every row is the same condition: vary speed, drift, turning or fin angles"
         )
     if drift == "auto" and reader.has_flow:
-        nu = _with_resisting_signs(nu, forces, notes)
+        nu = _with_resisting_signs(nu, fins, forces, notes)
     unused = tuple(heading for heading in table.cells if heading not in reader.used)
     if unused:
         notes.insert(
@@ -432,15 +432,21 @@ def _fins(reader: _Reader) -> dict[str, Array]:
     return fins
 
 
-def _with_resisting_signs(nu: Array, forces: Mapping[str, Array], notes: list[str]) -> Array:
-    """Turns v and w round where the force would otherwise drive the hull along them."""
+def _with_resisting_signs(
+    nu: Array, fins: Mapping[str, Array], forces: Mapping[str, Array], notes: list[str]
+) -> Array:
+    """Turns v and w round where the force would otherwise drive the hull along them, by its
+    regression on all states: on a rotating arm, the force of turning may be the larger one."""
     out = nu.copy()
+    states = np.column_stack([nu, *fins.values()])
+    states = states - states.mean(axis=0)
+    states = states / np.maximum(np.abs(states).max(axis=0), _SLOWEST)
     sides = (("Y", 1, "v", "beta", "starboard"), ("Z", 2, "w", "alpha", "below"))
     for axis, i, velocity, angle, side in sides:
         if axis not in forces:
             continue
-        v = nu[:, i] - nu[:, i].mean()
-        if np.ptp(nu[:, i]) > 0.0 and v @ (forces[axis] - forces[axis].mean()) > 0.0:
+        slopes = np.linalg.lstsq(states, forces[axis] - forces[axis].mean(), rcond=None)[0]
+        if np.ptp(nu[:, i]) > 0.0 and slopes[i] > 0.0:
             out[:, i] *= -1.0
             notes.append(
                 f"{axis} would push along {velocity} with a positive {angle} to {side}, so it is "
