@@ -15,6 +15,7 @@ from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
 from rov_ident.model.added_mass import cylinder, parse_hull, spheroid
 from rov_ident.model.coefficients import AXES
+from rov_ident.model.equations import build
 from rov_ident.model.fins import X
 from rov_ident.offline import captive_report
 from rov_ident.offline import captive_tests as force_tables
@@ -219,6 +220,18 @@ def test_rates_over_speed_and_length(tmp_path):
         force_tables.read_table(path, {"N": "N'"})
     with pytest.raises(UserError, match="but r is read in rad/s: map it to r'"):
         force_tables.read_table(path, {"r": "r'"}, scale)
+
+
+def test_a_term_of_the_table_by_its_other_name_in_the_file(tmp_path):
+    """Y_vu of the file is Y_uv of the table."""
+    vehicle = config.load(REMUS)
+    other = {"Y_vu" if n == "Y_uv" else n: x for n, x in vehicle.model.values.items()}
+    vehicle = vehicle.with_model(build(vehicle.model.body, other))
+    u, v = (a.ravel() for a in np.meshgrid([1.0, 1.5, 2.0], [-0.3, -0.15, 0.0, 0.15, 0.3]))
+    noise = 0.01 * np.random.default_rng(0).standard_normal(len(u))
+    path = write(tmp_path / "t.csv", {"u": u, "v": v, "Y": -30.0 * u * v + noise})
+    new = force_tables.configured(vehicle, force_tables.fit(force_tables.read_table(path)))
+    assert new.value("Y_uv") == pytest.approx(-30.0, rel=0.01) and "Y_vu" not in new.model.names
 
 
 def test_radius_x_tail_and_comments(tmp_path):

@@ -793,7 +793,7 @@ def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
     """
     values = dict(config.model.values)
     for f in fits.values():
-        for name in (*f.pool, *f.aliases):
-            values.pop(name, None)
+        told = {parse(n).place for n in (*f.pool, *f.aliases) if not n.endswith("_0")}
+        values = {n: x for n, x in values.items() if parse(n).place not in told}
         values |= {n: float(x) for n, x in zip(f.names, f.values) if not n.endswith("_0")}
     return config.with_model(build(config.model.body, values))
