@@ -168,6 +168,16 @@ def test_zigzag_turns_back_at_the_switching_heading(remus, rudder, switch):
     assert (peaks[1:] > np.radians(switch)).all()  # overshoot, never short of it
 
 
+def test_a_zigzag_begins_to_either_side(remus):
+    """A negative angle is the mirror image, with the same switching heading."""
+    right, left = (
+        autopilot.manoeuvre(remus, "zigzag", angle, duration=30.0).angles[:, 2]
+        for angle in (0.2, -0.2)
+    )
+    assert np.abs(left).max() > 0.2
+    assert left.min() == pytest.approx(-right.max(), rel=0.05)
+
+
 @pytest.mark.parametrize("name", autopilot.MANOEUVRES)
 def test_manoeuvres_as_a_command(name, tmp_path):
     out = tmp_path / "run.csv"

@@ -215,7 +215,7 @@ def manoeuvre(
 ) -> Run:
     """A manoeuvre by name, the depth held where the vehicle has stern planes.
 
-    ``angle`` [rad] is the rudder's for `zigzag` (reversed at ``switch``, the same by default) and
+    ``angle`` [rad] is the rudder's for `zigzag` (reversed at ``switch``, its size by default) and
     `turn`, the course for `heading`; `dive` goes to ``depth`` [m]. `waypoints` go to either side
     by ``angle``, down to ``depth`` and up, at times drawn by ``seed``.
 
@@ -237,7 +237,7 @@ def manoeuvre(
 
         return steer(model, waypoints, duration, speed, servo, step, speeds=speeds)
     laws: dict[str, Law] = {
-        "zigzag": Kempf(angle, angle if switch is None else switch),
+        "zigzag": Kempf(angle, abs(angle) if switch is None else switch),
         "turn": turn(angle),
         "heading": to_heading(angle, yaw),
         "dive": to_depth(depth, pitch),
