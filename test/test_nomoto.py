@@ -551,6 +551,27 @@ def test_bag_with_a_rudder_topic(short, tmp_path):
     assert run.unit == "rad" and run.held
 
 
+def test_a_rudder_is_unknown_before_its_first_message(short, tmp_path):
+    """Published on change alone, it first tells where it goes, not where it has stood."""
+    path, zeros, last = tmp_path / "run.mcap", np.zeros(3), short.rudder[0]
+    with BagWriter(path) as writer:
+        for t, heading, rudder in zip(short.t, short.heading, short.rudder):
+            stamp = 1_000_000_000 + round(1e9 * t)
+            if rudder != last:
+                cdr = struct.pack("<4Bd", 0, 1, 0, 0, rudder)
+                writer.write("/rudder", "std_msgs/msg/Float64", stamp, cdr)
+            last = rudder
+            pose = quaternion_from_euler(0.0, 0.0, heading)
+            odometry = Odometry(
+                stamp, "world_ned", "base_link_frd", zeros, pose, zeros, zeros, np.zeros(6)
+            )
+            writer.write("/odom", ODOMETRY_TYPE, stamp, encode(odometry))
+    first = int(np.argmax(np.diff(short.rudder) != 0.0)) + 1
+    run = read(path)
+    np.testing.assert_allclose(run.heading, short.heading[first:], atol=1e-9)
+    np.testing.assert_allclose(run.rudder, short.rudder[first:])
+
+
 def test_bag_of_other_types(short, tmp_path):
     """The configuration says the types, as to the other commands."""
     zeros = np.zeros(3)

@@ -208,6 +208,11 @@ def from_bag(path: Path, config: Config | None = None) -> Zigzag:
     if len(t) < 2 or len(at) < 1:
         raise UserError(f"{path} has too few messages of heading or rudder: record a longer run")
     heading = np.unwrap(heading[first])
+    # Before its first message the input is not known: a rudder published on change may have stood
+    # elsewhere for long.
+    t, heading = t[t >= at[0]], heading[t >= at[0]]
+    if len(t) < 2:
+        raise UserError(f"{path} has no heading after its first rudder: record both together")
     # Heading and input on the instants of either, so that a step of the input keeps its time.
     both = np.unique(np.concatenate([t, at[(at > t[0]) & (at < t[-1])]]))
     index = np.clip(np.searchsorted(at, both, side="right") - 1, 0, len(at) - 1)
