@@ -264,6 +264,19 @@ def test_water_in_layers(tmp_path):
     assert config.model.body.buoyancy == pytest.approx(1025.0 * 0.01 * GRAVITY)
 
 
+@pytest.mark.parametrize("name", ["gazebo", "auv_controllers"])
+def test_a_file_is_known_by_its_root_and_may_begin_with_a_mark(name, diagonal, tmp_path):
+    """<robotNamespace> of a plugin makes no URDF, nor does a comment."""
+    content = export(diagonal, name).content
+    if name == "gazebo":
+        plugin = '<plugin name="ros"><robotNamespace>/rov</robotNamespace></plugin></model>'
+        content = content.replace("<sdf", "<!-- of a <robot> -->\n<sdf", 1)
+        content = content.replace("</model>", plugin)
+    (tmp_path / "model").write_text(content, encoding="utf-8-sig")
+    config, _ = import_model(tmp_path / "model")
+    assert set(config.model.names) == set(diagonal.model.names)
+
+
 def test_added_mass_of_either_sign(tmp_path):
     for text in ("<xDotU>5</xDotU><yDotR>-1</yDotR>", "<xDotU>-5</xDotU><yDotR>1</yDotR>"):
         path = tmp_path / "model.sdf"
