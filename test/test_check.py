@@ -530,10 +530,15 @@ def proposal(heavy, surge_only):
 
 @pytest.mark.parametrize(
     "effects",
-    [{"thruster_lag": {"time_constant": 0.5}}, {"thruster_gain": {"gain_X": 0.5, "gain_Y": 0.5}}],
+    [
+        {"thruster_lag": {"time_constant": 0.5}},
+        {"thruster_gain": {"gain_X": 0.5, "gain_Y": 0.5}},
+        {"wave": {"fx": 40.0, "frequency": 0.15, "phase": 0.0}},
+    ],
 )
 def test_a_flight_goes_as_far_as_the_vehicle_does(heavy, effects):
-    """With what its thrusters make of commands: a lag overshoots, weak thrust goes less far."""
+    """With what its thrusters make of commands, a lag overshoots, weak thrust goes less far; a wave
+    pushes at the time of the manoeuvre."""
     parameters = configuration.to_parameters(heavy) | {"effects": effects}
     config = configuration.from_parameters(parameters)
     manoeuvre = closed_loop_manoeuvres.library(Limits())[0]

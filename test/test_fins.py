@@ -168,6 +168,33 @@ def test_zigzag_turns_back_at_the_switching_heading(remus, rudder, switch):
     assert (peaks[1:] > np.radians(switch)).all()  # overshoot, never short of it
 
 
+def test_a_zigzag_begins_to_either_side(remus):
+    """A negative angle is the mirror image, with the same switching heading."""
+    right, left = (
+        autopilot.manoeuvre(remus, "zigzag", angle, duration=30.0).angles[:, 2]
+        for angle in (0.2, -0.2)
+    )
+    assert np.abs(left).max() > 0.2
+    assert left.min() == pytest.approx(-right.max(), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("effects", "column", "least", "most"),
+    [
+        ({"ocean_current": {"east": 0.5}}, "y_m", 9.0, 11.0),  # half a metre a second
+        ({"thruster_gain": {"gain_X": 0.5}}, "u", 1.0, 1.2),  # of 1.5, towards its root of a half
+        ({"fin_offset": {"delta_r": 0.05}}, "rudder_deg", -3.0, -2.7),  # the rudder makes up for it
+    ],
+)
+def test_steer_with_the_effects_of_the_file(effects, column, least, most, tmp_path):
+    parameters = config.to_parameters(config.load(REMUS)) | {"effects": effects}
+    config.dump(config.from_parameters(parameters), tmp_path / "c.yaml")
+    arguments = ["--manoeuvre", "heading", "--angle", "0", "--duration", "20"]
+    arguments += ["--config", str(tmp_path / "c.yaml"), "--out", str(tmp_path / "run.csv")]
+    assert main(["steer", *arguments]) == 0
+    assert least < read_csv(tmp_path / "run.csv").numbers(column)[-1] < most
+
+
 @pytest.mark.parametrize("name", autopilot.MANOEUVRES)
 def test_manoeuvres_as_a_command(name, tmp_path):
     out = tmp_path / "run.csv"

@@ -15,6 +15,7 @@ from rov_ident.cli.program import main
 from rov_ident.core.errors import UserError
 from rov_ident.model.added_mass import cylinder, parse_hull, spheroid
 from rov_ident.model.coefficients import AXES
+from rov_ident.model.equations import build
 from rov_ident.model.fins import X
 from rov_ident.offline import captive_report
 from rov_ident.offline import captive_tests as force_tables
@@ -193,6 +194,44 @@ def test_flow_angles_of_either_sign(tmp_path, side):
     assert found["Y_vv"] == pytest.approx(-100.0, rel=0.05)
     other = force_tables.read_table(path, drift="port")
     np.testing.assert_allclose(other.nu[:, 1], -speed * np.sin(beta), atol=1e-9)
+
+
+def test_drift_on_a_rotating_arm(tmp_path):
+    """Bow in, drift and turning go together, and the force of turning outweighs that of drift."""
+    beta, rate = np.array([[0, 2, 4, 6, 8, 10, 4, 8], [0, 2, 4, 6, 8, 10, 2, 4]])
+    speed, beta, r = 1.5 + 0.0 * beta, np.radians(beta), 0.1 * rate
+    u, v = speed * np.cos(beta), speed * np.sin(beta)
+    y = -28.6 * u * v + 12.0 * u * r
+    columns = {"U_mps": speed, "beta_rad": beta, "r": r, "Y": y, "N": -10.0 * u * v - 4.0 * u * r}
+    table = force_tables.read_table(write(tmp_path / "t.csv", columns))
+    np.testing.assert_allclose(table.nu[:, 1], v, atol=1e-9)
+    assert not table.notes
+
+
+def test_rates_over_speed_and_length(tmp_path):
+    """As r' = r L / U, under its own heading or another; not as rad/s, and not passed over."""
+    speed, r = (a.ravel() for a in np.meshgrid([0.5, 1.0, 1.5], [-0.4, -0.2, 0.0, 0.2, 0.4]))
+    columns = {"U_mps": speed, "r'": 2.0 * r / speed, "N'": -r / (500.0 * speed * 8.0)}
+    path = write(tmp_path / "t.csv", columns)
+    scale = force_tables.parse_nondimensional("rho=1000,L=2")
+    table = force_tables.read_table(path, nondimensional=scale)
+    np.testing.assert_allclose(table.nu[:, 5], r, atol=1e-9)
+    with pytest.raises(UserError, match="r' looks non-dimensional: give --nondimensional"):
+        force_tables.read_table(path, {"N": "N'"})
+    with pytest.raises(UserError, match="but r is read in rad/s: map it to r'"):
+        force_tables.read_table(path, {"r": "r'"}, scale)
+
+
+def test_a_term_of_the_table_by_its_other_name_in_the_file(tmp_path):
+    """Y_vu of the file is Y_uv of the table."""
+    vehicle = config.load(REMUS)
+    other = {"Y_vu" if n == "Y_uv" else n: x for n, x in vehicle.model.values.items()}
+    vehicle = vehicle.with_model(build(vehicle.model.body, other))
+    u, v = (a.ravel() for a in np.meshgrid([1.0, 1.5, 2.0], [-0.3, -0.15, 0.0, 0.15, 0.3]))
+    noise = 0.01 * np.random.default_rng(0).standard_normal(len(u))
+    path = write(tmp_path / "t.csv", {"u": u, "v": v, "Y": -30.0 * u * v + noise})
+    new = force_tables.configured(vehicle, force_tables.fit(force_tables.read_table(path)))
+    assert new.value("Y_uv") == pytest.approx(-30.0, rel=0.01) and "Y_vu" not in new.model.names
 
 
 def test_radius_x_tail_and_comments(tmp_path):

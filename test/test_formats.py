@@ -247,6 +247,36 @@ def test_a_stock_gazebo_model(tmp_path):
     assert "neutral" in notes[1]
 
 
+def test_water_in_layers(tmp_path):
+    """Buoyancy is that of the density below the surface."""
+    water = (
+        '<plugin name="gz::sim::systems::Buoyancy"><graded_buoyancy>'
+        "<default_density>1025</default_density><density_change><above_depth>0</above_depth>"
+        "<density>1</density></density_change></graded_buoyancy></plugin>"
+    )
+    box = '<collision name="c"><geometry><box><size>1 0.1 0.1</size></box></geometry></collision>'
+    text = STOCK.format("<xU>-1</xU>").replace("</inertial></link>", f"</inertial>{box}</link>", 1)
+    world = text.replace("<model", f'<world name="w">{water}<model').replace(
+        "</sdf>", "</world></sdf>"
+    )
+    (tmp_path / "world.sdf").write_text(world)
+    config, _ = import_model(tmp_path / "world.sdf")
+    assert config.model.body.buoyancy == pytest.approx(1025.0 * 0.01 * GRAVITY)
+
+
+@pytest.mark.parametrize("name", ["gazebo", "auv_controllers"])
+def test_a_file_is_known_by_its_root_and_may_begin_with_a_mark(name, diagonal, tmp_path):
+    """<robotNamespace> of a plugin makes no URDF, nor does a comment."""
+    content = export(diagonal, name).content
+    if name == "gazebo":
+        plugin = '<plugin name="ros"><robotNamespace>/rov</robotNamespace></plugin></model>'
+        content = content.replace("<sdf", "<!-- of a <robot> -->\n<sdf", 1)
+        content = content.replace("</model>", plugin)
+    (tmp_path / "model").write_text(content, encoding="utf-8-sig")
+    config, _ = import_model(tmp_path / "model")
+    assert set(config.model.names) == set(diagonal.model.names)
+
+
 def test_added_mass_of_either_sign(tmp_path):
     for text in ("<xDotU>5</xDotU><yDotR>-1</yDotR>", "<xDotU>-5</xDotU><yDotR>1</yDotR>"):
         path = tmp_path / "model.sdf"

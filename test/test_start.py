@@ -15,13 +15,13 @@ from rov_ident.cli.program import main
 from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS, from_parameters, to_parameters
 from rov_ident.config.writing import annotated
 from rov_ident.core.frames import from_core, to_core
-from rov_ident.core.messages import IMU, ODOMETRY, Imu, Odometry
+from rov_ident.core.messages import IMU, ODOMETRY, Imu, Odometry, Wrench
 from rov_ident.core.yaml_file import parse
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.cdr import ROLE_TYPES, encode
-from rov_ident.io.mounting import sensor_placement
+from rov_ident.io.mounting import sensor_placement, with_mounting
 from rov_ident.io.topics import ROLE_NAMES
 from rov_ident.simulation import virtual_sensors as sensors
 
@@ -147,6 +147,25 @@ def test_mounting_by_any_tree(tmp_path, transforms, position, yaw):
     if found:
         np.testing.assert_allclose(found["imu.position"], position, atol=1e-9)
         np.testing.assert_allclose(found["imu.rotation"], [0.0, 0.0, yaw], atol=1e-9)
+
+
+def test_a_turned_velocity_sensor_is_said(tmp_path, heavy):
+    """Its velocities are taken as along the body axes, unless the file has its angles."""
+    path, zero, unit = tmp_path / "dvl.mcap", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    with BagWriter(path) as bag:
+        tree = tree_of(("base_link", "dvl_link", (0.2, 0.0, -0.1), LEFT))
+        bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, tree)
+        odometry = Odometry(1, "dvl_link", "", zero, unit, zero, zero, np.zeros(6))
+        bag.write("/odom", "nav_msgs/msg/Odometry", 1, encode(odometry))
+        wrench = Wrench(1, "base_link", zero, zero)
+        bag.write("/wrench", "geometry_msgs/msg/WrenchStamped", 1, encode(wrench))
+    placed, notes = with_mounting(heavy, [path])
+    np.testing.assert_allclose(placed.odometry.position, [0.2, 0.0, 0.1], atol=1e-9)
+    (said,) = [note for note in notes if "set effects.sensor_misalignment" in note]
+    assert "[0.0, 0.0, -1.571] rad by /tf_static of dvl.mcap" in said
+    angles = {"roll": 0.0, "pitch": 0.0, "yaw": -np.pi / 2}
+    known = dataclasses.replace(heavy, effects={"sensor_misalignment": angles})
+    assert not [note for note in with_mounting(known, [path])[1] if "turned" in note]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from rov_ident.core.yaml_file import parse_file
 from rov_ident.io import topics
 from rov_ident.io.ardupilot_log import FRAMES, SUFFIXES, read_log
 from rov_ident.io.bag_reader import Bag
-from rov_ident.io.mounting import sensor_placement
+from rov_ident.io.mounting import TURNED, sensor_placement, turned
 
 _MODELS = (".urdf", ".xml", ".sdf")
 _OF_FRAME = {1: "bluerov2", 2: "bluerov2_heavy"}  # FRAME_CONFIG of ArduSub
@@ -224,6 +224,9 @@ def _add_bag(path: Path, found: _Found) -> None:
     signs = FLIP_BODY if found.parameters["vehicle"].get("frame") == "flu" else np.ones(3)
     mounted = sensor_placement(bag, {role: source.frames for role, source in seen.items()})
     for key, vector in mounted.items():
+        if key == TURNED:
+            found.notes += turned(vector, path.name)
+            continue
         found.put(key, [round(float(x), 6) + 0.0 for x in signs * vector], "/tf_static")
     if "/tf_static" in bag.topics and not mounted:
         found.notes.append("/tf_static does not say where IMU and velocity sensor are")

@@ -44,9 +44,8 @@ def _coast_down(options: argparse.Namespace) -> None:
     if options.json:
         write_file(options.json, found.to_json())
     if options.save:
-        known = {name: found.value(name) for name in found.names if name in model.names}
         names = ", ".join(path.name for path in options.runs)
-        comment = f"{', '.join(known)} from {names} by rov-ident coast-down."
-        configuration.dump(config.with_values(known), options.save, comment)
+        comment = f"X_u, X_uu, X_udot from {names} by rov-ident coast-down."
+        configuration.dump(coast_down.configured(config, found), options.save, comment)
     common.OUT.print(found.numbers("thrust k1 n + k2 |n| n, drag and added mass in surge"))
     common.say(f"speed RMSE {found.rmse:.3g} m/s")

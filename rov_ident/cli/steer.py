@@ -39,8 +39,9 @@ def _steer(options: argparse.Namespace) -> None:
 
     if not abs(options.angle) <= 180.0:
         raise UserError(f"--angle {options.angle:g}: give degrees from -180 to 180")
+    config = configuration.load(options.config)
     run = autopilot.manoeuvre(
-        configuration.load(options.config).dynamics,
+        config.dynamics,
         options.manoeuvre,
         math.radians(options.angle),
         math.radians(options.switch) if options.switch else None,
@@ -48,6 +49,7 @@ def _steer(options: argparse.Namespace) -> None:
         options.duration,
         options.speed,
         autopilot.Servo(rate=math.radians(options.servo_rate)),
+        effects=config.effects,
     )
     noise = math.radians(options.noise)
     write_file(options.out, autopilot.to_csv(run, options.sample, noise, options.seed))

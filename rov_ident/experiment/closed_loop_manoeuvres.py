@@ -112,7 +112,7 @@ def fly(config: Config, manoeuvre: AlternatingTargets, duration: float, limits: 
         acting = demand[k].copy()
         act(effects, of_thrusters, float(t), CONTROL, acting)
         run = simulate(
-            model, grid, np.tile(acting, (len(grid), 1)), nu, position, orientation,
+            model, t + grid, np.tile(acting, (len(grid), 1)), nu, position, orientation,
             effects=effects,
         )  # fmt: skip
         nu, position, orientation = run.nu[-1], run.position[-1], run.orientation[-1]

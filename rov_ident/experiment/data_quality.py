@@ -26,7 +26,7 @@ from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.experiment.messages_alone import BAD, GOOD, WARNING, Remark, of_dynamics, of_messages
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
-from rov_ident.io.mounting import sensor_placement, with_mounting
+from rov_ident.io.mounting import TURNED, sensor_placement, with_mounting
 from rov_ident.model.coefficients import MOTIONS, WRENCH_UNITS
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import authority
@@ -222,6 +222,8 @@ def prospects(config: Config, std: Array) -> tuple[Prospect, ...]:
 def _mounting_remarks(told: Mapping[str, Array], config: Config) -> Iterator[Remark]:
     """Whether `/tf_static` says of the sensors what the configuration says."""
     for key, vector in told.items():
+        if key == TURNED:
+            continue  # with_mounting says it
         section, name = key.split(".")
         configured = np.array(getattr(getattr(config, section), name))
         turned = name == "rotation"

@@ -22,13 +22,19 @@ from rov_ident.io.topics import FrameIds, first_frames, select
 
 STATIC = "/tf_static"
 _NOWHERE = 1e-6  # m, rad: what is left of zero by rounding
+TURNED = "odometry.rotation"  # which no configuration has: velocities are along the body axes
 
 
 def with_mounting(config: Config, paths: Iterable[Path]) -> tuple[Config, tuple[str, ...]]:
     """The configuration with sensors that it leaves at the body's origin, unturned, where the first
-    bag with a `/tf_static` says that they are; and a note on each that was moved."""
+    bag with a `/tf_static` says that they are; and a note on each that was moved, or on a turned
+    velocity sensor."""
     notes = []
     for key, vector, name in _told_of_mounting(config, paths):
+        if key == TURNED:
+            if "sensor_misalignment" not in config.effects:
+                notes += turned(vector, name)
+            continue
         section, own = key.split(".")
         settings = getattr(config, section)
         if not np.any(getattr(settings, own)) and np.abs(vector).max() > _NOWHERE:
@@ -40,6 +46,19 @@ def with_mounting(config: Config, paths: Iterable[Path]) -> tuple[Config, tuple[
                 "configuration has none"
             )
     return config, tuple(notes)
+
+
+def turned(rotation: Array, name: str) -> list[str]:
+    """What to do about a velocity sensor at roll, pitch, yaw (3,) [rad] by the bag of that name,
+    if it is turned."""
+    told = [round(float(x), 3) + 0.0 for x in rotation]
+    if not any(told):
+        return []
+    return [
+        f"the velocity sensor is turned by roll, pitch, yaw {told} rad by {STATIC} of {name}, but "
+        "its velocities are taken as along the body axes: if they are along its own, set "
+        "effects.sensor_misalignment"
+    ]
 
 
 def _told_of_mounting(config: Config, paths: Iterable[Path]) -> list[tuple[str, Array, str]]:
@@ -55,8 +74,8 @@ def _told_of_mounting(config: Config, paths: Iterable[Path]) -> list[tuple[str, 
 
 def sensor_placement(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Array]:
     """Where `/tf_static` says that the sensors are, (3,) each, forward-starboard-down in the body
-    frame: `imu.position` [m], `imu.rotation` [rad], `odometry.position` [m]; what it does not say
-    is left out.
+    frame: `imu.position` [m], `imu.rotation` [rad], `odometry.position` [m], `odometry.rotation`
+    [rad] (:data:`TURNED`); what it does not say is left out.
 
     ``frames`` as `first_frames` gives them. The body frame is that of the odometry (its child), or
     `base_link`. Frames of the tree have their axes forward, left, up, or as their name says
@@ -94,6 +113,7 @@ def sensor_placement(bag: Bag, frames: Mapping[str, FrameIds]) -> dict[str, Arra
         found["imu.rotation"] = quaternion_to_euler(at[1])
     if motion and not child and (at := placed(motion, "base_link")):
         found["odometry.position"] = at[0]
+        found[TURNED] = quaternion_to_euler(at[1])
     return found
 
 

@@ -138,7 +138,7 @@ def read_table(
     turning radius `R_m` (r = U / R; empty: straight on). Fins: `rudder_deg`, `stern_deg`,
     `aileron_deg` (or `delta_r_deg` ...; or `_rad`), the fins of an X tail `ul ur ll lr` or a cross
     tail `upper lower port starboard`. Forces: `X Y Z K M N`; with ``nondimensional`` also
-    `X'` ...
+    `X'` ..., and the rates `p' q' r'` over U / L.
 
     ``drift`` says what a positive beta (and alpha) means: `starboard` v = U sin(beta) (Fossen),
     `port` v = -U sin(beta) (SNAME, towing tanks), `auto`: as a hull resists its motion.
@@ -150,7 +150,7 @@ def read_table(
         raise UserError(f"{path} has {len(table.lines)} rows: thin it to {_MOST_ROWS}")
     reader = _Reader(table, dict(columns or {}))
     notes: list[str] = []
-    nu, speed = _states(reader, drift)
+    nu, speed = _states(reader, drift, nondimensional)
     fins = _fins(reader)
     reader.refuse_likely()
     forces = _forces(reader, speed, nondimensional)
@@ -159,7 +159,7 @@ def read_table(
             f"{path}: every row is the same condition: vary speed, drift, turning or fin angles"
         )
     if drift == "auto" and reader.has_flow:
-        nu = _with_resisting_signs(nu, forces, notes)
+        nu = _with_resisting_signs(nu, fins, forces, notes)
     unused = tuple(heading for heading in table.cells if heading not in reader.used)
     if unused:
         notes.insert(
@@ -185,6 +185,11 @@ class _Reader:
                 raise UserError(
                     f"{table.path}: `{heading}` seems to be in {unit}, but {name} is read in SI "
                     "units: convert the column, and rename it"
+                )
+            if name in ("p", "q", "r") and heading.endswith("'"):
+                raise UserError(
+                    f"{table.path}: `{heading}` looks non-dimensional, but {name} is read in "
+                    f"rad/s: map it to {name}'"
                 )
 
     def column(self, name: str, blank: bool = False) -> Array | None:
@@ -260,7 +265,7 @@ _SAME = {
     "U_mps": ("u",),
     **{f"beta_{unit}": ("v", "beta_deg", "beta_rad") for unit in ("deg", "rad")},
     **{f"alpha_{unit}": ("w", "alpha_deg", "alpha_rad") for unit in ("deg", "rad")},
-    "r": ("R_m", "radius_m"),
+    "r": ("R_m", "radius_m", "r'"),
     **{
         f"{names[0]}_{unit}": tuple(f"{name}_{u}" for name in names for u in ("deg", "rad"))
         for names in _FIN_COLUMNS.values()
@@ -302,7 +307,9 @@ def _guessed_name(heading: str) -> str:
     return f"{name}_{known}" if angular else name
 
 
-def _states(reader: _Reader, drift: str) -> tuple[Array, Array]:
+def _states(
+    reader: _Reader, drift: str, nondimensional: Mapping[str, float] | None
+) -> tuple[Array, Array]:
     """nu (n, 6) and the speed (n,)."""
     n, path = len(reader.table.lines), reader.table.path
     direct = {name: x for name in VELOCITIES if (x := reader.column(name)) is not None}
@@ -346,6 +353,18 @@ def _states(reader: _Reader, drift: str) -> tuple[Array, Array]:
         if (radius == 0.0).any():
             raise UserError(f"{path}: {name} is 0 in a row: leave it empty for straight runs")
         nu[:, 5] = np.where(np.isnan(radius), 0.0, speed / radius)
+    for name in "pqr":
+        primed = reader.column(f"{name}'")
+        if primed is None:
+            continue
+        if nu[:, VELOCITIES.index(name)].any():
+            raise UserError(f"{path} says {name} and {name}': keep one of them")
+        if not nondimensional:
+            raise UserError(
+                f"{path}: {name}' looks non-dimensional: give --nondimensional rho=...,L=..., or "
+                f"{name} in rad/s beside forces in newtons"
+            )
+        nu[:, VELOCITIES.index(name)] = primed * speed / nondimensional["L"]
     return nu, speed
 
 
@@ -413,15 +432,21 @@ def _fins(reader: _Reader) -> dict[str, Array]:
     return fins
 
 
-def _with_resisting_signs(nu: Array, forces: Mapping[str, Array], notes: list[str]) -> Array:
-    """Turns v and w round where the force would otherwise drive the hull along them."""
+def _with_resisting_signs(
+    nu: Array, fins: Mapping[str, Array], forces: Mapping[str, Array], notes: list[str]
+) -> Array:
+    """Turns v and w round where the force would otherwise drive the hull along them, by its
+    regression on all states: on a rotating arm, the force of turning may be the larger one."""
     out = nu.copy()
+    states = np.column_stack([nu, *fins.values()])
+    states = states - states.mean(axis=0)
+    states = states / np.maximum(np.abs(states).max(axis=0), _SLOWEST)
     sides = (("Y", 1, "v", "beta", "starboard"), ("Z", 2, "w", "alpha", "below"))
     for axis, i, velocity, angle, side in sides:
         if axis not in forces:
             continue
-        v = nu[:, i] - nu[:, i].mean()
-        if np.ptp(nu[:, i]) > 0.0 and v @ (forces[axis] - forces[axis].mean()) > 0.0:
+        slopes = np.linalg.lstsq(states, forces[axis] - forces[axis].mean(), rcond=None)[0]
+        if np.ptp(nu[:, i]) > 0.0 and slopes[i] > 0.0:
             out[:, i] *= -1.0
             notes.append(
                 f"{axis} would push along {velocity} with a positive {angle} to {side}, so it is "
@@ -768,7 +793,7 @@ def configured(config: Config, fits: Mapping[str, AxisFit]) -> Config:
     """
     values = dict(config.model.values)
     for f in fits.values():
-        for name in (*f.pool, *f.aliases):
-            values.pop(name, None)
+        told = {parse(n).place for n in (*f.pool, *f.aliases) if not n.endswith("_0")}
+        values = {n: x for n, x in values.items() if parse(n).place not in told}
         values |= {n: float(x) for n, x in zip(f.names, f.values) if not n.endswith("_0")}
     return config.with_model(build(config.model.body, values))

@@ -10,6 +10,7 @@ Fitted by output error: u is simulated from the shaft speed n, run by run, each 
 starting speed, and compared with the measured one.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +18,15 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
+from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.io.csv_table import read_csv
-from rov_ident.model.equations import Array
+from rov_ident.model.equations import Array, build
 from rov_ident.reports.result import Result, as_json
 
-_UNITS = {"k1": "N s", "k2": "N s2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
+_UNITS = {"k1": "N/n", "k2": "N/n2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class CoastDown(Result):
-    """k1 and k2 are per shaft speed in 1/s or its unit; ``rmse`` [m/s] of the simulated speed."""
+    """k1 and k2 are per shaft speed n in the unit of the runs; ``rmse`` [m/s] of the simulated
+    speed."""
 
     rmse: float
 
@@ -139,6 +142,16 @@ def fit_coast_downs(
     )
 
 
+def configured(config: Config, found: CoastDown) -> Config:
+    """The configuration with X_u, X_uu and X_udot as found, also where it lacks them: one of the
+    two drags alone is not that of the runs.
+
+    Raises UserError if the values make no passive hull.
+    """
+    hull = {name: found.value(name) for name in ("X_u", "X_uu", "X_udot")}
+    return config.with_model(build(config.model.body, {**config.model.values, **hull}))
+
+
 def _check(runs: Sequence[Run]) -> None:
     for i, r in enumerate(runs):
         if not (len(r.t) == len(r.n) == len(r.u)) or len(r.t) < 10:
@@ -158,11 +171,24 @@ def _check(runs: Sequence[Run]) -> None:
 
 
 def _inflation(residuals: Sequence[Array]) -> float:
-    """By how much means of the residuals scatter more than white noise would let them."""
-    lagged = sum(float(e[1:] @ e[:-1]) for e in residuals)
+    """By how much means of the residuals scatter more than white noise would let them.
+
+    The sum of their correlations, by pairs of lags, to the first pair that is not positive, none
+    counted for more than the one before (initial monotone sequence: Geyer 1992). The neighbour's
+    correlation alone does not tell how long a slow error lasts, once white noise is on top of it.
+    """
     power = sum(float(e @ e) for e in residuals)
-    rho = min(max(lagged / max(power, 1e-300), 0.0), 0.99)
-    return (1.0 + rho) / (1.0 - rho)
+
+    def correlation(lag: int) -> float:
+        return sum(float(e[lag:] @ e[: len(e) - lag]) for e in residuals) / max(power, 1e-300)
+
+    total, pair = -1.0, math.inf  # both directions, but the lag zero once
+    for lag in range(0, min(map(len, residuals)) - 1, 2):
+        pair = min(pair, correlation(lag) + correlation(lag + 1))
+        if pair <= 0.0:
+            break
+        total += 2.0 * pair
+    return max(total, 1.0)
 
 
 @kernel

@@ -15,6 +15,8 @@ import numpy as np
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_euler, wrap_angle
 from rov_ident.core.messages import Array
+from rov_ident.effects import Values, act, compiled, memory, steering_memory
+from rov_ident.effects import steer as act_on_fins
 from rov_ident.model.coefficients import INPUT_LETTERS, INPUTS
 from rov_ident.model.equations import Model
 from rov_ident.simulation.open_loop import simulate
@@ -78,12 +80,14 @@ def steer(
     step: float = 0.02,
     depth: float = 0.0,
     speeds: Callable[[float], float] | None = None,
+    effects: Values | None = None,
 ) -> Run:
     """Run a law for ``duration`` [s] from straight level motion at ``speed`` [m/s].
 
     The propeller keeps the thrust of that speed, or of that which ``speeds`` gives for the time
     [s]; where the model knows what the propeller does, by its revolutions. Fin
-    angles are linear within a step, of which the middle acts.
+    angles are linear within a step, of which the middle acts. ``effects`` act on thrust, fins and
+    motion; those on sensors do not: a law sees the motion as it is.
 
     Raises UserError if the vehicle has no fins in its coefficients, or the motion diverges.
     """
@@ -96,6 +100,8 @@ def steer(
     position, orientation = np.array([0.0, 0.0, depth]), np.array([1.0, 0.0, 0.0, 0.0])
     nu, surge = np.eye(6)[0] * speed, np.eye(6)[0]
     angles = np.zeros(3)
+    acting = compiled(effects or {})
+    of_thrusters, of_fins = memory(), steering_memory()
     fins = dict.fromkeys("sra", 0.0)
     out = np.empty((n, 17))
     for i in range(n):
@@ -103,14 +109,19 @@ def steer(
         driven = [fins["s"], fins["r"], fins["a"], thrust, turning]
         out[i] = np.concatenate([position, angles, nu, driven])
         ordered = law(Now(i * step, position, angles, nu))
-        middle = np.zeros((2, len(INPUTS)))
-        middle[:, INPUTS.index("n")] = turning
+        read = np.zeros((2, len(INPUTS)))  # the mean over the step, and at its end
+        read[:, INPUTS.index("n")] = turning
         for letter, now in fins.items():
             wanted = np.clip(ordered.get(letter, 0.0), -servo.limit, servo.limit)
             fins[letter] = now + float(np.clip(wanted - now, -servo.rate * step, servo.rate * step))
-            middle[:, INPUT_LETTERS.index(letter)] = 0.5 * (now + fins[letter])
-        both = np.array([0.0, step]), np.tile(thrust * surge, (2, 1))
-        run = simulate(model, *both, nu, position, orientation, inputs=middle)
+            read[:, INPUT_LETTERS.index(letter)] = 0.5 * (now + fins[letter]), fins[letter]
+        act_on_fins(acting, of_fins, step, read)
+        wrench = thrust * surge
+        act(acting, of_thrusters, i * step, step, wrench)
+        run = simulate(
+            model, np.array([i, i + 1]) * step, np.tile(wrench, (2, 1)), nu, position, orientation,
+            effects=acting, inputs=np.tile(read[0], (2, 1)),
+        )  # fmt: skip
         position, orientation, nu = run.position[1], run.orientation[1], run.nu[1]
         yaw = angles[2]
         angles = np.array(quaternion_to_euler(orientation))
@@ -212,10 +223,11 @@ def manoeuvre(
     servo: Servo = Servo(),
     step: float = 0.02,
     seed: int = 0,
+    effects: Values | None = None,
 ) -> Run:
     """A manoeuvre by name, the depth held where the vehicle has stern planes.
 
-    ``angle`` [rad] is the rudder's for `zigzag` (reversed at ``switch``, the same by default) and
+    ``angle`` [rad] is the rudder's for `zigzag` (reversed at ``switch``, its size by default) and
     `turn`, the course for `heading`; `dive` goes to ``depth`` [m]. `waypoints` go to either side
     by ``angle``, down to ``depth`` and up, at times drawn by ``seed``.
 
@@ -235,9 +247,9 @@ def manoeuvre(
             there = to_heading(course(now.t), yaw)(now)
             return {**there, **to_depth(level(now.t), pitch)(now)} if pitch else there
 
-        return steer(model, waypoints, duration, speed, servo, step, speeds=speeds)
+        return steer(model, waypoints, duration, speed, servo, step, speeds=speeds, effects=effects)
     laws: dict[str, Law] = {
-        "zigzag": Kempf(angle, angle if switch is None else switch),
+        "zigzag": Kempf(angle, abs(angle) if switch is None else switch),
         "turn": turn(angle),
         "heading": to_heading(angle, yaw),
         "dive": to_depth(depth, pitch),
@@ -247,7 +259,7 @@ def manoeuvre(
     law = laws[name]
     if name != "dive" and pitch:
         law = both(law, to_depth(0.0, pitch))
-    return steer(model, law, duration, speed, servo, step)
+    return steer(model, law, duration, speed, servo, step, effects=effects)
 
 
 def to_csv(run: Run, step: float, heading_noise: float = 0.0, seed: int = 0) -> str:

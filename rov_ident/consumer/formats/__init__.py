@@ -1,5 +1,8 @@
 """Models into the files of controllers and simulators, and back."""
 
+import io
+import xml.etree.ElementTree as ET
+from contextlib import suppress
 from pathlib import Path
 
 from rov_ident.config import Config, from_parameters
@@ -60,7 +63,7 @@ def holds_hydrodynamics(path: Path) -> bool:
 
 def _text(path: Path) -> str:
     try:
-        return read_input(path, _LARGEST).decode()
+        return read_input(path, _LARGEST).decode("utf-8-sig")  # some editors begin with its mark
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -68,4 +71,8 @@ def _text(path: Path) -> str:
 
 
 def _is_urdf(text: str) -> bool:
-    return text.lstrip().startswith("<") and "<robot" in text
+    """By the name of its root, up to which it is read: <robot may stand anywhere in an SDF file."""
+    with suppress(ET.ParseError):
+        for _, root in ET.iterparse(io.StringIO(text), ["start"]):  # nosec B314
+            return root.tag == "robot"
+    return False

@@ -182,7 +182,8 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
             f"the volume of {', '.join(others)} is left out of the buoyancy: it is no box, sphere "
             "or cylinder; set vehicle.buoyancy and vehicle.cob"
         )
-    density = _numbers(root, ".//uniform_fluid_density", [DENSITY])[0]
+    graded = _numbers(root, ".//graded_buoyancy/default_density", [DENSITY])
+    density = _numbers(root, ".//uniform_fluid_density", graded)[0]
     coefficients = damping(plugin, notes)
     if (plugin.findtext("disable_added_mass") or "").strip() in ("true", "1"):
         coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
