@@ -139,7 +139,7 @@ def test_a_dataflash_log(tmp_path, dive):
 
 def test_an_attitude_in_hundredths_of_a_degree(tmp_path, dive):
     """Without the EKF's quaternion the autopilot's angles serve: 0.005 deg at most off."""
-    kinds = [kind for kind in FORMATS if kind != 2]
+    kinds = {kind: own for kind, own in FORMATS.items() if kind != 2}
     path = dataflash(tmp_path / "log.bin", rows_of(dive, quaternion=False), kinds)
     report = import_log(path, tmp_path / "log.mcap", configured(**GEOMETRY))
     assert "the attitude is the autopilot's angles" in report.notes[-1]
