@@ -121,6 +121,33 @@ def test_what_is_taken_up_within_a_held_out_block_leaves_nothing(seed):
     assert not any("left" in note for note in findings.notes)
 
 
+def test_each_record_has_a_clock_of_its_own():
+    """Waves, and a battery that runs down, begin with each record; a payload is taken up in one."""
+    duration, onset = 40.0, 15.0
+    dive_of = {
+        "wave": {"fx": 10.0, "fy": 5.0, "fz": 0.0, "frequency": 0.23, "phase": 1.0},
+        "battery_sag": {"end_loss": 0.3, "duration": duration},
+    }
+    payload = {"mass_wet": 1.0, "x": 0.1, "y": 0.0, "z": 0.0, "onset": onset}
+    bags = [record(1, duration, **dive_of), record(2, duration, **dive_of, payload=payload)]
+    streams, begins = joined(bags)
+    assert streams.longest == pytest.approx(max(bag.duration for bag in bags))
+    payload["onset"] = begins[1] + onset
+    there = {**dive_of, "payload": payload}
+    h = Hypothesis(TODAY, {(e, n): x for e, of in there.items() for n, x in of.items()})
+    problem = WindowedProblem(streams, blocks(streams))
+    motion = problem.motion(h, problem.measured_starts())
+    for error in (problem.errors(h), problem.measured - motion.nu[problem.nodes]):
+        assert (np.sqrt(np.mean(error**2, axis=0)) < np.repeat([0.02, 0.01], 3)).all()
+    sag = h.without([k for k in h.keys if k[0] == "battery_sag"]).having(
+        {("battery_sag", "end_loss"): 0.1}
+    )
+    halves = [s for a, b in blocks(streams) for s in windows(a, b)]
+    sag = dataclasses.replace(sag, constants=Search(streams, TODAY, halves).given.constants)
+    fitted = fit(WindowedProblem(streams, halves), sag)
+    assert fitted.hypothesis.values["battery_sag", "end_loss"] == pytest.approx(0.3, abs=0.02)
+
+
 def fitted_to_each(bags, effect, parameters):
     """A search, the records, and fits to all of them and to each that have an effect."""
     streams, begins = joined(bags)

@@ -9,6 +9,8 @@ is taken as measured. Sensitivities solve the linearised equations along that mo
 for any change dF of the wrench, so that a hundred candidate causes cost little more than one.
 """
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from rov_ident.core.jit import copy, floats, inner, record, released
 from rov_ident.core.runge_kutta import NODES, linear_step, multiply, runge_kutta
-from rov_ident.effects import Acting, act, add_surroundings, memory, surrounds
+from rov_ident.effects import Acting, act, add_surroundings, memory, on_clock, surrounds
 from rov_ident.model.coefficients import EXTENDED_SIZE
 from rov_ident.model.equations import (
     CURRENT,
@@ -50,6 +52,8 @@ class Steps(NamedTuple):
     piece: Indices  # (K,)
     inputs: Array  # (K, 4): mean of INPUTS over each step
     given: Array  # (K, 6) accelerations that guided axes are measured to have, else 0; or (0, 6)
+    begin: Array  # (K,) s, of the record, from which effects count the time
+    piece_begin: Array  # (J,) s, the same of pieces
 
 
 class Equations(NamedTuple):
@@ -97,7 +101,9 @@ def thrust(steps: Steps, acting: Acting) -> Array:
     wrench = steps.demand
     if acting.inputs.any():
         wrench = wrench.copy()
-        _thrust(acting, memory(), steps.piece_t, steps.anew, wrench)
+        for begin, rows in _records(steps.piece_begin):
+            t = steps.piece_t[rows.start : rows.stop + 1] - begin
+            _thrust(on_clock(acting, begin), memory(), t, steps.anew[rows], wrench[rows])
     out = np.zeros((2, len(steps.piece), 6))
     _means(steps.piece_t, wrench, steps.t, steps.piece, out)
     return out
@@ -110,12 +116,22 @@ def shoot(
     k = wrench.shape[1]
     zeros = [np.zeros(shape) for shape in 2 * [(k, 6)] + 2 * [(k, 6, 6)]]
     motion = Motion(np.full((k + 1, 6), np.nan), *zeros)
-    _shoot(
-        eq.acting, eq.structure, eq.mass, eq.added, eq.inverse,
-        eq.theta, np.repeat(eq.theta, _LANES, axis=1), eq.restoring, steps, wrench, first, last,
-        start, np.zeros(1, _SCRATCH), motion,
-    )  # fmt: skip
+    for begin, rows in _records(steps.begin):
+        mine = slice(*np.searchsorted(first, [rows.start, rows.stop]))
+        _shoot(
+            on_clock(eq.acting, begin), eq.structure, eq.mass, eq.added, eq.inverse,
+            eq.theta, np.repeat(eq.theta, _LANES, axis=1), eq.restoring,
+            steps._replace(t=steps.t - begin), wrench, first[mine], last[mine], start[mine],
+            np.zeros(1, _SCRATCH), motion,
+        )  # fmt: skip
     return motion
+
+
+def _records(begin: Array) -> Iterator[tuple[float, slice]]:
+    """When each record begins [s], and which rows are its own, of which each says when that was."""
+    edges = np.flatnonzero(np.diff(begin, prepend=np.nan, append=np.nan) != 0.0).tolist()
+    for first, last in pairwise(edges):
+        yield float(begin[first]), slice(first, last)
 
 
 def tangent(
@@ -148,10 +164,12 @@ def regressors(eq: Equations, steps: Steps, motion: Motion) -> Array:
 def wrenches(eq: Equations, steps: Steps, thrust: Array, motion: Motion) -> Array:
     """Wrench effects and current (K, 6) along a motion; ``thrust`` (K, 6) is of the thrusters."""
     out = np.zeros((len(motion.middle), 6))
-    _wrenches(
-        eq.acting, eq.structure, eq.added, eq.theta, steps, thrust, motion.middle,
-        np.zeros(1, CURRENT), out,
-    )  # fmt: skip
+    for begin, rows in _records(steps.begin):
+        _wrenches(
+            on_clock(eq.acting, begin), eq.structure, eq.added, eq.theta,
+            steps.t[rows.start : rows.stop + 1] - begin, steps.position[rows], steps.middle[rows],
+            steps.inputs[rows], thrust[rows], motion.middle[rows], np.zeros(1, CURRENT), out[rows],
+        )  # fmt: skip
     return out
 
 
@@ -177,13 +195,15 @@ def _means(piece_t, wrench, t, piece, out):
 
 
 @released
-def _wrenches(acting, structure, added, theta, steps, thrust, nu, scratch, out):
-    t, middle, s = steps.t, steps.middle, scratch[0]
+def _wrenches(
+    acting, structure, added, theta, t, position, middle, inputs, thrust, nu, scratch, out
+):  # fmt: skip
+    s = scratch[0]
     for k in range(len(nu) if surrounds(acting) else 0):
         now = 0.5 * (t[k] + t[k + 1])
-        extend_inputs(1, structure, steps.inputs[k], s.extended)
+        extend_inputs(1, structure, inputs[k], s.extended)
         add_surroundings(
-            acting, structure, added, theta, now, steps.position[k], nu[k], middle[k],
+            acting, structure, added, theta, now, position[k], nu[k], middle[k],
             thrust[k], s, out[k],
         )  # fmt: skip
 

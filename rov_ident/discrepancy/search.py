@@ -96,7 +96,7 @@ class Search:
             if name in config.estimate and not streams.guided[parse(name).row]
         }
         parameters = [(e.name, p) for e in EFFECTS.values() for p in e.parameters]
-        duration = {(e, p.name): streams.duration for e, p in parameters if p.role == "fixed"}
+        duration = {(e, p.name): streams.longest for e, p in parameters if p.role == "fixed"}
         self.given = Hypothesis(config, base, duration)
         self._workers = Workers(self.problem)
         self.screening = Screening(self.problem, self._workers)

@@ -32,7 +32,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     wrenches,
 )
 from rov_ident.discrepancy.reading_noise import SMALL, draws
-from rov_ident.effects import EFFECTS, Values, compiled, rigid_body, steered
+from rov_ident.effects import EFFECTS, Values, compiled, on_clock, rigid_body, steered
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import INERTIA, Array, Model, RigidBody
@@ -115,6 +115,8 @@ class WindowedProblem:
             np.searchsorted(pieces, nodes[:-1]),
             means,
             given,
+            streams.begin_of(nodes[:-1]),
+            streams.begin_of(pieces[:-1]),
         )
         at = np.searchsorted(nodes, t)
         first, last = [], []
@@ -395,15 +397,16 @@ class WindowedProblem:
             each, self.first, self.last, self.measured_starts(), strict=True
         ):
             (mean, slope), inputs = self.thrust(there.effects), self.driven(there.effects).inputs
-            nodes = slice(first, last + 1)
+            nodes, begin = slice(first, last + 1), float(self.steps.begin[first])
             at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
             if self.guided.any():
                 guide = Guide(~self.guided, nu[nodes], self.orientation[nodes])
             with contextlib.suppress(UserError):
                 simulated[nodes] = simulate(
-                    there.model, self.steps.t[nodes], mean[at], start, self.steps.position[at[0]],
-                    orientation=self.orientation[first], wrench_slope=slope[at], guide=guide,
-                    effects=compiled(there.effects), inputs=inputs[at],
+                    there.model, self.steps.t[nodes] - begin, mean[at], start,
+                    self.steps.position[at[0]], orientation=self.orientation[first],
+                    wrench_slope=slope[at], guide=guide,
+                    effects=on_clock(compiled(there.effects), begin), inputs=inputs[at],
                 ).nu  # fmt: skip
         return self.measured - simulated[self.nodes]
 

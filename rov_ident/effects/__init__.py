@@ -133,6 +133,26 @@ def compiled(effects: Values) -> Acting:
     )
 
 
+def on_clock(acting: Acting, begin: float) -> Acting:
+    """The same effects, by a clock that begins at ``begin`` [s]: what sets in does so that much
+    earlier."""
+    if begin == 0.0:
+        return acting
+    earlier = (begin * _onsets(library) for library in (_INPUT, _WRENCH))
+    parameters = acting.input_parameters, acting.wrench_parameters
+    inputs, wrenches = (p - e for p, e in zip(parameters, earlier, strict=True))
+    return acting._replace(input_parameters=inputs, wrench_parameters=wrenches)
+
+
+def _onsets(library: list[Effect]) -> Array:
+    """One where a parameter (effects, SIZE) is an onset, else zero."""
+    out = np.zeros((len(library), SIZE))
+    for row, effect in enumerate(library):
+        for i, p in enumerate(effect.parameters):
+            out[row, i] = p.role == "onset"
+    return out
+
+
 def _table(library: list[Effect], effects: Values) -> tuple[NDArray[np.bool_], Array]:
     there, parameters = np.zeros(len(library), dtype=bool), np.zeros((len(library), SIZE))
     for row, effect in enumerate(library):

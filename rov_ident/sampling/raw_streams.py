@@ -52,6 +52,7 @@ class Streams:
     odometry: ``t`` (N,), position (N, 3), orientation (N, 4) w x y z, nu (N, 6) as measured.
     IMU: ``imu_t`` (M,), gyro (M, 3), specific_force (M, 3) in sensor axes.
     wrench: ``demand_t`` (K,), demand (K, 6), each held to the next; dropped ones are estimated.
+    ``begins`` (R,) [s]: of the records that were joined, each of which has a clock of its own.
     fins and shafts: ``inputs_t`` (I,), inputs (I, 4) of INPUTS, straight from each to the next.
     ``notes`` say what was left out. ``rates_std`` (3,) [rad/s]: a bias of the angular velocities is
     none beyond that. ``max_step`` [s]: no longer may a simulation's be, for drag to stop no motion
@@ -78,6 +79,7 @@ class Streams:
     notes: tuple[str, ...] = ()
     rates_std: Array = field(default_factory=lambda: np.zeros(3))
     max_step: float = MAX_STEP
+    begins: Array = field(default_factory=lambda: np.zeros(1))
     posed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     is_reckoned: bool = False
     unmeasured: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
@@ -100,6 +102,18 @@ class Streams:
     @property
     def duration(self) -> float:
         return float(self.t[-1])
+
+    @property
+    def longest(self) -> float:
+        """Seconds that the longest record lasts."""
+        ends = np.append(self.begins[1:] - PAUSE, self.duration)
+        return float(np.max(ends - self.begins))
+
+    def begin_of(self, t: Array) -> Array:
+        """When the records began to which instants t (n,) belong [s]."""
+        which = np.searchsorted(self.begins, t + 0.5 * PAUSE, side="right") - 1
+        begins: Array = self.begins[np.maximum(which, 0)]
+        return begins
 
     @property
     def recordings(self) -> tuple[Array, Array]:
@@ -249,7 +263,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
     }
     for name in (f.name for f in fields(Streams) if f.name not in both):
         each = [getattr(bag, name) for bag in bags]
-        if name == "t" or name.endswith("_t"):
+        if name in ("t", "begins") or name.endswith("_t"):
             each = [t + begin for t, begin in zip(each, begins, strict=True)]
         both[name] = np.concatenate(each)
     return Streams(**both), begins
