@@ -283,6 +283,9 @@ def test_approval_and_revert(start):
     assert not one.ask("approve").success
     one.call(SetBool, "/controller_bridge/enable", SetBool.Request(data=True))
     one.hears("waiting for ~/approve")
+    one.call(SetBool, "/controller_bridge/enable", SetBool.Request(data=False))
+    answer = one.ask("approve")  # what was pending before is not, although nothing has looked since
+    assert not answer.success and one.held() == [-10.0, -100.0]
 
 
 def test_rate_and_lists(start, heavy):

@@ -151,6 +151,14 @@ def test_a_node_of_its_own_section_overrides_the_common_one(file):
     assert load(file(MINIMAL.replace("/**", "/rls_node"))).name == "bluerov2_heavy"
 
 
+def test_a_file_of_two_vehicles_is_refused(file):
+    """The last of two sections that a node would take counted, whichever vehicle it was of."""
+    for names in (("/rov1/**", "/rov2/**"), ("/**", "**")):
+        both = "\n".join(MINIMAL.replace("/**", name) for name in names)
+        with pytest.raises(UserError, match="keep a file for each vehicle"):
+            load(file(both))
+
+
 def test_estimate_is_in_the_order_of_the_model_and_knows_both_names_of_a_term():
     config = from_parameters(
         minimal(coefficients__Y_rdot=0.1, estimate=["X_u", "N_vdot", "X_udot"])

@@ -50,6 +50,28 @@ def hydrodynamics(heavy):
     return HydrodynamicModel(heavy)
 
 
+def test_trim_and_thrust_that_the_estimator_finds_are_taken_along(hydrodynamics, heavy):
+    """Its coefficients are right only with them: hovering took a force of the wrong sign."""
+    level = [0.0, 0.0, 1.0]
+    before = hydrodynamics.g(level)
+    found = [
+        status("X_u", "-20.0"),
+        status("thrust_scale.scale", "0.85", "1"),
+        status("buoyancy.delta", "2.5", "N"),
+        status("thruster_lag.time_constant", "0.2", "s"),  # of no matrix
+        status("cog_offset.dx", "0.01", "m", b"\x01"),
+    ]
+    taken = hydrodynamics.take(message(*found), 0.0)
+    assert taken.values == {"X_u": -20.0, "thrust_scale.scale": 0.85, "buoyancy.delta": 2.5}
+    assert list(taken.refused) == ["cog_offset.dx"] and hydrodynamics.fresh(0.0)
+    assert hydrodynamics.thrust_scale == 0.85
+    np.testing.assert_allclose(hydrodynamics.g(level) - before, [0, 0, -2.5, 0, 0, 0], atol=1e-9)
+    wrong = [status("X_u", "-20.0"), status("thrust_scale.scale", "0.0", "1")]
+    assert "beyond" in hydrodynamics.take(message(*wrong), 0.1).refused["thrust_scale.scale"]
+    assert hydrodynamics.thrust_scale == 0.85
+    assert HydrodynamicModel(heavy).thrust_scale == 1.0
+
+
 def test_matrices(hydrodynamics):
     """They are the model's, and together the wrench; attitude is a quaternion or a direction."""
     rng = np.random.default_rng(1)

@@ -71,6 +71,21 @@ def test_intervals_hold_the_truth():
     assert np.mean(inside) >= 0.86  # 30 intervals of 95 %: by chance fewer one time in sixty
 
 
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_what_comes_twice_counts_once(kind):
+    """A single repeated stamp began the motion anew, and left the UKF without filters for good."""
+    t, heading, rudder = steered(0.3, 4.0, noise=1e-3, seed=2, duration=90.0)
+    once = fold(kind, t, heading, rudder).result
+    rng = np.random.default_rng(0)
+    order = np.sort(np.append(np.arange(len(t)), [4, *rng.integers(0, len(t), 50)]))
+    twice = fold(kind, t[order], heading[order], rudder[order]).result
+    np.testing.assert_array_equal(twice.values, once.values)
+    late = t.copy()
+    late[5] = t[4] - 0.005  # and a stamp that is a little early
+    early = fold(kind, late, heading, rudder).result
+    assert early.values == pytest.approx(once.values, rel=0.02)
+
+
 def test_headings_wrap_and_gaps_are_bridged():
     t, heading, rudder = steered(0.3, 4.0, seed=1)
     whole = fold("rls", t, heading, rudder).result

@@ -359,11 +359,16 @@ def _section(document: Any, node: str) -> dict[str, Any]:
         raise UserError("is empty: give a section /**: with ros__parameters: below it")
     if not isinstance(document, Mapping):
         raise UserError(f"is {shown(document)} at the top, but must begin with /**:")
-    sections = {
-        str(name).rpartition("/")[2]: content["ros__parameters"]
-        for name, content in document.items()
-        if isinstance(content, Mapping) and "ros__parameters" in content
-    }
+    sections, names = {}, dict[str, str]()
+    for name, content in document.items():
+        if isinstance(content, Mapping) and "ros__parameters" in content:
+            own = str(name).rpartition("/")[2]
+            if own in sections:
+                raise UserError(
+                    f"has {names[own]} and {name}, of which a node or command takes only one: keep "
+                    "a file for each vehicle"
+                )
+            sections[own], names[own] = content["ros__parameters"], str(name)
     if not sections:
         raise UserError("has no ros__parameters: put /**: and ros__parameters: above the keys")
     chosen = [sections[name] for name in ("**", node) if name in sections]

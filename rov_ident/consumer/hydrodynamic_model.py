@@ -5,7 +5,7 @@ No middleware: a message is anything with the fields of diagnostic_msgs/Diagnost
 
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any
 
@@ -17,8 +17,11 @@ from rov_ident.core.errors import UserError, require
 from rov_ident.core.frames import gravity_direction, quaternion_normalise
 from rov_ident.core.messages import SECOND
 from rov_ident.core.states import Level
+from rov_ident.effects import EFFECTS, parameter, rigid_body
 from rov_ident.estimation.physical import is_passive
 from rov_ident.model.equations import Array, Model, build
+
+_THRUST_SCALE = "thrust_scale"
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,9 @@ class HydrodynamicModel:
     :meth:`take` is given every message; of a message only the converged coefficients are taken up,
     and only if the whole set is physical with them. Sets are exchanged in one assignment: ``model``
     is the present one, and a controller thread that needs several matrices of the same set keeps
-    it in a variable. Of the effects in the configuration, those on the rigid body are in the
-    matrices; the others are left out.
+    it in a variable. Of the effects in the configuration, and of those that the estimator finds
+    beside it, those on the rigid body are in the matrices, and ``thrust_scale`` is what the thrust
+    is off by; the others are left out.
 
     ``config`` is the path of a parameter file, or a Config; ``hold_after`` is the time in seconds
     without a message after which :meth:`fresh` says no. ``now`` is always a time in seconds on a
@@ -62,9 +66,16 @@ class HydrodynamicModel:
             raise UserError(f"hold_after is {hold_after} s, but must be positive")
         config = load(config)
         self.hold_after = hold_after
-        self._model = config.dynamics
+        self._model, self._body = config.dynamics, config.model.body
         self._prior = prior_of(config)
+        self._effects = {n: dict(v) for n, v in config.effects.items()}
         self._units = {c.name: c.unit for c in config.model.coefficients}
+        self._units |= {
+            f"{name}.{p.name}": p.unit
+            for name, effect in EFFECTS.items()
+            for p in effect.parameters
+            if effect.body or name == _THRUST_SCALE
+        }
         self._stamp: int | None = None  # ns, of the last message in order
         self._renewed = -math.inf  # s, on the caller's clock
 
@@ -83,8 +94,9 @@ class HydrodynamicModel:
         levels: set[Level] = set()
         names = [status.name for status in message.status]
         for status in message.status:
-            if "." in status.name:
-                continue  # a parameter of an effect is not in these matrices
+            is_coefficient = "." not in status.name
+            if not is_coefficient and status.name not in self._units:
+                continue  # a parameter of an effect that is in neither matrices nor command
             try:
                 if names.count(status.name) > 1:
                     raise ValueError("given twice")
@@ -92,18 +104,28 @@ class HydrodynamicModel:
             except ValueError as error:
                 refused[status.name] = str(error)
                 continue
-            levels.add(level)
+            if is_coefficient:
+                levels.add(level)
             if level == Level.OK:
                 values[status.name] = value
             else:
                 refused[status.name] = f"{level.name}: {status.message}"
         if not levels:
             return Taken(refused=refused, reason="it has no coefficient that can be read")
-        candidate = self._model.with_values(values)
+        effects = {n: dict(v) for n, v in self._effects.items()}
+        for name in values:
+            effect, _, own = name.partition(".")
+            if own:
+                nulls = {p.name: p.null for p in EFFECTS[effect].parameters}
+                effects.setdefault(effect, nulls)[own] = values[name]
+        coefficients = {n: x for n, x in values.items() if "." not in n}
+        candidate = replace(
+            self._model.with_values(coefficients), body=rigid_body(self._body, effects)
+        )
         reason = self.why_unphysical(candidate) if values else ""
         if reason:
             return Taken(refused=refused | dict.fromkeys(values, reason), reason=reason)
-        self._model = candidate
+        self._model, self._effects = candidate, effects
         self._stamp = stamp
         self._renewed = -math.inf if levels == {Level.STALE} else now
         return Taken(values, refused)
@@ -131,6 +153,9 @@ class HydrodynamicModel:
             value = float(pairs["value"])
         except (TypeError, ValueError):
             raise ValueError(f"{pairs['value']!r} is not a number") from None
+        effect, _, own = status.name.partition(".")
+        if own and not parameter(effect, own).lower < value < parameter(effect, own).upper:
+            raise ValueError(f"{pairs['value']} is beyond what it can be")
         if not abs(value) <= LARGEST:
             raise ValueError(f"{pairs['value']} is not finite or of no sensible size")
         level = status.level
@@ -153,6 +178,12 @@ class HydrodynamicModel:
     def model(self) -> Model:
         """The present set, whole: it stays as it is when the next one comes."""
         return self._model
+
+    @property
+    def thrust_scale(self) -> float:
+        """What the thrusters give, over what their wrench says (`thrust_scale`); 1 if not known: to
+        get a wrench, command it divided by this."""
+        return self._effects.get(_THRUST_SCALE, {}).get("scale", 1.0)
 
     @property
     def M(self) -> Array:

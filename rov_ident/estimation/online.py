@@ -299,7 +299,9 @@ class OnlineEstimator:
                 if len(self._about):
                     self._recentre()
             self._recent.forget(self._last_t, self.memory())
-        if self.monitor is not None and self.sampler.commands is not None:
+        if self.monitor is not None and self.sampler.commands is None:
+            self.sampler.commands = []  # it was attached while the sampler was replaced
+        elif self.monitor is not None and self.sampler.commands is not None:
             window = self.monitor.take(samples, self.sampler.commands)
             if window is not None:
                 report = self.report()

@@ -325,6 +325,9 @@ class ControllerBridge(GuardedNode):
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._enabled = request.data
+        if not request.data:  # or it could be approved still
+            self._pending = ()
+            self._publish_pending()
         response.success = True
         response.message = "enabled" if request.data else "disabled: nothing is sent"
         self.get_logger().info(response.message)

@@ -124,6 +124,7 @@ class ExampleController(GuardedNode):
             nu_dot = (self._command - self._reference) / _LAG
             nu_dot += self._gain * (self._reference - self._nu)
             command = self._hydrodynamics.wrench(self._nu, nu_dot, self._down)
+            command /= self._hydrodynamics.thrust_scale
             tau[self._gain > 0.0] = np.clip(command, -self._limit, self._limit)[self._gain > 0.0]
             fresh = "fresh" if self._hydrodynamics.fresh(now) else "the last good"
             state = f"controlling with {fresh} coefficients"

@@ -21,7 +21,7 @@ import numpy as np
 from rov_ident.core.messages import Array
 from rov_ident.steering.nomoto_filter import Filter, heading_noise
 from rov_ident.steering.nomoto_model import Structure
-from rov_ident.steering.zigzag import GAP
+from rov_ident.steering.zigzag import FEWEST, GAP
 
 STEP = 0.1  # s between the samples used: a tenth of the least T in docs/nomoto.md
 _CORNERS = 0.01 * 4.0 ** np.arange(6)  # rad/s: T from a tanker's to less than a second
@@ -118,11 +118,12 @@ class RecursiveNomoto:
         self.result: KandT | None = None  # after the last sample; None while nothing is known
 
     def push(self, t: float, heading: float, rudder: float) -> None:
-        """A sample at t [s], both in rad; one that is less than STEP after the last is left out."""
+        """A sample at t [s], both in rad; one that is less than STEP from the last is left out, as
+        is one that comes twice."""
         if not math.isfinite(t + heading + rudder):
             return
         last = self._last
-        if last is not None and t > last[0] and t - last[0] < 0.999 * STEP:
+        if last is not None and abs(t - last[0]) < 0.999 * STEP:
             return
         begins = last is None or not 0.0 < t - last[0] <= GAP
         if last is not None:
@@ -153,6 +154,8 @@ class RecursiveNomoto:
         else:
             self._samples = [*self._samples[-_MOST:], (*sample, begins)]
             rough = self.result
+            if len(self._samples) < FEWEST:
+                return
             if rough is None or (rough.std > _ROUGHLY * np.abs(rough.values)).any():
                 return
             self._filters = self._first_filters(rough)
