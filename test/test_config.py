@@ -225,6 +225,7 @@ REFUSED = [
     # unknown
     ({"vehicle__mas": 1.0}, "vehicle.mas is an unknown key: did you mean mass?"),
     ({"vehicles": 1.0}, "vehicles is an unknown key: did you mean vehicle?"),
+    ({"estimate_effects": {}}, "estimate_effects is an unknown key: did you mean estimate?"),
     ({"rls": {"gat": 1.0}}, "rls.gat is an unknown key: did you mean gate?"),
     ({"qos": {"zzz": 1.0}}, "qos.zzz is an unknown key: use one of reliability, depth"),
     (

@@ -13,6 +13,7 @@ from program import run
 import rov_ident as ri
 from bench import ROOT
 from rov_ident.api import identification
+from rov_ident.cli.program import main
 from rov_ident.discrepancy.explain import Explanation
 from rov_ident.discrepancy.extension import Kept
 from rov_ident.discrepancy.hypothesis import Hypothesis
@@ -87,6 +88,26 @@ def test_a_dive_at_rest_is_refused_with_a_manoeuvre(tmp_path, dives):
     assert "no dive is fit" in done.stderr and "fly instead: " in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not out.exists()
+
+
+def test_the_folder_may_have_any_name(tmp_path, monkeypatch):
+    """Also one with a dot, or with what is the ending of a file elsewhere."""
+
+    class Found(identification.Identification):
+        fit = SimpleNamespace(save_config=lambda path: path.write_text(""))
+        page = to_json = table = lambda self: ""
+        sentence, advice = "", ()
+
+        def __init__(self):
+            pass
+
+    monkeypatch.setattr(identification, "identify", lambda *_, **__: Found())
+    for name in ("tank_2026.11", "run.json"):
+        out = tmp_path / name
+        assert main(["identify", "dive.mcap", "--config", str(VEHICLE), "--out", str(out)]) == 0
+        assert {path.name for path in out.iterdir()} == {
+            "report.html", "result.json", "extended.yaml",
+        }  # fmt: skip
 
 
 def test_what_is_missing_is_said_before_any_dive_is_read(dives):

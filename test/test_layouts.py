@@ -180,6 +180,9 @@ def test_shipped(tmp_path, capsys):
     bad = ["layouts", "--config", str(HEAVY), "--out", str(tmp_path), "--namespace", "a b"]
     assert main(bad) == 2
     assert "is no namespace" in capsys.readouterr().err
+    # at once: a pattern that splits a name in every way takes twice as long for each letter
+    assert main([*bad[:-1], f"{100 * 'rov_'}-1"]) == 2
+    assert main([*bad[:-1], "/fleet/rov_1/"]) == 0
     with pytest.raises(SystemExit, match="2"):
         main(["layouts", "--config", str(HEAVY), "--out", ""])
     assert "an empty name is no folder" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from tiers import more
 
 from rov_ident import config
 from rov_ident.cli import main
+from rov_ident.config.prior import prior_of
 from rov_ident.core.errors import UserError
 from rov_ident.core.messages import DRIVE
 from rov_ident.io import topics
@@ -182,6 +183,27 @@ def test_intervals_hold_a_slow_error_beneath_white_noise():
     assert np.mean(inside) > 0.8
 
 
+def test_intervals_count_what_the_scale_is_off_by():
+    """A wrong added mass or mass scales all forces, which no residual tells; with a bollard pull
+    a wrong mass makes X_udot wrong by as much."""
+    known = fit_coast_downs(surge_runs(), MASS, added_mass=-7.0)
+    off = fit_coast_downs(surge_runs(), MASS, added_mass=-4.0)
+    assert np.all(np.abs(off.values - known.values)[:4] > 10.0 * known.std[:4])
+    stated = fit_coast_downs(surge_runs(), MASS, added_mass=-7.0, added_mass_std=3.0)
+    expected = np.hypot(known.std, off.values - known.values)
+    np.testing.assert_allclose(stated.std, expected, rtol=1e-6)
+    lighter = fit_coast_downs(surge_runs(), MASS - 1.0, added_mass=-7.0)
+    stated = fit_coast_downs(surge_runs(), MASS, added_mass=-7.0, mass_std=1.0)
+    expected = np.hypot(known.std, lighter.values - known.values)
+    np.testing.assert_allclose(stated.std, expected, rtol=1e-6)
+    pulled, doubtful = (
+        fit_coast_downs(surge_runs(), MASS, bollard=(20.0, 28.0), mass_std=std)
+        for std in (0.0, 1.0)
+    )
+    np.testing.assert_allclose(doubtful.std[:4], pulled.std[:4])
+    assert doubtful.std[4] == pytest.approx(np.hypot(pulled.std[4], 1.0))
+
+
 @pytest.mark.parametrize(
     ("runs", "options", "said"),
     [
@@ -215,7 +237,13 @@ def test_coast_down_on_the_command_line(heavy_path, tmp_path, capsys):
     assert main(["coast-down", *common, "--json", str(result), "--save", str(saved)]) == 0
     assert "k1 n + k2 |n| n" in capsys.readouterr().out
     told = json.loads(result.read_text())
-    found = fit_coast_downs(runs, mass, added_mass=heavy.value("X_udot"))
+    found = fit_coast_downs(
+        runs,
+        mass,
+        added_mass=heavy.value("X_udot"),
+        mass_std=heavy.vehicle_uncertainty.mass_std * mass,
+        added_mass_std=prior_of(heavy).std[heavy.estimate.index("X_udot")],
+    )
     assert told["coefficients"] == found.entries()
     assert told["speed_rmse_mps"] == found.rmse
     assert told["coefficients"]["k2"]["unit"] == "N/n2"  # of whatever the column counts

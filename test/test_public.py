@@ -1,6 +1,7 @@
 """The public face: `import rov_ident as ri`, what it offers, and what it leaves alone."""
 
 import ast
+import dataclasses
 import errno
 import inspect
 import json
@@ -422,6 +423,23 @@ def test_what_only_one_configuration_has_and_its_body_are_told(tmp_path, fit, ca
     assert dict(zip(found.names, found.difference))["vehicle.mass"] == 0.5
     # A fit takes the body as it is: nothing of it is missing there.
     assert not any(name.startswith("vehicle") for name in ri.compare(HEAVY, fit).only_a)
+
+
+def test_effects_of_configurations_are_compared(tmp_path):
+    """With each other, and with what a fit found of them."""
+    given = ri.load(HEAVY)
+    a, b = (
+        dataclasses.replace(given, effects={"thrust_scale": {"scale": scale}})
+        for scale in (0.8, 1.2)
+    )
+    found = ri.compare(a, b)
+    assert f"1 of {len(given.model.names) + 1} coefficients differ" in found.sentence
+    assert dict(zip(found.names, found.difference))["thrust_scale.scale"] == pytest.approx(0.4)
+    path = tmp_path / "fit.json"
+    path.write_text(document(X_u=(-13.0, 0.1, "N s/m"), **{"thrust_scale.scale": (1.0, 0.05, "1")}))
+    found = ri.compare(a, path)
+    assert found.names == ("X_u", "thrust_scale.scale") and found.only_b == ()
+    assert found.deviations[1] == pytest.approx(4.0)
 
 
 def test_intervals_are_those_that_the_results_state(tmp_path):

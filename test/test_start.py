@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from test_bags import write_mcap
 
 import rov_ident as ri
 from bench import DATA, DEMO, ROOT
-from rov_ident.api import identification
+from rov_ident.api import functions, identification
 from rov_ident.cli.program import main
 from rov_ident.config import PARAMETERS, VEHICLE_PARAMETERS, from_parameters, to_parameters
 from rov_ident.config.writing import annotated
 from rov_ident.core.frames import from_core, to_core
-from rov_ident.core.messages import IMU, ODOMETRY, Imu, Odometry, Wrench
+from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.core.yaml_file import parse
+from rov_ident.experiment.design import Proposal
 from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
@@ -166,6 +168,42 @@ def test_a_turned_velocity_sensor_is_said(tmp_path, heavy):
     angles = {"roll": 0.0, "pitch": 0.0, "yaw": -np.pi / 2}
     known = dataclasses.replace(heavy, effects={"sensor_misalignment": angles})
     assert not [note for note in with_mounting(known, [path])[1] if "turned" in note]
+
+
+def test_replay_and_plan_have_the_mounting_of_a_bag(monkeypatch, heavy, tmp_path):
+    """As `fit` has it: nodes by the file that they are given, and a plan says so."""
+    pytest.importorskip("rclpy")
+    from rov_ident.nodes import replay
+
+    told = []
+
+    def started(name, parameters, namespace):
+        told.append(ri.load(parameters))
+        raise ri.UserError("no node is needed")
+
+    path, zero, unit = tmp_path / "dive.mcap", np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    with BagWriter(path) as bag:
+        tree = tree_of(("base_link_frd", "imu_link_frd", (0.3, 0.1, -0.2), LEVEL))
+        bag.write("/tf_static", "tf2_msgs/msg/TFMessage", 1, tree)
+        for role, message in (
+            (
+                ODOMETRY,
+                Odometry(1, "odom_ned", "base_link_frd", zero, unit, zero, zero, np.zeros(6)),
+            ),
+            (IMU, Imu(1, "imu_link_frd", unit, zero, zero, zero, zero)),
+            (WRENCH, Wrench(1, "base_link_frd", zero, zero)),
+        ):
+            bag.write(f"/{ROLE_NAMES[role]}", ROLE_TYPES[role], 1, encode(message))
+    monkeypatch.setattr(replay, "_Process", started)
+    with pytest.raises(ri.UserError, match="no node is needed"):
+        replay.replay(path, SHIPPED)
+    np.testing.assert_allclose(told[0].imu.position, [0.3, 0.1, -0.2], atol=1e-9)
+
+    proposal = Proposal(heavy, None, "", (), (), (), (), ())
+    monkeypatch.setattr(functions.archive, "opened", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(functions.design, "propose", lambda *_: proposal)
+    (note,) = ri.plan(SHIPPED, path).notes
+    assert note.startswith("imu.position is [0.3, 0.1, -0.2]")
 
 
 @pytest.mark.parametrize(

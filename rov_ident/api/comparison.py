@@ -15,6 +15,7 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import read_input
 from rov_ident.core.messages import Array
+from rov_ident.effects import parameter
 from rov_ident.model.equations import INERTIA
 from rov_ident.reports.result import NORMAL, Figure, Result, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table, estimate
@@ -225,10 +226,8 @@ def compare(
     """
     one, two = _estimates(a), _estimates(b)
     # No result has the rigid body, which a fit takes as it is.
-    shared = ("",) if one.is_config and two.is_config else tuple("XYZKMN")
-    mine, other = (
-        [n for n in e.names if not e.is_config or n.startswith(shared)] for e in (one, two)
-    )
+    whole = one.is_config and two.is_config
+    mine, other = ([n for n in e.names if whole or not n.startswith(_BODY)] for e in (one, two))
     names = tuple(name for name in mine if name in other)
     if not names:
         raise UserError(f"{one.label} and {two.label} have no coefficient in common")
@@ -280,6 +279,11 @@ def _numbers_of_config(config: Config, label: str) -> Estimates:
     model, body = config.model, config.model.body
     entries = [
         (c.name, c.unit, value) for c, value in zip(model.coefficients, model.theta.tolist())
+    ]
+    entries += [
+        (f"{name}.{own}", parameter(name, own).unit, value)
+        for name, values in config.effects.items()
+        for own, value in values.items()
     ]
     for key, unit in (("mass", "kg"), ("weight", "N"), ("buoyancy", "N")):
         entries.append((f"{_BODY}{key}", unit, getattr(body, key)))

@@ -396,7 +396,8 @@ def plan(
     if len(sides) != 3 or not numeric:
         raise UserError(f"tank is {tank!r}, but must be three lengths [m], such as (6, 6, 2)")
     limits, paths = Limits(sides, thrust), [] if bag is None else several(bag)
-    given, _ = with_mounting(given, paths)
+    given, placed = with_mounting(given, paths)
     known = archive.opened(paths, given, say=say) if paths else contextlib.nullcontext()
     with known as bags:
-        return design.propose(given, bags, duration, limits, say)
+        found = design.propose(given, bags, duration, limits, say)
+    return dataclasses.replace(found, notes=placed)

@@ -208,9 +208,13 @@ class Identification(Shown):
         )
 
     def _writers(self) -> dict[str, Callable[[Path], None]]:
-        return super()._writers() | {".yaml": self.fit.save_config, "": self._write_folder}
+        return super()._writers() | {".yaml": self.fit.save_config, "": self.write_folder}
 
-    def _write_folder(self, folder: Path) -> None:
+    def write_folder(self, folder: Path) -> None:
+        """Write report.html, result.json and extended.yaml into a folder of any name.
+
+        Raises UserError if they cannot be written there.
+        """
         write_file(folder / "report.html", self.page())
         write_file(folder / "result.json", self.to_json())
         self.fit.save_config(folder / "extended.yaml")

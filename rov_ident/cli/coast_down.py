@@ -25,6 +25,7 @@ def add(commands: common.Commands) -> None:
 
 def _coast_down(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
+    from rov_ident.config.prior import prior_of
     from rov_ident.io.csv_log import parse_columns
     from rov_ident.offline import coast_down
     from rov_ident.reports.result import provenance
@@ -35,10 +36,13 @@ def _coast_down(options: argparse.Namespace) -> None:
     runs, digests = zip(*(coast_down.read_run(path, columns) for path in options.runs))
     anchor = {"bollard": options.bollard} if options.bollard else {}
     if not anchor and "X_udot" in model.names:
-        anchor = {"added_mass": config.value("X_udot")}
+        (std,) = prior_of(dataclasses.replace(config, estimate=("X_udot",))).std
+        anchor = {"added_mass": config.value("X_udot"), "added_mass_std": std}
+    mass = model.body.mass
+    anchor["mass_std"] = config.vehicle_uncertainty.mass_std * mass
     with common.progress(options) as tell:
         tell("fitting")
-        found = coast_down.fit_coast_downs(runs, model.body.mass, **anchor)
+        found = coast_down.fit_coast_downs(runs, mass, **anchor)
     files = zip((path.name for path in options.runs), digests)
     found = dataclasses.replace(found, provenance=provenance(files, vehicle=config.name))
     if options.json:

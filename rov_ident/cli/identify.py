@@ -26,7 +26,7 @@ def _identify(options: argparse.Namespace) -> None:
     with progress(options) as tell:
         found = identify(options.bags, options.config, validate=options.validate, progress=tell)
         tell("drawing")
-        found.save(options.out)
+        found.write_folder(options.out)  # its name may have a dot, as of a date
     OUT.print(found.sentence)
     show(found, found.notes)
     for advice in found.advice:

@@ -58,7 +58,7 @@ def _layouts(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
     from rov_ident.dashboard import layouts
 
-    if not re.fullmatch(r"(/?[A-Za-z_]\w*)*/?", options.namespace):
+    if not re.fullmatch(r"(/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*)?/?", options.namespace, re.ASCII):
         raise UserError(f"{options.namespace!r} is no namespace of ROS 2, such as rov1")
     writers = {
         options.out / "foxglove.json": layouts.foxglove,

@@ -35,4 +35,4 @@ def _plan(options: argparse.Namespace) -> None:
     if options.out:
         write_messages(options.out, found.best.dive(found.config, seed=0).messages)
     common.OUT.print(found.sentence)
-    common.show(found)
+    common.show(found, found.notes)

@@ -58,6 +58,7 @@ def _replay(options: argparse.Namespace) -> None:
         ]
         head = ["", "value", PLUS_MINUS, "unit", "state"]
         common.OUT.print(Table(f"{name}, at the end of {options.bag}", head, rows, text=(3, 4)))
+    common.say(*result.notes)
     common.say(f"{result.messages} messages in {result.seconds:.1f} s")
     if result.out:
         common.say(f"recorded: {result.out}")

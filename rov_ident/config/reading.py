@@ -150,8 +150,9 @@ def _read_section(section: type, values: Any, prefix: str) -> dict[str, Any]:
     if not isinstance(values, Mapping):
         raise UserError(f"{prefix[:-1]} is {shown(values)}, but must be a section of keys")
     fields = {item.name: item for item in dataclasses.fields(section)}
-    if section is Config:  # these are made from `vehicle` and `coefficients`
-        del fields["name"], fields["model"], fields["vehicle_uncertainty"]
+    if section is Config:  # these are made from `vehicle`, `coefficients` and `estimate`
+        for own in ("name", "model", "vehicle_uncertainty", "estimate_effects"):
+            del fields[own]
     for name in values:
         if name not in fields:
             others = ["vehicle", "coefficients"] if section is Config else []

@@ -89,6 +89,7 @@ class Proposal(Shown):
     """Every candidate's name and the relative standard deviation of its worst coefficient."""
     left_out: tuple[str, ...]
     candidates: tuple[Candidate, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
@@ -157,6 +158,7 @@ class Proposal(Shown):
                 for n, s in self.others
             ],
             "left_out": list(self.left_out),
+            "notes": list(self.notes),
         }
         return as_json(document)
 

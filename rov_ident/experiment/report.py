@@ -64,8 +64,8 @@ def of_plan(found: Proposal) -> str:
         ),
         report.table(["manoeuvre", "worst"], others),
     ]
-    if found.left_out:
-        sections.append(report.bullets(found.left_out))
+    if said := (*found.left_out, *found.notes):
+        sections.append(report.bullets(said))
     lead = f"{found.sentence[:1].upper()}{found.sentence[1:]}."
     return report.page(
         f"Next manoeuvre for {config.name}", lead, sections, f"rov_ident {version('rov_ident')}"

@@ -27,6 +27,7 @@ from rov_ident.estimation.online import ESTIMATORS, Report
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.mounting import with_mounting
 from rov_ident.nodes.common import subscribed
 from rov_ident.nodes.player import OnReport, Player, apart
 
@@ -36,12 +37,14 @@ _EXIT_TIME = 10.0  # s; for a node to end after an interrupt, which takes under 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """The last ``reports`` by estimator, and the number of ``messages`` that every node took."""
+    """The last ``reports`` by estimator, the number of ``messages`` that every node took, and what
+    was taken from the bag's `/tf_static`."""
 
     reports: Mapping[str, Report]
     messages: int
     seconds: float
     out: Path | None
+    notes: tuple[str, ...]
 
 
 def replay(
@@ -68,7 +71,7 @@ def replay(
     if out is not None:
         check_output(out, [bag, config_path], bag=True)
     recorded = Bag(Path(bag))
-    config = configuration.load(config_path)
+    config, notes = with_mounting(configuration.load(config_path), [recorded.path])
     topics = inputs.select(recorded, config)
     started = time.monotonic()
     # ROS lists and records no name that begins with an underscore unless it is asked to.
@@ -82,8 +85,9 @@ def replay(
             name = f"{estimator}_node"
             # A new file: the given one may hold what our reader accepts and that of ROS 2 does not.
             parameters = folder / f"{name}.yaml"
+            own, _ = with_mounting(configuration.load(config_path, name), [recorded.path])
             settings = replace(
-                configuration.load(config_path, name),
+                own,
                 qos=Qos(reliability="reliable"),
                 inputs=config.inputs.standard,  # the player converts: see inputs.as_played
             )
@@ -116,9 +120,8 @@ def replay(
             writer.go_live()
         count = player.play(inputs.as_played(recorded, topics, config), rate)
         player.finish()
-        return ReplayResult(
-            player.reports, count, time.monotonic() - started, None if out is None else Path(out)
-        )
+        seconds, written = time.monotonic() - started, None if out is None else Path(out)
+        return ReplayResult(player.reports, count, seconds, written, notes)
 
 
 def _on_this_computer() -> AbstractContextManager[None]:

@@ -79,11 +79,13 @@ def fit_coast_downs(
     *,
     added_mass: float | None = None,
     bollard: tuple[float, float] | None = None,
+    mass_std: float = 0.0,
+    added_mass_std: float = 0.0,
 ) -> CoastDown:
     """Fit step-up and coast-down runs.
 
     ``added_mass``: X_udot [kg], not positive; or ``bollard``: a shaft speed and the thrust [N] at
-    rest there. One of the two.
+    rest there. One of the two. ``mass_std`` and ``added_mass_std``: standard deviations [kg].
 
     Raises UserError if the scale is not given, or the runs lack thrust, coasting, or speed.
     """
@@ -132,12 +134,19 @@ def fit_coast_downs(
             )
     # of the four and of X_udot = mass - inertia, by the four ratios
     jacobian = np.vstack([inertia * np.eye(4) + np.outer(ratio, slope), -slope])
+    covariance = jacobian @ covariance @ jacobian.T
+    # What the mass is off by, a bollard pull leaves to X_udot; else it scales all forces, as X_udot
+    # does. No residual tells of either.
+    of_mass = np.append(np.zeros(4), 1.0) if bollard else np.append(ratio, 0.0)
+    of_added_mass = np.append(-ratio, 1.0)
+    for by, std in ((of_mass, mass_std), (of_added_mass, 0.0 if bollard else added_mass_std)):
+        covariance += std**2 * np.outer(by, by)
     return CoastDown(
         estimator="output error",
         names=tuple(_UNITS),
         units=tuple(_UNITS.values()),
         values=np.append(inertia * ratio, mass - inertia),
-        covariance=jacobian @ covariance @ jacobian.T,
+        covariance=covariance,
         rmse=float(np.sqrt(np.mean(left**2))),
     )
 
