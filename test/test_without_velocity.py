@@ -1,6 +1,7 @@
 """A vehicle without a velocity sensor: what can be told is, the rest is said to be impossible."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 
@@ -21,6 +22,7 @@ from rov_ident.io import topics
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.write_messages import write_messages
 from rov_ident.reports.result import NORMAL
+from rov_ident.sampling.records import read_record
 from rov_ident.sampling.without_velocity import refuse_without_velocity
 
 NOT_MEASURED = {
@@ -119,6 +121,15 @@ def test_nothing_scores_what_was_not_measured(messages, tmp_path, capsys):
     assert velocities["u"]["r2"] is None and velocities["u"]["rmse"] is None
     assert velocities["r"]["rmse"] > 0.0
     assert ri.simulate(HEAVY, bag=path).plot()
+
+
+def test_the_depth_is_that_of_the_origin(messages, tmp_path, heavy):
+    """A pose is that of the body; `odometry.position` is the place of the velocity sensor."""
+    path = written(tmp_path / "without.mcap", messages, *NOT_MEASURED["large variance"])
+    placed = replace(heavy, odometry=replace(heavy.odometry, position=(0.4, 0.1, 0.2)))
+    depths = [read_record(path, config).samples["depth"] for config in (heavy, placed)]
+    assert np.ptp(depths[0]) > 0.0
+    np.testing.assert_array_equal(*depths)
 
 
 def test_bags_with_and_without_are_fitted_apart(messages, tmp_path):

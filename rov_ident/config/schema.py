@@ -272,7 +272,9 @@ class Thrusters(thrusters.Geometry):
 class OdometrySensor:
     """`odometry`: the velocity sensor."""
 
-    position: Vector = option((0.0, 0.0, 0.0), "velocity sensor from the body origin", "m")
+    position: Vector = option(
+        (0.0, 0.0, 0.0), "velocity sensor from the body origin; the pose is the origin's", "m"
+    )
     linear_std: float = positive(
         0.01, "noise of a velocity, where the message gives no variance", "m/s"
     )

@@ -17,7 +17,6 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.jit import kernel
 from rov_ident.core.messages import ODOMETRY, Message, Odometry
-from rov_ident.core.quaternions import rotation
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.coefficients import Coefficient
@@ -124,7 +123,6 @@ class SimulatedVelocity:
         model = config.dynamics
         mass = model.mass_matrix
         self._task = model.structure, mass, np.linalg.inv(mass), model.theta, model.body.restoring
-        self._lever = np.array(config.odometry.position)
 
     def fill(self, sample: NDArray[np.void], odometry: Odometry | None, age: float) -> None:
         """Complete a sample (1,) of SAMPLE whose rates, attitude and wrench are known.
@@ -138,8 +136,7 @@ class SimulatedVelocity:
         sample["nu"][0, :3] = self.v
         sample["odometry"][0, :3] = np.nan
         if odometry is not None:
-            q = odometry.orientation / np.linalg.norm(odometry.orientation)
-            sample["depth"] = odometry.position[2] - rotation(q)[2] @ self._lever
+            sample["depth"] = odometry.position[2]
             sample["depth_age"], sample["depth_variance"] = age, DEPTH_STD**2
 
 
