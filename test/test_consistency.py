@@ -322,6 +322,17 @@ def test_what_an_error_of_the_attitude_rights_is_no_force_that_the_model_lacks(h
     np.testing.assert_allclose(limits, expected, rtol=1e-3)
 
 
+def test_noise_of_the_reading_is_no_force_that_the_model_lacks(heavy):
+    """White noise of this density moves the prediction in a second as such a force does; what is
+    far beyond it still counts."""
+    heavy = replace(heavy, odometry=replace(heavy.odometry, attitude_std=0.0))
+    noise = np.square(np.array([0.0, 0.005, 0.02, 0.0, 0.02, 0.0]) * authority(heavy.model))
+    prior, share = prior_of(heavy), np.array([0.005, 0.011, 0.028, 0.011, 0.04, 0.005])
+    found = consistency_of(heavy, prior, prior.mean, share, reading_noise=noise)
+    failed = [test.name[-1] for test in found.tests if not test.passed]
+    assert failed == ["K", "M"]
+
+
 def test_a_fit_that_predicts_worse_than_its_file_is_said_to(heavy):
     before = np.array([0.1, 0.1, np.nan, 0.1, 0.1, 0.1])
     after = np.array([0.05, 0.2, 0.3, 0.1, 0.1, 0.1])

@@ -16,6 +16,7 @@ from rov_ident.core.linalg import widened
 from rov_ident.core.messages import Array
 from rov_ident.core.states import IDENTIFIABLE, State
 from rov_ident.core.whiteness import BY_CHANCE
+from rov_ident.estimation.innovation_monitor import TIME
 from rov_ident.estimation.process_noise import FIRST_FORCE
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.scales import authority
@@ -31,6 +32,8 @@ SUPPOSED = 2.8
 _SELDOM = 1.645  # normal deviate that 5 % exceed, as of SUPPOSED
 _BEYOND = 3.0  # standard deviations beyond a bound: chance asks for it once in 700 times
 _SENSORS = 3.0  # standard deviations, as of a lone outlier
+# as many of the variance of noise that TIME averages of sums over a second make of it
+_BY_SCATTER = 1.0 + _SENSORS * float(np.sqrt(2.0 / TIME))
 _WHITE = 2.0  # times what noise explains, of which clean dives reach 1.2 (table in docs/live.md)
 _WORSE = 1.05  # what the scatter of a second dive allows
 _RUINED = 3.0  # times the error before, whatever the uncertainty: clean dives fitted from the right
@@ -176,6 +179,7 @@ def consistency_of(
     lasting: Array | None = None,
     sensors: Mapping[str, float] | None = None,
     std: Array | None = None,
+    reading_noise: Array | None = None,
 ) -> Consistency:
     """Judge an estimate.
 
@@ -184,12 +188,17 @@ def consistency_of(
     ``unexplained`` (6,) is the force that lasts a second and that the model does not have, relative
     to the working wrench; NaN where it is not known. ``lasting`` (6,), of RLS, UKF and ML, is the
     power of innovations added up over a second in motion: 1 is expected, NaN where it is not known.
-    ``sensors`` are test ratios of the odometry's parts against the IMU.
+    ``sensors`` are test ratios of the odometry's parts against the IMU. ``reading_noise`` (6,) is
+    the variance density [N2 s, (N m)2 s] of what is read beside the wrench and not followed by the
+    vehicle: over a second, it leaves as much unexplained.
     """
     tests = []
     # weight rights the vehicle to the measured attitude, whose error lasts as long as such a force
-    righting = np.linalg.norm(config.model.body.restoring, axis=1) / authority(config.model)
+    working = authority(config.model)
+    righting = np.linalg.norm(config.model.body.restoring, axis=1) / working
     limits = np.hypot(FIRST_FORCE, config.odometry.attitude_std * righting)
+    if reading_noise is not None:
+        limits = np.hypot(limits, np.sqrt(_BY_SCATTER * reading_noise) / working)
     for axis, share, limit in zip(AXES, unexplained.tolist(), limits.tolist(), strict=True):
         if np.isfinite(share):
             tests.append(

@@ -472,7 +472,7 @@ class OnlineEstimator:
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         consistency = consistency_of(
             self.config, self.prior, raw.values, self._unexplained(), self._whiteness(),
-            self.sampler.kinematic_filter.contradictions, raw.std,
+            self.sampler.kinematic_filter.contradictions, raw.std, self._not_followed(raw.values),
         )  # fmt: skip
         # before any disagreement widens the covariance, which ends at the prior's: with a thrust
         # that is held at its limit, drag and inertia go as the data have it
@@ -531,11 +531,19 @@ class OnlineEstimator:
         """Why some coefficients, by their index, are not updated at present; ``values`` (n,)."""
         if not self._reading_noise.any():
             return {}
-        coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))
-        mass = self.config.dynamics.with_values(coefficients).mass_matrix
-        noisy = noisy_axes(mass, self._reading_noise, self._state.monitor)
+        noisy = self._noisy_axes(values, self._reading_noise)
         held = enumerate(informative_axes(self.config) & noisy)
         return {i: too_noisy(axes) for i, axes in held if axes.any()}
+
+    def _noisy_axes(self, values: Array, reading_noise: Array) -> NDArray[np.bool_]:
+        coefficients = dict(zip(self.config.estimate, values.tolist(), strict=False))
+        mass = self.config.dynamics.with_values(coefficients).mass_matrix
+        return noisy_axes(mass, reading_noise, self._state.monitor)
+
+    def _not_followed(self, values: Array) -> Array:
+        """(6,): variance density of what is read of the wrench and does not move the vehicle."""
+        found = self.sampler.noise_found
+        return np.where(self._noisy_axes(values, found), found, 0.0)
 
     def _unexplained(self) -> Array:
         """(6,): force that the model lacks over the working wrench, NaN where that is not known."""

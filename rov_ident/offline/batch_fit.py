@@ -84,6 +84,7 @@ class _Stage(NamedTuple):
     more: dict[str, Any]
     unexplained: Array  # (6,): as consistency_of takes it
     lasting: Array  # (6,), too
+    reading_noise: Array  # (6,), too
     noise: maximum_likelihood.Noise | None = None
 
 
@@ -112,6 +113,7 @@ def fit_batch(
     values, asked, covariance = prior.mean.copy(), prior.mean.copy(), np.diag(prior.std**2)
     states = dict.fromkeys(prior.names, State.HELD)
     unexplained, lasting = np.full((2, 6), np.nan)
+    reading_noise = np.zeros(6)
     now, parts = config, []
     for stage in settings.stages or (MOTIONS,):
         found: _Stage | None
@@ -127,6 +129,7 @@ def fit_batch(
         covariance[np.ix_(at, at)] = found.covariance
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
+        reading_noise = np.maximum(reading_noise, found.reading_noise)
         now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     say("open loop, fitted")
@@ -135,7 +138,9 @@ def fit_batch(
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
     sensors = worst_of(bag.contradictions for bag in judged.bags)
     std = np.sqrt(np.diag(covariance)) if kind == "ml" else None
-    consistency = consistency_of(config, prior, asked, unexplained, lasting, sensors, std)
+    consistency = consistency_of(
+        config, prior, asked, unexplained, lasting, sensors, std, reading_noise
+    )
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
     if settings.unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
@@ -278,6 +283,7 @@ def _stage(
     found, covariance, asked = least.values, least.covariance, least.values
     noise = None
     unexplained, lasting = np.full((2, 6), np.nan)
+    reading_noise = np.zeros(6)
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
@@ -301,10 +307,11 @@ def _stage(
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         unexplained[:2] = np.nan if settings.unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
+        reading_noise = likelihood.reading_noise
         more |= _numbers_of(likelihood, names, free)
         if likelihood.held.any():
             waiting = ", ".join(n for n, held in zip(names, likelihood.held, strict=True) if held)
-            notes.append(f"{waiting} held: {too_noisy(likelihood.noisy)}")
+            notes.append(f"{waiting} held: {too_noisy(reading_noise > 0.0)}")
         if not likelihood.converged:
             notes.append(f"{name}: the iteration did not settle: give a better configuration")
     gain = gain_of(covariance, prior.std) if settings.prior else None
@@ -330,8 +337,9 @@ def _stage(
     if free[0] and not np.any(archive.each(thrust_axes), axis=0)[0]:
         notes += _scale_notes(config, names, covariance)
     return _Stage(
-        names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting, noise
-    )
+        names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting,
+        reading_noise, noise,
+    )  # fmt: skip
 
 
 def _with_estimated(

@@ -335,9 +335,11 @@ class Likelihood:
     NaN where it is not known.
     ``by_axis`` (n, 6): what the values are wrong by if the thrust of one axis is off by its
     standard deviation (`config.prior.axis_std_of`); (n, 0) where none is supposed.
-    ``held`` (n,): what kept its prior, as the axes ``noisy`` (6,) would teach it noise of the
-    wrench's reading: their coefficients, and factors of the thrust there. Other parameters of
-    thrusters are learnt from the other axes (a lag would smooth the noise away).
+    ``reading_noise`` (6,) is the variance density [N2 s, (N m)2 s] of noise of the wrench's
+    reading, on axes that would teach that; zero on others.
+    ``held`` (n,): what kept its prior, as it would be learnt from such axes: their coefficients,
+    and factors of the thrust there. Other parameters of thrusters are learnt from the other axes
+    (a lag would smooth the noise away).
     """
 
     values: Array
@@ -349,7 +351,7 @@ class Likelihood:
     lasting: Array
     by_axis: Array
     held: NDArray[np.bool_]
-    noisy: NDArray[np.bool_]
+    reading_noise: Array
     iterations: int
     converged: bool
 
@@ -447,9 +449,11 @@ def maximise(
     by_axis = np.zeros_like(errors)
     by_axis[~held] = inverse @ errors[~held]
     bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
+    reading_noise = np.where(noisy, readings / samples, 0.0)
     return Likelihood(
-        theta, asked, covariance, bound, noise, at, lasting, by_axis, held, noisy, steps, converged
-    )
+        theta, asked, covariance, bound, noise, at, lasting, by_axis, held, reading_noise, steps,
+        converged,
+    )  # fmt: skip
 
 
 def _first_levels(config: Config, process: bool, also: Noise | None) -> list[Noise]:

@@ -125,6 +125,11 @@ class ActingWrench:
         variance = self._noise.variance
         return variance * self.hold if self.hold else variance
 
+    @property
+    def noise_found(self) -> Array:
+        """The same (6,) however large the wrench is; zero until it is known."""
+        return self._noise.found * self.hold
+
     def over(
         self,
         start: float,

@@ -94,6 +94,11 @@ class Sampler:
         if self._simulated is not None:
             self._simulated.configure(config)
 
+    @property
+    def noise_found(self) -> Array:
+        """(6,): `ActingWrench.noise_found`."""
+        return self._acting.noise_found
+
     def _take_delay(self, config: Config) -> None:
         self._late.delay = velocity_delay(config.effects)
         self._queues.grace = config.grace + self._late.delay

@@ -64,12 +64,14 @@ class ReadingNoise:
 
     ``relative`` is the noise in proportion to the wrench that is known of; ``variance`` (6,) that
     of what is found beside it, zero where it has less than ``SHARE`` of the power of late, and
-    infinite until a block of readings tells.
+    infinite until a block of readings tells. ``found`` (6,) is that of late,
+    however large the wrench.
     """
 
     def __init__(self, relative: float = 0.0) -> None:
         self.relative = relative
         self.variance = np.full(6, np.inf)
+        self.found = np.zeros(6)
         self._power = np.zeros(6)
         self._t: list[float] = []
         self._readings: list[Array] = []
@@ -87,6 +89,7 @@ class ReadingNoise:
         block = np.array(self._readings)
         share = 1.0 if not self._power.any() else -math.expm1((self._t[0] - t) / RECENT)
         self._power += share * (np.mean(block**2, axis=0) - self._power)
-        variance = np.nan_to_num(scatter(block, self.relative)[0]) ** 2
+        variance = scatter(block, self.relative)[0] ** 2
+        self.found += share * np.where(np.isfinite(variance), variance - self.found, 0.0)
         self.variance = np.where(variance > SHARE * self._power, variance, 0.0)
         self._t, self._readings = [], []
