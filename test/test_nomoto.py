@@ -590,6 +590,20 @@ def test_doubts_about_a_bag_are_said(short, tmp_path, capsys):
     assert "topics.odom chooses another of its type: /truth" in capsys.readouterr().err
 
 
+def test_a_file_given_twice_counts_once(short, tmp_path, capsys):
+    path, copy = (write(tmp_path / name, short) for name in ("run.csv", "copy.csv"))
+    told = []
+    for files in ((path,), (path, copy)):
+        result = tmp_path / "result.json"
+        words = ["nomoto", *map(str, files), "--order", "1", "--json", str(result)]
+        assert main(words) == 0
+        told.append(json.loads(result.read_text()))
+    note = f"{copy} holds the same data as {path}: it counts once"
+    assert told[1].pop("notes") == [note, *told[0].pop("notes")]
+    assert told[0] == told[1]
+    assert note in capsys.readouterr().err
+
+
 def test_a_run_with_a_pause_counts_as_two():
     """Rows lost while the zigzag goes on. Simulated through, they made a K of -0.02."""
     whole = every(simulated(0.5, 4.0, 0.35, duration=80.0, noise=0.0035), 0.2)

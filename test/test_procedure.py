@@ -260,7 +260,15 @@ def test_coast_down_on_the_command_line(heavy_path, tmp_path, capsys):
     assert main(["coast-down", *arguments]) == 0
     told = json.loads(result.read_text())["coefficients"]["X_udot"]
     assert abs(told["value"] - heavy.value("X_udot")) < 4.0 * told["std"]
+    once, copy = result.read_text(), tmp_path / "copy.csv"
+    copy.write_bytes(logs[0].read_bytes())
     capsys.readouterr()
+    assert main(["coast-down", str(copy), *arguments]) == 0
+    twice = json.loads(result.read_text())
+    assert twice["coefficients"] == json.loads(once)["coefficients"]
+    (note,) = twice["notes"]
+    assert note == f"{logs[0]} holds the same data as {copy}: it counts once"
+    assert note in capsys.readouterr().err
     assert main(["coast-down", *common[:2], "--config", str(heavy_path)]) == 2
     assert "--map n=HEADING" in capsys.readouterr().err
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError, require
+from rov_ident.core.files import sha256_of
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.io.bag_reader import Bag
@@ -59,10 +60,15 @@ def same_data(path: Path, others: Sequence[Path]) -> Path | None:
     """Which of other files holds the same data, if any does; None where it cannot be read."""
     size = _size(path)
     of_size = [other for other in others if _size(other) == size]
-    with suppress(UserError):  # who reads it says what is wrong with it
-        digest = Bag(path).sha256 if of_size else ""
-        return next((other for other in of_size if Bag(other).sha256 == digest), None)
+    with suppress(OSError, UserError):  # who reads it says what is wrong with it
+        digest = _sha256(path) if of_size else ""
+        return next((other for other in of_size if _sha256(other) == digest), None)
     return None
+
+
+def _sha256(path: Path) -> str:
+    """Of a file, as a CSV table and a bag of one file have it, or of a rosbag2 directory."""
+    return Bag(path).sha256 if path.is_dir() else sha256_of([path])
 
 
 def _size(path: Path) -> int:

@@ -25,6 +25,7 @@ def add(commands: common.Commands) -> None:
 
 def _coast_down(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
+    from rov_ident.api.reading import once, several
     from rov_ident.config.prior import prior_of
     from rov_ident.io.csv_log import parse_columns
     from rov_ident.offline import coast_down
@@ -33,7 +34,8 @@ def _coast_down(options: argparse.Namespace) -> None:
     config = configuration.load(options.config)
     model = config.model
     columns = parse_columns(options.map)
-    runs, digests = zip(*(coast_down.read_run(path, columns) for path in options.runs))
+    paths, repeated = once(several(options.runs))
+    runs, digests = zip(*(coast_down.read_run(path, columns) for path in paths))
     anchor = {"bollard": options.bollard} if options.bollard else {}
     if not anchor and "X_udot" in model.names:
         (std,) = prior_of(dataclasses.replace(config, estimate=("X_udot",))).std
@@ -43,13 +45,14 @@ def _coast_down(options: argparse.Namespace) -> None:
     with common.progress(options) as tell:
         tell("fitting")
         found = coast_down.fit_coast_downs(runs, mass, **anchor)
-    files = zip((path.name for path in options.runs), digests)
-    found = dataclasses.replace(found, provenance=provenance(files, vehicle=config.name))
+    files = zip((path.name for path in paths), digests)
+    made = provenance(files, vehicle=config.name)
+    found = dataclasses.replace(found, provenance=made, notes=(*repeated, *found.notes))
     if options.json:
         write_file(options.json, found.to_json())
     if options.save:
-        names = ", ".join(path.name for path in options.runs)
+        names = ", ".join(path.name for path in paths)
         comment = f"X_u, X_uu, X_udot from {names} by rov-ident coast-down."
         configuration.dump(coast_down.configured(config, found), options.save, comment)
     common.OUT.print(found.numbers("thrust k1 n + k2 |n| n, drag and added mass in surge"))
-    common.say(f"speed RMSE {found.rmse:.3g} m/s")
+    common.say(f"speed RMSE {found.rmse:.3g} m/s", *found.notes)

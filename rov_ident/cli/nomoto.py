@@ -1,6 +1,7 @@
 """K and T of Nomoto's steering model from zigzags."""
 
 import argparse
+import dataclasses
 import math
 from pathlib import Path
 
@@ -46,11 +47,13 @@ def add(commands: Commands) -> None:
 
 def _nomoto(options: argparse.Namespace) -> None:
     from rov_ident import config as configuration
+    from rov_ident.api.reading import once, several
     from rov_ident.steering import nomoto, nomoto_model, zigzag
 
     config = configuration.load(options.config) if options.config else None
     measured = options.measured
-    runs = [zigzag.read(path, config, measured) for path in options.files]
+    paths, repeated = once(several(options.files))
+    runs = [zigzag.read(path, config, measured) for path in paths]
     judge = zigzag.read(options.validate, config, measured) if options.validate else None
     with progress(options) as tell:
         tell("fitting")
@@ -58,6 +61,7 @@ def _nomoto(options: argparse.Namespace) -> None:
             runs, options.order if options.order == "auto" else int(options.order),
             options.nonlinear, options.method, options.interpolate, options.step,
         )  # fmt: skip
+    model = dataclasses.replace(model, notes=(*repeated, *model.notes))
     validation = nomoto_model.predict(model, judge)[1] if judge else None
     diverges = judge is not None and nomoto.diverges(model, judge)
     if options.json:

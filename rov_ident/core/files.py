@@ -80,6 +80,16 @@ def read_input(path: Place, largest: int) -> bytes:
     return data
 
 
+def sha256_of(paths: Iterable[Place]) -> str:
+    """Hexadecimal digest of the contents of files, in order. Raises OSError as above."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with open_input(path) as stream:
+            while piece := stream.read(1 << 20):
+                digest.update(piece)
+    return digest.hexdigest()
+
+
 def write_file(path: Place, content: str | bytes) -> None:
     """Write a file whole or not at all, text in UTF-8; its folder is made where there is none.
 

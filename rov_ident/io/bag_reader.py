@@ -6,7 +6,6 @@ Reading goes block by block: a block is a chunk, or a run of messages outside ch
 walked through instead, and every complete block of it is kept.
 """
 
-import hashlib
 import io
 import mmap
 import os
@@ -33,7 +32,7 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from rov_ident.core.errors import UserError
-from rov_ident.core.files import open_input
+from rov_ident.core.files import open_input, sha256_of
 from rov_ident.core.yaml_file import parse_file
 from rov_ident.io.other_bags import OtherFile, Ros1File, SqliteFile
 
@@ -138,12 +137,7 @@ class Bag:
     @cached_property
     def sha256(self) -> str:
         """Hexadecimal digest of the contents of the files, in order."""
-        digest = hashlib.sha256()
-        for path in [file.path for file in self._files] + [file.path for file in self._others]:
-            with open_input(path) as stream:
-                while piece := stream.read(1 << 20):
-                    digest.update(piece)
-        return digest.hexdigest()
+        return sha256_of([f.path for f in self._files] + [f.path for f in self._others])
 
     def iter_raw(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """The messages of these topics (None: of all) in the order of their log times.

@@ -49,6 +49,7 @@ class CoastDown(Result):
         result = {
             "coefficients": self.entries(),
             "speed_rmse_mps": self.rmse,
+            "notes": list(self.notes),
             "provenance": self.provenance,
         }
         return as_json(result)
