@@ -151,6 +151,14 @@ def test_a_node_of_its_own_section_overrides_the_common_one(file):
     assert load(file(MINIMAL.replace("/**", "/rls_node"))).name == "bluerov2_heavy"
 
 
+def test_what_a_node_alone_needs_may_stand_in_the_common_file(file):
+    """Commands and other nodes pass over it."""
+    without = to_parameters(load(file(MINIMAL)))
+    path = file(f"{MINIMAL}    checkpoint_path: ~/.ros/rov_ident/\n")
+    for node in ("", "rls_node", "controller_bridge"):
+        assert to_parameters(load(path, node)) == without
+
+
 def test_a_file_of_two_vehicles_is_refused(file):
     """The last of two sections that a node would take counted, whichever vehicle it was of."""
     for names in (("/rov1/**", "/rov2/**"), ("/rov1/rls_node", "/rov2/rls_node")):

@@ -22,13 +22,13 @@ from bench.simulators.live import Vehicle, end_node, start_node
 from rov_ident import config
 from rov_ident.config import Inputs, schema
 from rov_ident.io.topics import sources
-from rov_ident.nodes import controller_bridge, dashboard_node, estimator_node, parameters
+from rov_ident.nodes import controller_bridge, dashboard_node, parameters
 
 LAUNCH = sorted((ROOT / "launch").glob("*.py"))
 OF_ESTIMATORS = {p.key for p in config.VEHICLE_PARAMETERS + config.PARAMETERS} | {"use_sim_time"}
 DECLARED = {
-    "rls_node": OF_ESTIMATORS | {p.key for p in estimator_node._OWN},
-    "ukf_node": OF_ESTIMATORS | {p.key for p in estimator_node._OWN},
+    "rls_node": OF_ESTIMATORS | {p.key for p in config.ESTIMATOR_PARAMETERS},
+    "ukf_node": OF_ESTIMATORS | {p.key for p in config.ESTIMATOR_PARAMETERS},
     "controller_bridge": OF_ESTIMATORS | {p.key for p in controller_bridge._OWN},
     "dashboard_node": {p.key for p in dashboard_node._OWN},
 }

@@ -6,6 +6,7 @@ Knows the model and the effects; nothing of messages, bags or ROS. A new key is 
 
 from rov_ident.config.reading import checked, from_parameters, load, thruster_signal
 from rov_ident.config.schema import (
+    ESTIMATOR_PARAMETERS,
     LARGEST,
     PARAMETERS,
     VEHICLE_PARAMETERS,
@@ -21,6 +22,6 @@ from rov_ident.config.schema import (
 )
 from rov_ident.config.writing import as_file_name, dump, to_parameters
 
-__all__ = ["LARGEST", "PARAMETERS", "VEHICLE_PARAMETERS", "Config", "Fin", "Inputs", "Names"]
-__all__ += ["Parameter", "Qos", "Shaft", "Thrusters", "Vector", "as_file_name", "checked", "dump"]
-__all__ += ["from_parameters", "load", "thruster_signal", "to_parameters"]
+__all__ = ["ESTIMATOR_PARAMETERS", "LARGEST", "PARAMETERS", "VEHICLE_PARAMETERS", "Config", "Fin"]
+__all__ += ["Inputs", "Names", "Parameter", "Qos", "Shaft", "Thrusters", "Vector", "as_file_name"]
+__all__ += ["checked", "dump", "from_parameters", "load", "thruster_signal", "to_parameters"]

@@ -14,6 +14,7 @@ import numpy as np
 from rov_ident.config.schema import (
     ANY,
     BY_KEY,
+    ESTIMATOR_PARAMETERS,
     LARGEST,
     POSITIVE,
     PULSE_TYPES,
@@ -77,7 +78,7 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
     Raises UserError: one sentence naming the key and what to change.
     """
     values = unflatten(parameters)
-    for own in _ROS_OWN:
+    for own in (*_ROS_OWN, *(p.key for p in ESTIMATOR_PARAMETERS)):
         values.pop(own, None)
     for key in ("vehicle", "coefficients"):
         if key not in values:

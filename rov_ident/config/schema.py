@@ -559,4 +559,14 @@ VEHICLE_PARAMETERS = _declared(Vehicle, "vehicle.")
 PARAMETERS = _declared(Config)
 """Every other key with a fixed name; ``prior.std.*`` and ``effects.*`` are open to names."""
 
+ESTIMATOR_PARAMETERS = (
+    Parameter("save_path", str, "",
+        "file that ~/save writes; empty: named by vehicle, namespace and node"),
+    Parameter("checkpoint_path", str, "",
+        "file in which what is learnt outlives a crash, or a folder for it; empty: none"),
+    Parameter("lockstep", bool, False, "a player sets the pace"),
+)  # fmt: skip
+"""Of the nodes that estimate. They may stand in the file, too: whatever else reads it passes over
+them."""
+
 BY_KEY = {p.key: p for p in VEHICLE_PARAMETERS + PARAMETERS}

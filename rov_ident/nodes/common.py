@@ -122,7 +122,7 @@ INPUTS = subscribed(Inputs())  # by default
 def live(
     name: str,
     make: Callable[[], AnyNode],
-    own: Collection[str],
+    own: Collection[str] = (),
     executor: Callable[[], Any] = Executor,
     begin: Callable[[AnyNode, threading.Event], None] = lambda node, interrupted: None,
     leave: Callable[[AnyNode], None] = lambda node: None,

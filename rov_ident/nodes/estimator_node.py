@@ -22,7 +22,7 @@ from std_msgs.msg import Float64MultiArray, UInt64
 from std_srvs.srv import SetBool, Trigger
 
 from rov_ident import config as configuration
-from rov_ident.config import Config, Parameter
+from rov_ident.config import ESTIMATOR_PARAMETERS, Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import from_core
 from rov_ident.core.messages import ODOMETRY, WRENCH, Wrench
@@ -46,14 +46,6 @@ from rov_ident.nodes.diagnostics import Diagnostics, Inputs
 from rov_ident.nodes.model_monitor import ModelMonitor
 from rov_ident.nodes.nomoto_input import NomotoInput
 
-_OWN = (
-    Parameter("save_path", str, "",
-        "file that ~/save writes; empty: named by vehicle, namespace and node"),
-    Parameter("checkpoint_path", str, "",
-        "file in which what is learnt outlives a crash, or a folder for it; empty: none"),
-    Parameter("lockstep", bool, False, "a player sets the pace"),
-)  # fmt: skip
-_OWN_NAMES = [parameter.key for parameter in _OWN]
 _SILENCE_PERIOD = 0.1  # s; between looks at the inputs: a tenth of the default timeout
 _CHECKPOINT_PERIOD = 0.3  # s; with the time to write it a crash costs less than a second
 _INPUT_SHARE = 4.0  # s left to the inputs for each of publishing, whatever publish_rate says
@@ -79,8 +71,8 @@ class EstimatorNode(GuardedNode):
 
     def __init__(self, kind: Kind, compiling: CompileState) -> None:
         super().__init__(f"{kind}_node", automatically_declare_parameters_from_overrides=True)
-        config = parameters.declare(self, _OWN_NAMES)
-        settings = parameters.declare_own(self, _OWN)
+        config = parameters.declare(self)
+        settings = parameters.declare_own(self, ESTIMATOR_PARAMETERS)
         named = f"{self._own_name(config)}.yaml"
         self._save_path = os.path.abspath(settings["save_path"] or named)
         self._lockstep: bool = settings["lockstep"]
@@ -126,9 +118,7 @@ class EstimatorNode(GuardedNode):
         self.create_timer(DIAGNOSTICS_PERIOD, self._diagnose)
         if self._keeper is not None:
             self.create_timer(_CHECKPOINT_PERIOD, self._write_checkpoint)
-        parameters.follow(
-            self, partial(parameters.changed, self, _OWN_NAMES), self._take_parameters
-        )
+        parameters.follow(self, partial(parameters.changed, self), self._take_parameters)
 
         # Last of all: from here on messages come in.
         qos = QoSProfile(
@@ -377,7 +367,6 @@ def main(kind: Kind) -> int:
     return live(
         f"{kind}_node",
         lambda: _kernels_loaded(kind, compiling),
-        _OWN_NAMES,
         begin=EstimatorNode.begin_monitoring,
         leave=EstimatorNode.take_leave,
     )

@@ -28,7 +28,7 @@ _LARGEST_INTEGER = 2**31 - 1
 _DECLARED = {p.key: p for p in config.VEHICLE_PARAMETERS + config.PARAMETERS}
 
 
-def declare(node: Node, own: Iterable[str]) -> Config:
+def declare(node: Node, own: Iterable[str] = ()) -> Config:
     """Check what the node was started with, and declare every parameter with its description.
 
     The node declares its overrides by itself, so that names that nobody knows are seen and
@@ -63,13 +63,11 @@ def declare(node: Node, own: Iterable[str]) -> Config:
     return checked
 
 
-def changed(node: Node, own: Iterable[str], changes: Iterable[RosParameter] = ()) -> Config:
+def changed(node: Node, changes: Iterable[RosParameter] = ()) -> Config:
     """The configuration of the node's parameters with these changes; raises as above."""
     values = {name: p.value for name, p in node.get_parameters_by_prefix("").items()}
     values.update({change.name: change.value for change in changes})
-    return config.from_parameters(
-        {name: v for name, v in values.items() if name not in own and v not in (None, [])}
-    )
+    return config.from_parameters({name: v for name, v in values.items() if v not in (None, [])})
 
 
 def declare_own(node: Node, declared: Iterable[config.Parameter]) -> dict[str, Any]:
