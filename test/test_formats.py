@@ -322,7 +322,7 @@ def test_a_pose_in_each_notation_of_sdformat(tmp_path, pose):
         ('<pose relative_to="__model__">0 0 0 0 0 0</pose>', "relative to '__model__'"),
         ('<pose rotation_format="matrix">0 0 0 0 0 0</pose>', "must be euler_rpy or quat_xyzw"),
         ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>', "of length 0"),
-        ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0</pose>', "must be numbers"),
+        ('<pose rotation_format="quat_xyzw">0 0 0 0 0 0</pose>', "must be 7 numbers"),
     ],
 )
 def test_a_pose_that_cannot_be_read_is_refused(tmp_path, pose, words):
@@ -630,7 +630,7 @@ def test_every_coefficient_and_effect_is_held_or_named(name, heavy, tmp_path):
         ("<a", "not valid XML"),
         ("<robot name='x'/>", "a robot has one root"),
         ("<!DOCTYPE x><sdf/>", "entities"),
-        (STOCK.format("<xU>two</xU>"), "must be numbers"),
+        (STOCK.format("<xU>two</xU>"), "<xU>two</xU> must be a number"),
         (STOCK.replace("<mass>10</mass>", "").format(""), "mass"),
         (STOCK.replace(">base_link<", ">other<").format(""), "other"),
         (STOCK.format("<xU>3</xU>"), "positive"),

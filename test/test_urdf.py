@@ -117,6 +117,35 @@ def test_a_hydrodynamics_plugin_gives_the_coefficients(tmp_path):
     assert any("taken as neutral" in note for note in notes)
 
 
+def test_a_hydrodynamics_plugin_says_the_same_in_a_urdf_as_in_sdformat(tmp_path):
+    """Added mass that it disables had been taken, the current it sets had been left out."""
+    more = """<xDotU>-9</xDotU><disable_added_mass>true</disable_added_mass>
+        <default_current>0.3 0.2 0</default_current></plugin>"""
+    plugin = PLUGIN.replace("</plugin>", more)
+    link = """<link name="base_link"><inertial><mass>10</mass><inertia><ixx>1</ixx><iyy>1</iyy>
+        <izz>1</izz></inertia></inertial></link>"""
+    element = plugin.partition("<gazebo>")[2].partition("</gazebo>")[0]
+    sdf = f'<sdf version="1.10"><model name="m">{link}{element}</model></sdf>'
+    of_sdf, _ = import_model(save(tmp_path / "m.sdf", sdf))
+    robot = save(tmp_path / "r.urdf", ROBOT.replace("</robot>", plugin))
+    for base in (None, config.load(HEAVY)):
+        of_urdf, _ = import_model(robot, base)
+        assert of_urdf.model.values == of_sdf.model.values == {"X_u": -5.0, "Y_vv": -70.0}
+        current = {"north": 0.2, "east": 0.3, "down": 0.0}
+        assert of_urdf.effects == of_sdf.effects == {"ocean_current": current}
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("simulated", False), ("imu_link", True), ("ImuLink", True), ("rovimu", True)],
+)
+def test_an_imu_is_known_by_a_word_of_its_own(tmp_path, name, found):
+    _, notes = import_model(
+        save(tmp_path / "r.urdf", ROBOT.replace("imu_link", name)), config.load(HEAVY)
+    )
+    assert (f"imu sits at the link {name}" in notes) == found
+
+
 BLOCK = """
   <hydrodynamics>
     <inertial>

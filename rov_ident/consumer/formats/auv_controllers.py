@@ -18,6 +18,7 @@ from rov_ident.consumer.formats.base import (
     Read,
     Written,
     diagonal,
+    finite,
     lost_besides,
     lost_terms,
     plain,
@@ -44,7 +45,7 @@ _TAGS = {
 """The kind of each element's coefficients, and its attributes in their order."""
 
 _LENGTHS = {
-    **dict.fromkeys(("mass", "weight", "buoyancy"), 0),
+    **dict.fromkeys(("mass", "weight", "buoyancy"), 1),
     **dict.fromkeys(("moments_of_inertia", "center_of_buoyancy", "center_of_gravity"), 3),
     **dict.fromkeys(PARAMETERS, 6),
 }
@@ -143,12 +144,7 @@ def _attributes(
         text = element.get(key)
         if text is None and required:
             raise UserError(f"{tags} has no attribute {key}")
-        try:
-            numbers.append(float(text or 0.0))
-        except ValueError:
-            numbers.append(np.nan)
-        if not np.isfinite(numbers[-1]):
-            raise UserError(f"{tags}: {key}={text!r} must be a number")
+        numbers.append(finite(text or 0.0, f"{tags}: {key}={text!r}")[0])
     return np.array(numbers)
 
 
@@ -157,8 +153,11 @@ def _from_parameters(text: str) -> tuple[RigidBody, dict[str, float]]:
     section = _find(parse(text))
     if section is None:
         raise UserError("has no section `hydrodynamics`: give a parameter file of auv_controllers")
-    numbers = {key: _numbers(section, key, length) for key, length in _LENGTHS.items()}
-    mass, cog = float(numbers["mass"]), numbers["center_of_gravity"]
+    if missing := [key for key in _LENGTHS if key not in section]:
+        raise UserError(f"hydrodynamics.{missing[0]} is missing")
+    numbers = {k: finite(section[k], f"hydrodynamics.{k}", n) for k, n in _LENGTHS.items()}
+    (mass,), (weight,), (buoyancy,) = (numbers[k] for k in ("mass", "weight", "buoyancy"))
+    cog = numbers["center_of_gravity"]
     moments = numbers["moments_of_inertia"] - mass * (np.dot(cog, cog) - cog**2)
     # a name left out is not in the model
     coefficients = {
@@ -168,7 +167,7 @@ def _from_parameters(text: str) -> tuple[RigidBody, dict[str, float]]:
         if x != 0.0
     }
     body = RigidBody(
-        mass, float(numbers["weight"]), float(numbers["buoyancy"]), cog,
+        float(mass), float(weight), float(buoyancy), cog,
         numbers["center_of_buoyancy"], np.diag(moments),
     )  # fmt: skip
     return body, coefficients
@@ -182,16 +181,3 @@ def _find(node: object) -> dict[str, object] | None:
     if isinstance(inner, dict):
         return inner
     return next((found for v in node.values() if (found := _find(v)) is not None), None)
-
-
-def _numbers(section: dict[str, object], key: str, length: int) -> np.ndarray:
-    if key not in section:
-        raise UserError(f"hydrodynamics.{key} is missing")
-    try:
-        value = np.array(section[key], dtype=float)
-    except (TypeError, ValueError):
-        value = np.full(length or (), np.nan)
-    if value.shape != ((length,) if length else ()) or not np.isfinite(value).all():
-        what = f"{length} numbers" if length else "a number"
-        raise UserError(f"hydrodynamics.{key} must be {what}")
-    return value

@@ -14,6 +14,7 @@ import numpy as np
 
 from rov_ident.config import Config, Thrusters
 from rov_ident.core.errors import UserError
+from rov_ident.core.messages import Array
 from rov_ident.effects import EFFECTS
 from rov_ident.model import equations
 from rov_ident.model.coefficients import DIAGONAL, Coefficient
@@ -35,6 +36,17 @@ class Read(NamedTuple):
 
     parameters: Mapping[str, Any]
     notes: tuple[str, ...] = ()
+
+
+def finite(given: object, what: str, count: int = 1) -> Array:
+    """The numbers (count,) of a text or a list; raises UserError that says so of ``what``."""
+    try:
+        numbers = np.array(given.split() if isinstance(given, str) else given, dtype=float, ndmin=1)
+    except (TypeError, ValueError):
+        numbers = np.array([np.nan])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise UserError(f"{what} must be {'a number' if count == 1 else f'{count} numbers'}")
+    return numbers
 
 
 def diagonal(values: Mapping[str, float], kind: str) -> list[float]:

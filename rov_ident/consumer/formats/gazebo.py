@@ -13,14 +13,24 @@ about the centre of buoyancy.
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from rov_ident.config import Config
 from rov_ident.config.writing import vehicle_section
-from rov_ident.consumer.formats.base import INERTIA, Read, Written, lost_besides, plain, xml_root
+from rov_ident.consumer.formats.base import (
+    INERTIA,
+    Read,
+    Written,
+    finite,
+    lost_besides,
+    plain,
+    xml_root,
+)
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FLIP_BODY, FLIP_WORLD, quaternion_from_euler, quaternion_to_matrix
+from rov_ident.core.messages import Array
 from rov_ident.model.coefficients import AXES, EVEN, ONE, PLAIN, VELOCITIES, Coefficient, parse
 from rov_ident.model.equations import GRAVITY, RigidBody
 
@@ -142,7 +152,7 @@ def read(text: str) -> Read:
     root = xml_root(text, "SDFormat file")
     for model in root.iter("model"):
         for plugin in model.findall("plugin"):
-            if "hydrodynamics" in plugin.get("name", "").lower() + plugin.get("filename", ""):
+            if is_hydrodynamics(plugin):
                 return _read(root, model, plugin)
     raise UserError(
         "has no model with the plugin gz::sim::systems::Hydrodynamics: give the file that has it"
@@ -184,22 +194,33 @@ def _read(root: ET.Element, model: ET.Element, plugin: ET.Element) -> Read:
         )
     graded = _numbers(root, ".//graded_buoyancy/default_density", [DENSITY])
     density = _numbers(root, ".//uniform_fluid_density", graded)[0]
-    coefficients = damping(plugin, notes)
-    if (plugin.findtext("disable_added_mass") or "").strip() in ("true", "1"):
-        coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
-    coefficients |= _fluid_added_mass(link)
+    told = of_plugin(plugin, notes)
+    told["coefficients"] |= _fluid_added_mass(link)
     buoyancy = density * gravity * volume if volume else mass * gravity
     body = RigidBody(mass, mass * gravity, buoyancy, FLIP_BODY * cog, FLIP_BODY * centre, tensor)
     vehicle = vehicle_section(model.get("name") or "vehicle", body)
-    parameters = {"vehicle": vehicle, "coefficients": coefficients}
-    current = _numbers(plugin, "default_current", [0.0, 0.0, 0.0])
-    if np.any(current):
-        ned = plain(FLIP_WORLD @ current)
-        parameters["effects"] = {"ocean_current": dict(zip(("north", "east", "down"), ned))}
-    return Read(parameters, tuple(notes))
+    return Read({"vehicle": vehicle, **told}, tuple(notes))
 
 
-def damping(plugin: ET.Element, notes: list[str]) -> dict[str, float]:
+def is_hydrodynamics(plugin: ET.Element) -> bool:
+    """Whether it gives a hull its forces."""
+    return "hydrodynamics" in f"{plugin.get('name')} {plugin.get('filename')}".lower()
+
+
+def of_plugin(plugin: ET.Element, notes: list[str]) -> dict[str, dict[str, Any]]:
+    """What the hydrodynamics plugin says of `coefficients` and, where there is a current, of
+    `effects`."""
+    coefficients = _damping(plugin, notes)
+    if (plugin.findtext("disable_added_mass") or "").strip() in ("true", "1"):
+        coefficients = {n: x for n, x in coefficients.items() if not parse(n).is_added_mass}
+    current = FLIP_WORLD @ _numbers(plugin, "default_current", [0.0, 0.0, 0.0])
+    if not np.any(current):
+        return {"coefficients": coefficients}
+    ned = dict(zip(("north", "east", "down"), plain(current)))
+    return {"coefficients": coefficients, "effects": {"ocean_current": ned}}
+
+
+def _damping(plugin: ET.Element, notes: list[str]) -> dict[str, float]:
     """Damping and, in old files, added mass of the plugin, forward-starboard-down."""
     found: dict[tuple[int, ...], tuple[str, float]] = {}
     for element in plugin:
@@ -291,23 +312,20 @@ _FLAT = ("empty", "plane")  # shapes without a volume
 
 
 _VOLUMES: dict[str, Callable[[ET.Element], float]] = {
-    "box": lambda x: float(np.prod(_numbers(x, "size"))),
+    "box": lambda x: float(np.prod(_numbers(x, "size", count=3))),
     "sphere": lambda x: 4.0 / 3.0 * np.pi * _numbers(x, "radius")[0] ** 3,
     "cylinder": lambda x: np.pi * _numbers(x, "radius")[0] ** 2 * _numbers(x, "length")[0],
 }
 
 
-def _numbers(parent: ET.Element, path: str, default: list[float] | None = None) -> list[float]:
+def _numbers(
+    parent: ET.Element, path: str, default: Array | list[float] | None = None, count: int = 1
+) -> Array:
+    """Those in an element: as many as the default, or where there is none, ``count``."""
     text = parent.findtext(path)
-    if text is None:
-        if default is None:
-            raise UserError(f"<{path.replace('/', '><')}> is missing")
-        return default
-    try:
-        numbers = [float(x) for x in text.split()]
-    except ValueError:
-        numbers = []
-    wanted = len(default) if default else max(len(numbers), 1)
-    if len(numbers) != wanted or not np.isfinite(numbers).all():
-        raise UserError(f"<{path.split('/')[-1]}> is {text.strip()!r}, but must be numbers")
-    return numbers
+    if text is not None:
+        tag, count = path.split("/")[-1], count if default is None else len(default)
+        return finite(text, f"<{tag}>{text.strip()}</{tag}>", count)
+    if default is None:
+        raise UserError(f"<{path.replace('/', '><')}> is missing")
+    return np.array(default)

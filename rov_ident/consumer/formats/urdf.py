@@ -16,14 +16,14 @@ import numpy as np
 from rov_ident.config import Config, to_parameters
 from rov_ident.config.writing import vehicle_section
 from rov_ident.consumer.formats import auv_controllers
-from rov_ident.consumer.formats.base import INERTIA, Read, plain, xml_root
-from rov_ident.consumer.formats.gazebo import damping
+from rov_ident.consumer.formats.base import INERTIA, Read, finite, plain, xml_root
+from rov_ident.consumer.formats.gazebo import is_hydrodynamics, of_plugin
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import FLIP_BODY, quaternion_from_euler, quaternion_to_matrix
 from rov_ident.core.messages import Array
 from rov_ident.model.equations import GRAVITY, RigidBody
 
-_IMU = re.compile(r"imu", re.IGNORECASE)
+_IMU = re.compile(r"(?<![a-z])imu|imu(?![a-z])", re.IGNORECASE)  # not as in "simulated"
 _VELOCITY = re.compile(r"dvl|velocity", re.IGNORECASE)
 _THRUSTER = re.compile(r"thruster|propeller", re.IGNORECASE)
 
@@ -70,9 +70,11 @@ def read(text: str, base: Config | None = None) -> Read:
             )
         parameters["coefficients"] = coefficients
     else:
-        body, coefficients = _of_the_tree(robot, links, joints, places, base, notes)
-        if coefficients:
-            parameters["coefficients"] = coefficients
+        body, told = _of_the_tree(robot, links, joints, places, base, notes)
+        if told["coefficients"]:
+            parameters["coefficients"] = told["coefficients"]
+        if "effects" in told:
+            parameters["effects"] = parameters.get("effects", {}) | told["effects"]
     name = base.name if base else robot.get("name") or "vehicle"
     parameters["vehicle"] = parameters.get("vehicle", {}) | vehicle_section(name, body)
     if links:
@@ -84,8 +86,7 @@ def read(text: str, base: Config | None = None) -> Read:
 def holds_hydrodynamics(text: str) -> bool:
     """Whether the robot has coefficients, in whichever way. Raises UserError as :func:`read`."""
     robot = _robot(text)
-    plugins = _plugins(robot)[:1]
-    return robot.find("hydrodynamics") is not None or any(damping(p, []) for p in plugins)
+    return robot.find("hydrodynamics") is not None or bool(_of_plugin(robot, [])["coefficients"])
 
 
 def _robot(text: str) -> ET.Element:
@@ -94,10 +95,10 @@ def _robot(text: str) -> ET.Element:
     return xml_root(text, "URDF")
 
 
-def _plugins(robot: ET.Element) -> list[ET.Element]:
-    """Those of Gazebo that give the hull its forces."""
-    named = ((p, p.get("name", "") + p.get("filename", "")) for p in robot.iter("plugin"))
-    return [plugin for plugin, name in named if "hydrodynamics" in name.lower()]
+def _of_plugin(robot: ET.Element, notes: list[str]) -> dict[str, dict[str, Any]]:
+    """What Gazebo's hydrodynamics plugin says, the first if there are several."""
+    plugins = [plugin for plugin in robot.iter("plugin") if is_hydrodynamics(plugin)]
+    return of_plugin(plugins[0], notes) if plugins else {"coefficients": {}}
 
 
 def _of_the_tree(
@@ -107,15 +108,14 @@ def _of_the_tree(
     places: Mapping[str, _Place],
     base: Config | None,
     notes: list[str],
-) -> tuple[RigidBody, dict[str, float]]:
-    """The links as one body, and the coefficients of the hydrodynamics plugin, if any."""
+) -> tuple[RigidBody, dict[str, dict[str, Any]]]:
+    """The links as one body, and what the hydrodynamics plugin says, if there is one."""
     mass, cog, inertia = _rigid_body(links, places)
     if moving := [j.name for j in joints if j.kind != "fixed" and not _THRUSTER.search(j.name)]:
         notes.append(f"joints that move are taken at their zero: {', '.join(moving)}")
 
-    plugins = _plugins(robot)
-    coefficients = damping(plugins[0], notes) if plugins else {}
-    if not coefficients and base is None:
+    told = _of_plugin(robot, notes)
+    if not told["coefficients"] and base is None:
         raise UserError("holds no hydrodynamics: give --config with the coefficients to start from")
     gravity = base.gravity if base else GRAVITY
     lift, cob = 0.0, FLIP_BODY * cog
@@ -126,7 +126,7 @@ def _of_the_tree(
     else:
         notes.append("it says nothing of buoyancy: taken as neutral, about the centre of gravity")
     weight, tensor = mass * gravity, np.outer(FLIP_BODY, FLIP_BODY) * inertia
-    return RigidBody(mass, weight, weight + lift, FLIP_BODY * cog, cob, tensor), coefficients
+    return RigidBody(mass, weight, weight + lift, FLIP_BODY * cog, cob, tensor), told
 
 
 def _joint(element: ET.Element) -> _Joint:
@@ -151,14 +151,7 @@ def _numbers(element: ET.Element | None, name: str, default: list[float]) -> Arr
     text = None if element is None else element.get(name)
     if element is None or text is None:
         return np.array(default)
-    try:
-        numbers = np.array([float(x) for x in text.split()])
-    except ValueError:
-        numbers = np.array([np.nan])
-    if len(numbers) != len(default) or not np.isfinite(numbers).all():
-        wanted = "a number" if len(default) == 1 else f"{len(default)} numbers"
-        raise UserError(f"<{element.tag} {name}={text!r}> must be {wanted}")
-    return numbers
+    return finite(text, f"<{element.tag} {name}={text!r}>", len(default))
 
 
 def _link_poses(links: list[str], joints: list[_Joint]) -> dict[str, _Place]:
