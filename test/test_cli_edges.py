@@ -260,6 +260,41 @@ def test_wrong_use(tmp_path, bag):
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    "option",
+    [("--duration", 5), ("--seed", 3), ("--noise", 0), ("--imu-rate", 50), ("--drop", 0.1)],
+)
+def test_what_a_bag_decides_is_not_asked_of_a_simulation(tmp_path, bag, option):
+    """Such options had been passed over without a word."""
+    out = tmp_path / "out.mcap"
+    refused(
+        simulate(out, *option, source=("--bag", bag)), option[0] if option[0] != "--imu-rate" else
+        "rates", "has no meaning with a bag: leave it out"
+    )  # fmt: skip
+    assert not out.exists()
+
+
+def test_all_axes_of_a_manoeuvre_move(tmp_path):
+    refused(simulate(tmp_path / "a.mcap", "--channels", "surge"), "--channels", "a manoeuvre")
+
+
+@pytest.mark.parametrize(
+    ("command", "more"), [("simulate", ("--manoeuvre", "steps")), ("plan", ("--tank", "9,9,4"))]
+)
+def test_what_a_simulated_bag_is_read_with_is_said(tmp_path, command, more):
+    """It has the usual topics, whatever those of the vehicle are."""
+    path, out = tmp_path / "c.yaml", tmp_path / "out.mcap"
+    own = (
+        "    inputs: {odom: geometry_msgs/TwistStamped}\n    topics: {imu: /rov/imu, odom: /odom}\n"
+    )
+    path.write_text(HEAVY.read_text() + own)
+    for config, said in ((path, True), (HEAVY, False)):
+        done = run(command, *more, "--config", config, "--duration", 10, "--out", out)
+        assert done.returncode == 0, done.stderr
+        advice = "leave inputs.odom, topics.imu out of the configuration"
+        assert (advice in " ".join(done.stderr.split())) == said
+
+
 def test_a_bag_is_not_replayed_onto_itself(bag):
     before = bag.read_bytes()
     refused(

@@ -16,7 +16,7 @@ import numpy as np
 from rov_ident.api.reading import File, Files, axes, existing, load, once, same_data, several
 from rov_ident.config import Config
 from rov_ident.config.prior import prior_of
-from rov_ident.core.errors import UserError, require
+from rov_ident.core.errors import UserError, refuse_ignored, require
 from rov_ident.core.messages import DRIVE, WRENCH, Message
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
@@ -123,6 +123,10 @@ def fit(
     if not live and estimator not in KINDS:
         known = ", ".join((*ESTIMATORS, *KINDS))
         raise UserError(f"there is no estimator '{estimator}': use {known}")
+    if prior_from is not None and not prior:
+        raise UserError(
+            "prior_from (--prior-from), prior=False (--no-prior) exclude each other: leave one out"
+        )
     ignored = {
         "channels (--channels)": live and channels is not None,
         "prior (--no-prior)": live and not prior,
@@ -132,12 +136,7 @@ def fit(
         "dask (--dask)": live and bool(dask),
         "reference (--reference)": estimator != "ukf" and bool(reference),
     }
-    if prior_from is not None and not prior:
-        raise UserError(
-            "prior_from (--prior-from), prior=False (--no-prior) exclude each other: leave one out"
-        )
-    if wrong := [name for name, is_ignored in ignored.items() if is_ignored]:
-        raise UserError(f"{wrong[0]} has no meaning with the estimator {estimator}")
+    refuse_ignored(ignored, f"the estimator {estimator}")
     if not (isinstance(jobs, int) and jobs >= 1):
         raise UserError(f"jobs is {jobs!r}, but must be a whole number from 1 on")
     if not 0.0 <= reference < math.inf:

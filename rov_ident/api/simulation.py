@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from rov_ident.api.reading import File, axes, load, read
 from rov_ident.config import Config
-from rov_ident.core.errors import UserError, require
+from rov_ident.core.errors import UserError, refuse_ignored, require
 from rov_ident.core.messages import Array, Message
 from rov_ident.core.progress import Progress
 from rov_ident.core.threads import one_blas_thread
 from rov_ident.effects import compiled
-from rov_ident.io.write_messages import write_messages
+from rov_ident.io.write_messages import unlike_inputs, write_messages
 from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.reports.result import Figure, Shown, as_json
 from rov_ident.reports.table import Table
@@ -34,6 +34,7 @@ from rov_ident.sampling.records import (
 from rov_ident.simulation.virtual_sensors import Dive, Suite, dive, measure, odometry_of
 from rov_ident.steering import autopilot
 
+DURATION = 180.0  # s; of a manoeuvre, unless said otherwise
 _POINTS = 2000  # of a curve in a picture
 _FIN_ANGLE = float(np.radians(20.0))  # of zigzags (IMO MSC.137(76)), and of changes of course
 
@@ -125,7 +126,7 @@ def simulate(
     bag: File | None = None,
     manoeuvre: str | None = None,
     channels: str | None = None,
-    duration: float = 180.0,
+    duration: float = DURATION,
     sensors: Suite | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -158,8 +159,8 @@ def simulate(
     Raises
     ------
     UserError
-        If not one of bag and manoeuvre is given, the bag cannot be read, there is no such
-        manoeuvre, or the simulation diverges.
+        If not one of bag and manoeuvre is given, an option has no meaning with it, the bag cannot
+        be read, there is no such manoeuvre, or the simulation diverges.
     """
     require(Real, "a number", duration=duration)
     require(str | None, "text", manoeuvre=manoeuvre)
@@ -168,6 +169,14 @@ def simulate(
     free = None if channels is None else axes(channels)
     if (bag is None) == (manoeuvre is None):
         raise UserError("give either a bag or a manoeuvre to simulate")
+    beside = bag is not None
+    ignored = {
+        "duration (--duration)": beside and duration != DURATION,
+        "seed (--seed)": beside and seed != 0,
+        "sensors (rates, --noise, --delay, --jitter, --drop)": beside and sensors is not None,
+        "channels (--channels)": not beside and channels is not None,
+    }
+    refuse_ignored(ignored, "a bag" if beside else "a manoeuvre")
     if not 0.0 < duration < math.inf:
         raise UserError(f"duration is {duration:g} s, but must be positive")
     if not (isinstance(seed, int | np.integer) and seed >= 0):
@@ -180,7 +189,10 @@ def simulate(
             run = _steered(given, manoeuvre, duration, suite, seed)
         else:
             run = dive(given, manoeuvre, duration, suite, seed)
-        return Simulation(manoeuvre, run.truth.t, run.truth.nu, run.messages, duration=duration)
+        truth, notes = run.truth, unlike_inputs(given)
+        return Simulation(
+            manoeuvre, truth.t, truth.nu, run.messages, notes=notes, duration=duration
+        )
     assert bag is not None
     return _beside(bag, given, free, progress)
 

@@ -26,7 +26,7 @@ def add(commands: common.Commands) -> None:
 
 def _plan(options: argparse.Namespace) -> None:
     from rov_ident.api.functions import plan
-    from rov_ident.io.write_messages import write_messages
+    from rov_ident.io.write_messages import unlike_inputs, write_messages
 
     limits = {name: getattr(options, name) for name in ("duration", "tank", "thrust")}
     with common.progress(options) as tell:
@@ -35,4 +35,4 @@ def _plan(options: argparse.Namespace) -> None:
     if options.out:
         write_messages(options.out, found.best.dive(found.config, seed=0).messages)
     common.OUT.print(found.sentence)
-    common.show(found, found.notes)
+    common.show(found, (*found.notes, *(unlike_inputs(found.config) if options.out else ())))

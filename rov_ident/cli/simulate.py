@@ -51,9 +51,9 @@ def _simulate(options: argparse.Namespace) -> None:
             options.config,
             bag=options.bag,
             manoeuvre=options.manoeuvre,
-            channels=options.channels if options.bag else None,
+            channels=options.channels,
             duration=options.duration,
-            sensors=suite,
+            sensors=None if suite == Suite() else suite,
             seed=options.seed,
             progress=tell,
         )
@@ -64,4 +64,5 @@ def _simulate(options: argparse.Namespace) -> None:
     if options.bag:
         common.show(run, run.notes)
     else:
-        common.say(f"{options.out}: {len(run.messages)} messages, {options.duration:g} s")
+        counted = f"{options.out}: {len(run.messages)} messages, {options.duration:g} s"
+        common.say(counted, *run.notes)

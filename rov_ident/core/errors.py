@@ -1,5 +1,6 @@
 """Exceptions for errors that the user can correct."""
 
+from collections.abc import Mapping
 from typing import Any
 
 _LONGEST = 2000  # characters
@@ -16,6 +17,16 @@ class UserError(Exception):
         if len(sentence) <= _LONGEST:
             return sentence
         return f"{sentence[: _LONGEST - 505]} ... {sentence[-500:]}"
+
+
+def refuse_ignored(given: Mapping[str, bool], what: str) -> None:
+    """Refuse options without a meaning with ``what``, by their names and whether they are given.
+
+    Raises UserError.
+    """
+    for name, is_given in given.items():
+        if is_given:
+            raise UserError(f"{name} has no meaning with {what}: leave it out")
 
 
 def require(kind: Any, words: str, /, **arguments: Any) -> None:

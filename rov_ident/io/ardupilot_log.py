@@ -45,7 +45,7 @@ from rov_ident.core.messages import (
     Wrench,
     fault,
 )
-from rov_ident.io.write_messages import write_messages
+from rov_ident.io.write_messages import unlike_inputs, write_messages
 from rov_ident.model.thruster_allocation import PWM, Allocator, check, knows, matrix
 
 SUFFIXES = (".bin", ".log", ".tlog", ".ulg")
@@ -233,6 +233,7 @@ def import_log(
     # The wrench first: at equal stamps it already acts on the velocity that follows.
     messages.sort(key=lambda row: (row[0], row[1] != WRENCH))
     write_messages(out, messages)
+    notes += unlike_inputs(config)
     dropped = sum(track.dropped for track in vars(log).values() if isinstance(track, _Track))
     if dropped:
         notes.append(f"{dropped} messages with backward, repeated or impossible times are left out")
