@@ -129,6 +129,28 @@ def test_a_dive_given_twice_counts_once(dives, tmp_path):
     assert "copy.mcap" not in str(refused.value)
 
 
+def test_a_dive_to_validate_on_is_held_back_by_whatever_name(dives, tmp_path, monkeypatch):
+    """Of a single dive it had left "no bag", a copy had been fitted as well."""
+    long, short, copy = dives / "long.mcap", dives / "short.mcap", tmp_path / "copy.mcap"
+    copy.write_bytes(long.read_bytes())
+    usable = SimpleNamespace(usable=True, record=SimpleNamespace(samples=None))
+    monkeypatch.setattr(identification, "check", lambda *_, **__: usable)
+    monkeypatch.setattr(identification, "is_without_velocity", lambda _: True)
+    asked = []
+
+    def fit(bags, *_, validate, progress):
+        asked.append((bags, validate))
+        raise InterruptedError
+
+    monkeypatch.setattr(identification, "fit_bags", fit)
+    for judge in (long, copy):
+        with pytest.raises(ri.UserError, match=r"long.mcap is the only dive to fit.*--validate"):
+            ri.identify(long, WRONG, validate=judge)
+        with pytest.raises(InterruptedError):
+            ri.identify([long, short], WRONG, validate=judge)
+    assert asked == [([short], long)] * 2
+
+
 @pytest.mark.parametrize("agree", [True, False])
 def test_a_fit_that_the_data_contradict_is_doubted_in_the_headline(dives, agree):
     fit = ri.fit(dives / "short.mcap", WRONG, "ls")

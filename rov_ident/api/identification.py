@@ -11,7 +11,7 @@ import numpy as np
 
 from rov_ident.api.functions import check, explain, plan
 from rov_ident.api.functions import fit as fit_bags
-from rov_ident.api.reading import File, Files, existing, load, once, several
+from rov_ident.api.reading import File, Files, existing, load, once, same_data, several
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import write_file
@@ -259,6 +259,8 @@ def identify(
     paths, repeated = once(several(dives))
     given, placed = with_mounting(load(config), paths)
     judge = None if validate is None else existing(validate)
+    if judge and (same := same_data(judge, paths)):
+        judge = same  # one of the dives, which is then held back
     checked: list[tuple[Path, Check]] = []
     left_out: dict[str, str] = {}
     for path in paths:
@@ -273,6 +275,12 @@ def identify(
     if judge is None and len(checked) > 1:
         judge, _ = min(checked, key=lambda pair: pair[1].duration)
     used = [path for path, _ in checked if path != judge]
+    if not used:
+        others = "".join(f"; {name} is left out: {why}" for name, why in left_out.items())
+        raise UserError(
+            f"{judge} is the only dive to fit, and cannot judge as well: leave validate "
+            f"(--validate) out, or give another dive{others}"
+        )
     start, explanation = given, None
     if not any(is_without_velocity(found.record.samples) for _, found in checked):
         # with the mounting that any of the dives tells; else by the name of the file
