@@ -252,6 +252,12 @@ def test_the_command(tmp_path, dive, capsys):
     path = str(dataflash(tmp_path / "log.BIN", rows_of(dive)))
     out, result = str(tmp_path / "log.mcap"), tmp_path / "log.json"
     command = ["import", path, "--config", str(tmp_path / "c.yaml"), "--out", out]
+    for option in (
+        ("--map", "u=x"), ("--body-frame", "flu"), ("--wrench-timing", "bin"),
+        ("--mask-rates-above", "1"),
+    ):  # fmt: skip
+        assert main([*command, *option]) == 2
+        assert f"{option[0]} is for a CSV alone" in capsys.readouterr().err
     assert main([*command, "--json", str(result)]) == 0
     assert '"odometry": ' in result.read_text()
     assert "odometry" in capsys.readouterr().err

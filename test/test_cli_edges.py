@@ -253,6 +253,9 @@ def test_wrong_use(tmp_path, bag):
     misused(simulate(out, "--odometry-rate", 0), "--odometry-rate", "above 0")
     misused(simulate(out, "--duration", "nan"), "--duration", "above 0")
     misused(run("replay", bag, "--config", HEAVY, "--rate", -1), "--rate", "from 0")
+    pull = ("coast-down", bag, "--config", HEAVY, "--bollard")
+    for numbers in ((10, "nan"), ("inf", 3)):
+        misused(run(*pull, *numbers), "--bollard", "must be a finite number")
     misused(
         run("simulate", "--config", HEAVY, "--bag", bag, "--channels", "surge,foo", "--out", out),
         "no channel 'foo'",

@@ -245,6 +245,10 @@ REFUSED = [
     ({"estimate": ["X_uv"]}, "estimate: X_uv is not in coefficients: did you mean X_u?"),
     ({"prior": {"std": {"N_r": 1.0}}}, "prior.std.N_r is not in coefficients: use one of X_udot"),
     (
+        {"coefficients__Y_rdot": 0.1, "prior": {"std": {"N_vdot": 5.0, "Y_rdot": 1.0}}},
+        "prior.std.N_vdot and prior.std.Y_rdot are the same: keep one",
+    ),
+    (
         {"effects": {"quadratic_damping": {}}},
         "effects.quadratic_damping is a family of coefficients: put X_uu, Y_vv, ",
     ),

@@ -475,6 +475,15 @@ def test_the_matrices_of_mss_make_the_same_wrench(coupled):
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "function"),
+    [("rov-2", "rov_2"), ("1rov", "vehicle_1rov"), ("end", "vehicle_end"), ("köln", "k_ln")],
+)
+def test_a_function_of_mss_has_a_name_that_matlab_takes(heavy, name, function):
+    out = export(dataclasses.replace(heavy, name=name), "mss")
+    assert out.content.startswith(f"function vehicle = {function}()\n")
+
+
 def mss_wrench(content, nu, nu_dot, down):
     """The formula in the file's comment, with the file's matrices."""
     fields = {}

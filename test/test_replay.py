@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -198,6 +198,24 @@ def test_a_replay_is_heard_by_nobody_and_hears_nobody(domain, brief):
     assert {topic for topic in bystander.heard if topic not in own} <= {"/parameter_events"}
     others = {topic for topic in bystander.seen if not topic.startswith("/_replay_")}
     assert others == set(TOPICS)
+
+
+def test_an_estimator_given_twice_is_one_node(brief, monkeypatch):
+    """Two nodes of one name had published on the same topics."""
+    started = []
+
+    def process(name, *_):
+        started.append(name)
+        return nullcontext()
+
+    def player(*_):
+        raise InterruptedError
+
+    monkeypatch.setattr("rov_ident.nodes.replay._Process", process)
+    monkeypatch.setattr("rov_ident.nodes.replay.Player", player)
+    with pytest.raises(InterruptedError):
+        replay(brief, HEAVY, ("rls", "ukf", "rls"))
+    assert started == ["rls_node", "ukf_node"]
 
 
 def test_wrong_use(brief, tmp_path):

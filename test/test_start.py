@@ -58,6 +58,15 @@ def test_every_option_stands_there_at_its_default():
         assert value == (list(p.default) if isinstance(p.default, tuple) else p.default), p.key
 
 
+def test_what_is_given_stands_in_one_section():
+    """`prior` had been written twice, as `std` below it is open to names: no YAML."""
+    heavy = ri.load(ROOT / "config/bluerov2_heavy.yaml")
+    given = to_parameters(heavy) | {"prior": {"relative_std": 0.3, "std": {"X_u": 2.0}}}
+    given["effects"] = {"thruster_lag": {"time_constant": 0.1}, "ocean_current": {"north": 0.1}}
+    read = from_parameters(parse(annotated(given, {}))["/**"]["ros__parameters"])
+    assert to_parameters(read) == to_parameters(from_parameters(given))
+
+
 def test_what_is_unknown_is_refused_until_it_is_given(tmp_path, capsys):
     assert main(["init", str(DEMO), "--out", str(tmp_path / "c.yaml")]) == 0
     assert "mass, buoyancy" in capsys.readouterr().err

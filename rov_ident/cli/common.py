@@ -133,7 +133,7 @@ def _whole(meaning: str, low: int, high: float) -> Callable[[str], int]:
     return parse
 
 
-number = _real("a number", lambda value: True)
+number = _real("a finite number", math.isfinite)
 rate = _real(f"from 0 to {LARGEST:g}", lambda value: 0.0 <= value <= LARGEST)
 share = _real("from 0 to below 1", lambda value: 0.0 <= value < 1.0)
 positive = _real(f"above 0, up to {LARGEST:g}", lambda value: 0.0 < value <= LARGEST)

@@ -11,6 +11,12 @@ if TYPE_CHECKING:
     from rov_ident.core.progress import Progress
 
 
+_OF_CSV = (
+    "map", "body_frame", "wrench_timing", "mask_rates_above", "degrees", "polarity", "despike",
+    "depth", "smooth", "cut", "cut_idle",
+)  # fmt: skip
+
+
 def add(commands: common.Commands) -> None:
     text = "turn plain CSV or logs of ArduSub or PX4 into a bag"
     import_ = common.command(commands, "import", text, _import, "--json", "bag")
@@ -26,11 +32,9 @@ def add(commands: common.Commands) -> None:
     )
     import_.add_argument("--out", required=True, type=Path, metavar="BAG", help="bag to write")
     common.columns_option(import_, "u=surge_speed; w=0 is a constant")
+    import_.add_argument("--body-frame", choices=("frd", "flu"), help="axes of a CSV (default frd)")
     import_.add_argument(
-        "--body-frame", choices=("frd", "flu"), default="frd", help="axes of a CSV (frd)"
-    )
-    import_.add_argument(
-        "--wrench-timing", choices=("held", "mean", "bin"), default="held",
+        "--wrench-timing", choices=("held", "mean", "bin"),
         help="a row's wrench holds from its time on, is the mean around it, or of the bin from its "
         "time to the next row's (default held)",
     )  # fmt: skip
@@ -94,7 +98,7 @@ def _import_ardupilot(options: argparse.Namespace, tell: "Progress") -> tuple[An
             "thrusters turn them into a wrench"
         )
     config = configuration.load(options.config)
-    for option in ("degrees", "polarity", "despike", "depth", "smooth", "cut", "cut_idle"):
+    for option in _OF_CSV:
         if getattr(options, option):
             raise UserError(f"--{option.replace('_', '-')} is for a CSV alone")
     report = import_log(log, options.out, config, lambda share: tell(f"reading {log.name}", share))
@@ -115,9 +119,9 @@ def _import_csv(options: argparse.Namespace, tell: "Progress") -> tuple[Any, str
         options.out,
         columns=parse_columns(options.map),
         degrees=options.degrees,
-        body_frame=options.body_frame,
+        body_frame=options.body_frame or "frd",
         mask_rates_above=options.mask_rates_above,
-        wrench_timing=options.wrench_timing,
+        wrench_timing=options.wrench_timing or "held",
         prepare=Preparation(
             tuple(options.polarity), options.despike, dict(options.depth), options.smooth,
             options.cut, options.cut_idle,

@@ -107,7 +107,13 @@ def from_parameters(parameters: Mapping[str, Any]) -> Config:
         )
     if "prior" in settings:
         prior = settings["prior"]
-        std = {_name_in_model(model, k, f"prior.std.{k}"): value for k, value in prior.std.items()}
+        keys: dict[str, str] = {}
+        for key in prior.std:
+            name = _name_in_model(model, key, f"prior.std.{key}")
+            if other := keys.get(name):
+                raise UserError(f"prior.std.{other} and prior.std.{key} are the same: keep one")
+            keys[name] = key
+        std = {name: prior.std[key] for name, key in keys.items()}
         settings["prior"] = dataclasses.replace(prior, std=std)
     known = {f.name: getattr(vehicle, f.name) for f in dataclasses.fields(VehicleUncertainty)}
     settings["vehicle_uncertainty"] = VehicleUncertainty(**known)

@@ -100,7 +100,8 @@ def annotated(parameters: Mapping[str, Any], remarks: Mapping[str, str], comment
         if any(not row.startswith("#") for row in rows.values())
         for depth in range(1, section.count(".") + 2)
     }
-    for section in sorted(sections, key=lambda name: name != "" and list(sections).index(name)):
+    heads = list(dict.fromkeys(section.partition(".")[0] for section in ("", *sections)))
+    for section in sorted(sections, key=lambda name: heads.index(name.partition(".")[0])):
         rows = sorted(sections[section].values(), key=lambda row: row.startswith("#"))
         path = tuple(section.split(".")) if section else ()
         for depth, name in enumerate(path):

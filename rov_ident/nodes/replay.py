@@ -70,6 +70,7 @@ def replay(
         raise UserError(f"{min(unknown)} is no live estimator: use {' or '.join(ESTIMATORS)}")
     if out is not None:
         check_output(out, [bag, config_path], bag=True)
+    estimators = tuple(dict.fromkeys(estimators))  # two nodes of one name would share their topics
     recorded = Bag(Path(bag))
     config, notes = with_mounting(configuration.load(config_path), [recorded.path])
     topics = inputs.select(recorded, config)

@@ -12,6 +12,11 @@ from rov_ident.config import Config
 from rov_ident.consumer.formats.base import Written, diagonal, lost_besides, lost_terms
 from rov_ident.model.coefficients import DIAGONAL, ONE
 
+_KEYWORDS = (  # what iskeyword of MATLAB lists
+    "break case catch classdef continue else elseif end for function global if otherwise parfor "
+    "persistent return spmd switch try while"
+).split()
+
 
 def write(config: Config) -> Written:
     """``vehicle = NAME()`` with the fields above."""
@@ -21,8 +26,8 @@ def write(config: Config) -> Written:
     held = {c.name for c in linear} | {c.name for c in model.coefficients if c.is_added_mass}
     lost = lost_terms(model.coefficients, held | set(DIAGONAL["quadratic"]))
     lost += lost_besides(config)
-    name = re.sub(r"\W", "_", config.name)
-    name = name if name[:1].isalpha() else f"vehicle_{name}"
+    name = re.sub(r"\W", "_", config.name, flags=re.ASCII)
+    name = name if name[:1].isalpha() and name not in _KEYWORDS else f"vehicle_{name}"
     fields = {
         "m": [[body.mass]],
         "W": [[body.weight]],
