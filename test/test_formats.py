@@ -652,6 +652,11 @@ def test_bad_files_are_refused_in_one_sentence(content, part, tmp_path):
         import_model(path)
 
 
+def test_the_command_offers_every_format(heavy_path, tmp_path):
+    done = run("export", "--config", heavy_path, "--format", "none", "--out", tmp_path / "m")
+    assert re.findall(r"\w+", done.stderr.partition("choose from")[2]) == [*WRITERS]
+
+
 def test_the_commands(heavy_path, tmp_path):
     sdf, again = tmp_path / "heavy.sdf", tmp_path / "again.yaml"
     done = run("export", "--config", heavy_path, "--format", "gazebo", "--out", sdf)

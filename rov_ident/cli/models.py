@@ -11,6 +11,7 @@ def add(commands: Commands) -> None:
     text = "write the model for a controller or simulator"
     export = command(commands, "export", text, _export, "--config --json")
     export.add_argument(
+        # WRITERS of consumer.formats, which takes a second to import: --help is there at once
         "--format", required=True, choices=("auv_controllers", "gazebo", "mss"),
         help="of the other program",
     )  # fmt: skip

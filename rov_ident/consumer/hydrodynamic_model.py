@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import LARGEST, Config, load
-from rov_ident.config.prior import prior_of
+from rov_ident.config.prior import THRUST_SCALE, prior_of
 from rov_ident.core.errors import UserError, require
 from rov_ident.core.frames import gravity_direction, quaternion_normalise
 from rov_ident.core.messages import SECOND
@@ -20,8 +20,6 @@ from rov_ident.core.states import Level
 from rov_ident.effects import EFFECTS, parameter, rigid_body
 from rov_ident.estimation.physical import is_passive
 from rov_ident.model.equations import Array, Model, build
-
-_THRUST_SCALE = "thrust_scale"
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class HydrodynamicModel:
             f"{name}.{p.name}": p.unit
             for name, effect in EFFECTS.items()
             for p in effect.parameters
-            if effect.body or name == _THRUST_SCALE
+            if effect.body or f"{name}.{p.name}" == THRUST_SCALE
         }
         self._stamp: int | None = None  # ns, of the last message in order
         self._renewed = -math.inf  # s, on the caller's clock
@@ -183,7 +181,8 @@ class HydrodynamicModel:
     def thrust_scale(self) -> float:
         """What the thrusters give, over what their wrench says (`thrust_scale`); 1 if not known: to
         get a wrench, command it divided by this."""
-        return self._effects.get(_THRUST_SCALE, {}).get("scale", 1.0)
+        effect, _, own = THRUST_SCALE.partition(".")
+        return self._effects.get(effect, {}).get(own, 1.0)
 
     @property
     def M(self) -> Array:
