@@ -74,7 +74,7 @@ class EstimatorNode(GuardedNode):
         config = parameters.declare(self)
         settings = parameters.declare_own(self, ESTIMATOR_PARAMETERS)
         named = f"{self._own_name(config)}.yaml"
-        self._save_path = os.path.abspath(settings["save_path"] or named)
+        self._save_path = os.path.abspath(os.path.expanduser(settings["save_path"] or named))
         self._lockstep: bool = settings["lockstep"]
         self.outlives = not self._lockstep  # a replay tells its caller instead
         self._started = time.monotonic()
