@@ -1,5 +1,7 @@
 """K and T while the vehicle steers: the recursion, and the nodes over DDS."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
@@ -9,9 +11,11 @@ from tiers import more
 from bench import DATA
 from rov_ident.core.frames import quaternion_from_euler
 from rov_ident.core.messages import Odometry
+from rov_ident.estimation.online import Report
 from rov_ident.io import cdr
 from rov_ident.nodes.common import STREAM
 from rov_ident.nodes.conversions import from_diagnostics, to_time
+from rov_ident.nodes.nomoto_input import NomotoInput
 from rov_ident.steering import nomoto
 from rov_ident.steering.nomoto_model import simulate_heading
 from rov_ident.steering.nomoto_recursive import RecursiveNomoto
@@ -59,6 +63,72 @@ def test_k_and_t_are_found(kind, K, T, duration):
     found = fold(kind, *steered(K, T, noise=1e-3, seed=2, duration=duration)).result
     assert found.values == pytest.approx([K, T], rel=0.05)
     assert (np.abs(found.values - [K, T]) < 3.0 * found.std).all()
+
+
+def commanded(K, T, period, duration=120.0, step=0.1):
+    """(t, heading) at even steps, (at, angle) of commands that are held: one each period, between
+    the headings, of 5 degrees more or less than the last."""
+    rng = np.random.default_rng(0)
+    fine = np.arange(0.0, duration, 0.01)
+    at = np.arange(0.03, duration, period)
+    angle = np.radians(5.0) * np.cumsum(rng.choice([-1.0, 1.0], len(at)))
+    held = np.append(0.0, angle)[np.searchsorted(at, fine + 1e-6)]
+    heading, state = np.empty(len(fine)), np.zeros(3)
+    simulate_heading(1, 1 / T, 0.0, K / T, 0.0, 0.0, 0.0, fine, held, True, state, 0.01, heading)
+    every = round(step / 0.01)
+    return (fine[::every], heading[::every]), (at, angle)
+
+
+# 5e-3 in the next two tests: the recursion is off by 2e-3 also where the rudder is linear
+@pytest.mark.parametrize("kind", ["rls", "ukf"])
+def test_a_command_is_held_until_the_next(kind):
+    """Lines between commands one second apart had made K 0.89 for 0.5, and "converged"."""
+    (t, heading), (at, angle) = commanded(0.5, 3.0, period=1.0)
+    recursive, told = RecursiveNomoto(kind), 0
+    for now, psi in zip(t, heading, strict=True):
+        while told < len(at) and at[told] < now:
+            recursive.command(at[told], angle[told])
+            told += 1
+        recursive.push(now, psi, angle[told - 1] if told else 0.0)
+    assert recursive.result.values == pytest.approx([0.5, 3.0], rel=5e-3)
+
+
+class Helm:
+    """A node's input of K and T, without the node: ``now`` [ns] is its clock."""
+
+    def __init__(self, config, kind="rls"):
+        self.now = 0
+        clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.now))
+        node = SimpleNamespace(
+            create_subscription=lambda type_, topic, callback, qos: setattr(self, "put", callback),
+            get_clock=lambda: clock,
+            resolve_topic_name=lambda topic: f"/{topic}",
+        )
+        self.input = NomotoInput(node, config, kind, STREAM)
+
+    def head(self, stamp, heading):
+        q, zero = quaternion_from_euler(0.0, 0.0, heading), np.zeros(3)
+        frames = "odom_ned", "base_link_frd"
+        self.input.heading(Odometry(stamp, *frames, zero, q, zero, zero, np.zeros(6)))
+
+    @property
+    def report(self):
+        none, words = np.zeros(0), ()
+        empty = Report(0, words, words, *[none] * 4, np.zeros((0, 0)), none, words, words)
+        return self.input.beside(empty, silent=False)
+
+
+def test_a_command_that_rests_is_not_missed(heavy):
+    """A stick that is not moved sends nothing: no heading waits for it, and no pause is seen."""
+    helm = Helm(heavy)
+    (t, heading), (at, angle) = commanded(0.5, 3.0, period=7.0, duration=100.0)
+    rows = [(now, helm.head, psi) for now, psi in zip(t, heading, strict=True)]
+    rows += [(now, None, delta) for now, delta in zip(at, angle, strict=True)]
+    for now, take, value in sorted(rows, key=lambda row: row[0]):
+        helm.now = 10**15 + round(1e9 * now)
+        take(helm.now, value) if take else helm.put(Float64(data=value))
+    assert helm.report.stamp == 10**15 + round(1e9 * t[-1])
+    assert helm.report.values == pytest.approx([0.5, 3.0], rel=5e-3)
 
 
 def test_intervals_hold_the_truth():

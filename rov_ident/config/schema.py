@@ -444,8 +444,8 @@ class Config:
     )
     rudder_joint: str = option(
         "",
-        "the rudder's name in joint_states (sensor_msgs/JointState, position in rad); empty: the "
-        "rudder is on the topic rudder (std_msgs/Float64, rad), stamped on arrival",
+        "the rudder's name in joint_states (sensor_msgs/JointState, position in rad); empty: its "
+        "command is on the topic rudder (std_msgs/Float64, rad), stamped on arrival",
     )
     effects: Values = field(default_factory=dict)
     estimate_effects: tuple[tuple[str, str], ...] = ()

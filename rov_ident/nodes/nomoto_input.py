@@ -28,13 +28,15 @@ _MOST = 20_000  # messages that wait for the rudder: some minutes
 class NomotoInput:
     """Brings heading and rudder together by their stamps.
 
-    A heading waits until a rudder angle as late as it has come; the rudder is linear in between.
+    A measured angle is linear in between, and a heading waits for one that is as late. A command is
+    held until the next one, which is stamped on arrival: no heading that has come waits for it.
     """
 
     def __init__(self, node: GuardedNode, config: Config, kind: str, qos: QoSProfile) -> None:
         self._node, self._config, self._kind = node, config, kind
         self.reset()
         joint = config.rudder_joint
+        self._is_command = not joint  # as `rov-ident nomoto` takes a topic of that type
         self._topic = "joint_states" if joint else "rudder"
         if joint:
             node.create_subscription(JointState, self._topic, self._joints, qos)
@@ -82,19 +84,27 @@ class NomotoInput:
             self._advance()
 
     def _advance(self) -> None:
-        """The headings up to the last rudder angle."""
-        while self._headings and self._rudder and self._headings[0][0] <= self._rudder[-1][0]:
+        """The headings up to which the rudder is known."""
+        while self._headings and self._rudder:
+            if not self._is_command and self._headings[0][0] > self._rudder[-1][0]:
+                return
             at, heading = self._headings.popleft()
             while len(self._rudder) > 1 and self._rudder[1][0] < at:
                 self._rudder.popleft()
+                if self._is_command:
+                    since, angle = self._rudder[0]
+                    self._estimator.command(1e-9 * (since - self._origin), angle)
             begin, angle = self._rudder[0]
-            end, after = self._rudder[min(len(self._rudder), 2) - 1]
-            if at < begin or end - begin > GAP * 1e9:
+            if at < begin:
                 continue  # nothing is known of the rudder then
-            share = (at - begin) / (end - begin) if end > begin else 0.0
+            if not self._is_command:
+                end, after = self._rudder[min(len(self._rudder), 2) - 1]
+                if end - begin > GAP * 1e9:
+                    continue  # nor here
+                share = (at - begin) / (end - begin) if end > begin else 0.0
+                angle += share * (after - angle)
             self._origin = self._origin or at
-            turned = angle + share * (after - angle)
-            self._estimator.push(1e-9 * (at - self._origin), heading, turned)
+            self._estimator.push(1e-9 * (at - self._origin), heading, angle)
             self._stamp = at
 
     def beside(self, report: Report, silent: bool) -> Report:

@@ -44,11 +44,11 @@ class Filter:
         self.p[range(n), range(n)] = [self.r, *[self.rate**2] * self.structure.order]
 
     def predict(self, t: Array, rudder: Array, held: bool) -> None:
-        """From t[0] to t[1] [s], the rudder (2,) [rad] in between as in :class:`Zigzag`."""
+        """From the first to the last t (k,) [s], rudder (k,) [rad] as in :class:`Zigzag`."""
         n = len(self.x)
         spread = np.sqrt(n) * np.linalg.cholesky(self.p + 1e-14 * np.eye(n)).T
         points = self.x + np.vstack([spread, -spread])
-        out, state = np.empty(2), np.zeros(3)
+        out, state = np.empty(len(t)), np.zeros(3)
         for point in points:
             numbers = self.structure.numbers(point[self.states :] * self.sizes)
             state[:] = 0.0
@@ -58,7 +58,7 @@ class Filter:
         self.x = points.mean(axis=0)
         off = points - self.x
         self.p = off.T @ off / len(points)
-        self.p[1, 1] += self.q * (t[1] - t[0])
+        self.p[1, 1] += self.q * (t[-1] - t[0])
 
     def correct(self, heading: float) -> None:
         """A measured heading [rad]."""

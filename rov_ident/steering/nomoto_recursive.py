@@ -11,10 +11,15 @@ recursions run side by side; of those whose T fits their corner, the surest give
 `ukf`: the filter of :mod:`nomoto_filter`, started from half of what the recursion finds, as soon as
 that is roughly known, on the same samples. Four filters differ in the noise that stands for what
 the structure lacks; the likeliest gives the result.
+
+The rudder is linear from one sample to the next. Where it is commanded, it jumps at each command.
 """
 
 import math
+from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +35,7 @@ _REACH = math.log(3.0)  # either side, more than half of the distance between tw
 _FIRST = 1e4  # variance of parameters in units of c and of angles, before any data
 _ROUGHLY = 0.3  # relative standard deviation of K and T with which filters can begin
 _DRIVES = np.exp([-6.0, -4.5, -3.0, -1.5])  # over the rate; about those that docs/nomoto.md finds
-_MOST = 6000  # samples that filters begin with: ten minutes
+_MOST = 6000  # samples that filters begin with: ten minutes; commands between two samples
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,18 @@ class KandT:
         return np.sqrt(np.diag(self.covariance))
 
 
+class _Step(NamedTuple):
+    """From one sample to the next: t (n,) [s] and rudder (n,) [rad] of both and of the commands in
+    between, ``held`` as in :class:`Zigzag`; heading (2,) [rad]. ``begins``: of the motion before
+    the end nothing is known."""
+
+    t: Array
+    rudder: Array
+    held: bool
+    heading: Array
+    begins: bool
+
+
 class _Recursion:
     """Least squares in units of the corner: theta = a0/c, b0/c^2, b0 delta_0/c^2, two transients.
 
@@ -56,34 +73,33 @@ class _Recursion:
         self.c = corner
         self.theta, self.p = np.zeros(5), _FIRST * np.eye(5)
         self.square, self.count = 0.0, 0
-        self.sections, self.since, self.last = np.zeros(4), 0.0, 0.0
+        self.sections, self.since, self.last = [0.0] * 4, 0.0, 0.0
 
-    def begin(self, heading: float, rudder: float) -> None:
+    def _begin(self, heading: float, rudder: float) -> None:
         """A motion of which nothing is known before; the parameters are kept."""
-        self.sections[:] = heading, heading, rudder, rudder
+        self.sections = [heading, heading, rudder, rudder]
         self.since = self.last = 0.0
         self.theta[3:] = 0.0
         self.p[3:, :] = self.p[:, 3:] = 0.0
         self.p[3, 3] = self.p[4, 4] = _FIRST
 
-    def step(self, span: float, heading: Array, rudder: Array) -> None:
-        """From one sample to the next, both (2,) and linear in between."""
-        c = self.c
-        decay = math.exp(-c * span)
-        mean = (1.0 - decay) / (c * span)
-
-        def section(state: float, begin: float, end: float) -> float:
-            return decay * state + (mean - decay) * begin + (1.0 - mean) * end
-
-        a1, a2, b1, b2 = self.sections
-        new_a, new_b = section(a1, *heading), section(b1, *rudder)
-        self.sections[:] = new_a, section(a2, a1, new_a), new_b, section(b2, b1, new_b)
-        self.since += c * span
+    def step(self, step: _Step) -> None:
+        """The heading is linear from one sample to the next."""
+        begin, end = step.heading.tolist()
+        if step.begins:
+            self._begin(end, float(step.rudder[-1]))
+            return
+        span = float(step.t[-1] - step.t[0])
+        self._filter(0, span, begin, end)
+        rows = zip(step.t.tolist(), step.rudder.tolist(), strict=True)
+        for (since, angle), (until, after) in pairwise(rows):
+            self._filter(2, until - since, angle, angle if step.held else after)
+        self.since += self.c * span
         if self.since - self.last < 0.5:
             return
         self.last = self.since
         a1, a2, _, b2 = self.sections
-        left = float(heading[1]) - 2.0 * a1 + a2  # the filtered acceleration, over c^2
+        left = end - 2.0 * a1 + a2  # the filtered acceleration, over c^2
         fading = math.exp(-self.since)
         row = np.array([a2 - a1, b2, -1.0, fading, self.since * fading])
         pr = self.p @ row
@@ -93,6 +109,17 @@ class _Recursion:
         self.p = self.p - np.outer(pr, pr) / total
         self.square += error**2 / total
         self.count += 1
+
+    def _filter(self, first: int, span: float, begin: float, end: float) -> None:
+        """Two sections, the ``first`` and the next, by an input that is linear for a span [s]."""
+        if span == 0.0:  # a command at the instant of a sample
+            return
+        decay = math.exp(-self.c * span)
+        mean = (1.0 - decay) / (self.c * span)
+        for i in (first, first + 1):
+            before = self.sections[i]
+            self.sections[i] = decay * before + (mean - decay) * begin + (1.0 - mean) * end
+            begin, end = before, self.sections[i]
 
     @property
     def result(self) -> KandT | None:
@@ -112,9 +139,10 @@ class RecursiveNomoto:
         self.kind = kind
         self._recursions = [_Recursion(float(c)) for c in _CORNERS]
         self._last: tuple[float, float, float] | None = None
-        self._samples: list[tuple[float, float, float, bool]] = []
+        # t and rudder, since the last sample
+        self._commands: deque[tuple[float, float]] = deque(maxlen=_MOST)
+        self._steps: list[_Step] = []
         self._filters: list[Filter] = []
-        self._filtered = (0.0, 0.0)  # t and rudder of the filters' last sample
         self.result: KandT | None = None  # after the last sample; None while nothing is known
 
     def push(self, t: float, heading: float, rudder: float) -> None:
@@ -126,19 +154,24 @@ class RecursiveNomoto:
         if last is not None and abs(t - last[0]) < 0.999 * STEP:
             return
         begins = last is None or not 0.0 < t - last[0] <= GAP
-        if last is not None:
-            heading = last[1] + math.remainder(heading - last[1], 2.0 * math.pi)
-        sample = (t, heading, rudder)
-        self._last = sample
+        last = last or (t, heading, rudder)
+        heading = last[1] + math.remainder(heading - last[1], 2.0 * math.pi)
+        times, angles = np.array([(last[0], last[2]), *self._commands, (t, rudder)]).T
+        held = len(self._commands) > 0
+        step = _Step(times, angles, held, np.array([last[1], heading]), begins)
+        self._last = (t, heading, rudder)
+        self._commands.clear()
         for recursion in self._recursions:
-            if begins or last is None:
-                recursion.begin(heading, rudder)
-            else:
-                span = t - last[0]
-                recursion.step(span, np.array([last[1], heading]), np.array([last[2], rudder]))
+            recursion.step(step)
         self.result = self._estimate()
         if self.kind == "ukf":
-            self._filter(sample, begins)
+            self._filter(step)
+
+    def command(self, t: float, rudder: float) -> None:
+        """From t [s] on, or from the last sample if that is later, the rudder is held at an angle
+        [rad]; samples have the angle that is held then."""
+        if math.isfinite(t + rudder):
+            self._commands.append((t if self._last is None else max(t, self._last[0]), rudder))
 
     def _estimate(self) -> KandT | None:
         found = [(r.c, r.result) for r in self._recursions]
@@ -148,20 +181,20 @@ class RecursiveNomoto:
             return min(fitting, key=lambda k: float(k.std[1] / abs(k.values[1])))
         return min(known, key=lambda pair: pair[0])[1] if known else None
 
-    def _filter(self, sample: tuple[float, float, float], begins: bool) -> None:
+    def _filter(self, step: _Step) -> None:
         if self._filters:
-            self._advance(sample, begins)
+            self._advance(step)
         else:
-            self._samples = [*self._samples[-_MOST:], (*sample, begins)]
+            self._steps = [*self._steps[-_MOST:], step]
             rough = self.result
-            if len(self._samples) < FEWEST:
+            if len(self._steps) < FEWEST:
                 return
             if rough is None or (rough.std > _ROUGHLY * np.abs(rough.values)).any():
                 return
             self._filters = self._first_filters(rough)
-            for i, (*each, first) in enumerate(self._samples):
-                self._advance((each[0], each[1], each[2]), first or i == 0)
-            self._samples = []
+            for i, each in enumerate(self._steps):
+                self._advance(each._replace(begins=each.begins or i == 0))
+            self._steps = []
         if self._filters:
             best = min(self._filters, key=lambda f: f.cost)
             n = best.states
@@ -171,29 +204,29 @@ class RecursiveNomoto:
 
     def _first_filters(self, rough: KandT) -> list[Filter]:
         k, time = rough.values
-        t, heading, rudder, _ = np.array(self._samples).T
+        ends = [(each.t[-1], each.heading[-1], each.rudder[-1]) for each in self._steps]
+        t, heading, rudder = np.array(ends).T
         theta = np.array([1.0 / time, k / time, 0.0])
         sizes = np.array([*np.abs(theta[:2]), 0.1 * max(float(np.std(rudder)), 1e-6)])
         rate = max(float(np.std(np.diff(heading) / np.diff(t))), 1e-9)
         given = Structure(1), 0.5 * theta, sizes, rate, heading_noise([heading])
         return [Filter(*given, rate * drive) for drive in _DRIVES]
 
-    def _advance(self, sample: tuple[float, float, float], begins: bool) -> None:
-        t, heading, rudder = sample
+    def _advance(self, step: _Step) -> None:
+        heading = float(step.heading[-1])
         good = []
         for f in self._filters:
             try:
-                if begins:
+                if step.begins:
                     f.begin(heading)
                 else:
-                    before, angle = self._filtered
-                    f.predict(np.array([before, t]), np.array([angle, rudder]), False)
+                    f.predict(step.t, step.rudder, step.held)
                     f.correct(heading)
             except np.linalg.LinAlgError:
                 continue
             if np.isfinite(f.x).all():
                 good.append(f)
-        self._filters, self._filtered = good, (t, rudder)
+        self._filters = good
 
 
 def _k_and_t(a0: float, b0: float, covariance: Array) -> KandT | None:
