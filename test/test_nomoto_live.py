@@ -1,11 +1,12 @@
 """K and T while the vehicle steers: the recursion, and the nodes over DDS."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Header
 from tiers import more
 
 from bench import DATA
@@ -109,7 +110,8 @@ class Helm:
     def head(self, stamp, heading):
         q, zero = quaternion_from_euler(0.0, 0.0, heading), np.zeros(3)
         frames = "odom_ned", "base_link_frd"
-        self.input.heading(Odometry(stamp, *frames, zero, q, zero, zero, np.zeros(6)))
+        odometry = Odometry(stamp, *frames, zero, q, zero, zero, np.zeros(6))
+        self.input.heading(odometry, self.now)
 
     @property
     def report(self):
@@ -129,6 +131,24 @@ def test_a_command_that_rests_is_not_missed(heavy):
         take(helm.now, value) if take else helm.put(Float64(data=value))
     assert helm.report.stamp == 10**15 + round(1e9 * t[-1])
     assert helm.report.values == pytest.approx([0.5, 3.0], rel=5e-3)
+
+
+@pytest.mark.parametrize("joint", ["", "helm"])
+def test_clocks_that_differ_are_named(heavy, joint):
+    """That was "the rudder has not yet turned the vehicle enough", in whatever zigzag."""
+    helm = Helm(replace(heavy, rudder_joint=joint))
+    for k in range(100):
+        stamp = 10**9 + k * 50_000_000  # of a simulation, or since the start
+        helm.now = 10**18 + stamp
+        late = to_time(helm.now - 10**8)
+        header = Header(stamp=late)
+        helm.put(JointState(header=header, name=["helm"], position=[0.3]) if joint else Float64())
+        helm.head(stamp, 0.1 * k)
+    words = "held: /rudder is stamped after /odom (1e+09 s): have one clock stamp both"
+    words = f"{words} (beside a simulator: use_sim_time)"
+    if joint:
+        words = "held: /joint_states is stamped after /odom (1e+09 s): have one clock stamp both"
+    assert set(helm.report.messages) == {words}
 
 
 def test_intervals_hold_the_truth():

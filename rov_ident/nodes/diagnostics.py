@@ -55,6 +55,15 @@ class Inputs:
         self.lost[f"{role}: lost before it reached the node"] = event.total_count
 
 
+def clock_fault(topic: str, odometry: str, apart: float) -> str:
+    """What is wrong where messages that come together are stamped ``apart`` [s]; or nothing."""
+    if abs(apart) <= ONE_CLOCK:
+        return ""
+    order = "before" if apart < 0.0 else "after"
+    words = f"{topic} is stamped {order} {odometry} ({abs(apart):.3g} s)"
+    return f"{words}: have one clock stamp both"
+
+
 class Diagnostics:
     """Publishes `/diagnostics` of a node, a status each for inputs, estimation, model, checkpoint.
 
@@ -147,12 +156,8 @@ class Diagnostics:
         complaints = []
         for role, stamp in stamps.items():
             apart = (stamp - stamps.get(ODOMETRY, stamp)) * 1e-9
-            if abs(apart) > ONE_CLOCK:
-                topic, odometry = (self._topic(each) for each in (role, ODOMETRY))
-                order = "before" if apart < 0.0 else "after"
-                words = f"{topic} is stamped {order} {odometry} ({abs(apart):.3g} s)"
-                complaints.append(f"{words}: have one clock stamp both")
-        return complaints
+            complaints.append(clock_fault(self._topic(role), self._topic(ODOMETRY), apart))
+        return [complaint for complaint in complaints if complaint]
 
     def _topic(self, role: str) -> str:
         return str(self._node.resolve_topic_name(self._inputs.sources[role][0]))

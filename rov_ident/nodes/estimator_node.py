@@ -146,7 +146,8 @@ class EstimatorNode(GuardedNode):
     def _receive(self, source: str, data: bytes) -> None:
         self._inputs.received[source] += 1
         self._inputs.silence[source] = 0.0
-        arrival = self.get_clock().now().nanoseconds if self._reader.on_arrival else 0
+        timed = self._reader.on_arrival or self._nomoto
+        arrival = self.get_clock().now().nanoseconds if timed else 0
         if len(self._waiting) == _MOST_WAITING:
             self._waiting.popleft()
             self._reader.counts["queue: too many messages wait, the oldest is left out"] += 1
@@ -171,7 +172,7 @@ class EstimatorNode(GuardedNode):
     def _take(self, source: str, data: bytes, arrival: int) -> None:
         for role, message in self._reader.read(source, data, arrival):
             if self._nomoto and role == ODOMETRY and self._online.enabled:
-                self._nomoto.heading(message)
+                self._nomoto.heading(message, arrival)
             info = self._online.push(role, message)
             if len(info):
                 self._idle = 0.0

@@ -11,11 +11,13 @@ from std_msgs.msg import Float64
 
 from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_to_euler, to_core
-from rov_ident.core.messages import Message, Odometry
+from rov_ident.core.messages import ODOMETRY, Message, Odometry
 from rov_ident.core.states import State, is_known
 from rov_ident.estimation.online import Report
+from rov_ident.io.topics import sources
 from rov_ident.nodes.common import GuardedNode
 from rov_ident.nodes.conversions import from_time
+from rov_ident.nodes.diagnostics import clock_fault
 from rov_ident.reports.result import NORMAL
 from rov_ident.steering.nomoto_recursive import RecursiveNomoto
 from rov_ident.steering.zigzag import GAP
@@ -48,11 +50,13 @@ class NomotoInput:
         self._headings: deque[tuple[int, float]] = deque(maxlen=_MOST)  # stamp [ns], angle [rad]
         self._rudder: deque[tuple[int, float]] = deque(maxlen=_MOST)
         self._origin = self._stamp = self._heard = 0  # ns
+        self._age = {"heading": 0, "rudder": 0}  # ns; of the last message, when it arrived
 
-    def heading(self, message: Message) -> None:
-        """A message of the odometry, in the axes of its topic."""
+    def heading(self, message: Message, arrival: int) -> None:
+        """A message of the odometry, in the axes of its topic, and when it arrived [ns]."""
         if isinstance(message, Odometry):
             core: Any = to_core(message, self._config.frames)
+            self._age["heading"] = arrival - core.stamp
             if self._is_set_back(core.stamp, self._heard):
                 self._headings.clear()
                 self._rudder.clear()
@@ -71,12 +75,16 @@ class NomotoInput:
         if self._config.rudder_joint in names:  # other joints may have messages of their own
             angle = float(message.position[names.index(self._config.rudder_joint)])
             stamp = from_time(message.header.stamp)
-            self._take_rudder(stamp or self._node.get_clock().now().nanoseconds, angle)
+            self._take_rudder(stamp, angle)
 
     def _angle(self, message: Float64) -> None:
-        self._take_rudder(self._node.get_clock().now().nanoseconds, float(message.data))
+        self._take_rudder(0, float(message.data))
 
     def _take_rudder(self, stamp: int, angle: float) -> None:
+        """``stamp`` 0: there is none."""
+        arrival = self._node.get_clock().now().nanoseconds
+        stamp = stamp or arrival
+        self._age["rudder"] = arrival - stamp
         if self._rudder and self._is_set_back(stamp, self._rudder[-1][0]):
             self._rudder.clear()
         if not self._rudder or stamp > self._rudder[-1][0]:
@@ -114,9 +122,14 @@ class NomotoInput:
         covariance = np.diag(_UNKNOWN**2) if found is None else found.covariance
         std = np.sqrt(np.diag(covariance))
         text, state = "converging", State.CONVERGING
+        rudder = self._node.resolve_topic_name(self._topic)
+        odometry = self._node.resolve_topic_name(sources(self._config.inputs)[ODOMETRY].topic)
+        apart = 1e-9 * (self._age["heading"] - self._age["rudder"])
         if not self._rudder:
-            topic = self._node.resolve_topic_name(self._topic)
-            text, state = f"held: no rudder on {topic}", State.HELD
+            text, state = f"held: no rudder on {rudder}", State.HELD
+        elif self._heard and (fault := clock_fault(rudder, odometry, apart)):
+            beside = " (beside a simulator: use_sim_time)" if self._is_command else ""
+            text, state = f"held: {fault}{beside}", State.HELD
         elif found is None:
             text, state = "held: the rudder has not yet turned the vehicle enough", State.HELD
         elif silent or self._heard - self._stamp > GAP * 1e9:
