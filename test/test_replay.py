@@ -23,9 +23,10 @@ from nav_msgs.msg import Odometry
 from program import messages_in
 from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Float64
 
 from bench import HEAVY
 from bench.simulators.live import Vehicle, children, is_alive, slowness
@@ -34,11 +35,14 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level
 from rov_ident.estimation.online import ESTIMATORS, OnlineEstimator
 from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.write_messages import write_messages
 from rov_ident.nodes.common import Executor
-from rov_ident.nodes.conversions import from_diagnostics
+from rov_ident.nodes.conversions import from_diagnostics, to_time
 from rov_ident.nodes.replay import _Process, replay
 from rov_ident.simulation import virtual_sensors as sensors
+from rov_ident.steering.nomoto_recursive import RecursiveNomoto
+from rov_ident.steering.zigzag import read
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +136,41 @@ def test_live_equals_offline(domain, bag, tmp_path):
     expected = [from_diagnostics(deserialize_message(data, DiagnosticArray)) for data in raw]
     pairs = [pair for r in expected for pair in zip(r.values, r.std, strict=True)]
     np.testing.assert_array_equal(json.loads(heard), pairs)
+
+
+@pytest.mark.parametrize("joint", ["", "helm"])
+def test_the_rudder_is_played(domain, brief, tmp_path, joint):
+    """For a node with K and T; a command is stamped as recorded, at whatever speed it is played."""
+    path, steered = tmp_path / "nomoto.yaml", tmp_path / "steered.mcap"
+    chosen = f"    nomoto: true\n    rudder_joint: '{joint}'\n"
+    path.write_text(f"{HEAVY.read_text().rstrip()}\n{chosen}")
+    with BagWriter(steered) as writer:
+        for k, raw in enumerate(Bag(brief).iter_raw()):
+            writer.write(raw.topic, raw.type_name, raw.log_time, raw.data)
+            if k % 7 == 0 and joint:
+                message = JointState(name=["helm"], position=[0.1 * np.sin(k)])
+                message.header.stamp = to_time(raw.log_time)
+                data = serialize_message(message)
+                writer.write("/joint_states", "sensor_msgs/msg/JointState", raw.log_time, data)
+            elif k % 7 == 0:
+                data = serialize_message(Float64(data=0.1 * np.sin(k)))
+                writer.write("/helm/rudder", "std_msgs/msg/Float64", raw.log_time, data)
+    live = replay(steered, path, rate=0.0).reports["rls"]
+    assert live.names[-2:] == ("nomoto.K", "nomoto.T")
+    assert "no rudder" not in live.messages[-1]
+    if joint:
+        return
+    run = read(steered, config.load(path))
+    recursive, rudder = RecursiveNomoto("rls"), run.rudder[0]
+    for t, heading, angle in zip(run.t, run.heading, run.rudder, strict=True):
+        if np.isfinite(heading):
+            recursive.push(t, heading, rudder)
+        if angle != rudder:
+            recursive.command(t, angle)
+            rudder = angle
+    expected = recursive.result
+    np.testing.assert_allclose(live.values[-2:], expected.values, rtol=1e-6)
+    np.testing.assert_allclose(live.std[-2:], expected.std, rtol=1e-6)
 
 
 def test_pace_without_imu(domain, brief):

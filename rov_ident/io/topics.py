@@ -52,8 +52,9 @@ _USUAL = {
 }
 """As robot_localization, mavros and uuv_simulator call them: taken where no topic has our name."""
 
-POSE, BATTERY = "pose", "battery"
+POSE, BATTERY, RUDDER = "pose", "battery", "rudder"
 _JOINTS = "sensor_msgs/JointState"
+_COMMANDS = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 
 _STAMPED = ("geometry_msgs/WrenchStamped", "sensor_msgs/JointState", "mavros_msgs/RCOut")
 _NAMED = 5  # topics; of arrays of numbers a bag may have dozens
@@ -116,6 +117,11 @@ def sources(inputs: Inputs) -> dict[str, Source]:
     if inputs.joints:
         found[DRIVE] = Source(ROLE_NAMES[DRIVE], _JOINTS)
     return found
+
+
+def rudder_name(config: Config) -> str:
+    """The topic of Nomoto's rudder as the nodes call it: measured angles, or else commands."""
+    return ROLE_NAMES[DRIVE] if config.rudder_joint else RUDDER
 
 
 class Reader:
@@ -303,6 +309,31 @@ def _select_topic(
     raise UserError(
         f"{bag.path} has no {name} topic ({type_name}): record it too; the bag has {holds}."
     )
+
+
+def rudder_topic(bag: Bag, measured: bool = False) -> str:
+    """The topic of a bag whose name ends in `rudder`, [rad], or of one that is ``measured``, in
+    `joint_states`; empty where there is none.
+
+    Raises UserError if there are several.
+    """
+    name = ROLE_NAMES[DRIVE] if measured else RUDDER
+    types = (_full_name(_JOINTS),) if measured else _COMMANDS
+    found = [
+        topic
+        for topic, info in bag.topics.items()
+        if info.type_name in types and topic.endswith(name) and info.message_count
+    ]
+    if len(found) > 1:
+        raise UserError(f"{bag.path} has several rudders, {', '.join(found)}: keep one")
+    return found[0] if found else ""
+
+
+def rudder_commands(bag: Bag, topic: str) -> Iterator[tuple[float, RawMessage]]:
+    """The angle [rad] of each message of a commanded rudder."""
+    kind = _COMMANDS[bag.topics[topic].type_name]
+    for raw in bag.iter_raw([topic]):
+        yield float(np.frombuffer(raw.data, ("<" if raw.data[1] else ">") + kind, 1, 4)[0]), raw
 
 
 def doubts(bag: Bag, topics: Mapping[str, str], config: Config) -> list[str]:

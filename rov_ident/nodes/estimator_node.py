@@ -11,6 +11,7 @@ from collections import deque
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -124,7 +125,9 @@ class EstimatorNode(GuardedNode):
         qos = QoSProfile(
             depth=config.qos.depth, reliability=ReliabilityPolicy[config.qos.reliability.upper()]
         )
-        self._nomoto = NomotoInput(self, config, kind, qos) if config.nomoto else None
+        self._nomoto = (
+            NomotoInput(self, config, kind, qos, self._lockstep) if config.nomoto else None
+        )
         # Raw: our decoder is fifty times as fast, and the one that reads bags.
         for role, (name, type_) in self._inputs.sources.items():
             self._inputs.subscriptions[role] = self.create_subscription(
@@ -142,6 +145,12 @@ class EstimatorNode(GuardedNode):
     @property
     def _config(self) -> Config:
         return self._online.config
+
+    @property
+    def _played(self) -> list[Any]:
+        """The subscriptions to all that a player plays."""
+        rudder = [self._nomoto.subscription] if self._nomoto else []
+        return [*self._inputs.subscriptions.values(), *rudder]
 
     def _receive(self, source: str, data: bytes) -> None:
         self._inputs.received[source] += 1
@@ -271,7 +280,7 @@ class EstimatorNode(GuardedNode):
         if self._lockstep:
             if os.getppid() != self._parent:
                 self.context.try_shutdown()
-            elif all(s.get_publisher_count() for s in self._inputs.subscriptions.values()):
+            elif all(s.get_publisher_count() for s in self._played):
                 self._acknowledge.publish(UInt64(data=self._inputs.received.total()))
             return
         if self._compiling.switched(self._config, self.get_logger()):

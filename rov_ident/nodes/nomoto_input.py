@@ -14,7 +14,7 @@ from rov_ident.core.frames import quaternion_to_euler, to_core
 from rov_ident.core.messages import ODOMETRY, Message, Odometry
 from rov_ident.core.states import State, is_known
 from rov_ident.estimation.online import Report
-from rov_ident.io.topics import sources
+from rov_ident.io.topics import RUDDER, rudder_name, sources
 from rov_ident.nodes.common import GuardedNode
 from rov_ident.nodes.conversions import from_time
 from rov_ident.nodes.diagnostics import clock_fault
@@ -32,18 +32,20 @@ class NomotoInput:
 
     A measured angle is linear in between, and a heading waits for one that is as late. A command is
     held until the next one, which is stamped on arrival: no heading that has come waits for it.
+    With ``lockstep`` it comes as the joint `rudder`, stamped by a player at any speed.
     """
 
-    def __init__(self, node: GuardedNode, config: Config, kind: str, qos: QoSProfile) -> None:
+    def __init__(
+        self, node: GuardedNode, config: Config, kind: str, qos: QoSProfile, lockstep: bool = False
+    ) -> None:
         self._node, self._config, self._kind = node, config, kind
         self.reset()
-        joint = config.rudder_joint
-        self._is_command = not joint  # as `rov-ident nomoto` takes a topic of that type
-        self._topic = "joint_states" if joint else "rudder"
-        if joint:
-            node.create_subscription(JointState, self._topic, self._joints, qos)
-        else:
-            node.create_subscription(Float64, self._topic, self._angle, qos)
+        self._lockstep = lockstep
+        self._topic = rudder_name(config)
+        self._is_command = not config.rudder_joint  # as `rov-ident nomoto` takes a Float64
+        angle = Float64, self._angle
+        kind, take = angle if self._is_command and not lockstep else (JointState, self._joints)
+        self.subscription = node.create_subscription(kind, self._topic, take, qos)
 
     def reset(self) -> None:
         self._estimator = RecursiveNomoto(self._kind)
@@ -71,9 +73,9 @@ class NomotoInput:
         return stamp < before - GAP * 1e9
 
     def _joints(self, message: JointState) -> None:
-        names = list(message.name)
-        if self._config.rudder_joint in names:  # other joints may have messages of their own
-            angle = float(message.position[names.index(self._config.rudder_joint)])
+        names, own = list(message.name), self._config.rudder_joint or RUDDER
+        if own in names:  # other joints may have messages of their own
+            angle = float(message.position[names.index(own)])
             stamp = from_time(message.header.stamp)
             self._take_rudder(stamp, angle)
 
@@ -127,7 +129,7 @@ class NomotoInput:
         apart = 1e-9 * (self._age["heading"] - self._age["rudder"])
         if not self._rudder:
             text, state = f"held: no rudder on {rudder}", State.HELD
-        elif self._heard and (fault := clock_fault(rudder, odometry, apart)):
+        elif self._heard and not self._lockstep and (fault := clock_fault(rudder, odometry, apart)):
             beside = " (beside a simulator: use_sim_time)" if self._is_command else ""
             text, state = f"held: {fault}{beside}", State.HELD
         elif found is None:

@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 from rov_ident.estimation.online import Report
 from rov_ident.io.bag_reader import RawMessage
 from rov_ident.io.bag_writer import BagWriter
+from rov_ident.io.topics import RUDDER
 from rov_ident.nodes.common import INPUTS, LATCHED, STREAM, Executor
 from rov_ident.nodes.conversions import from_diagnostics, to_time
 
@@ -50,7 +51,8 @@ def apart(namespace: str) -> list[str]:
 class Player(Node):  # type: ignore[misc]
     """Plays one bag into the nodes ``{estimator}_node`` of a namespace, which is theirs alone.
 
-    ``check`` is called while waiting; it raises if there is nothing left to wait for.
+    ``check`` is called while waiting; it raises if there is nothing left to wait for. ``steered``
+    of the nodes listen to the rudder, too.
     """
 
     def __init__(
@@ -62,10 +64,12 @@ class Player(Node):  # type: ignore[misc]
         on_report: OnReport | None,
         check: Callable[[], None],
         listened: Mapping[str, tuple[str, type]] = INPUTS,
+        steered: int = 0,
     ) -> None:
         super().__init__("rov_ident_player", context=context, cli_args=apart(namespace))
         self.reports: dict[str, Report] = {}
         self._estimators = tuple(estimators)
+        self._listeners = dict.fromkeys(listened, len(self._estimators)) | {RUDDER: steered}
         self._writer = writer
         self._on_report = on_report
         self._check = check
@@ -127,9 +131,8 @@ class Player(Node):  # type: ignore[misc]
         self._wait(self._connected, "to start", _START_TIME)
 
     def _connected(self) -> bool:
-        count = len(self._estimators)
         return (
-            all(p.get_subscription_count() >= count for p in self._inputs.values())
+            all(p.get_subscription_count() >= self._listeners[r] for r, p in self._inputs.items())
             and all(s.get_publisher_count() > 0 for s in self._outputs)
             and all(client.service_is_ready() for client in self._flushes.values())
             and all(count >= 0 for count in self._acknowledged.values())
@@ -138,7 +141,8 @@ class Player(Node):  # type: ignore[misc]
     def play(self, messages: Iterable[tuple[str, RawMessage]], rate: float) -> int:
         """Play (role, message) at the recorded speed times ``rate``; 0: as fast as the nodes can.
 
-        Returns how many messages every node has taken: all of them.
+        Returns how many messages every node has taken: all of them, but for those of the rudder.
+        These are not counted, as not every node listens; they come before what is played later.
         """
         began: tuple[float, int] | None = None
         for role, raw in messages:
@@ -151,7 +155,7 @@ class Player(Node):  # type: ignore[misc]
             self._wait(partial(self._all_took, self._sent - WINDOW + 1), "to take messages")
             self._tick(raw.log_time)
             self._inputs[role].publish(raw.data)
-            self._sent += 1
+            self._sent += role != RUDDER
         self._wait(partial(self._all_took, self._sent), "to take the last messages")
         return self._sent
 

@@ -1,5 +1,6 @@
 """Plays a bag into live nodes: starts and ends their processes, records what they publish."""
 
+import heapq
 import os
 import secrets
 import signal
@@ -8,27 +9,30 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import rclpy
 from rclpy.context import Context
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
 
 from rov_ident import config as configuration
-from rov_ident.config import Qos
+from rov_ident.config import Config, Qos
 from rov_ident.core import children
 from rov_ident.core.errors import UserError
 from rov_ident.core.files import check_output
 from rov_ident.core.interrupts import Interrupted, noted_interrupts
 from rov_ident.estimation.online import ESTIMATORS, Report
 from rov_ident.io import topics as inputs
-from rov_ident.io.bag_reader import Bag
+from rov_ident.io.bag_reader import Bag, RawMessage
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.mounting import with_mounting
 from rov_ident.nodes.common import subscribed
+from rov_ident.nodes.conversions import to_time
 from rov_ident.nodes.player import OnReport, Player, apart
 
 _LOOPBACK = Path(__file__).with_name("loopback.xml")
@@ -81,7 +85,7 @@ def replay(
         stack.enter_context(_on_this_computer())
         writer = None if out is None else stack.enter_context(BagWriter(out))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rov_ident-")))
-        nodes = []
+        nodes, steered = [], []
         for estimator in estimators:
             name = f"{estimator}_node"
             # A new file: the given one may hold what our reader accepts and that of ROS 2 does not.
@@ -93,6 +97,7 @@ def replay(
                 inputs=config.inputs.standard,  # the player converts: see inputs.as_played
             )
             configuration.dump(settings, parameters)
+            steered += [own] if own.nomoto else []
             nodes.append(stack.enter_context(_Process(name, parameters, namespace)))
 
         interrupts = stack.enter_context(noted_interrupts())
@@ -103,26 +108,42 @@ def replay(
             for node in nodes:
                 node.check()
 
+        listened = subscribed(config.inputs.standard)
+        played = inputs.as_played(recorded, topics, config)
+        if steered:
+            name = inputs.rudder_name(steered[0])
+            if name not in dict(listened.values()):  # else the joints are played already
+                listened[inputs.RUDDER] = name, JointState
+                rudder = _rudder(recorded, steered[0])
+                played = heapq.merge(played, rudder, key=lambda message: message[1].log_time)
+
         context = Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stack.callback(rclpy.try_shutdown, context=context)
         player = Player(
-            context,
-            namespace,
-            estimators,
-            writer,
-            on_report,
-            check,
-            subscribed(config.inputs.standard),
+            context, namespace, estimators, writer, on_report, check, listened, len(steered)
         )
         stack.callback(player.destroy_node)
         player.wait_for_nodes(next(recorded.iter_raw(topics.values())).log_time)
         if writer is not None:
             writer.go_live()
-        count = player.play(inputs.as_played(recorded, topics, config), rate)
+        count = player.play(played, rate)
         player.finish()
         seconds, written = time.monotonic() - started, None if out is None else Path(out)
         return ReplayResult(player.reports, count, seconds, written, notes)
+
+
+def _rudder(bag: Bag, config: Config) -> Iterator[tuple[str, RawMessage]]:
+    """The joints of a bag, or else each command of its rudder as one, stamped as recorded."""
+    topic = inputs.rudder_topic(bag, measured=bool(config.rudder_joint))
+    if topic and config.rudder_joint:
+        for raw in bag.iter_raw([topic]):
+            yield inputs.RUDDER, raw
+    elif topic:
+        for angle, raw in inputs.rudder_commands(bag, topic):
+            joint = JointState(name=[inputs.RUDDER], position=[angle])
+            joint.header.stamp = to_time(raw.log_time)
+            yield inputs.RUDDER, raw._replace(data=serialize_message(joint))
 
 
 def _on_this_computer() -> AbstractContextManager[None]:

@@ -13,12 +13,11 @@ from rov_ident.core.frames import quaternion_to_euler, to_core
 from rov_ident.core.messages import ODOMETRY, WRENCH, Array, Odometry, Wrench
 from rov_ident.io.bag_reader import SUFFIXES, Bag
 from rov_ident.io.csv_table import CsvTable, read_csv
-from rov_ident.io.topics import POSE, USUAL, doubts, messages, select
+from rov_ident.io.topics import POSE, USUAL, doubts, messages, rudder_commands, rudder_topic, select
 
 FEWEST = 20  # headings of a run: three for each of six parameters, and the first state
 GAP = 3.0  # s without a sample, after which the motion before is unknown
 _GAP_ROWS = 3.0  # of the usual distance: rows of a ship may be further apart than that
-_RUDDER_TYPES = {"std_msgs/msg/Float64": "f8", "std_msgs/msg/Float32": "f4"}
 _STEEPEST = np.radians(100.0)  # a rudder beyond it is no angle in radians
 _TURNED = 2.5 * np.pi  # a heading beyond it counts turns, or is in degrees
 _FAINT = 1.0  # deg; a zigzag whose angles all stay below it is one in radians
@@ -213,13 +212,7 @@ def from_bag(path: Path, config: Config | None = None, measured: bool = False) -
     A command is held until the next one. A rudder that is ``measured`` is linear in between.
     """
     bag = Bag(path)
-    steered = [
-        name
-        for name, topic in bag.topics.items()
-        if topic.type_name in _RUDDER_TYPES and name.endswith("rudder") and topic.message_count
-    ]
-    if len(steered) > 1:
-        raise UserError(f"{path} has several rudders, {', '.join(steered)}: keep one")
+    steered = rudder_topic(bag)
     roles = (ODOMETRY,) if steered else (ODOMETRY, WRENCH)
     config = config or USUAL
     chosen = select(bag, config, (*roles, POSE))
@@ -235,10 +228,8 @@ def from_bag(path: Path, config: Config | None = None, measured: bool = False) -
         if np.isfinite(value):
             rows[role].append((1e-9 * core.stamp, value))
     if steered:
-        kind = _RUDDER_TYPES[bag.topics[steered[0]].type_name]
-        for m in bag.iter_raw(steered):
-            angle = np.frombuffer(m.data, ("<" if m.data[1] else ">") + kind, 1, 4)[0]
-            rows[WRENCH].append((1e-9 * m.log_time, float(angle)))
+        commands = rudder_commands(bag, steered)
+        rows[WRENCH] = [(1e-9 * raw.log_time, angle) for angle, raw in commands]
     (t, heading), (at, steering) = (np.array(rows[k]).reshape(-1, 2).T for k in (ODOMETRY, WRENCH))
     t, first = np.unique(t, return_index=True)
     at, once = np.unique(at, return_index=True)
@@ -257,7 +248,7 @@ def from_bag(path: Path, config: Config | None = None, measured: bool = False) -
     notes = [*doubts(bag, chosen, config), *filter(None, [bag.damage])]
     if steered and not measured:
         notes.append(
-            f"{path.name}: {steered[0]} counts as a command, held until the next one: if it is a "
+            f"{path.name}: {steered} counts as a command, held until the next one: if it is a "
             "measured angle, give --measured, or T comes out too short"
         )
     # Heading and input on the instants of either, so that a step of the input keeps its time.
