@@ -144,7 +144,11 @@ def test_store(report):
     clock.now += 5.0
     state, marks = store.changes(marks)
     assert len(state["estimators"]["/rls_node"]["history"]["rows"]) == 1
-    assert state["estimators"]["/rls_node"]["gone"]
+    one = state["estimators"]["/rls_node"]
+    assert one["gone"] and set(one["states"]) == {"stale"} and set(one["levels"]) == {3}
+    known, _ = store.reports["/rls_node"]
+    assert one["messages"] == list(known.report.messages)
+    assert one["messages"][0].startswith("stale: the node is silent (before: ")
     # What goes on to a controller is kept by itself.
     bridge = Status(0, "waiting for ~/approve", {"controller": "/c", "pending": "X_u"})
     store.take_status("/controller_bridge", "bridge", bridge)
@@ -662,6 +666,25 @@ def test_watch_cuts_no_name_and_no_state_in_a_narrow_terminal(kinds):
         assert ("N s2/m2" in text) == units
         if units:
             assert all(name in text for name in report.names)
+
+
+def test_watch_prints_every_report(monkeypatch):
+    """Nodes publish at 5 Hz by default, and a look at 4 Hz had missed one of five."""
+    given = config.load(CONFIGS / "bluerov2_heavy.yaml")
+    report, store, interrupts = OnlineEstimator(given, "rls").report(), Store(Clock()), []
+
+    def spin(seconds):
+        for _ in range(2):
+            store.take_report("/rls_node", "heavy", replace(report, stamp=len(interrupts)))
+            interrupts.append(2)
+
+    monkeypatch.setattr(
+        watch_terminal, "_listening", lambda: contextlib.nullcontext((store, spin, interrupts))
+    )
+    out = io.StringIO()
+    watch_terminal.watch(True, Console(file=out), Console(file=io.StringIO()))
+    lines = [json.loads(line)["estimators"]["/rls_node"] for line in out.getvalue().splitlines()]
+    assert [line["stamp_ns"] for line in lines] == [0, 1]
 
 
 def test_watch_hears_nobody(domain):

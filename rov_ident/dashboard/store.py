@@ -6,13 +6,14 @@ A store is filled by one thread and read by others.
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from rov_ident.core.messages import Array
+from rov_ident.core.states import State
 from rov_ident.estimation.online import Report
 
 POINTS = 600  # of a coefficient's history: more than a picture has pixels
@@ -22,7 +23,7 @@ DIGITS = 6  # significant; a picture shows three
 MOST = 64  # nodes shown: six times those of five vehicles; anybody on the network may invent more
 LONGEST = 1000  # characters of a text, and entries of a status: ours have a tenth
 KINDS = ("inputs", "estimation", "model", "checkpoint")  # of an estimator's statuses
-GONE = 3.0  # s without a message after which an estimator is silent: three of its /diagnostics
+GONE = 3.0  # s without a report, after which what it said is stale: three of its /diagnostics
 
 Mark = tuple[int, int]  # what a reader has of a series: (epoch, rows)
 
@@ -102,6 +103,14 @@ class Estimator:
     bin: list[Array] = field(default_factory=list)
     bin_start: float = math.nan  # s
 
+    def at(self, now: float) -> "Estimator":
+        """What is to be shown of it at a time in s: an estimator that has gone is stale."""
+        if self.report is None or now - self.heard <= GONE:
+            return self
+        words = tuple(f"stale: the node is silent (before: {m})" for m in self.report.messages)
+        states = (State.STALE,) * len(words)
+        return replace(self, report=replace(self.report, states=states, messages=words))
+
 
 class Store:
     """All estimators by the full names of their nodes; ``now`` is a steady clock in s."""
@@ -111,6 +120,7 @@ class Store:
         self._lock = threading.Lock()
         self._estimators: dict[str, Estimator] = {}
         self._bridges: dict[str, Status] = {}  # what is sent to controllers
+        self.follow: Callable[[Estimator], None] = lambda known: None  # called for each report
 
     def add(self, name: str) -> None:
         """An estimator exists, even if it has not published yet."""
@@ -137,6 +147,8 @@ class Store:
             last = known.history.last
             if report.stamp and (last is None or last[0] != t):
                 known.history.append(t, report.values, report.std)
+            now = replace(known)
+        self.follow(now)
 
     def take_covariance(self, name: str, matrix: Array) -> None:
         """(n, n), in the order of the coefficients."""
@@ -193,7 +205,7 @@ class Store:
         with self._lock:
             now = self._now()
             return {
-                name: (known, now - known.heard)
+                name: (known.at(now), now - known.heard)
                 for name, known in sorted(self._estimators.items())
                 if known.report is not None
             }
@@ -222,7 +234,7 @@ class Store:
                     if known.correlation is None
                     else np.round(known.correlation, 2).tolist(),
                     "statuses": {kind: vars(s) for kind, s in known.statuses.items()},
-                    **_described(known.report),
+                    **_described(known.at(now).report),
                 }
             bridges = {name: vars(status) for name, status in sorted(self._bridges.items())}
         return {"estimators": shown, "bridges": bridges}, after

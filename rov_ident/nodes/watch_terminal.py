@@ -41,17 +41,15 @@ def watch(as_json: bool, out: Console, err: Console) -> None:
             live = Live(console=err, auto_refresh=False, vertical_overflow="crop")
             stack.enter_context(live)
             live.update(_picture({}, out), refresh=True)
-        shown: dict[str, int] = {}  # by estimator, the identity of the last report
+        new: list[Estimator] = []  # not printed as it comes: a node outlives a closed pipe
+        store.follow = new.append if as_json else store.follow
         while not interrupts:
             spin(1.0 / _REFRESH)
-            heard = store.reports
             if live is not None:
-                live.update(_picture(heard, err), refresh=True)
-                continue
-            for name, (known, silent) in heard.items():
-                if shown.get(name) != id(known.report):
-                    shown[name] = id(known.report)
-                    _print_json({name: (known, silent)}, out)
+                live.update(_picture(store.reports, err), refresh=True)
+            for known in new:
+                _print_json({known.name: (known, 0.0)}, out)
+            new.clear()
 
 
 def watch_once(patience: float, as_json: bool, out: Console) -> None:

@@ -180,7 +180,7 @@ function heading(parent, text) {
 
 function stateCounts(state) {
   const counts = Object.fromEntries(Object.keys(STATES).map((word) => [word, 0]));
-  for (const word of state.states ?? []) counts[state.gone ? "stale" : word] += 1;
+  for (const word of state.states ?? []) counts[word] += 1;
   return counts;
 }
 
@@ -290,7 +290,7 @@ function buildCoefficients(main, names, coefficients) {
         const at = cursor === null ? null : nearest(state.history, end - cursor);
         const [v, s] = at ? [at[1][i], at[2][i]] : [state.values[i], state.std[i]];
         value.textContent = `${written(v, s)} ± ${interval(s)}`;
-        const word = state.gone ? "stale" : state.states[i], [sign, level] = STATES[word];
+        const word = state.states[i], [sign, level] = STATES[word];
         words.className = `state levels-${level}`;
         words.textContent = at ? `${duration(end - at[0])} ago` : sign;
         words.setAttribute("aria-label", at ? words.textContent : word);
