@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 from bench import HEAVY
 from bench.simulators.live import end_node
 from rov_ident.consumer import parameter_bridge as bridge
+from rov_ident.consumer.hydrodynamic_model import HydrodynamicModel
 from rov_ident.consumer.parameter_bridge import Target
 from rov_ident.core.errors import UserError
 from rov_ident.core.states import Level, State
@@ -27,6 +31,27 @@ TWO = 'mapping:=["X_u=hydrodynamics.X_u", "X_uu=hydrodynamics.X_uu"]'
 
 
 # ------------------------------------------------------------------ without ROS
+
+
+def test_a_message_that_is_no_good_is_ignored(heavy):
+    """One that is late had taken the set in use with it."""
+    from rov_ident.nodes.controller_bridge import ControllerBridge
+
+    node = SimpleNamespace(
+        _lock=threading.Lock(), _model=HydrodynamicModel(heavy),
+        _targets=bridge.targets(heavy, "{name}"), _wanted={}, _std={},
+        _refusal="no coefficients were heard yet",
+    )  # fmt: skip
+    report = OnlineEstimator(heavy, "rls").report()
+    converged = replace(report, states=(State.CONVERGED,) * len(report.names))
+    assert ControllerBridge._usable(node)[2] == "no coefficients were heard yet"
+    wrong = replace(converged, stamp=3 * 10**9, units=("cubits",) * len(report.names))
+    for message in (replace(converged, stamp=2 * 10**9), replace(converged, stamp=10**9), wrong):
+        ControllerBridge._take(node, to_diagnostics(message, heavy.name))
+        wanted, std, refusal = ControllerBridge._usable(node)
+        assert wanted.keys() == std.keys() == set(heavy.estimate) and not refusal
+    node._model.hold_after = 0.0
+    assert "no coefficient that can be read" in ControllerBridge._usable(node)[2]
 
 
 def test_targets(heavy):
@@ -162,7 +187,6 @@ class Bridge:
     def speak(self):
         if self.says is None:
             return
-        from dataclasses import replace
 
         values, levels = self.report.values.copy(), [Level.WARN] * len(self.report.names)
         for name, (value, level) in self.says.items():

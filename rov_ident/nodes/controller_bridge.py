@@ -130,30 +130,29 @@ class ControllerBridge(GuardedNode):
         return self.create_client(type_, f"{self._controller}/{service}", callback_group=group)
 
     def _take(self, message: DiagnosticArray) -> None:
+        """A message that is no good is ignored; what is wanted stays until it is stale."""
         with self._lock:
-            taken = self._model.take(message, time.monotonic())
-            self._wanted, self._std = {}, {}
-            self._refusal = taken.reason
-            if taken.reason:
-                return
             try:
                 report = from_diagnostics(message)
             except ValueError as error:
                 self._refusal = str(error)
                 return
+            taken = self._model.take(message, time.monotonic())
+            self._refusal = taken.reason
+            if taken.reason:
+                return
             std = dict(zip(report.names, report.std.tolist()))
             places = {target.coefficient for target in self._targets}
             self._wanted = {name: v for name, v in taken.values.items() if name in places}
             self._std = {name: std[name] for name in self._wanted}
-            if not self._wanted:
-                self._refusal = "no coefficient has converged"
 
     def _usable(self) -> tuple[dict[str, float], dict[str, float], str]:
         """Converged values, their standard deviations, and why there are none."""
         with self._lock:
-            if not self._refusal and not self._model.fresh(time.monotonic()):
-                return {}, {}, "the coefficients are stale"
-            return dict(self._wanted), dict(self._std), self._refusal
+            if not self._model.fresh(time.monotonic()):
+                return {}, {}, self._refusal or "the coefficients are stale"
+            none = "" if self._wanted else "no coefficient has converged"
+            return dict(self._wanted), dict(self._std), none
 
     def _compare_and_send(self) -> None:
         self._pending = ()
