@@ -188,6 +188,17 @@ def test_shipped(tmp_path, capsys):
     assert "an empty name is no folder" in capsys.readouterr().err
 
 
+def test_all_that_is_published_is_plotted():
+    """Also what no vehicle's file knows, which is estimated by default."""
+    vehicle = config.load(FOLDER / "bluerov2_heavy.yaml")
+    names = OnlineEstimator(vehicle, "rls").prior.names
+    assert "thrust_scale.scale" in names
+    panels = json.loads(layouts.foxglove(vehicle))["configById"].values()
+    root = ElementTree.fromstring(layouts.plotjuggler(vehicle).encode())
+    areas = {area.get("name") for area in root.iter("DockArea")}
+    assert set(names) <= {panel.get("foxglovePanelTitle") for panel in panels} & areas
+
+
 def test_every_shipped_vehicle():
     for path in sorted(FOLDER.glob("*.yaml")):
         vehicle = config.load(path)

@@ -43,6 +43,7 @@ def _tabs(
 
     The path of a curve is ``coefficient(node, name, key)`` or ``residual(node, axis)``.
     """
+    config = config.with_nuisance  # as the nodes estimate
     kinds: dict[str, list[str]] = {}
     own = {coefficient.name: coefficient for coefficient in config.model.coefficients}
     for name in config.estimate:
