@@ -7,7 +7,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,6 +41,7 @@ from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io import cdr
 from rov_ident.nodes.common import STREAM
 from rov_ident.nodes.conversions import from_diagnostics, from_time
+from rov_ident.nodes.estimator_node import EstimatorNode
 from rov_ident.simulation.virtual_sensors import dive
 
 STALE = bytes([Level.STALE])
@@ -246,6 +249,17 @@ def test_wrench_alone(live, heavy):
     assert report.stamp == 0
     assert set(report.levels) == {Level.STALE}
     np.testing.assert_array_equal(report.values, heavy.model.theta)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_what_waits_is_kept_by_a_node_that_is_told_what_it_does_already(before):
+    """And dropped by one that was disabled: it was received meanwhile."""
+    node = SimpleNamespace(
+        _waiting=deque(["message"]), _online=SimpleNamespace(enabled=before),
+        _publish=lambda: None, get_logger=lambda: SimpleNamespace(info=lambda words: None),
+    )  # fmt: skip
+    answer = EstimatorNode._enable(node, SetBool.Request(data=True), SetBool.Response())
+    assert answer.success and node._online.enabled and len(node._waiting) == before
 
 
 def test_clocks_that_differ_are_named(live, short_dive):

@@ -319,7 +319,8 @@ class EstimatorNode(GuardedNode):
         return response
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._waiting.clear()  # otherwise those received while disabled would be used
+        if request.data != self._online.enabled:
+            self._waiting.clear()  # otherwise those received while disabled would be used
         self._online.enabled = request.data
         self._publish()
         response.success = True
