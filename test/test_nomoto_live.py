@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Header
+from std_srvs.srv import SetBool
 from tiers import more
 
 from bench import DATA
@@ -295,3 +296,8 @@ def test_a_rudder_without_a_stamp_is_stamped_on_arrival(steering):
     played(vehicle, "", *steered(0.9, 0.5, noise=1e-3, seed=3, duration=10.0))
     near = pytest.approx(0.9, rel=0.3)  # whatever DDS takes on the way
     vehicle.until(lambda: from_diagnostics(vehicle.coefficients[-1]).values[-2] == near)
+    assert vehicle.call(SetBool, "enable", SetBool.Request(data=False)).success
+    vehicle.coefficients.clear()
+    vehicle.until(lambda: vehicle.coefficients)
+    disabled = from_diagnostics(vehicle.coefficients[-1])
+    assert all(text.startswith("disabled: ") for text in disabled.messages)

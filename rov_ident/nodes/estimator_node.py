@@ -218,22 +218,21 @@ class EstimatorNode(GuardedNode):
 
     def _publish(self) -> Report:
         report = self._online.report()
-        messages, states = report.messages, report.states
         if self._stopped:
-            messages = tuple(f"stale: {self._stopped} (before: {text})" for text in messages)
-            states = (State.STALE,) * len(states)
-        elif not self._online.enabled:
-            messages = tuple(f"disabled: {text}" for text in messages)
-        shown = replace(report, messages=messages, states=states)
+            words = tuple(f"stale: {self._stopped} (before: {text})" for text in report.messages)
+            report = replace(report, messages=words, states=(State.STALE,) * len(words))
         if self._nomoto:
             silent = self._inputs.is_missing(ODOMETRY, self._config.timeout)
-            shown = report = self._nomoto.beside(shown, silent and not self._waiting)
+            report = self._nomoto.beside(report, silent and not self._waiting)
+        if not self._online.enabled:
+            words = tuple(f"disabled: {text}" for text in report.messages)
+            report = replace(report, messages=words)
         pairs = np.stack([report.values, report.std], axis=1)
         columns = " ".join(report.names)
         self._covariance.publish(to_matrix(report.names, columns, report.covariance))
         self._values.publish(to_matrix(report.names, "value std", pairs))
-        self._coefficients.publish(to_diagnostics(shown, self._config.name))
-        return shown
+        self._coefficients.publish(to_diagnostics(report, self._config.name))
+        return report
 
     def begin_monitoring(self, interrupted: threading.Event) -> None:
         """Look for what the model lacks, once kernels are compiled; a player waits for that."""
