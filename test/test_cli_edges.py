@@ -348,6 +348,13 @@ def test_out_is_a_file_that_is_no_bag(tmp_path):
     refused(done, "notes")
 
 
+def test_a_name_between_colons_is_no_emoji(tmp_path):
+    """rich draws `:x:` as a cross."""
+    config = ["--config", str(HEAVY)]
+    ended = run("check", str(tmp_path / "a:x:1.mcap"), *config)
+    assert "a:x:1.mcap cannot be read" in ended.stderr
+
+
 def test_no_empty_line_where_there_is_no_terminal(tmp_path):
     done = run_alone("fit", Path("none.mcap"), "--config", HEAVY, "--estimator", "rls")
     assert done.stderr.count("\n") == 1

@@ -32,8 +32,9 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-ERR = _Console(stderr=True, highlight=False, markup=False)
-OUT = _Console(highlight=False, markup=False, soft_wrap=True)
+# Without emoji: rich would draw `a:x:1` with a cross.
+ERR = _Console(stderr=True, highlight=False, markup=False, emoji=False)
+OUT = _Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
 
 LIVE = ("rls", "ukf")
 LARGEST = 1e5  # of any number on the command line: a day of simulation, 100 kHz
