@@ -12,6 +12,7 @@ from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.reports import html as report
 from rov_ident.reports import plots
 from rov_ident.reports.result import NORMAL
+from rov_ident.reports.table import estimate
 from rov_ident.sampling.records import HORIZON, UNITS, Record, predicted, score
 
 
@@ -51,7 +52,7 @@ def page(
     coefficients = [
         [name, f"{truth[name]:.5g}"]
         + [
-            f"{history.values[-1, i]:.5g} ± {NORMAL * history.std[-1, i]:.2g}"
+            " ± ".join(estimate(history.values[-1, i], NORMAL * history.std[-1, i]))
             for history in histories.values()
         ]
         + [history.units[i]]

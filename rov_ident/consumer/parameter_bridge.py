@@ -12,6 +12,7 @@ from rov_ident.config import Config
 from rov_ident.consumer.formats import auv_controllers
 from rov_ident.core.errors import UserError
 from rov_ident.reports.result import NORMAL
+from rov_ident.reports.table import estimate
 
 Value = float | tuple[float, ...]
 Values = Mapping[str, Value]
@@ -58,7 +59,8 @@ class Change:
 
     @property
     def words(self) -> str:
-        return f"{self.coefficient} {self.held:.5g} -> {self.wanted:.5g} ± {NORMAL * self.std:.2g}"
+        wanted = " ± ".join(estimate(self.wanted, NORMAL * self.std))
+        return f"{self.coefficient} {self.held:.5g} -> {wanted}"
 
 
 def targets(
