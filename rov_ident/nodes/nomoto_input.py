@@ -43,9 +43,9 @@ class NomotoInput:
         self._lockstep = lockstep
         self._topic = rudder_name(config)
         self._is_command = not config.rudder_joint  # as `rov-ident nomoto` takes a Float64
-        angle = Float64, self._angle
-        kind, take = angle if self._is_command and not lockstep else (JointState, self._joints)
-        self.subscription = node.create_subscription(kind, self._topic, take, qos)
+        joint, angle = (JointState, self._joints), (Float64, self._angle)
+        type_, take = angle if self._is_command and not lockstep else joint
+        self.subscription = node.create_subscription(type_, self._topic, take, qos)
 
     def reset(self) -> None:
         self._estimator = RecursiveNomoto(self._kind)
@@ -130,8 +130,8 @@ class NomotoInput:
         if not self._rudder:
             text, state = f"held: no rudder on {rudder}", State.HELD
         elif self._heard and not self._lockstep and (fault := clock_fault(rudder, odometry, apart)):
-            beside = " (beside a simulator: use_sim_time)" if self._is_command else ""
-            text, state = f"held: {fault}{beside}", State.HELD
+            advice = " (beside a simulator: use_sim_time)" if self._is_command else ""
+            text, state = f"held: {fault}{advice}", State.HELD
         elif found is None:
             text, state = "held: the rudder has not yet turned the vehicle enough", State.HELD
         elif silent or self._heard - self._stamp > GAP * 1e9:
