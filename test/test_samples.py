@@ -1,6 +1,7 @@
 """From messages to samples: against the true motion, in any order, with any rubbish among them."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -116,7 +117,9 @@ def test_samples_are_the_truth(heavy, odometry_rate, imu_rate, wrench_rate):
     assert np.abs(samples["down"] - down[at]).max() < 1e-6 + 0.1 * step
     np.testing.assert_allclose(np.linalg.norm(samples["down"], axis=1), 1.0, rtol=1e-9)
     slope = np.diff(samples["down"], axis=0) / samples["dt"][1:, None]
-    np.testing.assert_allclose(samples["down_slope"][1:], slope, atol=1e-9)
+    turn = np.cross(samples["down"], samples["nu"][:, 3:])
+    bend = (turn[:-1] - turn[1:]) / 6.0
+    np.testing.assert_allclose(samples["down_slope"][1:], slope - bend, atol=1e-9)
 
     scale = np.abs(dive.demand).max(axis=0)
     for k in range(1, len(samples), 7):
@@ -189,6 +192,45 @@ def test_lever_arm_without_an_imu(heavy):
     samples, sampler = taken(mounted, without_arrival(dive))
     error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
     assert np.abs(error).max() < 1e-6
+
+
+def test_rates_that_are_not_measured_do_not_turn_the_arm(heavy):
+    """A velocity sensor knows its velocity alone: the gyro tells how its arm turns."""
+    mounted = with_section(heavy, "odometry", position=(0.3, -0.2, 0.1))
+    dive = clean(mounted)
+    unknown = np.repeat([1e-6, 1e6], 3)
+    messages = [
+        (role, m._replace(angular=np.full(3, 7.0), twist_variance=unknown))
+        if role == ODOMETRY
+        else (role, m)
+        for role, m in without_arrival(dive)
+    ]
+    samples, sampler = taken(mounted, messages)
+    error = samples["nu"] - dive.truth.nu[instants(dive, sampler, samples)]
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 0.01
+    constant = [
+        (role, m._replace(angular=np.zeros(3)) if role == ODOMETRY else m) for role, m in messages
+    ]
+    streams = gather(constant, mounted)
+    truth = dive.truth.nu[np.searchsorted(dive.truth.t - dive.truth.t[0], streams.t - 1e-7)]
+    assert np.sqrt(np.mean((streams.nu - truth)[:, :3] ** 2)) < 0.01
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0])
+def test_the_mean_of_gravity_over_an_interval_is_that_of_the_turn(heavy, rate):
+    """Between two messages of a slow odometry the vehicle turns on. The mean of the two ends is off
+    by their distance squared, and the righting moment with it."""
+    dive = clean(heavy, 20.0, imu_rate=0.0, odometry_rate=rate)
+    samples, sampler = taken(heavy, without_arrival(dive))
+    at = instants(dive, sampler, samples)
+    truth, t = quaternion_to_matrix(dive.truth.orientation)[:, 2], dive.truth.t
+    parts = [slice(a, b + 1) for a, b in itertools.pairwise(at)]
+    whole = np.array([np.trapezoid(truth[part], t[part], axis=0) for part in parts])
+    exact = whole / samples["dt"][1:, None]
+    ends = 0.5 * (truth[at[1:]] + truth[at[:-1]])
+    mean = samples["down"] - 0.5 * samples["dt"][:, None] * samples["down_slope"]
+    error = np.sqrt(np.mean((mean[1:] - exact) ** 2))
+    assert error < 0.1 * np.sqrt(np.mean((ends - exact) ** 2))
 
 
 def test_biases_are_found(heavy):

@@ -208,7 +208,7 @@ class KinematicFilter:
         into["has_odometry"][0] = odometry is not None
         into["age"][0] = age
         if odometry is not None:
-            self._take_odometry(odometry)
+            self._take_odometry(odometry, imu)
         into["has_imu"][0] = imu is not None
         if imu is not None:
             self._take_imu(imu)
@@ -221,10 +221,14 @@ class KinematicFilter:
         )
         return *taken, stopped
 
-    def _take_odometry(self, message: Odometry) -> None:
+    def _take_odometry(self, message: Odometry, imu: Imu | None) -> None:
         """The message without what the effects on the sensors have added."""
         into = self._into
         linear, angular = message.linear, message.angular
+        if imu is not None and UNKNOWN <= max(message.twist_variance[3:].tolist()) < math.inf:
+            # not measured: the arm of a velocity sensor turns as the gyro says
+            gyro = self._settings["imu_rotation"][0] @ imu.angular_velocity
+            angular = gyro - self.state["gyro_bias"][0]
         if self._corrects:
             linear, angular, *_ = correct(Reading(linear, angular, _ZERO, _ZERO), self._effects)
         orientation = message.orientation
@@ -283,6 +287,18 @@ def _cross(a, b, i):
     """Component i of a x b."""
     j, m = (i + 1) % 3, (i + 2) % 3
     return a[j] * b[m] - a[m] * b[j]
+
+
+@inlined
+def slope_of_mean(down, later, rate, later_rate, dt, i):
+    """Component i of the slope of the line that ends at ``later`` and has the mean of the cubic
+    between both, whose slope at each end is ``down x rate``.
+
+    The mean of both ends alone lacks the curvature of a turn: by ``dt^2 / 12`` of the second
+    derivative, which for the righting moment looks like so much less inertia.
+    """
+    bend = _cross(down, rate, i) - _cross(later, later_rate, i)
+    return (later[i] - down[i]) / dt - bend / 6.0
 
 
 @inlined
@@ -588,6 +604,7 @@ def fuse(
         for i in range(6):
             k.power[i] = 0.0
     out.measured, out.tilt = taken, k.tilt
+    before = k.rate.copy()
     _assign(k.rate, rate)
     r_rate = gyro_variance if has_imu else r_angular
     blend = min(dt / _POWER_TIME, 1.0)  # a single value may well be noise
@@ -597,6 +614,6 @@ def fuse(
         out.moving[i] = k.power[i] > _MOVING * (r_linear if i < 3 else r_rate)
     for i in range(3):
         out.down[i] = down[i]
-        out.down_slope[i] = (down[i] - k.down[i]) / dt if dt > 0.0 else 0.0
-        k.down[i] = down[i]
+        out.down_slope[i] = slope_of_mean(k.down, down, before, rate, dt, i) if dt > 0.0 else 0.0
+    _assign(k.down, down)
     return taken, k.known, anew

@@ -206,7 +206,11 @@ def _as_configured(read: Streams, config: Config) -> Streams:
     imu = correct(imu, config.effects)
     out = corrected(read, config.effects)
     nu = out.nu.copy()
-    nu[:, :3] -= velocity_of_arm(nu[:, 3:], config.odometry.position)
+    rates = nu[:, 3:]
+    if len(read.imu_t):  # where the odometry has none, the arm turns as the gyro says
+        gyro = interpolated(read.imu_t, imu.gyro, read.t)
+        rates = np.where(read.unmeasured[3:], gyro, rates)
+    nu[:, :3] -= velocity_of_arm(rates, config.odometry.position)
     nu = np.where(read.unmeasured, read.nu, nu)
     return replace(out, nu=nu, gyro=imu.gyro @ body, specific_force=imu.specific_force @ body)
 

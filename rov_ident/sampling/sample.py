@@ -31,7 +31,7 @@ SAMPLE = record(
         ("orientation", "f8", (4,)),  # w x y z, body -> world
         ("position", "f8", (3,)),  # m: in the world, as last measured
         ("down", "f8", (3,)),  # unit, body axes
-        ("down_slope", "f8", (3,)),  # per s, over the interval
+        ("down_slope", "f8", (3,)),  # per s: of the line that ends at down and has its mean over dt
         ("tilt", "f8"),  # rad2 s: variance density of an error of down that lasts a second
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment

@@ -20,6 +20,7 @@ from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import rotation, turned
+from rov_ident.sampling.kinematic_filter import slope_of_mean
 from rov_ident.sampling.sample import stretches
 
 _LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
@@ -68,8 +69,7 @@ def _smooth(part: NDArray[np.void]) -> None:
     down = np.empty((len(part), 3))
     _correct_attitude(ahead, error, part["orientation"], down)
     part["down"] = down
-    dt = np.maximum(part["dt"][1:], 1e-6)
-    part["down_slope"][1:] = (down[1:] - down[:-1]) / dt[:, None]
+    _take_slopes(down, part["nu"][:, 3:], np.maximum(part["dt"], 1e-6), part["down_slope"])
 
 
 @kernel
@@ -80,6 +80,14 @@ def _integrate(q, first, nu, dt, out):
         out[k] = turned(out[k - 1], 0.5 * (nu[k - 1, 3:] + nu[k, 3:]) * dt[k])
     for k in range(first - 1, -1, -1):
         out[k] = turned(out[k + 1], -0.5 * (nu[k + 1, 3:] + nu[k, 3:]) * dt[k + 1])
+
+
+@kernel
+def _take_slopes(down, rate, dt, out):
+    """As a sample has them (k, 3), of down (k, 3) and rates (k, 3); the first stays."""
+    for k in range(1, len(out)):
+        for i in range(3):
+            out[k, i] = slope_of_mean(down[k - 1], down[k], rate[k - 1], rate[k], dt[k], i)
 
 
 @kernel
