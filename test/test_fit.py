@@ -205,6 +205,24 @@ def test_two_records_are_one_fit(heavy, record, broken, fits):
     assert files == ["quiet.mcap", "gap.mcap"]
 
 
+@pytest.mark.parametrize("effects", [{}, {"thruster_lag": {"time_constant": 0.01}}])
+def test_sensors_that_contradict_each_other_in_any_record_are_told(folder, heavy, quiet, effects):
+    """Without effects to estimate, samples are those of the records; with, messages are read."""
+    given = from_parameters({**to_parameters(heavy), "effects": effects})
+    assert bool(given.estimate_effects) == bool(effects)
+    wrong = [
+        (at, role, m._replace(angular_velocity=1.5 * m.angular_velocity) if role == "imu" else m)
+        for at, role, m in quiet
+    ]
+    for name, messages in (("right", quiet), ("wrong", wrong)):
+        write_messages(folder / f"{name}.mcap", messages)
+    right, wrong = (read_record(folder / f"{name}.mcap", given) for name in ("right", "wrong"))
+    for records, passes in (([right], True), ([wrong], False), ([wrong, right], False)):
+        tests = fit_online(records, given, "rls").consistency.tests
+        told = [test.passed for test in tests if test.name == "odometry and IMU: angular rate"]
+        assert told == [passes]
+
+
 def test_no_such_estimator(heavy, record):
     with pytest.raises(UserError, match="no estimator 'ols': use rls or ukf"):
         fit_online([record], heavy, "ols")

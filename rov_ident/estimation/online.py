@@ -467,12 +467,18 @@ class OnlineEstimator:
             self._window[0] = 0.0
 
     @one_blas_thread()
-    def report(self) -> Report:
-        """The present coefficients, made physical, with their state in words."""
+    def report(self, sensors: Mapping[str, float] | None = None) -> Report:
+        """The present coefficients, made physical, with their state in words.
+
+        ``sensors`` are test ratios of the odometry's parts against the IMU; None: those of the
+        messages pushed since the last record began, which are all that the sampler knows of.
+        """
+        if sensors is None:
+            sensors = self.sampler.kinematic_filter.contradictions
         raw: Estimate = self._module.estimate(self._task, self._state, self.prior)
         consistency = consistency_of(
             self.config, self.prior, raw.values, self._unexplained(), self._whiteness(),
-            self.sampler.kinematic_filter.contradictions, raw.std, self._not_followed(raw.values),
+            sensors, raw.std, self._not_followed(raw.values),
         )  # fmt: skip
         # before any disagreement widens the covariance, which ends at the prior's: with a thrust
         # that is held at its limit, drag and inertia go as the data have it

@@ -13,7 +13,7 @@ from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_share
 from rov_ident.core.messages import Array
 from rov_ident.core.states import IDENTIFIABLE, State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
-from rov_ident.estimation.consistency import Consistency, Test
+from rov_ident.estimation.consistency import Consistency, Test, worst_of
 from rov_ident.estimation.online import Kind, OnlineEstimator
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
@@ -270,7 +270,10 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         else:
             estimator.take(record.samples)
             estimator.flush()
-    report = estimator.report()
+    config, read = estimator.config, archive.of_records(records)
+    found = config.with_values(estimator.report().by_name)
+    judged = read.as_read_by(found, config)
+    report = estimator.report(worst_of(bag.contradictions for bag in judged.bags))
     assert report.consistency is not None and report.beyond_driving is not None
     own = np.sqrt(np.maximum(report.std**2 - report.beyond_driving, 0.0))
     states = [
@@ -281,10 +284,6 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
             report.values, own, estimator.prior.std, report.states, strict=True
         )
     ]
-    config = estimator.config
-    found = config.with_values(dict(zip(report.names, report.values.tolist(), strict=True)))
-    read = archive.of_records(records)
-    judged = read.as_read_by(found, config)
     before, after = open_loop(read, config), open_loop(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
     return Fit(
