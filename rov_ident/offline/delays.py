@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_to_matrix
@@ -21,7 +22,7 @@ from rov_ident.offline.batch_fit import AT_REST
 from rov_ident.offline.filtered_regression import filtered_rows, regression, spacing_of
 from rov_ident.offline.least_squares import PERIOD
 from rov_ident.sampling.queues import LONGEST_INTERVAL
-from rov_ident.sampling.raw_streams import Streams, measured_at
+from rov_ident.sampling.raw_streams import MAX_STEP, Streams, measured_at
 from rov_ident.sampling.records import beside_odometry
 from rov_ident.sampling.sample import SAMPLE
 from rov_ident.sampling.without_velocity import is_without_velocity
@@ -141,19 +142,40 @@ def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
 
 
 def samples_of(streams: Streams) -> NDArray[np.void]:
-    """Samples (N,) of SAMPLE at the odometry messages, as far as :func:`filtered` needs them."""
-    samples = np.zeros(len(streams.t), dtype=SAMPLE)
-    dt = np.diff(streams.t, prepend=streams.t[0])
+    """Samples (k,) of SAMPLE at the odometry messages and, at most MAX_STEP apart, between them, as
+    far as :func:`filtered` needs them.
+
+    A wrench of which the mean over an interval h alone is known has lost its first moment there:
+    filtered with a corner w, it seems late by w h^2 / 12, 80 ms at 2.5 Hz. So intervals are short.
+    Motion goes between messages as a cubic: along straight lines it seemed up to 20 ms ahead.
+    """
+    apart = np.diff(streams.t)
+    joined = (apart > 0.0) & (apart <= LONGEST_INTERVAL)
+    steps = np.where(joined, np.ceil(apart / MAX_STEP), 1.0)
+    place = np.cumsum(np.append(0.0, steps))  # of the messages among the samples
+    at = np.arange(place[-1] + 1.0)
+    # as the clock goes, but never back
+    running = np.cumsum(np.append(0.0, np.where(joined, apart, LONGEST_INTERVAL)))
+    between = np.interp(at, place, running)
+
+    def curved(values: Array) -> Array:
+        slope = np.gradient(values, running, axis=0)
+        out: Array = CubicHermiteSpline(running, values, slope)(between)
+        return out
+
+    t = np.interp(at, place, streams.t)
+    samples = np.zeros(len(t), dtype=SAMPLE)
+    dt = np.diff(t, prepend=t[0])
     impulse = np.concatenate(
         [np.zeros((1, 6)), np.cumsum(np.diff(streams.demand_t)[:, None] * streams.demand[:-1], 0)]
     )
-    at = interpolated(streams.demand_t, impulse, streams.t)
-    samples["t"], samples["dt"], samples["nu"] = streams.t, dt, streams.nu
+    given = interpolated(streams.demand_t, impulse, t)
+    samples["t"], samples["dt"], samples["nu"] = t, dt, curved(streams.nu)
     samples["restart"] = (dt <= 0.0) | (dt > LONGEST_INTERVAL)
-    samples["wrench"][1:] = np.diff(at, axis=0) / np.maximum(dt[1:, None], 1e-9)
+    samples["wrench"][1:] = np.diff(given, axis=0) / np.maximum(dt[1:, None], 1e-9)
     if len(streams.inputs_t):
-        samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, streams.t)
-    samples["down"] = quaternion_to_matrix(streams.orientation)[:, 2]
+        samples["inputs"][:, 1] = interpolated(streams.inputs_t, streams.inputs, t)
+    samples["down"] = curved(quaternion_to_matrix(streams.orientation)[:, 2])
     samples["down_slope"][1:] = np.diff(samples["down"], axis=0) / np.maximum(dt[1:, None], 1e-9)
     return samples
 

@@ -41,7 +41,7 @@ _SPIKE = 10.0  # standard deviations of what velocities change by: no noise reac
 # of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
 # a tenth as noisy; without noise the sum of true velocities is a fifth of it off
 _RECKONED = 0.1
-MAX_STEP = 0.05  # s; of a simulation's steps, where odometry is slower
+MAX_STEP = 0.05  # s; of a simulation's or a filter's steps, where odometry is slower
 PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
 
 
