@@ -175,17 +175,17 @@ def test_a_fit_that_the_data_contradict_is_doubted_in_the_headline(dives, agree)
 
 
 def test_a_model_that_diverges_on_the_dive_held_back_is_not_recommended(dives):
-    fit = ri.fit(dives / "short.mcap", WRONG, "ls")
+    fit = ri.fit(dives / "long.mcap", WRONG, "ls")
     judged = {
         "rmse_before": {"u": 0.2, "v": 0.2, "p": None},
         "rmse": {"u": math.inf, "v": math.inf, "p": None},
-        "bags": [{"file": "long.mcap"}],
+        "bags": [{"file": "short.mcap"}],
     }
     fit = dataclasses.replace(fit, more=fit.more | {"validation": judged})
-    assert "On long.mcap, the 10 s prediction diverges." in fit.sentence
+    assert "On short.mcap, the 10 s prediction diverges." in fit.sentence
     assert [row[2] for row in fit.table().parts[1].rows] == ["inf", "inf", ""]
     assert json.loads(fit.to_json())["validation"]["rmse"] == dict.fromkeys("uvp")
-    found = identification.Identification(fit, None, (), {}, "long.mcap", None, judged)
+    found = identification.Identification(fit, None, (), {}, "short.mcap", None, judged)
     assert "the 10 s prediction diverges" in found.sentence
     assert found.advice[-1].startswith("Keep the configuration")
     assert json.loads(found.to_json())["rmse"]["u"] == {"before": 0.2, "after": None}

@@ -27,6 +27,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.messages import Array
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONTRADICTED, IDENTIFIABLE, State, of_fit
+from rov_ident.core.whiteness import JUDGED_TIME
 from rov_ident.estimation.consistency import Test, consistency_of, worst_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
@@ -136,6 +137,8 @@ def fit_batch(
     judged = read.as_read_by(now, config)
     after = open_loop(judged, now)
     chance = by_chance(judged, now, prior.names, covariance, list(states.values()))
+    if sum(archive.each(_time_in_motion)) <= JUDGED_TIME:
+        unexplained = np.full(6, np.nan)  # not known yet, as to the recursive estimators
     sensors = worst_of(bag.contradictions for bag in judged.bags)
     std = np.sqrt(np.diag(covariance)) if kind == "ml" else None
     consistency = consistency_of(
@@ -494,6 +497,11 @@ def predicted_information(
 def _mean_square_wrench(samples: Samples) -> Array:
     """(6,) over the samples."""
     return np.mean(samples["wrench"] ** 2, axis=0)
+
+
+def _time_in_motion(samples: Samples) -> float:
+    """Seconds in which any velocity is above the noise of its sensor."""
+    return float(samples["dt"][(samples["moving"] != 0).any(axis=1)].sum())
 
 
 def _velocity_range(samples: Samples) -> tuple[Array, Array]:
