@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_to_matrix
@@ -149,6 +148,8 @@ def samples_of(streams: Streams) -> NDArray[np.void]:
     filtered with a corner w, it seems late by w h^2 / 12, 80 ms at 2.5 Hz. So intervals are short.
     Motion goes between messages as a cubic: along straight lines it seemed up to 20 ms ahead.
     """
+    from scipy.interpolate import CubicHermiteSpline  # here: it takes its time to import
+
     apart = np.diff(streams.t)
     joined = (apart > 0.0) & (apart <= LONGEST_INTERVAL)
     steps = np.where(joined, np.ceil(apart / MAX_STEP), 1.0)
