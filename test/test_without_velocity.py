@@ -156,8 +156,8 @@ def dive(folder, driving, seed, seconds):
 
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory):
-    """Heave and all rotations driven, surge and sway at rest."""
-    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 13.0)
+    """Heave and all rotations driven, surge and sway at rest; long enough to be judged."""
+    return dive(tmp_path_factory.mktemp("turning"), "four-axis", 1, 24.0)
 
 
 @pytest.fixture(scope="module")
