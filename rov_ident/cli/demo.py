@@ -84,7 +84,6 @@ def _table(config: "Config", truth: dict[str, float], seen: "dict[str, list[Repo
     from rich.text import Text
 
     from rov_ident.reports.result import NORMAL
-    from rov_ident.reports.table import estimate
 
     # Lines between the columns would need more than 80 characters.
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -100,7 +99,7 @@ def _table(config: "Config", truth: dict[str, float], seen: "dict[str, list[Repo
                 cells.append(Text())
                 continue
             colour = ("green", "yellow", "red", "dim")[state.levels[i]]
-            cells.append(Text(" ± ".join(estimate(state.values[i], NORMAL * state.std[i])), colour))
+            cells.append(Text(f"{state.values[i]:.4g} ± {NORMAL * state.std[i]:.2g}", colour))
         start = config.value(name)
         unit = config.model.coefficients[config.model.names.index(name)].unit
         table.add_row(name, f"{truth[name]:.4g}", f"{start:.4g}", *cells, unit)
