@@ -38,8 +38,9 @@ from rov_ident.discrepancy.explain import (
     _gains_elsewhere,
     _is_between_readings,
     _of_guided,
+    _set_right,
+    _started,
     _with_all_data,
-    _with_reading,
     explain,
 )
 from rov_ident.discrepancy.findings import (
@@ -185,8 +186,8 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
     whole = explain([there.streams], there.case.config).findings
     assert whole.effects[0].separable and CUT_SHORT not in whole.notes
 
-    spans = split(there.streams.duration)[0]
-    search, _ = _with_reading(Search(there.streams, there.case.config, spans), spans)
+    data = _set_right([there.streams], there.case.config, None)
+    search, _, _ = _started(data, there.case.config)
     first_step = search.problem.steps_moved
     monkeypatch.setattr(discrepancy, "BUDGET", first_step)
     findings = explain([there.streams], there.case.config).findings

@@ -43,6 +43,7 @@ from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.search import INTERPLAY_NAME, Search
 from rov_ident.discrepancy.sensor_choice import noise_of_wrench
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.model.coefficients import AXES
 from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams, gather, inspected, orientation_at
 
@@ -599,9 +600,39 @@ def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy)
     there = Search(streams, config, split(streams.duration)[0])
     assert there.problem.reading_std[3:5].all()
     start = there.start()
-    assert bool(noise_of_wrench(there, start)) == noisy
+    noise = noise_of_wrench(there, start)
+    assert bool(noise.values) == noisy
+    if driving != "axis by axis":  # roll and pitch have no stick, and an autopilot that is drowned
+        assert noise.lost.tolist() == [noisy and axis in "KM" for axis in AXES]
     assert sensor_choice.may_be_noise(start, "XYZKMN") == noisy
     assert not sensor_choice.may_be_noise(start, "")
+
+
+@pytest.mark.parametrize("seed", [1, *more(0, 2, 3)])
+def test_nothing_is_said_about_axes_whose_wrench_is_lost_in_noise(seed):
+    """What an autopilot asks for in roll and pitch was taken for noise, and what it did for a
+    payload, drag across axes or a dead band."""
+    _, streams, config = streams_of("wrench noise", "pilot", seed, 150.0)
+    findings = explain([streams], config).findings
+    (found,) = findings.effects
+    assert found.effect == "wrench_noise" and found.separable
+    assert set(found.axes) == set("XYZN")
+    assert any("cannot be told from noise of its reading on K" in note for note in findings.notes)
+
+
+def test_a_little_more_noise_moves_no_reading_across_the_threshold():
+    """A finite difference across the jump made a hundred times the noise that there is."""
+    _, streams, config = streams_of("wrench noise", "pilot", 1)
+    problem = WindowedProblem(streams, split(streams.duration)[0])
+    noise = Hypothesis(config, {}).effects | {
+        "wrench_noise": {f"std_{a}": s for a, s in zip(AXES, problem.reading_std, strict=True)}
+    }
+    for effects in ({}, noise):
+        added = problem.noisy_thrust(effects)
+        assert (np.abs(added).max(axis=(0, 2)) < 6.0 * problem.reading_std).all()
+        resting = problem.thrust(effects)[0] == 0.0
+        assert resting[:, 3].any() == bool(effects)
+        assert not added[resting].any()
 
 
 # ------------------------------------------------------------------ accelerometer and attitude

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident import config as configuration
 from rov_ident.config import Config
@@ -53,12 +54,13 @@ from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Simulated, Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, Values, with_trait
-from rov_ident.model.coefficients import AXES, VELOCITIES
+from rov_ident.model.coefficients import AXES, VELOCITIES, WRENCH_UNITS
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.raw_streams import Streams, corrected, joined
+from rov_ident.sampling.raw_streams import Streams, corrected, joined, without_repeats
 from rov_ident.sampling.sample import NO_MOMENT
+from rov_ident.sampling.wrench_scatter import resting_noise
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
@@ -93,6 +95,11 @@ _FILTERED = (
     "cause beside it is sure; record what the filter is fed with"
 )
 _UNMEASURED = "not measured, as they never change, and left as they are: {}"
+_IN_NOISE = (
+    "the wrench cannot be told from noise of its reading on {}: how the vehicle moves along these "
+    "axes is taken from the measurement, not simulated, and nothing is said about it; record the "
+    "commands without noise, or drive these axes well above it"
+)
 _ONLY_FITTED = (
     "the extended model cannot be simulated through all of the data: its values are those of the "
     "part that the search fitted"
@@ -179,8 +186,13 @@ def explain(
     say("comparing the sensors", 0.05)
     data = _set_right(bags, config, validate)
     say("refitting the coefficients", 0.1)
-    search, start = _with_reading(Search(data.streams, config, thinned(data.to_fit)), data.to_fit)
+    search, start, data = _started(data, config)
     retuned, model, residual = _searched(search, start, say)
+    # in a model that lacks much, noise of the wrench's reading may not have shown
+    reading = sensor_choice.noise_of_wrench(search, model.final)
+    if reading.values or reading.lost.any():
+        search, data = _with_reading(search, data, reading)
+        retuned, model, residual = _searched(search, search.start(), say)
     say("judging on held-out data", 0.9)
     likeliest, begun = model.final.hypothesis, beginnings(model.final)
     judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, likeliest, begun)
@@ -325,13 +337,27 @@ class _Data:
         """Whether another bag is judged."""
         return self.recorded.judged is not self.recorded.streams
 
+    def without(self, lost: NDArray[np.bool_]) -> "_Data":
+        """The same without further axes (6,) that are lost in noise of the wrench's reading."""
+
+        def marked(streams: Streams) -> Streams:
+            return dataclasses.replace(streams, in_noise=streams.in_noise | lost)
+
+        streams = marked(self.recorded.streams)
+        judged = marked(self.recorded.judged) if self.validated else streams
+        recorded = dataclasses.replace(self.recorded, streams=streams, judged=judged)
+        return dataclasses.replace(
+            self, bags=[marked(bag) for bag in self.bags], streams=marked(self.streams),
+            judged=marked(self.judged), recorded=recorded,
+        )  # fmt: skip
+
 
 def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None) -> _Data:
-    rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
+    rates = [rates_and_attitude.agreed(without_repeats(bag), config) for bag in bags]
     bags = [r.streams for r in rates]
     clocks = clock_errors.of(bags, config)
     if validate is not None:
-        validate = rates_and_attitude.agreed(validate, config).streams
+        validate = rates_and_attitude.agreed(without_repeats(validate), config).streams
     with_others = [*bags, *([] if validate is None else [validate])]
     as_headed = joined(bags)[0] if validate is None else validate
     turned, headings = repetition.turned(with_others, config)
@@ -488,16 +514,28 @@ def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams
     return streams, *of_all
 
 
-def _with_reading(search: Search, spans: Spans) -> tuple[Search, Fitted | None]:
-    """The search with the noise of the wrench's reading in its configuration, where that is
-    believed, and the fit from which it starts."""
+def _started(data: _Data, config: Config) -> tuple[Search, Fitted | None, _Data]:
+    """The search, the fit from which it starts, and the data, with what these two tell of noise of
+    the wrench's reading."""
+    search = Search(data.streams, config, thinned(data.to_fit))
     start = search.start()
-    noise = {} if start is None else sensor_choice.noise_of_wrench(search, start)
-    if not noise:
-        return search, start
-    config = sensor_choice.with_noise(search.given, noise).config
-    there = Search(search.problem.streams, config, thinned(spans))
-    return there, there.start()
+    if start is None:
+        return search, None, data
+    reading = sensor_choice.noise_of_wrench(search, start)
+    if not (reading.values or reading.lost.any()):
+        return search, start, data
+    search, data = _with_reading(search, data, reading)
+    return search, search.start(), data
+
+
+def _with_reading(
+    search: Search, data: _Data, reading: sensor_choice.ReadingNoise
+) -> tuple[Search, _Data]:
+    """The search with the noise of the wrench's reading in its configuration, where that is
+    believed, and the data without the axes that are lost in it."""
+    values, data = reading.values, data.without(reading.lost)
+    config = sensor_choice.with_noise(search.given, values).config if values else search.config
+    return Search(data.streams, config, thinned(data.to_fit)), data
 
 
 def _left(streams: Streams, rmse: Mapping[str, float], noise: Array) -> dict[str, float]:
@@ -546,7 +584,10 @@ def _of_guided(streams: Streams) -> list[str]:
     """Notes on velocities that are taken as measured."""
     never = ", ".join(c for c, so in zip(VELOCITIES, streams.unmeasured, strict=True) if so)
     notes = [] if streams.is_turned else [NO_MOMENT]
-    return [*notes, _UNMEASURED.format(never)] if never else notes
+    notes += [_UNMEASURED.format(never)] if never else []
+    std = resting_noise(streams.demand)
+    lost = [f"{AXES[i]} ({std[i]:.2g} {WRENCH_UNITS[i]})" for i in np.flatnonzero(streams.in_noise)]
+    return notes + ([_IN_NOISE.format(", ".join(lost))] if lost else [])
 
 
 def _told(left: Mapping[str, float]) -> str:

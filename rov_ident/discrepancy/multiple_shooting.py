@@ -98,15 +98,20 @@ def guided_by(eq: Equations, guided: NDArray[np.bool_]) -> Equations:
 
 def thrust(steps: Steps, acting: Acting) -> Array:
     """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
+    out = np.zeros((2, len(steps.piece), 6))
+    _means(steps.piece_t, acted(steps, acting), steps.t, steps.piece, out)
+    return out
+
+
+def acted(steps: Steps, acting: Acting) -> Array:
+    """The thrusters' wrench in each piece, shaped as ``steps.demand``, after the input effects."""
     wrench = steps.demand
     if acting.inputs.any():
         wrench = wrench.copy()
         for begin, rows in _records(steps.piece_begin):
             t = steps.piece_t[rows.start : rows.stop + 1] - begin
             _thrust(on_clock(acting, begin), memory(), t, steps.anew[rows], wrench[rows])
-    out = np.zeros((2, len(steps.piece), 6))
-    _means(steps.piece_t, wrench, steps.t, steps.piece, out)
-    return out
+    return wrench
 
 
 def shoot(

@@ -209,7 +209,10 @@ class Screening:
         """The shape (onset, place) of an effect that scores best, with its linear amplitudes. Where
         a place is not part of the shape, the moments that it makes are fitted as well."""
         linearisation = now.linearisation
-        keys = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        own = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        keys = [key for key in own if self._is_shown(key, now.hypothesis)]
+        if not keys:
+            return None
         places = [p for p in effect.parameters if p.role == "place" and p.name not in shapes[0]]
         moments = [(f"{effect.name} moment", p.name) for p in places]
         best: Candidate | None = None

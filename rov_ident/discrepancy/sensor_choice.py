@@ -10,8 +10,10 @@ commands rest, is believed if the dynamics fit better without it.
 import dataclasses
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_to_matrix
@@ -37,6 +39,9 @@ BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _WATER = (("ocean_current", "north"), ("ocean_current", "east"))
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
+_LOUD = 0.1
+"""Of the power of what is read, that of the noise. Thrust seems weaker by as much (attenuation),
+which the default uncertainty of its scale, 15 %, still covers."""
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
 
@@ -255,32 +260,44 @@ def _moves_velocity(name: str, values: Mapping[str, float]) -> bool:
 # ------------------------------------------------------------------ the wrench
 
 
-def noise_of_wrench(search: Search, start: Fitted) -> dict[str, float]:
-    """The parameters of the noise of the reading, on the axes where the fit ``start`` is likelier
-    without it; empty where it is on none, or where the vehicle may follow what looks like noise. It
-    has no parameter that is fitted, so no more is asked.
+class ReadingNoise(NamedTuple):
+    """The parameters of the noise of the wrench's reading, none where it is on no axis, and the
+    axes (6,) that are lost in it."""
+
+    values: Mapping[str, float]
+    lost: NDArray[np.bool_]
+
+
+def noise_of_wrench(search: Search, start: Fitted) -> ReadingNoise:
+    """The noise of the reading on the axes where the fit ``start`` is likelier without it; on none
+    where the vehicle may follow what looks like noise. It has no parameter that is fitted, so no
+    more is asked.
+
+    What is read while a command is taken to rest is set to zero only where it is nothing but noise.
+    Where small commands are among it, as of an autopilot that keeps the vehicle upright, it is left
+    as it is; and where noise makes much of all that is read there, the axis is lost.
     """
     config, problem = search.config, search.problem
+    none = ReadingNoise({}, np.zeros(6, dtype=bool))
     if NOISE in config.effects or not problem.reading_std.any():
-        return {}
+        return none
     evidence = _evidence_of_noise(start)
     possible = evidence > -VERY_STRONG
     if evidence[possible].sum() < VERY_STRONG:
-        return {}
-    names = {p.axis: p.name for p in EFFECTS[NOISE].parameters}
+        return none
     std = np.where(possible, problem.reading_std, 0.0)
-    values = {names[a]: float(s) for a, s in zip(AXES, std, strict=True)}
-    there = fit(problem, with_noise(start.hypothesis, values))
-    # What is read on an axis may act after all: tried with what the noise is taken off there.
-    acting = {} if there is None else _better_as_read(there)
-    if there is not None and acting:
-        values = {name: 0.0 if name in acting else value for name, value in values.items()}
-        there = fit(problem, with_noise(start.hypothesis, values)) if any(values.values()) else None
-    if there is None:
-        return {}
-    free = ~problem.guided
-    likelier = np.log(there.noise[free]).sum() < np.log(start.noise[free]).sum()
-    return values if likelier else {}
+    acts = _acts_at_rest(start, with_noise(start.hypothesis, _on_axes(std)))
+    lost = acts & (std**2 > _LOUD * np.mean(problem.streams.demand**2, axis=0))
+    std = np.where(acts, 0.0, std)
+    there = fit(problem, with_noise(start.hypothesis, _on_axes(std))) if std.any() else None
+    use = ~problem.guided & ~lost
+    likelier = bool(there and np.log(there.noise[use]).sum() < np.log(start.noise[use]).sum())
+    return ReadingNoise(_on_axes(std) if likelier else {}, lost)
+
+
+def _on_axes(std: Array) -> dict[str, float]:
+    names = {p.axis: p.name for p in EFFECTS[NOISE].parameters}
+    return {names[a]: s for a, s in zip(AXES, std.tolist(), strict=True)}
 
 
 def may_be_noise(rest: Fitted, axes: Container[str]) -> bool:
@@ -311,24 +328,21 @@ def _evidence_of_noise(fitted: Fitted) -> Array:
     return gain / np.maximum(inflation, 1e-9)
 
 
-def _better_as_read(fitted: Fitted) -> set[str]:
-    """The parameters of the noise without which a fit that has them all would be better."""
-    linearisation, h = fitted.linearisation, fitted.hypothesis
-    problem = linearisation.problem
-    change = problem.thrust(with_noise(h, {}).effects)[0] - problem.thrust(h.effects)[0]
-    use = [i for i in np.flatnonzero(~problem.guided) if change[:, i].any()]
-    if not use:
-        return set()
-    columns = np.zeros((*change.shape, len(use)))
-    for k, i in enumerate(use):
-        columns[:, i, k] = change[:, i]
-    keys = [(NOISE, AXES[i]) for i in use]
-    linear = linearisation.having(keys, linearisation.sensitivity_to(columns))
-    slope, normal = linear.gradient.sum(axis=0), np.diag(linear.normal)
-    at = linear.index(keys)
-    better = 2.0 * slope[at] > normal[at]
-    names = {p.axis: p.name for p in EFFECTS[NOISE].parameters}
-    return {names[AXES[i]] for i, yes in zip(use, better, strict=True) if yes}
+def _acts_at_rest(start: Fitted, noisy: Hypothesis) -> NDArray[np.bool_]:
+    """Axes (6,) on which what is read while a command is taken to rest, by the hypothesis
+    ``noisy``, would move the vehicle by more than noise alone does: small commands are among it,
+    slower than noise."""
+    linearisation = start.linearisation
+
+    def moved(thrust: Array) -> Array:
+        columns = linearisation.sensitivity_to(thrust[:, :, None] * np.eye(6))
+        squares: Array = np.sum(columns**2, axis=0)
+        return squares
+
+    read, noise = linearisation.problem.thrust_at_rest(noisy.effects)
+    chance = np.stack([moved(n) for n in noise])
+    acts: NDArray[np.bool_] = moved(read) > chance.mean(axis=0) + _SURE * chance.std(axis=0, ddof=1)
+    return acts
 
 
 def with_noise(h: Hypothesis, values: Mapping[str, float]) -> Hypothesis:

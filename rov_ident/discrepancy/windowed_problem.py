@@ -24,6 +24,7 @@ from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_o
 from rov_ident.discrepancy.multiple_shooting import (
     Motion,
     Steps,
+    acted,
     equations,
     guided_by,
     regressors,
@@ -32,7 +33,17 @@ from rov_ident.discrepancy.multiple_shooting import (
     wrenches,
 )
 from rov_ident.discrepancy.reading_noise import SMALL, draws
-from rov_ident.effects import EFFECTS, Values, compiled, on_clock, rigid_body, steered
+from rov_ident.effects import (
+    EFFECTS,
+    Acting,
+    Values,
+    compiled,
+    of_the_vehicle,
+    on_clock,
+    reading_noise,
+    rigid_body,
+    steered,
+)
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import INERTIA, Array, Model, RigidBody
@@ -196,26 +207,48 @@ class WindowedProblem:
         """What noise of the reading adds to the mean thrust in each step, (K, 6, draws)."""
 
         def added() -> Array:
-            base, acting = self.thrust(effects)[0], compiled(effects)
+            steps, acting, counts = self._as_commanded(effects)
+            base = thrust(steps, acting)[0]
             of = draws(SMALL * self.reading_std, len(self.streams.demand))
-            demands = (self.steps.demand + noise[self._held] for noise in of)
-            moved = [thrust(self.steps._replace(demand=d), acting)[0] for d in demands]
+            demands = (steps.demand + counts * noise[self._held] for noise in of)
+            moved = [thrust(steps._replace(demand=d), acting)[0] for d in demands]
             return np.stack([(m - base) / SMALL for m in moved], axis=2)
 
         return self._noisy.of(_inputs(effects), added)
 
+    def thrust_at_rest(self, effects: Values) -> tuple[Array, Array]:
+        """The mean thrust in each step of what is read while a command is taken to rest, (K, 6),
+        and of noise alone in its place, (draws, K, 6)."""
+        steps, acting, counts = self._as_commanded(effects)
+
+        def of(readings: Array) -> Array:
+            return thrust(steps._replace(demand=np.where(counts, 0.0, readings)), acting)[0]
+
+        noise = draws(reading_noise(effects), len(self.streams.demand))
+        return of(self.steps.demand), np.stack([of(n[self._held]) for n in noise])
+
     def response(self, effects: Values) -> Array:
         """What a unit of each reading of the wrench adds to the mean thrust in each step, (K, 6,
         D), by changes of the size of their noise."""
-        base, acting = self.thrust(effects)[0], compiled(effects)
+        steps, acting, counts = self._as_commanded(effects)
+        base = thrust(steps, acting)[0]
         out = np.zeros((*base.shape, len(self.streams.demand)))
         step = SMALL * np.where(self.reading_std > 0.0, self.reading_std, 1.0)
         for i in range(out.shape[2]):
             at = self._held == i
             if at.any():
-                moved = self.steps._replace(demand=self.steps.demand + step * at[:, None])
+                moved = steps._replace(demand=steps.demand + step * at[:, None] * counts)
                 out[:, :, i] = (thrust(moved, acting)[0] - base) / step
         return out
+
+    def _as_commanded(self, effects: Values) -> tuple[Steps, Acting, NDArray[np.bool_]]:
+        """The time axis without what is read while a command is taken to rest, the effects beside
+        that, and which readings of the pieces (shaped as ``demand``) still count. A little more
+        noise changes nothing of which they are: the threshold between them is a jump."""
+        of_vehicle = of_the_vehicle(effects)
+        of_reading = {name: values for name, values in effects.items() if name not in of_vehicle}
+        read, demand = acted(self.steps, compiled(of_reading)), self.steps.demand
+        return self.steps._replace(demand=read), compiled(of_vehicle), read == demand
 
     def with_less(self, taken: Array) -> "WindowedProblem":
         """The same with something (D, 6) taken off what was read of the wrench."""

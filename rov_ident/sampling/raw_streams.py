@@ -62,7 +62,8 @@ class Streams:
     anything beside the velocities; ``is_reckoned``, whether they are the sum of these;
     ``unmeasured`` (6,), velocities that never change, as a record in the plane holds zeros for the
     rest; ``is_turned``, whether it is known what turns the vehicle: the wrench holds a moment, or
-    fins move.
+    fins move. ``in_noise`` (6,): axes whose commands cannot be told from noise of the wrench's
+    reading, if that was asked.
     """
 
     t: Array
@@ -84,6 +85,7 @@ class Streams:
     is_reckoned: bool = False
     unmeasured: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
     is_turned: bool = True
+    in_noise: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
 
     @property
     def has_pose(self) -> bool:
@@ -94,10 +96,11 @@ class Streams:
     def guided(self) -> NDArray[np.bool_]:
         """Axes (6,) whose velocity a simulation can only take as measured.
 
-        Rates, if nothing is known that turns the vehicle, and velocities that were not measured.
+        Rates, if nothing is known that turns the vehicle, velocities that were not measured, and
+        those along which nobody knows what drives it.
         """
         unknown: NDArray[np.bool_] = np.repeat([False, not self.is_turned], 3)
-        return unknown | self.unmeasured
+        return unknown | self.unmeasured | self.in_noise
 
     @property
     def duration(self) -> float:
@@ -224,6 +227,16 @@ def corrected(streams: Streams, effects: Values) -> Streams:
     return replace(there, nu=nu)
 
 
+def without_repeats(streams: Streams) -> Streams:
+    """The streams without wrenches that only repeat the one before, if most do: what a slow sensor
+    has read was published more often, with the same noise each time."""
+    new = np.append(True, np.diff(streams.demand, axis=0).any(axis=1))
+    at = np.flatnonzero(new)
+    if len(at) < 2 or np.median(np.diff(at)) <= 1.0:
+        return streams
+    return replace(streams, demand_t=streams.demand_t[at], demand=streams.demand[at])
+
+
 def in_place(streams: Streams, effects: Values) -> Streams:
     """The odometry with velocities of the time of its stamp (the last ones are held) and an
     attitude against the world."""
@@ -264,6 +277,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
         "is_reckoned": any(bag.is_reckoned for bag in bags),
         "unmeasured": np.any([bag.unmeasured for bag in bags], axis=0),
         "is_turned": all(bag.is_turned for bag in bags),
+        "in_noise": np.any([bag.in_noise for bag in bags], axis=0),
     }
     for name in (f.name for f in fields(Streams) if f.name not in both):
         each = [getattr(bag, name) for bag in bags]
