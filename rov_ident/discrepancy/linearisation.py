@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rov_ident.core.frames import rotated
 from rov_ident.core.linalg import scaled_solve, unit_diagonal
@@ -76,16 +75,14 @@ class Linearisation:
         self.problem, self.hypothesis, self.starts = problem, h, starts
         self.noise, self.motion, self.more = noise, motion, more
         error = (problem.measured - motion.nu[problem.nodes]) / noise
-        self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
-        self._weight = ~problem.guided / noise * np.ones_like(error)
-        outliers = np.abs(error) >= _OUTLIER * np.maximum(robust_std(error), 1.0)
-        outliers &= ~problem.guided
-        self._lost = self._squares_of(outliers, error)
-        self._weight[outliers] = 0.0
+        spread = robust_std(error)
+        self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
+        self._weight[:, problem.guided] = 0.0
         error = (error * (self._weight > 0.0)).reshape(-1, 1)
-        self._tilts = self._of_tilts()
+        self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
         if more is not None:
             error -= self._moved(more.taken[..., None])
+        self._tilts = self._of_tilts()
         error = self._whitened(error)
         j0 = self._whitened(self._moved()).reshape(-1, 6)[:, ~problem.guided]
         self._q, self._r = [], []
@@ -127,25 +124,15 @@ class Linearisation:
 
     @property
     def of_windows(self) -> Array:
-        """Squared residuals (W,), with those of outliers, or a fit could improve by losing a
-        window."""
-        return self._squares + self._lost
+        """Squared residuals (W,); an outlier counts as the least residual that is one, or a fit
+        could improve by losing a window."""
+        out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0, axis=1)
+        return self._squares + _OUTLIER**2 * np.add.reduceat(out, self._rows)
 
     @property
     def first(self) -> Indices:
         """Where each window begins in the residuals (6 N,)."""
         return 6 * self._rows
-
-    def _squares_of(self, outliers: NDArray[np.bool_], error: Array) -> Array:
-        """What outliers (N, 6) among the residuals count as in each window (W,): no more than the
-        least residual that is one, and less where an error of the attitude explains it."""
-        if not outliers.any():
-            return np.zeros(len(self._rows))
-        self._tilts = self._of_tilts()
-        rest = self._without_tilts((error * (self._weight > 0.0)).reshape(-1, 1)).reshape(-1, 6)
-        squares = np.where(outliers, np.minimum(rest**2, _OUTLIER**2), 0.0)
-        lost: Array = np.add.reduceat(squares.sum(axis=1), self._rows)
-        return lost
 
     def _spans(self) -> Iterable[tuple[int, int]]:
         edges = [*self._rows.tolist(), len(self.problem.nodes)]
@@ -218,15 +205,10 @@ class Linearisation:
 
     def _whitened(self, columns: Array) -> Array:
         """Columns (6 N, P) in units of the noise of the velocities in those of all noise."""
-        columns = self._without_tilts(columns)
-        return columns if self.more is None else self.more.whitening @ columns
-
-    def _without_tilts(self, columns: Array) -> Array:
-        """The same in those of the noise of velocities and attitude."""
         for (j, matrix), (a, b) in zip(self._tilts, self._spans(), strict=True):
             part = columns[6 * a : 6 * b]
             part -= j @ (matrix @ (j.T @ part))
-        return columns
+        return columns if self.more is None else self.more.whitening @ columns
 
     def of_biases(self) -> Array:
         """Columns (6 N, 3): biases of the angular velocities, each as large as it may be, in the

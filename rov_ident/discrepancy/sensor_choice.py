@@ -39,6 +39,7 @@ BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _WATER = (("ocean_current", "north"), ("ocean_current", "east"))
 _SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
+_LIKELY = 2.0  # of the same; from twelve draws, beyond which noise alone is in 4 % (Student)
 _LOUD = 0.1
 """Of the power of what is read, that of the noise. Thrust seems weaker by as much (attenuation),
 which the default uncertainty of its scale, 15 %, still covers."""
@@ -341,7 +342,8 @@ def _acts_at_rest(start: Fitted, noisy: Hypothesis) -> NDArray[np.bool_]:
 
     read, noise = linearisation.problem.thrust_at_rest(noisy.effects)
     chance = np.stack([moved(n) for n in noise])
-    acts: NDArray[np.bool_] = moved(read) > chance.mean(axis=0) + _SURE * chance.std(axis=0, ddof=1)
+    likely = chance.mean(axis=0) + _LIKELY * chance.std(axis=0, ddof=1)
+    acts: NDArray[np.bool_] = moved(read) > likely
     return acts
 
 
