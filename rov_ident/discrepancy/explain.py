@@ -58,7 +58,7 @@ from rov_ident.model.coefficients import AXES, VELOCITIES, WRENCH_UNITS
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.raw_streams import Streams, corrected, joined, without_repeats
+from rov_ident.sampling.raw_streams import Streams, corrected, joined
 from rov_ident.sampling.sample import NO_MOMENT
 from rov_ident.sampling.wrench_scatter import resting_noise
 
@@ -353,11 +353,11 @@ class _Data:
 
 
 def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None) -> _Data:
-    rates = [rates_and_attitude.agreed(without_repeats(bag), config) for bag in bags]
+    rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
     bags = [r.streams for r in rates]
     clocks = clock_errors.of(bags, config)
     if validate is not None:
-        validate = rates_and_attitude.agreed(without_repeats(validate), config).streams
+        validate = rates_and_attitude.agreed(validate, config).streams
     with_others = [*bags, *([] if validate is None else [validate])]
     as_headed = joined(bags)[0] if validate is None else validate
     turned, headings = repetition.turned(with_others, config)

@@ -227,16 +227,6 @@ def corrected(streams: Streams, effects: Values) -> Streams:
     return replace(there, nu=nu)
 
 
-def without_repeats(streams: Streams) -> Streams:
-    """The streams without wrenches that only repeat the one before, if most do: what a slow sensor
-    has read was published more often, with the same noise each time."""
-    new = np.append(True, np.diff(streams.demand, axis=0).any(axis=1))
-    at = np.flatnonzero(new)
-    if len(at) < 2 or np.median(np.diff(at)) <= 1.0:
-        return streams
-    return replace(streams, demand_t=streams.demand_t[at], demand=streams.demand[at])
-
-
 def in_place(streams: Streams, effects: Values) -> Streams:
     """The odometry with velocities of the time of its stamp (the last ones are held) and an
     attitude against the world."""
