@@ -13,6 +13,7 @@ from bench.studies import at_sea
 from bench.studies.at_sea import dive_of
 from bench.studies.explain_at_sea import CASES
 from rov_ident import config as configuration
+from rov_ident.core.errors import UserError
 from rov_ident.core.frames import (
     acceleration_of_arm,
     quaternion_from_euler,
@@ -618,6 +619,14 @@ def test_nothing_is_said_about_axes_whose_wrench_is_lost_in_noise(seed):
     assert found.effect == "wrench_noise" and found.separable
     assert set(found.axes) == set("XYZN")
     assert any("cannot be told from noise of its reading on K" in note for note in findings.notes)
+
+
+def test_a_dive_whose_every_command_is_lost_in_noise_is_refused(monkeypatch):
+    lost = sensor_choice.ReadingNoise({}, np.ones(6, dtype=bool))
+    monkeypatch.setattr(sensor_choice, "noise_of_wrench", lambda *_: lost)
+    _, streams, config = streams_of("clean", "pilot", 1, 30.0)
+    with pytest.raises(UserError, match="on any axis: record the commands without noise"):
+        explain([streams], config)
 
 
 def test_a_little_more_noise_moves_no_reading_across_the_threshold():

@@ -100,6 +100,10 @@ _IN_NOISE = (
     "axes is taken from the measurement, not simulated, and nothing is said about it; record the "
     "commands without noise, or drive these axes well above it"
 )
+_ALL_IN_NOISE = (
+    "the wrench cannot be told from noise of its reading on any axis: record the commands without "
+    "noise, or drive the vehicle well above it"
+)
 _ONLY_FITTED = (
     "the extended model cannot be simulated through all of the data: its values are those of the "
     "part that the search fitted"
@@ -532,8 +536,10 @@ def _with_reading(
     search: Search, data: _Data, reading: sensor_choice.ReadingNoise
 ) -> tuple[Search, _Data]:
     """The search with the noise of the wrench's reading in its configuration, where that is
-    believed, and the data without the axes that are lost in it."""
+    believed, and the data without the axes that are lost in it. UserError if none is left."""
     values, data = reading.values, data.without(reading.lost)
+    if data.streams.guided.all():
+        raise UserError(_ALL_IN_NOISE)
     config = sensor_choice.with_noise(search.given, values).config if values else search.config
     return Search(data.streams, config, thinned(data.to_fit)), data
 
