@@ -18,7 +18,7 @@ from rov_ident.offline import batch_fit
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.maximum_likelihood import assumed, one_pass
 from rov_ident.sampling.records import read_record
-from rov_ident.sampling.wrench_scatter import ReadingNoise, resting_noise
+from rov_ident.sampling.wrench_scatter import ReadingNoise, noise_that_lasts, resting_noise
 
 _RATE = 50.0  # Hz
 
@@ -65,6 +65,22 @@ def test_what_is_left_of_thrusters_that_cancel_is_no_noise(seed: int) -> None:
     readings[:, 4] = (readings[:, [0]] * arms).sum(axis=1) - readings[:, 0] * arms.sum()
     assert 0.0 < np.abs(readings[:, 4]).max() < 1e-12
     assert _after(readings).variance[4] == 0.0 and resting_noise(readings)[4] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_lasts_is_found_with_how_long_it_does(seed: int) -> None:
+    """On axes that rest between steps of a stick; white noise is none, nor is nothing."""
+    rng, count = np.random.default_rng(seed), 7500
+    steps = np.repeat(rng.uniform(-60.0, 60.0, (count // 50, 6)), 50, axis=0)
+    steps *= np.repeat(rng.random((count // 50, 6)) < 0.4, 50, axis=0)
+    lasts, std = rng.integers(2, 13, 6), rng.uniform(0.05, 0.5, 6)
+    each = np.array([rng.standard_normal(count)[np.arange(count) // n] for n in lasts]).T
+    found, length = noise_that_lasts(steps + std * each)
+    assert found == pytest.approx(std, rel=0.25)
+    assert length == pytest.approx(lasts, rel=0.25, abs=1.0)
+    for others in (steps, steps + std * rng.standard_normal(steps.shape)):
+        found, length = noise_that_lasts(others)
+        assert not found.any() and (length == 1).all()
 
 
 def _case(seed: int, noise: float, seconds: float) -> hidden.Case:

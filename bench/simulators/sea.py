@@ -122,6 +122,7 @@ class Sea:
     smoothing: float = 0.0  # s, time constant of the filter whose output the odometry is
     of_reading: tuple[float, ...] = (1.0,) * 6  # of each axis's wrench over what is read
     wrench_floor: tuple[float, ...] = (0.0,) * 6  # N, N m, std of the reading at any wrench
+    floor_lasts: int = 1  # readings for which that noise is the same
     wander: float = 0.0  # rad, std of an error of the odometry's attitude that lasts
     gyro_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # rad/s
     accelerometer_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # m/s2
@@ -685,7 +686,9 @@ def measured(truth: Truth, sea: Sea, rng: np.random.Generator) -> Messages:
     # wrench
     shape = truth.command.shape
     reading = truth.command / sea.of_reading * (1.0 + WRENCH_STD * rng.standard_normal(shape))
-    reading += sea.wrench_floor * rng.standard_normal(shape)
+    count, axes = shape
+    each = rng.standard_normal((-(-count // sea.floor_lasts), axes))
+    reading += sea.wrench_floor * np.repeat(each, sea.floor_lasts, axis=0)[:count]
     if sea.reversed_axis >= 0:
         reading[:, sea.reversed_axis] *= -1.0
     F, T = _FLIP * reading[:, :3], _FLIP * reading[:, 3:]

@@ -81,6 +81,11 @@ def _slightly_tilted(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, An
     return {**_wandering(rng, vehicle), "tilt": tuple(rng.uniform(-0.02, 0.02, 2).tolist())}
 
 
+def _lasting_noise(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
+    """Commands to each reading, of which the telemetry that makes its noise renews less often."""
+    return {**ALONE["wrench noise"](rng, vehicle), "floor_lasts": int(rng.integers(2, 11))}
+
+
 def _turned(rng: np.random.Generator, vehicle: Vehicle) -> dict[str, Any]:
     """A velocity sensor that is mounted at an angle."""
     angles = rng.uniform(0.05, 0.15, 3) * rng.choice([-1.0, 1.0], 3)
@@ -102,6 +107,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     "attitude that wanders": (_wandering, ()),
     "attitude that wanders, and biases": (_wandering_and_biased, ("imu_bias",)),
     "wrench noise": (ALONE["wrench noise"], ("wrench_noise",)),
+    "wrench noise that lasts": (_lasting_noise, ("wrench_noise",)),
     "biases": (ALONE["biases"], ("imu_bias",)),
     "thrust scale": (ALONE["thrust scale"], SCALE),
     "thruster lag": (ALONE["thruster lag"], ("thruster_lag",)),
@@ -138,7 +144,7 @@ CASES: dict[str, tuple[Draw, tuple[str, ...]]] = {
     ),
 }  # fmt: skip
 """What the file does not say, and the names that are right for it."""
-NOTHING = tuple(CASES)[:9]
+NOTHING = tuple(CASES)[:10]
 """Cases in which the vehicle moves as the file says, but for its coefficients."""
 KINDS = ("six-axis", "pilot", *SPARSE)
 

@@ -60,7 +60,7 @@ from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
 from rov_ident.sampling.raw_streams import Streams, corrected, joined
 from rov_ident.sampling.sample import NO_MOMENT
-from rov_ident.sampling.wrench_scatter import resting_noise
+from rov_ident.sampling.wrench_scatter import reading_noise
 
 _FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
 _SLIGHT = 0.1  # of the same: 99 % of its power are explained
@@ -193,9 +193,9 @@ def explain(
     search, start, data = _started(data, config)
     retuned, model, residual = _searched(search, start, say)
     # in a model that lacks much, noise of the wrench's reading may not have shown
-    reading = sensor_choice.noise_of_wrench(search, model.final)
-    if reading.values or reading.lost.any():
-        search, data = _with_reading(search, data, reading)
+    again, data = _with_reading(search, model.final, data)
+    if again is not search:
+        search = again
         retuned, model, residual = _searched(search, search.start(), say)
     say("judging on held-out data", 0.9)
     likeliest, begun = model.final.hypothesis, beginnings(model.final)
@@ -341,11 +341,12 @@ class _Data:
         """Whether another bag is judged."""
         return self.recorded.judged is not self.recorded.streams
 
-    def without(self, lost: NDArray[np.bool_]) -> "_Data":
-        """The same without further axes (6,) that are lost in noise of the wrench's reading."""
+    def with_noise(self, lost: NDArray[np.bool_], lasts: NDArray[np.int64]) -> "_Data":
+        """The same without further axes (6,) that are lost in noise of the wrench's reading, which
+        ``lasts`` (6,) so many of them."""
 
         def marked(streams: Streams) -> Streams:
-            return dataclasses.replace(streams, in_noise=streams.in_noise | lost)
+            return dataclasses.replace(streams, in_noise=streams.in_noise | lost, noise_lasts=lasts)
 
         streams = marked(self.recorded.streams)
         judged = marked(self.recorded.judged) if self.validated else streams
@@ -525,19 +526,23 @@ def _started(data: _Data, config: Config) -> tuple[Search, Fitted | None, _Data]
     start = search.start()
     if start is None:
         return search, None, data
-    reading = sensor_choice.noise_of_wrench(search, start)
+    again, data = _with_reading(search, start, data)
+    return again, start if again is search else again.start(), data
+
+
+def _with_reading(search: Search, fitted: Fitted, data: _Data) -> tuple[Search, _Data]:
+    """The search with the noise of the wrench's reading in its configuration, where the fit tells
+    of any, and the data without the axes that are lost in it; the same ones where there is none.
+    UserError if no axis is left."""
+    lasts, none = sensor_choice.noise_that_lasts(fitted), np.zeros(6, dtype=bool)
+    if (lasts != data.streams.noise_lasts).any():
+        data = data.with_noise(none, lasts)
+        search = Search(data.streams, search.config, thinned(data.to_fit))
+        fitted = search.start() or fitted
+    reading = sensor_choice.noise_of_wrench(search, fitted)
     if not (reading.values or reading.lost.any()):
-        return search, start, data
-    search, data = _with_reading(search, data, reading)
-    return search, search.start(), data
-
-
-def _with_reading(
-    search: Search, data: _Data, reading: sensor_choice.ReadingNoise
-) -> tuple[Search, _Data]:
-    """The search with the noise of the wrench's reading in its configuration, where that is
-    believed, and the data without the axes that are lost in it. UserError if none is left."""
-    values, data = reading.values, data.without(reading.lost)
+        return search, data
+    values, data = reading.values, data.with_noise(reading.lost, lasts)
     if data.streams.guided.all():
         raise UserError(_ALL_IN_NOISE)
     config = sensor_choice.with_noise(search.given, values).config if values else search.config
@@ -591,7 +596,7 @@ def _of_guided(streams: Streams) -> list[str]:
     never = ", ".join(c for c, so in zip(VELOCITIES, streams.unmeasured, strict=True) if so)
     notes = [] if streams.is_turned else [NO_MOMENT]
     notes += [_UNMEASURED.format(never)] if never else []
-    std = resting_noise(streams.demand)
+    std = reading_noise(streams.demand, streams.noise_lasts)
     lost = [f"{AXES[i]} ({std[i]:.2g} {WRENCH_UNITS[i]})" for i in np.flatnonzero(streams.in_noise)]
     return notes + ([_IN_NOISE.format(", ".join(lost))] if lost else [])
 

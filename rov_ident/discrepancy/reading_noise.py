@@ -11,6 +11,7 @@ instead (`wrench_smoothing`).
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.core.messages import Array
 
@@ -20,9 +21,10 @@ _HALF = 12  # readings to either side of which the mean is taken: half a block i
 _LARGEST = 3.0  # standard deviations of noise, of which 0.3 % is larger
 
 
-def jitter(demand: Array, std: Array) -> Array:
-    """What of readings (K, 6) looks like noise of standard deviations (6,): the distance from the
-    running mean, where the means before and after differ no more than noise makes them."""
+def jitter(demand: Array, std: Array, lasts: NDArray[np.int64]) -> Array:
+    """What of readings (K, 6) looks like noise of standard deviations (6,) that ``lasts`` (6,)
+    readings: the distance from the running mean, where the means before and after differ no more
+    than noise makes them."""
     width = 2 * _HALF + 1
     if len(demand) < width:
         return np.zeros_like(demand)
@@ -30,15 +32,17 @@ def jitter(demand: Array, std: Array) -> Array:
     total = np.cumsum(ends, axis=0)
     before = total[_HALF : -_HALF - 1] - total[:-width]
     after = total[width:] - total[_HALF + 1 : -_HALF]
-    rests = np.abs(after - before) <= _LARGEST * np.sqrt(2.0 * _HALF) * std
+    rests = np.abs(after - before) <= _LARGEST * np.sqrt(2.0 * _HALF * lasts) * std
     off: Array = demand - (total[width:] - total[:-width]) / width
     return np.where(rests, off, 0.0)
 
 
-def draws(std: Array, count: int) -> Array:
-    """Noise (DRAWS, count, 6) with standard deviations (6,): the same ones every time, so that
-    models are compared under the same noise."""
-    return _normal(count) * std
+def draws(std: Array, lasts: NDArray[np.int64], count: int) -> Array:
+    """Noise (DRAWS, count, 6) with standard deviations (6,) that ``lasts`` (6,) readings: the same
+    ones every time, so that models are compared under the same noise."""
+    held = np.arange(count)[:, None] // lasts
+    out: Array = np.take_along_axis(_normal(count), held[None], axis=1) * std
+    return out
 
 
 @lru_cache(maxsize=2)

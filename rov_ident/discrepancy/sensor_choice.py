@@ -21,6 +21,7 @@ from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key, bounds
+from rov_ident.discrepancy.linearisation import Linearisation
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.reading_noise import jitter
 from rov_ident.discrepancy.search import Search
@@ -30,6 +31,7 @@ from rov_ident.effects import EFFECTS, Values
 from rov_ident.effects.base import a_reading
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
+from rov_ident.sampling import wrench_scatter
 from rov_ident.sampling.raw_streams import Streams, corrected
 from rov_ident.sampling.wrench_scatter import RESTING
 
@@ -38,10 +40,9 @@ LATENCY = "velocity_latency"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _WATER = (("ocean_current", "north"), ("ocean_current", "east"))
-_SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %
-_LIKELY = 2.0  # of the same; from twelve draws, beyond which noise alone is in 4 % (Student)
+_SURE = 3.0  # standard deviations; a normal error is larger in 0.3 %, one known from twelve in 1 %
 _LOUD = 0.1
-"""Of the power of what is read, that of the noise. Thrust seems weaker by as much (attenuation),
+"""Of what the readings do, the share of the noise. Thrust seems weaker by as much (attenuation),
 which the default uncertainty of its scale, 15 %, still covers."""
 _TILTED = 2.45  # prior standard deviations, beyond which two normal biases together are in 5 %
 
@@ -275,21 +276,21 @@ def noise_of_wrench(search: Search, start: Fitted) -> ReadingNoise:
     more is asked.
 
     What is read while a command is taken to rest is set to zero only where it is nothing but noise.
-    Where small commands are among it, as of an autopilot that keeps the vehicle upright, it is left
-    as it is; and where noise makes much of all that is read there, the axis is lost.
+    Where an autopilot is among it, which keeps the vehicle upright, it is left as it is; and where
+    noise then makes much of what the readings do there, the axis is lost.
     """
     config, problem = search.config, search.problem
     none = ReadingNoise({}, np.zeros(6, dtype=bool))
     if NOISE in config.effects or not problem.reading_std.any():
         return none
-    evidence = _evidence_of_noise(start)
-    possible = evidence > -VERY_STRONG
-    if evidence[possible].sum() < VERY_STRONG:
+    evidence = _evidence_of_noise(start, problem.reading_std, problem.lasts)
+    possible = _does_not_follow(evidence)
+    if not possible.any():
         return none
     std = np.where(possible, problem.reading_std, 0.0)
-    acts = _acts_at_rest(start, with_noise(start.hypothesis, _on_axes(std)))
-    lost = acts & (std**2 > _LOUD * np.mean(problem.streams.demand**2, axis=0))
-    std = np.where(acts, 0.0, std)
+    follows = _follows_motion(start, with_noise(start.hypothesis, _on_axes(std)))
+    lost = follows & (std > 0.0) & (_share_of_noise(start) > _LOUD)
+    std = np.where(follows, 0.0, std)
     there = fit(problem, with_noise(start.hypothesis, _on_axes(std))) if std.any() else None
     use = ~problem.guided & ~lost
     likelier = bool(there and np.log(there.noise[use]).sum() < np.log(start.noise[use]).sum())
@@ -303,48 +304,91 @@ def _on_axes(std: Array) -> dict[str, float]:
 
 def may_be_noise(rest: Fitted, axes: Container[str]) -> bool:
     """Whether the vehicle surely does not follow what looks like noise on one of the axes, although
-    no noise is in the configuration: what follows it less then explains more than there is."""
+    no noise is in the configuration: what follows it less then explains more than there is. So it
+    may where noise lasts, even beside it: how alike neighbours are is known as one number only."""
     problem = rest.linearisation.problem
-    if NOISE in rest.hypothesis.config.effects or not problem.reading_std.any():
-        return False
-    surely = _evidence_of_noise(rest) >= VERY_STRONG
+    surely = problem.lasts > 1
+    if NOISE not in rest.hypothesis.config.effects and problem.reading_std.any():
+        evidence = _evidence_of_noise(rest, problem.reading_std, problem.lasts)
+        surely = surely | (evidence >= VERY_STRONG)
     return any(yes and axis in axes for axis, yes in zip(AXES, surely.tolist(), strict=True))
 
 
-def _evidence_of_noise(fitted: Fitted) -> Array:
+def noise_that_lasts(start: Fitted) -> NDArray[np.int64]:
+    """For how many readings (6,) the noise of the wrench is the same: more than one where what
+    rests differs so, and the vehicle does not follow it."""
+    streams = start.linearisation.problem.streams
+    std, lasts = wrench_scatter.noise_that_lasts(streams.demand)
+    lasts[streams.guided] = 1
+    possible = lasts > 1
+    if possible.any():
+        possible &= _does_not_follow(_evidence_of_noise(start, std * possible, lasts))
+    return np.where(possible, lasts, streams.noise_lasts)
+
+
+def _does_not_follow(evidence: Array) -> NDArray[np.bool_]:
+    """The axes (6,) whose noise the vehicle may not follow, where it surely does not on these
+    together, by twice the logarithm of the likelihood (6,) of each; otherwise none."""
+    possible: NDArray[np.bool_] = evidence > -VERY_STRONG
+    return possible & bool(evidence[possible].sum() >= VERY_STRONG)
+
+
+def _evidence_of_noise(fitted: Fitted, std: Array, lasts: NDArray[np.int64]) -> Array:
     """Twice the logarithm (6,) of the likelihood that the vehicle does not follow what looks like
-    noise on an axis, over that it does. What trembles can be a command (an autopilot passes on the
-    noise of its gyro); and noise that is too small to show cannot be what a model gains by
-    neglecting small commands: a trim can."""
+    noise of standard deviations (6,) on an axis, over that it does. What trembles can be a command
+    (an autopilot passes on the noise of its gyro); and noise that is too small to show cannot be
+    what a model gains by neglecting small commands: a trim can."""
     linearisation, effects = fitted.linearisation, fitted.hypothesis.effects
-    problem, base = linearisation.problem, linearisation.columns
-    still = problem.with_less(jitter(problem.streams.demand, problem.reading_std))
+    problem = linearisation.problem
+    still = problem.with_less(jitter(problem.streams.demand, std, lasts))
     trembling = problem.thrust(effects)[0] - still.thrust(effects)[0]
-    columns = linearisation.sensitivity_to(trembling[:, :, None] * np.eye(6))
-    normal = linearisation.linear.normal
-    columns -= base @ scaled_solve(normal, base.T @ columns, 1e-9)
+    columns = _own(linearisation, trembling[:, :, None] * np.eye(6))
     left = linearisation.error[:, None] + columns  # where the simulation does not follow it, either
     gain = np.sum(linearisation.error**2) - np.sum(left**2, axis=0)
     inflation = [mean_inflation(columns[:, [i]], left[:, i], linearisation.first) for i in range(6)]
     return gain / np.maximum(inflation, 1e-9)
 
 
-def _acts_at_rest(start: Fitted, noisy: Hypothesis) -> NDArray[np.bool_]:
+def _follows_motion(start: Fitted, noisy: Hypothesis) -> NDArray[np.bool_]:
     """Axes (6,) on which what is read while a command is taken to rest, by the hypothesis
-    ``noisy``, would move the vehicle by more than noise alone does: small commands are among it,
-    slower than noise."""
-    linearisation = start.linearisation
+    ``noisy``, depends on attitude and velocity more than noise alone seems to: an autopilot's
+    small commands are among it."""
+    problem = start.linearisation.problem
+    down = problem.steps.middle[:, 2]
+    motion = np.hstack([down, problem.measured_means(), np.ones((len(down), 1))])
+    basis = np.linalg.qr(motion)[0]
 
-    def moved(thrust: Array) -> Array:
-        columns = linearisation.sensitivity_to(thrust[:, :, None] * np.eye(6))
-        squares: Array = np.sum(columns**2, axis=0)
-        return squares
+    def explained(readings: Array) -> Array:
+        squares: Array = np.sum((basis.T @ readings) ** 2, axis=0)
+        return squares / np.maximum(np.sum(readings**2, axis=0), np.finfo(float).tiny)
 
-    read, noise = linearisation.problem.thrust_at_rest(noisy.effects)
-    chance = np.stack([moved(n) for n in noise])
-    likely = chance.mean(axis=0) + _LIKELY * chance.std(axis=0, ddof=1)
-    acts: NDArray[np.bool_] = moved(read) > likely
-    return acts
+    read, noise = problem.thrust_at_rest(noisy.effects)
+    chance = np.stack([explained(n) for n in noise])
+    follows: NDArray[np.bool_] = explained(read) > (
+        chance.mean(axis=0) + _SURE * chance.std(axis=0, ddof=1)
+    )
+    return follows
+
+
+def _share_of_noise(start: Fitted) -> Array:
+    """Of what the readings of each axis (6,) do to the simulated motion, beside what the parameters
+    of the model could do instead, the share that noise of these readings does."""
+    linearisation, effects = start.linearisation, start.hypothesis.effects
+    problem = linearisation.problem
+    read = problem.thrust(effects)[0][:, :, None] * np.eye(6)
+    noise = problem.noisy_thrust(effects)
+    each = (noise[:, :, None, :] * np.eye(6)[:, :, None]).reshape(len(noise), 6, -1)
+    moved, by_noise = (np.sum(_own(linearisation, x) ** 2, axis=0) for x in (read, each))
+    share: Array = by_noise.reshape(6, -1).mean(axis=1) / np.maximum(moved, np.finfo(float).tiny)
+    return share
+
+
+def _own(linearisation: Linearisation, force: Array) -> Array:
+    """The sensitivities (R, C) to wrenches (K, 6, C), less what the parameters of the model
+    explain of them."""
+    columns, base = linearisation.sensitivity_to(force), linearisation.columns
+    out: Array = columns - base @ scaled_solve(linearisation.linear.normal, base.T @ columns, 1e-9)
+    return out
 
 
 def with_noise(h: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
@@ -356,6 +400,7 @@ def with_noise(h: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
 
 
 def noise_std(streams: Streams, values: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations of the parameters: of as many second differences as they are from."""
-    count = RESTING * len(streams.demand)
-    return {name: value / max(count, 1.0) ** 0.5 for name, value in values.items()}
+    """Standard deviations of the parameters, of as many readings as they are from."""
+    count = np.maximum(RESTING * len(streams.demand) / streams.noise_lasts, 1.0)
+    std = _on_axes(1.0 / np.sqrt(count))
+    return {name: value * std[name] for name, value in values.items()}

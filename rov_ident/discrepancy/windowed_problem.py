@@ -47,8 +47,8 @@ from rov_ident.effects import (
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
 from rov_ident.model.equations import INERTIA, Array, Model, RigidBody
+from rov_ident.sampling import wrench_scatter
 from rov_ident.sampling.raw_streams import Streams, orientation_at
-from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.open_loop import Guide, simulate
 
 MAX_GAP = 0.5  # s without odometry: no window reaches across; stated in the error message below
@@ -91,7 +91,7 @@ class WindowedProblem:
     time axis ``steps``; ``window`` (N,) says in which window each lies, ``first`` and ``last``
     (W,) are the nodes where windows begin and end. ``guided`` (6,): axes that follow the
     measurement. ``patterns``: wrenches (K, 6) of no known cause, by key. ``reading_std`` (6,):
-    noise of the wrench's reading.
+    noise of the wrench's reading, which ``lasts`` (6,) so many of them.
     """
 
     def __init__(self, streams: Streams, spans: Sequence[tuple[float, float]]) -> None:
@@ -107,7 +107,8 @@ class WindowedProblem:
         pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
         pieces = pieces[pieces <= nodes[-1]]
         held = self._held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
-        self.reading_std = resting_noise(streams.demand)
+        self.lasts = streams.noise_lasts
+        self.reading_std = wrench_scatter.reading_noise(streams.demand, self.lasts)
         self.orientation, self.guided = orientation_at(streams, nodes), streams.guided
         given = np.empty((0, 6))  # accelerations of the guided axes, from each node to the next
         if self.guided.any():
@@ -168,6 +169,10 @@ class WindowedProblem:
         good = np.isfinite(self.streams.nu).all(axis=1)
         return interpolated(self.streams.t[good], self.streams.nu[good], t)
 
+    def measured_means(self) -> Array:
+        """Velocities (K, 6) as measured in the middle of each step."""
+        return self._measured_at(0.5 * (self.steps.t[1:] + self.steps.t[:-1]))
+
     @property
     def steps_moved(self) -> float:
         """Steps through which velocities were simulated, or moved by a wrench (each of
@@ -209,7 +214,7 @@ class WindowedProblem:
         def added() -> Array:
             steps, acting, counts = self._as_commanded(effects)
             base = thrust(steps, acting)[0]
-            of = draws(SMALL * self.reading_std, len(self.streams.demand))
+            of = draws(SMALL * self.reading_std, self.lasts, len(self.streams.demand))
             demands = (steps.demand + counts * noise[self._held] for noise in of)
             moved = [thrust(steps._replace(demand=d), acting)[0] for d in demands]
             return np.stack([(m - base) / SMALL for m in moved], axis=2)
@@ -224,7 +229,7 @@ class WindowedProblem:
         def of(readings: Array) -> Array:
             return thrust(steps._replace(demand=np.where(counts, 0.0, readings)), acting)[0]
 
-        noise = draws(reading_noise(effects), len(self.streams.demand))
+        noise = draws(reading_noise(effects), self.lasts, len(self.streams.demand))
         return of(self.steps.demand), np.stack([of(n[self._held]) for n in noise])
 
     def response(self, effects: Values) -> Array:

@@ -97,7 +97,7 @@ def smoothed(
     known of the reading then."""
     problem, h = plain.problem, plain.hypothesis
     response = problem.response(h.effects)
-    looks = _thrust(response, jitter(problem.streams.demand, problem.reading_std))
+    looks = _thrust(response, jitter(problem.streams.demand, problem.reading_std, problem.lasts))
     as_read, white = _whitened(plain, response, problem.reading_std)
     trembling = np.concatenate([_along(i, looks[:, [i]]) for i in range(6)], axis=2)
     columns = white.sensitivity_to(trembling)

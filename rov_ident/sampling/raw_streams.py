@@ -63,7 +63,7 @@ class Streams:
     ``unmeasured`` (6,), velocities that never change, as a record in the plane holds zeros for the
     rest; ``is_turned``, whether it is known what turns the vehicle: the wrench holds a moment, or
     fins move. ``in_noise`` (6,): axes whose commands cannot be told from noise of the wrench's
-    reading, if that was asked.
+    reading, if that was asked; ``noise_lasts`` (6,): for how many readings that noise is the same.
     """
 
     t: Array
@@ -86,6 +86,7 @@ class Streams:
     unmeasured: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
     is_turned: bool = True
     in_noise: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
+    noise_lasts: NDArray[np.int64] = field(default_factory=lambda: np.ones(6, dtype=np.int64))
 
     @property
     def has_pose(self) -> bool:
@@ -268,6 +269,7 @@ def joined(bags: Sequence[Streams]) -> tuple[Streams, list[float]]:
         "unmeasured": np.any([bag.unmeasured for bag in bags], axis=0),
         "is_turned": all(bag.is_turned for bag in bags),
         "in_noise": np.any([bag.in_noise for bag in bags], axis=0),
+        "noise_lasts": np.max([bag.noise_lasts for bag in bags], axis=0),
     }
     for name in (f.name for f in fields(Streams) if f.name not in both):
         each = [getattr(bag, name) for bag in bags]

@@ -9,8 +9,10 @@ docs/choices.md).
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.core.messages import Array
 from rov_ident.core.noise import robust_std, second_differences
@@ -21,6 +23,12 @@ _ROUNDING = 1e-6  # of the largest command on any axis: 32 bits round by less, a
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
+_MEAN = (
+    10  # readings: of a block five means, and white noise leaves a tenth of its variance in them
+)
+_MORE_THAN_WHITE = 1.5  # of that; noise that is the same for two readings leaves 1.9
+_RARE = 0.05  # of the blocks, which are quieter; with noise, chance alone makes them so
+_FLOOR = 0.5  # of that quartile: less in 1 % of means of five, and commands know no least
 RECENT = 5.0  # s; over which the power of a component is averaged: a few moves of a stick
 # of that power, which noise may be: the same section has the study
 SHARE = 0.01
@@ -31,6 +39,65 @@ def resting_noise(demand: Array) -> Array:
     if len(demand) < _BLOCK + 2:
         return np.zeros(6)
     return resting(scatter(demand))
+
+
+def reading_noise(demand: Array, lasts: NDArray[np.int64]) -> Array:
+    """Standard deviation (6,) of the noise of readings (K, 6) of the wrench, where it is known for
+    how many readings (6,) that lasts."""
+    return np.where(lasts > 1, noise_that_lasts(demand)[0], resting_noise(demand))
+
+
+def noise_that_lasts(demand: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Standard deviation (6,) of readings (K, 6) within each block in which commands rest, and for
+    how many readings (6,) their noise is the same; zero and one where it is white, or where it
+    differs from block to block as that of commands mostly does.
+
+    Noise that comes less often than the readings, as from telemetry of the thrusters, leaves little
+    in second differences. Means of several readings have more of it than of white noise: that of
+    the blocks is pooled, which are as quiet as :func:`resting` wants them."""
+    std, lasts = np.zeros(6), np.ones(6, dtype=np.int64)
+    count = len(demand) // _BLOCK
+    if not count:
+        return std, lasts
+    blocks = demand[: count * _BLOCK].reshape(count, _BLOCK, 6)
+    blocks = blocks - blocks.mean(axis=1, keepdims=True)
+    own = np.mean(blocks**2, axis=1)
+    of_means = np.mean(np.einsum("mk,bki->bmi", _running_means(), blocks) ** 2, axis=1)
+    least = (_ROUNDING * np.abs(demand).max()) ** 2
+    for i in range(6):
+        rare, quiet = np.quantile(own[:, i], (_RARE, RESTING))
+        if quiet <= least or rare < _FLOOR**2 * quiet:
+            continue
+        rest = own[:, i] <= _AS_QUIET**2 * quiet
+        ratio = of_means[rest, i].sum() / own[rest, i].sum()
+        own_left, of_means_left = _left_in_blocks().T
+        if ratio > _MORE_THAN_WHITE * of_means_left[0] / own_left[0]:
+            like = np.argmin(np.abs(of_means_left / own_left - ratio))
+            std[i], lasts[i] = np.sqrt(own[rest, i].mean() / own_left[like]), 1 + like
+    return std, lasts
+
+
+@lru_cache(maxsize=1)
+def _running_means() -> Array:
+    """Weights (M, K) of the means of neighbours in a block."""
+    each = np.arange(_BLOCK)
+    first = each[: -_MEAN + 1, None]
+    out: Array = ((each >= first) & (each < first + _MEAN)) / _MEAN
+    return out
+
+
+@lru_cache(maxsize=1)
+def _left_in_blocks() -> Array:
+    """The variance in a block of readings and of their running means (L, 2), of unit noise that is
+    the same for 1, 2 ... L readings: its correlation is 1 - d / L between readings d apart."""
+    ahead = np.abs(np.subtract.outer(np.arange(_BLOCK), np.arange(_BLOCK)))
+    centred = np.eye(_BLOCK) - 1.0 / _BLOCK
+    out = []
+    for lasts in range(1, _BLOCK // 2 + 1):
+        covariance = centred @ np.maximum(1.0 - ahead / lasts, 0.0) @ centred
+        of_means = _running_means() @ covariance @ _running_means().T
+        out.append((np.diag(covariance).mean(), np.diag(of_means).mean()))
+    return np.array(out)
 
 
 def scatter(demand: Array, relative: float = 0.0) -> Array:
