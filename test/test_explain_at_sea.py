@@ -629,6 +629,16 @@ def test_nothing_is_said_about_axes_whose_wrench_is_lost_in_noise(case, seed):
     assert any("cannot be told from noise of its reading on K" in note for note in findings.notes)
 
 
+def test_a_dead_band_is_not_sure_beside_noise_that_lasts():
+    """How alike neighbouring readings are is known as one number only, and what is left of noise
+    made a dead band of 1 N, surely, where they are alike for half a second."""
+    _, streams, config = streams_of("clean", "pilot", 1, 30.0)
+    lasting = dataclasses.replace(streams, noise_lasts=np.array([5, 1, 1, 1, 1, 1]))
+    start = Search(lasting, config, split(streams.duration)[0]).start()
+    assert sensor_choice.may_be_noise(start, "XZ")
+    assert not sensor_choice.may_be_noise(start, "YZ")
+
+
 def test_a_dive_whose_every_command_is_lost_in_noise_is_refused(monkeypatch):
     lost = sensor_choice.ReadingNoise({}, np.ones(6, dtype=bool))
     monkeypatch.setattr(sensor_choice, "noise_of_wrench", lambda *_: lost)
