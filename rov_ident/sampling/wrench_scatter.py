@@ -23,9 +23,7 @@ _ROUNDING = 1e-6  # of the largest command on any axis: 32 bits round by less, a
 RESTING = 0.25  # of the blocks at least that commands rest: those with the least scatter
 _AS_LOUD = 1.7  # of the noise: all but 1 in 1000 blocks of noise
 _AS_QUIET = 2.0  # of that quartile, which is 0.87 of the noise: all but 1 in 1000 blocks of noise
-_MEAN = (
-    10  # readings: of a block five means, and white noise leaves a tenth of its variance in them
-)
+_MEAN = 10  # neighbouring readings, whose mean has a tenth of the variance of white noise
 _MORE_THAN_WHITE = 1.5  # of that; noise that is the same for two readings leaves 1.9
 _RARE = 0.05  # of the blocks, which are quieter; with noise, chance alone makes them so
 _FLOOR = 0.5  # of that quartile: less in 1 % of means of five, and commands know no least
