@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from rov_ident.model.equations import Array, Model, RigidBody
 from rov_ident.model.scales import WORKING_SPEED, authority
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prior:
     """What to estimate, before any data: coefficients, then parameters of effects.
 
@@ -331,6 +332,7 @@ _WORKING_INPUTS = (0.3, 0.3, 0.3, 10.0)
 by such a share of the working wrench a published zero may be off."""
 
 
+@lru_cache(maxsize=16)  # as `authority`
 def typical(model: Model) -> Array:
     """(m,) the size at which each term alone would take its axis's whole working wrench."""
     wrench, inertia = authority(model), np.diag(model.body.mass_matrix)
@@ -344,4 +346,6 @@ def typical(model: Model) -> Array:
         else wrench[c.row] / (speed[c.left] * speed[c.right])
         for c in model.coefficients
     ]
-    return np.array(sizes)
+    out = np.array(sizes)
+    out.flags.writeable = False
+    return out

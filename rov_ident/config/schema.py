@@ -11,6 +11,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TypeVar
 
 from rov_ident.core.errors import UserError
@@ -450,7 +451,7 @@ class Config:
     effects: Values = field(default_factory=dict)
     estimate_effects: tuple[tuple[str, str], ...] = ()
 
-    @property
+    @cached_property
     def dynamics(self) -> Model:
         """The model with the effects on the rigid body: that of simulation and estimation."""
         return dataclasses.replace(self.model, body=rigid_body(self.model.body, self.effects))
@@ -467,7 +468,7 @@ class Config:
         """Of the estimated parameters of effects, such as thruster_lag.time_constant."""
         return tuple(".".join(key) for key in self.estimate_effects)
 
-    @property
+    @cached_property
     def nuisance_std(self) -> dict[tuple[str, str], float]:
         """Prior standard deviations of what no vehicle's file knows, by (effect, parameter)."""
         body, vehicle = self.model.body, self.vehicle_uncertainty

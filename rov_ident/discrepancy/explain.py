@@ -43,6 +43,7 @@ from rov_ident.discrepancy.held_out import (
     improved,
     is_practical,
     is_sure,
+    is_surely_practical,
     split,
     thinned,
     windows,
@@ -480,7 +481,7 @@ def _gaining(
 
 def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -> list[Finding]:
     """What is found, not sure where what the sensors do beside it, or what is ``left``, may have
-    made it."""
+    made it, or where its gain may have no practical weight."""
     if data.late:  # a filter does more than delay, and what it does besides looks like any cause
         found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
     if data.may_drift:
@@ -488,6 +489,7 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
     found = [unsure(f) if _is_between_readings(f, data.streams) else f for f in found]
     found = list(map(data.clocks.beside, found))
     found = _beside_each_other(found)
+    found = [f if is_surely_practical(f.gain) else unsure(f) for f in found]
     return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
 
 

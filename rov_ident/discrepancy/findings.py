@@ -9,7 +9,14 @@ from scipy.special import chdtri
 from rov_ident.config import Config
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.held_out import CHUNK, PRACTICAL, Judge, gain_of, improved, is_sure
+from rov_ident.discrepancy.held_out import (
+    CHUNK,
+    Judge,
+    gain_of,
+    improved,
+    is_sure,
+    is_surely_practical,
+)
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
     UNKNOWN,
@@ -284,7 +291,7 @@ def residuals(final: Fitted, trials: Trials) -> list[Residual]:
         keys = [k for k in h.keys if effect_of(k) == name]
         columns = problem.columns(h, final.linearisation.motion, keys)
         force = columns[:, i] @ np.array([h.values[k] for k in keys])
-        if gain is not None and gain.low >= 100.0 * PRACTICAL:
+        if gain is not None and is_surely_practical(gain):
             share = float(1.0 - after.sum() / before.sum())
             hertz = float(frequency) if frequency else None
             sure = bool(np.sqrt(np.mean(force**2)) > of_attitude[i])

@@ -194,6 +194,11 @@ def is_practical(gain: Gain) -> bool:
     return part.percent >= 100.0 * PRACTICAL and part.low > 0.0
 
 
+def is_surely_practical(gain: Gain) -> bool:
+    """Whether all of the gain's interval is large enough to matter."""
+    return judged(gain).low >= 100.0 * PRACTICAL
+
+
 def is_sure(gain: Gain) -> bool:
     """Whether predictions improve, be it by little."""
     return judged(gain).low > 0.0

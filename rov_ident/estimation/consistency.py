@@ -6,6 +6,7 @@ badly. "Does the model explain the data?" in docs/live.md has the study that lim
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,7 @@ class Consistency:
 
     tests: tuple[Test, ...]
 
-    @property
+    @cached_property
     def consistent(self) -> bool:
         return all(test.passed for test in self.tests)
 
@@ -80,12 +81,12 @@ class Consistency:
         """Whether every nuisance parameter is within the range that its prior allows for."""
         return all(test.passed for test in self.tests if test.name.startswith(_PRIOR))
 
-    @property
+    @cached_property
     def judged(self) -> bool:
         """Whether any axis moved enough to test what the model leaves unexplained on it."""
         return any(test.name.startswith(_LEFT) for test in self.tests)
 
-    @property
+    @cached_property
     def inflation(self) -> float:
         """How many times larger than stated errors may be: as the worst test says."""
         return max([1.0, *(test.inflation for test in self.tests)])
@@ -116,7 +117,7 @@ class Consistency:
             return "model and data agree"
         return max(failed, key=lambda test: test.value / test.limit).failure
 
-    @property
+    @cached_property
     def doubt(self) -> str:
         """Why nothing can have converged, in a few words; empty where something can."""
         if not self.consistent:

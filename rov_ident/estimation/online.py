@@ -157,6 +157,7 @@ class OnlineEstimator:
         self._is_time = np.array(times, dtype=bool)
         self._module = ESTIMATORS[kind]
         self._task = self._module.problem(config)
+        self._informative = informative_axes(config)
         self.sampler = Sampler(config)
         self._recent = RecentMessages()
         self.monitor: Monitor | None = None
@@ -538,7 +539,7 @@ class OnlineEstimator:
         if not self._reading_noise.any():
             return {}
         noisy = self._noisy_axes(values, self._reading_noise)
-        held = enumerate(informative_axes(self.config) & noisy)
+        held = enumerate(self._informative & noisy)
         return {i: too_noisy(axes) for i, axes in held if axes.any()}
 
     def _noisy_axes(self, values: Array, reading_noise: Array) -> NDArray[np.bool_]:
@@ -549,6 +550,8 @@ class OnlineEstimator:
     def _not_followed(self, values: Array) -> Array:
         """(6,): variance density of what is read of the wrench and does not move the vehicle."""
         found = self.sampler.noise_found
+        if not found.any():
+            return found
         return np.where(self._noisy_axes(values, found), found, 0.0)
 
     def _unexplained(self) -> Array:

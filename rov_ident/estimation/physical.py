@@ -1,6 +1,7 @@
 """What an estimator knows after data, and what physics allows of it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -107,6 +108,7 @@ def _multipliers(p: Array, excess: Array) -> Array:
     return x
 
 
+@lru_cache(maxsize=4)  # as `model.scales.authority`
 def _signs(model: Model, prior: Prior) -> tuple[Array, Array]:
     """Rows (k, n) and limits (k,) with ``rows @ values <= limit`` for a passive hull.
 

@@ -113,7 +113,7 @@ class Model:
     coefficients: tuple[Coefficient, ...]
     theta: Array
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coefficients)
 
@@ -149,7 +149,9 @@ class Model:
         """
         if np.shape(theta) != self.theta.shape:
             raise UserError(f"theta needs shape {self.theta.shape}, not {np.shape(theta)}")
-        return replace(self, theta=_vector(theta))
+        out = replace(self, theta=_vector(theta))
+        vars(out).update(names=self.names, structure=self.structure)
+        return out
 
     def with_values(self, values: Mapping[str, float]) -> "Model":
         """The same structure with some coefficients replaced by name.
