@@ -87,10 +87,13 @@ def dive_at_sea(folder, vehicle, seed, unknown, seconds=80.0):
 
 @pytest.mark.parametrize("seed", [4, *more(0, 1, 2, 3)])
 def test_noise_that_grows_in_a_window_is_not_left(tmp_path, seed):
-    """That of the measured state from which a window begins; of seed 4 it was 85 % of the roll."""
+    """That of the measured state from which a window begins; of seed 4 it was 85 % of the roll.
+
+    Whether an effect is listed as minor there differs between processors, as windows along the
+    measured attitude, which rights nothing, may run away."""
     streams, config = dive_at_sea(tmp_path, NOT_STABLE, seed, sea.Sea())
     findings = explain([streams], config).findings
-    assert findings.verdict != "unexplained"
+    assert not findings.residual and not any(f.separable for f in findings.effects)
     assert not any("left" in note and "of the motion" in note for note in findings.notes)
 
 
@@ -627,6 +630,8 @@ def test_nothing_is_said_about_axes_whose_wrench_is_lost_in_noise(case, seed):
     assert found.effect == "wrench_noise" and found.separable
     assert {"X", "Y", "N"} <= set(found.axes) <= set("XYZN")
     assert any("cannot be told from noise of its reading on K" in note for note in findings.notes)
+    told = any("is the same for several readings: " in note for note in findings.notes)
+    assert told == (case == "wrench noise that lasts")
 
 
 def test_a_dead_band_is_not_sure_beside_noise_that_lasts():

@@ -101,6 +101,10 @@ _IN_NOISE = (
     "axes is taken from the measurement, not simulated, and nothing is said about it; record the "
     "commands without noise, or drive these axes well above it"
 )
+_NOISE_LASTS = (
+    "noise of the wrench's reading is the same for several readings: {}; what publishes them holds "
+    "or filters what it measures"
+)
 _ALL_IN_NOISE = (
     "the wrench cannot be told from noise of its reading on any axis: record the commands without "
     "noise, or drive the vehicle well above it"
@@ -270,7 +274,7 @@ def explain(
     notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
     notes += [_FILTERED] if data.late else []
     notes += data.clocks.notes
-    notes += _of_guided(data.streams)
+    notes += [*_of_guided(data.streams), *_of_noise_that_lasts(data.streams)]
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
     findings = Findings(
@@ -601,6 +605,14 @@ def _of_guided(streams: Streams) -> list[str]:
     std = reading_noise(streams.demand, streams.noise_lasts)
     lost = [f"{AXES[i]} ({std[i]:.2g} {WRENCH_UNITS[i]})" for i in np.flatnonzero(streams.in_noise)]
     return notes + ([_IN_NOISE.format(", ".join(lost))] if lost else [])
+
+
+def _of_noise_that_lasts(streams: Streams) -> list[str]:
+    period = float(np.median(np.diff(streams.demand_t)))
+    lasting = [
+        f"{axis} {n} ({n * period:.2g} s)" for axis, n in zip(AXES, streams.noise_lasts) if n > 1
+    ]
+    return [_NOISE_LASTS.format(", ".join(lasting))] if lasting else []
 
 
 def _told(left: Mapping[str, float]) -> str:
