@@ -645,7 +645,7 @@ def test_a_dead_band_is_not_sure_beside_noise_that_lasts():
 
 
 def test_a_dive_whose_every_command_is_lost_in_noise_is_refused(monkeypatch):
-    lost = sensor_choice.ReadingNoise({}, np.ones(6, dtype=bool))
+    lost = sensor_choice.NoiseFound({}, np.ones(6, dtype=bool))
     monkeypatch.setattr(sensor_choice, "noise_of_wrench", lambda *_: lost)
     _, streams, config = streams_of("clean", "pilot", 1, 30.0)
     with pytest.raises(UserError, match="on any axis: record the commands without noise"):

@@ -25,7 +25,7 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.output_error import Fitted
 from rov_ident.discrepancy.selection import PENALTY, scores_of
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
-from rov_ident.effects import EFFECTS, reading_noise, with_trait
+from rov_ident.effects import EFFECTS, configured_noise, with_trait
 from rov_ident.effects.base import Effect
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
@@ -134,7 +134,7 @@ class Screening:
         if not axis or key[0] not in EFFECTS or EFFECTS[key[0]].act is None:
             return True
         i = AXES.index(axis)
-        noise = reading_noise(h.config.effects)[i] ** 2
+        noise = configured_noise(h.config.effects)[i] ** 2
         return bool(noise <= SHARE * np.mean(self._problem.streams.demand[:, i] ** 2))
 
     def _is_simulated(self, key: Key) -> bool:

@@ -262,7 +262,7 @@ def _moves_velocity(name: str, values: Mapping[str, float]) -> bool:
 # ------------------------------------------------------------------ the wrench
 
 
-class ReadingNoise(NamedTuple):
+class NoiseFound(NamedTuple):
     """The parameters of the noise of the wrench's reading, none where it is on no axis, and the
     axes (6,) that are lost in it."""
 
@@ -270,7 +270,7 @@ class ReadingNoise(NamedTuple):
     lost: NDArray[np.bool_]
 
 
-def noise_of_wrench(search: Search, start: Fitted) -> ReadingNoise:
+def noise_of_wrench(search: Search, start: Fitted) -> NoiseFound:
     """The noise of the reading on the axes where the fit ``start`` is likelier without it; on none
     where the vehicle may follow what looks like noise. It has no parameter that is fitted, so no
     more is asked.
@@ -280,7 +280,7 @@ def noise_of_wrench(search: Search, start: Fitted) -> ReadingNoise:
     noise then makes much of what the readings do there, the axis is lost.
     """
     config, problem = search.config, search.problem
-    none = ReadingNoise({}, np.zeros(6, dtype=bool))
+    none = NoiseFound({}, np.zeros(6, dtype=bool))
     if NOISE in config.effects or not problem.reading_std.any():
         return none
     evidence = _evidence_of_noise(start, problem.reading_std, problem.lasts)
@@ -294,7 +294,7 @@ def noise_of_wrench(search: Search, start: Fitted) -> ReadingNoise:
     there = fit(problem, with_noise(start.hypothesis, _on_axes(std))) if std.any() else None
     use = ~problem.guided & ~lost
     likelier = bool(there and np.log(there.noise[use]).sum() < np.log(start.noise[use]).sum())
-    return ReadingNoise(_on_axes(std) if likelier else {}, lost)
+    return NoiseFound(_on_axes(std) if likelier else {}, lost)
 
 
 def _on_axes(std: Array) -> dict[str, float]:

@@ -38,9 +38,9 @@ from rov_ident.effects import (
     Acting,
     Values,
     compiled,
+    configured_noise,
     of_the_vehicle,
     on_clock,
-    reading_noise,
     rigid_body,
     steered,
 )
@@ -229,7 +229,7 @@ class WindowedProblem:
         def of(readings: Array) -> Array:
             return thrust(steps._replace(demand=np.where(counts, 0.0, readings)), acting)[0]
 
-        noise = draws(reading_noise(effects), self.lasts, len(self.streams.demand))
+        noise = draws(configured_noise(effects), self.lasts, len(self.streams.demand))
         return of(self.steps.demand), np.stack([of(n[self._held]) for n in noise])
 
     def response(self, effects: Values) -> Array:

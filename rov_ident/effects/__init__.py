@@ -198,7 +198,7 @@ def heading_error(effects: Values) -> float:
     return sum(heading(**values) for heading, values in turns if heading is not None)
 
 
-def reading_noise(effects: Values) -> Array:
+def configured_noise(effects: Values) -> Array:
     """Standard deviations (6,) of what is read of the wrench beside the command [N, N m]."""
     parts = ((EFFECTS[name].noise, values) for name, values in effects.items())
     squares = [noise(**values) ** 2 for noise, values in parts if noise is not None]

@@ -32,9 +32,9 @@ from rov_ident.core.messages import (
 from rov_ident.effects import (
     acted,
     compiled,
+    configured_noise,
     heading_error,
     of_the_vehicle,
-    reading_noise,
     sense,
     steered,
     velocity_delay,
@@ -136,7 +136,7 @@ def measure(
         *_imu(config, t, sensed, np.searchsorted(t, imu_t), suite, rng),
     ]
     # of a generator of its own: without it everything else is as it would be anyway
-    read = demand + reading_noise(config.effects) * rng.spawn(1)[0].standard_normal(demand.shape)
+    read = demand + configured_noise(config.effects) * rng.spawn(1)[0].standard_normal(demand.shape)
     for at, wrench in zip(demand_t, read, strict=True):
         noisy = _coarse(wrench * (1.0 + suite.wrench_std * rng.standard_normal(6)))
         messages.append(_stamped(at, WRENCH, Wrench(0, "base_link_frd", noisy[:3], noisy[3:])))
