@@ -89,12 +89,31 @@ def dive_at_sea(folder, vehicle, seed, unknown, seconds=80.0):
 def test_noise_that_grows_in_a_window_is_not_left(tmp_path, seed):
     """That of the measured state from which a window begins; of seed 4 it was 85 % of the roll.
 
-    Whether an effect is listed as minor there differs between processors, as windows along the
-    measured attitude, which rights nothing, may run away."""
+    Windows that run away, whatever is fitted, led to other minima, and to names of what is not
+    there: of the first nine seeds one had `coriolis`, another was left open."""
     streams, config = dive_at_sea(tmp_path, NOT_STABLE, seed, sea.Sea())
     findings = explain([streams], config).findings
-    assert not findings.residual and not any(f.separable for f in findings.effects)
+    assert findings.verdict in ("agrees", "retuned") and not findings.effects
     assert not any("left" in note and "of the motion" in note for note in findings.notes)
+
+
+def test_a_window_is_followed_until_it_runs_away(tmp_path):
+    """And no further, whatever is fitted; the windows of a stable vehicle to their ends."""
+    streams, config = dive_at_sea(tmp_path, NOT_STABLE, 4, sea.Sea())
+    problem = Search(streams, config, split(streams.duration)[0]).problem
+    first = linearise(problem, Hypothesis(config, {}), problem.measured_starts(), np.full(6, 0.02))
+    shares = np.array([(first.of_windows > 0.0).mean(), first.told.mean()])
+    assert shares[0] == 1.0 and 0.5 < shares[1] < 0.9
+    for w in range(len(problem.first)):
+        told = first.told[problem.window == w]
+        assert told[0] and np.all(np.diff(told.astype(int)) <= 0)
+    drag = {key: 0.5 * value for key, value in first.hypothesis.values.items()}
+    other = linearise(problem, first.hypothesis.at(drag), first.starts, first.noise)
+    assert other is None or (other.told == first.told).all()
+    _, streams, config = streams_of("clean", "six-axis", 1, 60.0)
+    problem = Search(streams, config, split(streams.duration)[0]).problem
+    stable = linearise(problem, Hypothesis(config, {}), problem.measured_starts(), np.full(6, 0.02))
+    assert stable.told.all()
 
 
 @pytest.mark.parametrize("seed", [2, *more(0, 1)])
@@ -288,6 +307,8 @@ def test_a_bias_of_the_rates_is_in_the_residuals_as_the_covariance_has_it():
     here = Search(straight, config, spans).start()
     h, starts, noise = here.hypothesis, here.linearisation.starts, here.noise
     problems = [WindowedProblem(s, spans) for s in (straight, streams)]
+    for problem in problems:  # in both the same part of windows that run away
+        problem.told(lambda: here.linearisation.told)
     without, having = (linearise(p, h, starts, noise) for p in problems)
     expected = having.of_biases() @ (bias / BIAS)
     # between two messages the attitude is turned by the rates, which makes 2e-4 of it
@@ -403,8 +424,33 @@ def test_a_position_that_is_reckoned_from_the_velocities_says_nothing_of_them():
     nu = np.hstack([v, np.zeros_like(v)])
     streams = dataclasses.replace(streams, t=t, position=way, orientation=level, nu=nu)
     assert inspected(streams).has_pose
-    reckoned = np.cumsum(0.05 * v, axis=0)
-    assert not inspected(dataclasses.replace(streams, position=reckoned)).has_pose
+    reckoned = dataclasses.replace(streams, position=np.cumsum(0.05 * v, axis=0))
+    assert not inspected(reckoned).has_pose
+    # nor has a sum over the usual period, whatever the stamps: late or early by milliseconds
+    late = np.random.default_rng(0).uniform(0.0, 0.003, len(t))
+    assert not inspected(dataclasses.replace(reckoned, t=t + late)).has_pose
+
+
+def test_velocities_that_are_stated_to_be_useless_are_left_out():
+    """A DVL that has lost the ground: whatever it says, beside a variance of 1 (m/s)2."""
+    dive, streams, config = streams_of("clean", "pilot", 0, 60.0)
+
+    def told(lost_variance):
+        rng, messages = np.random.default_rng(0), []
+        for role, m in at_sea.messages_of(dive, config):
+            if role == ODOMETRY:
+                lost = (m.stamp * 1e-9) % 10.0 < 1.0
+                variance = lost_variance if lost else 64e-6
+                off = rng.normal(0.0, np.sqrt(variance), 3) if lost else np.zeros(3)
+                m = m._replace(linear=m.linear + off, twist_variance=np.full(6, variance))
+            messages.append((role, m))
+        return gather(messages, config)
+
+    lost = told(1.0)
+    (note,) = (note for note in lost.notes if "far worse than usual" in note)
+    assert 100 < len(streams.t) - len(lost.t) < 130 and "(120)" in note
+    assert np.isin(lost.nu, streams.nu).all()
+    assert not any("far worse" in note for note in told(4 * 64e-6).notes)
 
 
 @pytest.mark.parametrize("seed", [0, *more(1, 2)])

@@ -73,7 +73,7 @@ _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 CUT_SHORT = (
     "the search was cut short after as much simulation as it may take: not all further effects, "
     "and in place of those found only other effects, were tried; a configuration that fits better "
-    "(rov-ident fit) helps"
+    "helps (rov-ident fit, where it says that model and data agree)"
 )
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.core.frames import rotated
 from rov_ident.core.linalg import scaled_solve, unit_diagonal
@@ -21,6 +22,7 @@ from rov_ident.discrepancy.hypothesis import Hypothesis, Key
 from rov_ident.discrepancy.multiple_shooting import Motion, adjoint, tangent
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.equations import Array, Indices
+from rov_ident.model.scales import WORKING_SPEED
 from rov_ident.sampling.raw_streams import MAX_STEP
 
 _OUTLIER = 8.0
@@ -28,6 +30,11 @@ _OUTLIER = 8.0
 
 Well beyond the 3 of Hampel (1974): what is missing from a model makes large residuals, too.
 """
+
+_RUNS_AWAY = 0.2
+"""Of the working speed: where noise of a window's first velocity has grown to that, second-order
+terms are as large as noise. Few windows of ordinary dives reach it (3 of 520), and those that run
+away reach 1 to 80 ("Windows that run away" in docs/explain.md)."""
 
 _HIGHEST = 2.0  # Hz; of forces that are looked for: surface waves lie far below
 
@@ -61,7 +68,8 @@ class MoreNoise(NamedTuple):
 class Linearisation:
     """A hypothesis simulated through all windows: residuals ``error`` (6 N,), initial velocities
     eliminated, divided by the standard deviations ``noise`` (6,), and sensitivities; ``starts`` (W,
-    6) are the initial velocities. With ``more`` noise both are whitened."""
+    6) are the initial velocities. With ``more`` noise both are whitened. ``told`` (N,): which
+    measurements come before their window runs away; of the others there are no residuals."""
 
     def __init__(
         self,
@@ -78,8 +86,10 @@ class Linearisation:
         spread = robust_std(error)
         self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
         self._weight[:, problem.guided] = 0.0
-        error = (error * (self._weight > 0.0)).reshape(-1, 1)
         self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
+        self.told = problem.told(self._before_running_away)
+        self._weight[~self.told] = 0.0
+        error = (error * (self._weight > 0.0)).reshape(-1, 1)
         if more is not None:
             error -= self._moved(more.taken[..., None])
         self._tilts = self._of_tilts()
@@ -126,7 +136,7 @@ class Linearisation:
     def of_windows(self) -> Array:
         """Squared residuals (W,); an outlier counts as the least residual that is one, or a fit
         could improve by losing a window."""
-        out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0, axis=1)
+        out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0, axis=1) * self.told
         return self._squares + _OUTLIER**2 * np.add.reduceat(out, self._rows)
 
     @property
@@ -186,6 +196,20 @@ class Linearisation:
         e = self.problem
         e.count(6 if force is None else force.shape[2])
         return tangent(self.motion, e.first, e.last, e.nodes, force)
+
+    def _before_running_away(self) -> NDArray[np.bool_]:
+        """Of each measurement (N,) whether noise of the first velocity has not grown too much in
+        its window. Along the measured attitude no righting moment holds a simulation back; and what
+        is left out must not change with what is fitted, or fits could improve by losing it."""
+        odometry = self.hypothesis.config.odometry
+        first = np.repeat([odometry.linear_std, odometry.angular_std], 3)
+        growth = self.problem.growth(self.hypothesis)
+        grown = np.sqrt(np.sum((growth * first) ** 2, axis=2)) / WORKING_SPEED
+        away = grown[:, ~self.problem.guided].max(axis=1) > _RUNS_AWAY
+        told = np.ones(len(away), dtype=bool)
+        for a, b in self._spans():
+            told[a:b] = np.cumsum(away[a:b]) == 0
+        return told
 
     def _of_tilts(self) -> list[tuple[Array, Array]]:
         """For each window J (6 n, 6), what errors of its attitude of one standard deviation make of

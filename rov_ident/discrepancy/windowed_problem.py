@@ -29,6 +29,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     guided_by,
     regressors,
     shoot,
+    tangent,
     thrust,
     wrenches,
 )
@@ -46,7 +47,7 @@ from rov_ident.effects import (
 )
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, INPUTS
-from rov_ident.model.equations import INERTIA, Array, Model, RigidBody
+from rov_ident.model.equations import INERTIA, Array, Indices, Model, RigidBody
 from rov_ident.sampling import wrench_scatter
 from rov_ident.sampling.raw_streams import Streams, orientation_at
 from rov_ident.simulation.open_loop import Guide, simulate
@@ -155,6 +156,7 @@ class WindowedProblem:
         self._stopped = False
         self._driven = _Remembered(_REMEMBERED_THRUSTS)
         self._tilted: Array | None = None
+        self._told: NDArray[np.bool_] | None = None
         self._forget()
         self._counting = threading.Lock()
 
@@ -275,9 +277,24 @@ class WindowedProblem:
         if self._stopped:
             raise CancelledError
         self.count(1)
-        equations = guided_by(h.equations, self.guided)
-        motion = shoot(equations, self.driven(h.effects), wrench, self.first, self.last, starts)
+        motion = self._shot(h, wrench, self.first, self.last, starts)
         return motion if np.isfinite(motion.nu[self.nodes]).all() else None
+
+    def _shot(
+        self, h: Hypothesis, wrench: Array, first: Indices, last: Indices, starts: Array
+    ) -> Motion:
+        equations = guided_by(h.equations, self.guided)
+        return shoot(equations, self.driven(h.effects), wrench, first, last, starts)
+
+    def growth(self, h: Hypothesis) -> Array:
+        """Sensitivities (N, 6, 6) to the first velocity of each window along the measured motion:
+        of steps that each begin with what was measured."""
+        self.count(6)
+        inside = [np.arange(a, b) for a, b in zip(self.first, self.last, strict=True)]
+        each = np.concatenate(inside)
+        starts = self._measured_at(self.steps.t[each])
+        along = self._shot(h, self.thrust(h.effects), each, each + 1, starts)
+        return tangent(along, self.first, self.last, self.nodes)
 
     def columns(self, h: Hypothesis, motion: Motion, keys: Sequence[Key]) -> Array:
         """How the wrench on the vehicle changes with each parameter, (K, 6, P)."""
@@ -381,6 +398,12 @@ class WindowedProblem:
         if self._tilted is None:
             self._tilted = make()
         return self._tilted
+
+    def told(self, make: Callable[[], NDArray[np.bool_]]) -> NDArray[np.bool_]:
+        """Which measurements (N,) a simulation from the first velocity predicts, made once."""
+        if self._told is None:
+            self._told = make()
+        return self._told
 
     def tilting(self, body: RigidBody) -> Array:
         """What an error of the attitude about each body axis adds to the wrench, (K, 6, 6): three

@@ -37,10 +37,11 @@ from rov_ident.sampling.queues import LONGEST_INTERVAL
 from rov_ident.sampling.validation import NEW_CLOCK, REPEATED, RESTARTS, Validation, describe
 
 _USUAL = 2.0  # a choice: times what 99 % of the messages keep to
+_DOUBTFUL = 3.0  # usual standard deviations; a message then weighs as nine in sums of squares
 _SPIKE = 10.0  # standard deviations of what velocities change by: no noise reaches that
-# of what the noise of the velocities makes of a step: a fix that happened to agree as well would be
-# a tenth as noisy; without noise the sum of true velocities is a fifth of it off
-_RECKONED = 0.1
+# of what the noise of the velocities makes of a step: half of what the trapezoidal rule leaves of
+# velocities without noise, a twelfth of their second differences; no fix agrees by chance that well
+_RECKONED = 0.04
 MAX_STEP = 0.05  # s; of a simulation's or a filter's steps, where odometry is slower
 PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
 
@@ -137,7 +138,7 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
     """
     taken, counts = _accepted(messages, config)
     imu, wrench = (_despiked(role, taken[role], config, counts) for role in (IMU, WRENCH))
-    odometry = _without_spikes(taken[ODOMETRY], config, counts)
+    odometry = _without_spikes(_without_doubtful(taken[ODOMETRY], counts), config, counts)
     odometry = _while_commanded(odometry, [t for t, _ in wrench], config.timeout, counts)
     for name, found in (("odometry", odometry), ("wrench", wrench)):
         if len(found) < 2:
@@ -194,12 +195,17 @@ def _is_reckoned(read: Streams) -> bool:
     if len(read.t) < 3:
         return False
     v = rotated(quaternion_to_matrix(read.orientation), read.nu[:, :3])[:, :2]
-    dt = np.diff(read.t)[:, None]
     step = np.diff(read.position[:, :2], axis=0)
-    noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(dt)
+    noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(np.diff(read.t))
     rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
-    left = [np.median(np.abs(step - dt * rule), axis=0) for rule in rules]
-    return bool((np.min(left, axis=0) < _RECKONED * noise).all())
+    moved = step.any(axis=1)  # one that is rounded is repeated
+    if not moved.any():
+        return False
+    # across the velocity, as a stamp that is off moves a step along it
+    across = [step[:, 0] * rule[:, 1] - step[:, 1] * rule[:, 0] for rule in rules]
+    size = [np.maximum(np.hypot(*rule.T), 1e-12) for rule in rules]
+    left = min(np.median(np.abs(x / n)[moved]) for x, n in zip(across, size, strict=True))
+    return bool(left < _RECKONED * noise.min())
 
 
 def _as_configured(read: Streams, config: Config) -> Streams:
@@ -369,6 +375,18 @@ def _despiked(
             outliers.update(range(first, end))
     counts[f"{role}: outlier"] += len(outliers)
     return [taken[i] for i in range(len(taken)) if i not in outliers]
+
+
+def _without_doubtful(
+    odometry: list[tuple[float, Any]], counts: Counter[str]
+) -> list[tuple[float, Any]]:
+    """The messages without those whose linear velocity is stated to be far worse than usual, as
+    where a DVL has lost the ground and the velocity is held: here all velocities weigh the same."""
+    stated = np.array([np.max(m.twist_variance[:3]) for _, m in odometry])
+    usual = np.median(stated) if len(stated) else 0.0
+    doubtful = (stated > _DOUBTFUL**2 * usual) & (usual > 0.0)
+    counts["odom: velocity is stated to be far worse than usual"] += int(doubtful.sum())
+    return [m for m, drop in zip(odometry, doubtful, strict=True) if not drop]
 
 
 def _without_spikes(
