@@ -18,6 +18,7 @@ from bench.studies import at_sea
 from rov_ident import config as configuration
 from rov_ident.config.prior import (
     ATTITUDE_LASTS,
+    THRUST_SCALE,
     attitude_covariance,
     cob_std,
     covariance_beyond_driving,
@@ -25,10 +26,13 @@ from rov_ident.config.prior import (
     first_centre,
     prior_of,
     rigid_body_covariance,
+    share_of_arm,
+    turning_covariance,
 )
 from rov_ident.core.states import State
 from rov_ident.effects import EFFECTS, memory, steering_memory
 from rov_ident.estimation import rls, ukf
+from rov_ident.estimation.angular_acceleration import AngularAcceleration
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
 from rov_ident.offline import maximum_likelihood
@@ -416,6 +420,60 @@ def test_a_scale_of_the_velocity_sensor_is_one_of_inertia_and_drag(heavy, off):
         assert read @ axis == pytest.approx(wrench @ axis, rel=10.0 * off**2)
     turning = [n[0] in "KMN" for n in names]
     assert not np.any(moved[turning])
+
+
+def test_the_righting_arm_may_be_as_far_off_as_the_data_ask_for(heavy):
+    """What is supposed of the thrust bounds what an unknown arm does to its scale, until the data
+    move it by more: in a dive of station keeping the scale was 1.40, std 0.08, and the arm of 15 mm
+    known to a third; 2 of 18 intervals held."""
+    config = stated(heavy, cob_std=0.3 * abs(heavy.model.body.righting_arm))
+    supposed = config.wrench.scale_std
+    assert share_of_arm(config, 1.0 + 0.5 * supposed) == supposed
+    assert share_of_arm(config, 1.0 - 1.5 * supposed) == pytest.approx(1.5 * supposed)
+    assert share_of_arm(config, 1.0 + 4.0 * supposed) == pytest.approx(0.3)
+
+
+def test_what_a_wandering_attitude_makes_of_the_thrust_is_uncertain(heavy):
+    """By the share of its moment in those that turn the vehicle, as far as the scale has moved, and
+    as far as the gyro shows such an error."""
+    config = stated(heavy)
+    prior, body = prior_of(config, effects=True), config.model.body
+    i, at = prior.names.index(THRUST_SCALE), prior.mean.copy()
+    at[i] = 1.3
+    error = body.weight * body.righting_arm * config.odometry.attitude_std
+    inertia = np.diag(config.dynamics.mass_matrix)[3:5]
+
+    def std(turning, lasting):
+        return np.sqrt(np.diag(turning_covariance(config, prior.names, at, turning, lasting)))
+
+    tenth = 10.0 * (error / inertia) ** 2
+    assert std(tenth, 1.0)[i] == pytest.approx(0.1 * 1.3)
+    assert std(tenth, 0.2)[i] == pytest.approx(0.02 * 1.3)
+    assert std(tenth, 9.0)[i] == pytest.approx(0.1 * 1.3)  # no more than is stated
+    assert std(0.0 * tenth, 1.0)[i] == pytest.approx(0.3 * 1.3)  # no further than it has moved
+    assert not std(np.full(2, np.inf), 1.0).any()  # nothing is known yet
+    drag = prior.names.index("X_uu")
+    assert std(tenth, 1.0)[drag] == pytest.approx(0.1 * abs(at[drag]))
+
+
+@pytest.mark.parametrize("rate", [20.0, 100.0])
+def test_how_quickly_a_vehicle_turns(rate):
+    """The noise of its rates turns nothing; nor does it matter in what parts samples come."""
+    t = np.arange(0.0, 200.0, 1.0 / rate)
+    samples = np.zeros(len(t), dtype=SAMPLE)
+    samples["t"], std = t, 0.004
+    samples["nu"][:, 3] = 0.1 * np.sin(0.8 * t)
+    samples["nu"][:, 3:5] += std * np.random.default_rng(3).standard_normal((len(t), 2))
+    samples["gyro_variance"] = std**2
+    turning, one = AngularAcceleration(), AngularAcceleration()
+    for part in np.array_split(samples, 40):
+        for row in np.array_split(part, 7):
+            turning.add(row)
+        turning.follow()
+    found = turning.mean_square
+    assert found[0] == pytest.approx((0.1 * 0.8) ** 2 / 2.0, rel=0.2)
+    assert found[1] < 0.2 * found[0]
+    assert np.isinf(one.mean_square).all()
 
 
 @pytest.mark.parametrize("factor", [1.05, 0.97])

@@ -196,22 +196,58 @@ def covariance_beyond_driving(
 
     Of the stamps see :func:`_of_stamps`.
     """
-    body = config.model.body
-    masses, moments = _own_inertia(body)
-    own = masses | moments
+    masses, _ = _own_inertia(config.model.body)
     of_all = dict(zip(names, values.tolist(), strict=True))
-    scaled = {n: v - own.get(n, 0.0) for n, v in _with_thrust(body, names, values).items()}
     sources = _of_stamps(config, names)
-    if scaled:
-        # no more than is supposed of the scale: a body without an arm tells nothing of it
-        share = min(righting_arm_share(config), config.wrench.scale_std)
-        moved = {n: share * v for n, v in scaled.items()}
-        moved |= {n: share * off for n, off in _off_centre(config, of_all).items()}
-        sources.append(moved)
+    if scaled := _beside_righting(config, names, values):
+        share = share_of_arm(config, of_all[THRUST_SCALE])
+        sources.append({n: share * v for n, v in scaled.items()})
     of_velocity = {n: _degree(n) * (v - masses.get(n, 0.0)) for n, v in of_all.items()}
     sources.append({n: config.odometry.scale_std * v for n, v in of_velocity.items()})
     covariance = _consider_covariance(sources, names, gain)
     return covariance if by_axis is None else covariance + by_axis @ by_axis.T
+
+
+def turning_covariance(
+    config: Config, names: tuple[str, ...], values: Array, turning: Array, lasting: float
+) -> Array:
+    """What the attitude's error adds to the covariance (n, n) of estimates of a vehicle that hardly
+    turns: ``turning`` (2,) is the mean square [rad2/s4] of its angular acceleration about x and y,
+    ``lasting`` the variance of the error as it shows against a gyro, over what is stated.
+
+    An estimate that predicts this acceleration takes it from moments along the measured attitude.
+    Of them the error of the righting moment, G s for an attitude s off, is no acceleration, and
+    makes inertia and with it thrust and drag too large by the share (G s)^2 / (I p_dot)^2
+    (attenuation by a noisy regressor: Fuller 1987, sec. 1.1). How large s is only the file tells,
+    and that there is such an error the gyro; the share is no larger than the estimates have moved
+    ("Trim" in docs/choices.md).
+    """
+    scaled = _beside_righting(config, names, values)
+    if not scaled:
+        return np.zeros((len(names), len(names)))
+    body = config.model.body
+    error = 2.0 * (body.weight * body.righting_arm * config.odometry.attitude_std) ** 2
+    error *= min(lasting, 1.0)
+    moment = float(np.diag(config.dynamics.mass_matrix)[3:5] ** 2 @ turning)
+    share = min(error / max(moment, 1e-12), _moved(config, scaled[THRUST_SCALE]))
+    return _consider_covariance([{n: share * v for n, v in scaled.items()}], names, None)
+
+
+def _beside_righting(config: Config, names: tuple[str, ...], values: Array) -> dict[str, float]:
+    """What is larger by the same factor in the same motion, where the righting moment is; nothing
+    if no scale of the thrust is estimated."""
+    body = config.model.body
+    masses, moments = _own_inertia(body)
+    own = masses | moments
+    scaled = {n: v - own.get(n, 0.0) for n, v in _with_thrust(body, names, values).items()}
+    of_all = dict(zip(names, values.tolist(), strict=True))
+    return scaled | _off_centre(config, of_all) if scaled else {}
+
+
+def _moved(config: Config, scale: float) -> float:
+    """How far an estimated scale of the thrust is from the configured one."""
+    effect, name = THRUST_SCALE.split(".")
+    return abs(scale - config.effects[effect][name])
 
 
 def _of_stamps(config: Config, names: tuple[str, ...]) -> list[dict[str, float]]:
@@ -245,9 +281,12 @@ def cob_std(config: Config) -> float:
     return max(_COB, _ARM * abs(config.model.body.righting_arm)) if stated is None else stated
 
 
-def righting_arm_share(config: Config) -> float:
-    """The standard deviation of the righting arm, relative to it."""
-    return cob_std(config) / max(abs(config.model.body.righting_arm), 1e-9)
+def share_of_arm(config: Config, scale: float) -> float:
+    """The relative standard deviation that an uncertain righting arm gives an estimated ``scale``
+    of the thrust: no more than is supposed of it, as a body without an arm tells nothing of the
+    scale, unless the data have moved it by more."""
+    arm = cob_std(config) / max(abs(config.model.body.righting_arm), 1e-9)
+    return min(arm, max(config.wrench.scale_std, _moved(config, scale)))
 
 
 def _off_centre(config: Config, values: Mapping[str, float]) -> dict[str, float]:

@@ -19,6 +19,7 @@ from rov_ident.config.prior import (
     gain_of,
     prior_of,
     rigid_body_covariance,
+    turning_covariance,
 )
 from rov_ident.core.errors import UserError, require
 from rov_ident.core.jit import interpreting
@@ -28,6 +29,7 @@ from rov_ident.core.threads import one_blas_thread
 from rov_ident.core.whiteness import JUDGED_TIME
 from rov_ident.effects import parameter
 from rov_ident.estimation import innovation_monitor, rls, ukf
+from rov_ident.estimation.angular_acceleration import AngularAcceleration
 from rov_ident.estimation.consistency import Consistency, consistency_of
 from rov_ident.estimation.iterated_update import IteratedUpdate
 from rov_ident.estimation.physical import Estimate, physical
@@ -173,6 +175,7 @@ class OnlineEstimator:
         self._state = self._module.init(self._task)
         self._update = IteratedUpdate(self._module, self._state)
         self._last_t = math.nan
+        self._turning = AngularAcceleration()
         self._reading_noise = np.zeros(6)  # of the last sample
         self._recalled = 0  # ns: the stamp before the first sample
         # information over the prior's: in the window that is filling, and in the one before
@@ -293,7 +296,9 @@ class OnlineEstimator:
             if reason in self._module.REFUSALS:
                 self._sample_counts[f"sample: {self._module.REASONS[reason]}"] += 1
         self._window += sum(samples["dt"].tolist())
+        self._turning.add(samples)
         if self._is_due(samples):
+            self._turning.follow()
             self._centred = self._last_t
             with one_blas_thread():
                 self._follow_excitation()
@@ -485,8 +490,12 @@ class OnlineEstimator:
         # that is held at its limit, drag and inertia go as the data have it
         values = physical(self.config.dynamics, self.prior, raw)
         gain = gain_of(raw.covariance, self.prior.std)
-        covariance = raw.covariance + rigid_body_covariance(
-            self.config, raw.names, raw.values, gain
+        turning = self._turning.mean_square
+        lasting = self.sampler.kinematic_filter.lasting_attitude_error
+        covariance = (
+            raw.covariance
+            + rigid_body_covariance(self.config, raw.names, raw.values, gain)
+            + turning_covariance(self.config, raw.names, raw.values, turning, lasting)
         )
         moved = raw.values - self.prior.mean
         raw = replace(raw, covariance=consistency.widened(covariance, self.prior.std, moved))
@@ -509,10 +518,10 @@ class OnlineEstimator:
         if not diverged:
             seconds = float(self._state.monitor["judged"].max())
             trim = attitude_covariance(self.config, raw.names, seconds, gain)
-            lasting = covariance_beyond_driving(
+            beyond = covariance_beyond_driving(
                 self.config, raw.names, raw.values, gain, raw.by_axis
             )
-            covariance, beyond_driving = covariance + trim + lasting, np.diag(lasting)
+            covariance, beyond_driving = covariance + trim + beyond, np.diag(beyond)
             std = np.sqrt(np.diag(covariance))
         # A bound cuts the interval too: no part of it is physically possible.
         upper = np.minimum(values + NORMAL * std, self.prior.upper)

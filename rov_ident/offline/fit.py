@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rov_ident.config import Config, dump
-from rov_ident.config.prior import THRUST_SCALE, prior_of, righting_arm_share
+from rov_ident.config.prior import THRUST_SCALE, prior_of, share_of_arm
 from rov_ident.core.messages import Array
 from rov_ident.core.states import IDENTIFIABLE, State, of_fit
 from rov_ident.estimation.compilation import ensure_compiled
@@ -134,7 +134,7 @@ class Fit(Shown, Result):
         if (scale - 1.0) ** 2 > max(variance, least**2):
             std = math.sqrt(self.covariance[i, i])
             advice.append(f"Weigh the vehicle: {thrust_or_mass(scale, std)}.")
-        of_arm = min(righting_arm_share(self.given), self.given.wrench.scale_std) * scale
+        of_arm = share_of_arm(self.given, scale) * scale
         turned = np.isfinite(self.rmse[3:]).any()  # by moments that are known: else no arm tells
         if turned and of_arm**2 > _MOST * self.covariance[i, i]:
             advice.append(

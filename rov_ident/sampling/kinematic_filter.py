@@ -186,6 +186,17 @@ class KinematicFilter:
             ratios[_RATE] = min(ratios[_RATE], ratios[_RATE_AS_READ])
         return {part: x for part, x in zip(_PARTS, ratios) if x > 0.0}
 
+    @property
+    def lasting_attitude_error(self) -> float:
+        """How much more the attitude differs from the integrated gyro for a second, in the last
+        minute, than chance makes of white noise, over the variance that is stated of it; zero until
+        it is known."""
+        state, part = self.state[0], _PARTS.index("attitude")
+        if not state["judged"][part] > JUDGED_TIME:
+            return 0.0
+        by_chance = BY_CHANCE**2 * state["test_ratio"][part]
+        return max(float(state["lasting"][part].max() - by_chance), 0.0)
+
     def step(
         self,
         sample: NDArray[np.void],
