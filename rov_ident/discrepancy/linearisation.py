@@ -33,8 +33,8 @@ Well beyond the 3 of Hampel (1974): what is missing from a model makes large res
 
 _RUNS_AWAY = 0.2
 """Of the working speed: where noise of a window's first velocity has grown to that, second-order
-terms are as large as noise. Few windows of ordinary dives reach it (3 of 520), and those that run
-away reach 1 to 80 ("Windows that run away" in docs/explain.md)."""
+terms are as large as noise. In ordinary dives 3 of 488 windows come so far, of a vehicle with an
+unstable yaw every third ("Windows that run away" in docs/explain.md)."""
 
 _HIGHEST = 2.0  # Hz; of forces that are looked for: surface waves lie far below
 
