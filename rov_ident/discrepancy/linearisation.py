@@ -205,7 +205,7 @@ class Linearisation:
         first = np.repeat([odometry.linear_std, odometry.angular_std], 3)
         growth = self.problem.growth(self.hypothesis)
         grown = np.sqrt(np.sum((growth * first) ** 2, axis=2)) / WORKING_SPEED
-        away = grown[:, ~self.problem.guided].max(axis=1) > _RUNS_AWAY
+        away = np.where(self.problem.guided, 0.0, grown).max(axis=1) > _RUNS_AWAY
         told = np.ones(len(away), dtype=bool)
         for a, b in self._spans():
             told[a:b] = np.cumsum(away[a:b]) == 0
