@@ -15,7 +15,7 @@ from rov_ident import config as configuration
 from rov_ident.core.messages import Array
 from rov_ident.discrepancy.held_out import WINDOW
 from rov_ident.discrepancy.live_windows import MEMORY, is_watched
-from rov_ident.discrepancy.monitor import ALARM, Monitor, penalty, suspicions
+from rov_ident.discrepancy.monitor import ALARM, Monitor, exercise, penalty, suspicions
 from rov_ident.effects import EFFECTS
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.sample import SAMPLE
@@ -60,6 +60,11 @@ def test_what_is_missing_is_named(effect, axes):
     lowest = 0.5 if effect == "quadratic_damping" else 0.7
     for name, value in found[0].parameters.items():
         assert lowest < value / truth[name] < 1.3
+
+
+def test_a_vehicle_that_does_not_move_at_all_is_watched():
+    """No velocity ever changes, so that all follow the measurement: kernels are compiled so."""
+    exercise()
 
 
 @pytest.mark.parametrize("kind", ["rls", *more("ukf")])  # both have the same monitor
