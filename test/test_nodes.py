@@ -253,10 +253,11 @@ def test_wrench_alone(live, heavy):
 
 @pytest.mark.parametrize("before", [True, False])
 def test_what_waits_is_kept_by_a_node_that_is_told_what_it_does_already(before):
-    """And dropped by one that was disabled: it was received meanwhile."""
+    """And not used by one that was disabled: it was received meanwhile."""
     node = SimpleNamespace(
         _waiting=deque(["message"]), _online=SimpleNamespace(enabled=before),
-        _publish=lambda: None, get_logger=lambda: SimpleNamespace(info=lambda words: None),
+        _work=lambda: None, _publish=lambda: None,
+        get_logger=lambda: SimpleNamespace(info=lambda words: None),
     )  # fmt: skip
     answer = EstimatorNode._enable(node, SetBool.Request(data=True), SetBool.Response())
     assert answer.success and node._online.enabled and len(node._waiting) == before

@@ -2,6 +2,7 @@
 
 import dataclasses
 from copy import deepcopy
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -181,14 +182,21 @@ def test_a_recording_that_begins_with_the_first_thrust(heavy, wrong, kind, seed)
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_learning_anew_does_not_depend_on_how_messages_come(lagging, kind):
-    """One by one or as a recording: the same to the last bit."""
+    """One by one, as a recording or some at a time: the same to the last bit."""
     config, messages = lagging
-    pushed = fed(OnlineEstimator(config, kind), messages)
-    followed = OnlineEstimator(config, kind)
+    expected = fed(OnlineEstimator(config, kind), messages).report()
+    followed, grouped = OnlineEstimator(config, kind), OnlineEstimator(config, kind)
     followed.follow(messages)
-    expected = pushed.report()
-    assert followed.report().values.tolist() == expected.values.tolist()
-    assert followed.report().covariance.tolist() == expected.covariance.tolist()
+    rest, rng, told = iter(messages), np.random.default_rng(0), [sensors.START]
+    while group := list(islice(rest, int(rng.integers(1, 40)))):
+        for _ in grouped.push_all(group, lambda stamp: stamp - told[-1] >= 0.3 * SECOND):
+            if grouped.stamp - told[-1] >= 0.3 * SECOND:
+                told.append(grouped.stamp)
+    grouped.flush()
+    assert len(told) > 100 and np.diff(told).max() < 0.4 * SECOND
+    for report in (followed.report(), grouped.report()):
+        assert report.values.tolist() == expected.values.tolist()
+        assert report.covariance.tolist() == expected.covariance.tolist()
 
 
 def test_what_follows_is_sampled_with_the_lag_that_is_known_now(lagging):

@@ -10,6 +10,8 @@ from rov_ident.core.errors import UserError
 if TYPE_CHECKING:
     from rov_ident.estimation.online import Report
 
+_SHOWN_EVERY = 0.1  # s; nobody reads faster
+
 
 def add(commands: common.Commands) -> None:
     text = "play a bag into live nodes over DDS and record what they publish"
@@ -22,6 +24,7 @@ def add(commands: common.Commands) -> None:
         help="speed; 0: as fast as the nodes follow (default 1)",
     )
     replay.add_argument("--out", type=Path, help="bag to write")
+
 
 
 def _replay(options: argparse.Namespace) -> None:
@@ -39,7 +42,9 @@ def _replay(options: argparse.Namespace) -> None:
             known, count = sum(s is State.CONVERGED for s in report.states), len(report.levels)
             tell(f"{name}: {known} of {count} coefficients have converged", known / count)
 
-        result = replay(options.bag, options.config, estimators, options.rate, options.out, show)
+        result = replay(
+            options.bag, options.config, estimators, options.rate, options.out, show, _SHOWN_EVERY
+        )
     common.write_json(
         options.json,
         {

@@ -98,20 +98,28 @@ def guided_by(eq: Equations, guided: NDArray[np.bool_]) -> Equations:
 
 def thrust(steps: Steps, acting: Acting) -> Array:
     """Mean and slope (2, K, 6) of the thrusters' wrench in each step, after the input effects."""
-    out = np.zeros((2, len(steps.piece), 6))
-    _means(steps.piece_t, acted(steps, acting), steps.t, steps.piece, out)
+    return thrusts(steps, acting, steps.demand[None])[0]
+
+
+def thrusts(steps: Steps, acting: Acting, demands: Array) -> Array:
+    """The same (N, 2, K, 6) of several demands (N, J, 6)."""
+    out = np.zeros((len(demands), 2, len(steps.piece), 6))
+    for wrench, means in zip(acted(steps, acting, demands), out, strict=True):
+        _means(steps.piece_t, wrench, steps.t, steps.piece, means)
     return out
 
 
-def acted(steps: Steps, acting: Acting) -> Array:
-    """The thrusters' wrench in each piece, shaped as ``steps.demand``, after the input effects."""
-    wrench = steps.demand
-    if acting.inputs.any():
-        wrench = wrench.copy()
-        for begin, rows in _records(steps.piece_begin):
-            t = steps.piece_t[rows.start : rows.stop + 1] - begin
-            _thrust(on_clock(acting, begin), memory(), t, steps.anew[rows], wrench[rows])
-    return wrench
+def acted(steps: Steps, acting: Acting, demands: Array) -> Array:
+    """The thrusters' wrench (N, J, 6) in each piece, of demands shaped alike, after the input
+    effects."""
+    if not acting.inputs.any():
+        return demands
+    wrenches = demands.copy()
+    for begin, rows in _records(steps.piece_begin):
+        effects, t = on_clock(acting, begin), steps.piece_t[rows.start : rows.stop + 1] - begin
+        for wrench in wrenches:
+            _thrust(effects, memory(), t, steps.anew[rows], wrench[rows])
+    return wrenches
 
 
 def shoot(

@@ -31,6 +31,7 @@ from rov_ident.discrepancy.multiple_shooting import (
     shoot,
     tangent,
     thrust,
+    thrusts,
     wrenches,
 )
 from rov_ident.discrepancy.reading_noise import SMALL, draws
@@ -214,12 +215,8 @@ class WindowedProblem:
         """What noise of the reading adds to the mean thrust in each step, (K, 6, draws)."""
 
         def added() -> Array:
-            steps, acting, counts = self._as_commanded(effects)
-            base = thrust(steps, acting)[0]
             of = draws(SMALL * self.reading_std, self.lasts, len(self.streams.demand))
-            demands = (steps.demand + counts * noise[self._held] for noise in of)
-            moved = [thrust(steps._replace(demand=d), acting)[0] for d in demands]
-            return np.stack([(m - base) / SMALL for m in moved], axis=2)
+            return self._changed(effects, of[:, self._held]).transpose(1, 2, 0) / SMALL
 
         return self._noisy.of(_inputs(effects), added)
 
@@ -228,25 +225,24 @@ class WindowedProblem:
         and of noise alone in its place, (draws, K, 6)."""
         steps, acting, counts = self._as_commanded(effects)
 
-        def of(readings: Array) -> Array:
-            return thrust(steps._replace(demand=np.where(counts, 0.0, readings)), acting)[0]
-
         noise = draws(configured_noise(effects), self.lasts, len(self.streams.demand))
-        return of(self.steps.demand), np.stack([of(n[self._held]) for n in noise])
+        readings = np.concatenate([self.steps.demand[None], noise[:, self._held]])
+        found = thrusts(steps, acting, np.where(counts, 0.0, readings))[:, 0]
+        return found[0], found[1:]
 
     def response(self, effects: Values) -> Array:
         """What a unit of each reading of the wrench adds to the mean thrust in each step, (K, 6,
         D), by changes of the size of their noise."""
-        steps, acting, counts = self._as_commanded(effects)
-        base = thrust(steps, acting)[0]
-        out = np.zeros((*base.shape, len(self.streams.demand)))
         step = SMALL * np.where(self.reading_std > 0.0, self.reading_std, 1.0)
-        for i in range(out.shape[2]):
-            at = self._held == i
-            if at.any():
-                moved = steps._replace(demand=steps.demand + step * at[:, None] * counts)
-                out[:, :, i] = (thrust(moved, acting)[0] - base) / step
-        return out
+        at = self._held == np.arange(len(self.streams.demand))[:, None]
+        return (self._changed(effects, at[:, :, None] * step) / step).transpose(1, 2, 0)
+
+    def _changed(self, effects: Values, changes: Array) -> Array:
+        """What changes (N, J, 6) of the pieces as read add to the mean thrust in each step, (N, K,
+        6), where they count."""
+        steps, acting, counts = self._as_commanded(effects)
+        moved = thrusts(steps, acting, steps.demand + counts * changes)[:, 0]
+        return moved - thrust(steps, acting)[0]
 
     def _as_commanded(self, effects: Values) -> tuple[Steps, Acting, NDArray[np.bool_]]:
         """The time axis without what is read while a command is taken to rest, the effects beside
@@ -254,7 +250,8 @@ class WindowedProblem:
         noise changes nothing of which they are: the threshold between them is a jump."""
         of_vehicle = of_the_vehicle(effects)
         of_reading = {name: values for name, values in effects.items() if name not in of_vehicle}
-        read, demand = acted(self.steps, compiled(of_reading)), self.steps.demand
+        demand = self.steps.demand
+        read = acted(self.steps, compiled(of_reading), demand[None])[0]
         return self.steps._replace(demand=read), compiled(of_vehicle), read == demand
 
     def with_less(self, taken: Array) -> "WindowedProblem":

@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Literal, NamedTuple, Protocol
@@ -240,10 +240,13 @@ class OnlineEstimator:
         check_form(role, message)
         return self.take(self._sampled(role, message))
 
-    def follow(self, messages: Iterable[tuple[str, Message]]) -> None:
-        """:meth:`push` all messages of a recording and :meth:`flush`, with the same result.
+    def push_all(
+        self, messages: Iterable[tuple[str, Message]], due: Callable[[int], bool] = lambda _: False
+    ) -> Iterator[NDArray[np.void]]:
+        """:meth:`push` messages as they are asked for, with the same result, but in less time.
 
-        But samples wait until the next look at the parameters of effects, and are folded together.
+        Samples wait to be folded together: until there are no more messages, until the parameters
+        of effects are to be looked at, or until the stamp [ns] of one is ``due``. Their INFO (k,).
         """
         waiting: list[NDArray[np.void]] = []
         for role, message in messages:
@@ -251,11 +254,16 @@ class OnlineEstimator:
             if not len(samples):
                 continue
             waiting.append(samples)
-            if self._is_due(samples):
-                self.take(joined(waiting))
+            if self._is_due(samples) or due(self._stamp_of(samples["t"][-1])):
+                yield self.take(joined(waiting))
                 waiting = []
         if waiting:
-            self.take(joined(waiting))
+            yield self.take(joined(waiting))
+
+    def follow(self, messages: Iterable[tuple[str, Message]]) -> None:
+        """:meth:`push` all messages of a recording and :meth:`flush`."""
+        for _ in self.push_all(messages):
+            pass
         self.flush()
 
     def _sampled(self, role: str, message: Message) -> NDArray[np.void]:
@@ -579,7 +587,11 @@ class OnlineEstimator:
         """Of the last sample used [ns], also before a checkpoint; 0: of none."""
         if math.isnan(self._last_t) or self.sampler.origin is None:
             return self._recalled
-        return self.sampler.origin + round(self._last_t * 1e9)
+        return self._stamp_of(self._last_t)
+
+    def _stamp_of(self, t: float) -> int:
+        """The time t [s] of a sample in ns."""
+        return (self.sampler.origin or 0) + round(float(t) * 1e9)
 
     def _judge(
         self,

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,7 @@ from rov_ident import config as configuration
 from rov_ident.config import ESTIMATOR_PARAMETERS, Config
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import from_core
-from rov_ident.core.messages import ODOMETRY, WRENCH, Wrench
+from rov_ident.core.messages import ODOMETRY, WRENCH, Message, Wrench
 from rov_ident.core.states import State
 from rov_ident.estimation import checkpoint
 from rov_ident.estimation.online import ESTIMATORS, Kind, OnlineEstimator, Report
@@ -54,7 +55,7 @@ _TURN = 0.02  # s; of using messages that wait before anything else is done: one
 _MOST_WAITING = 200_000
 """messages, of half a kilobyte: what 100 MB hold, a quarter of an hour at 200 Hz. More than enough
 for compiling, unless that fails for ever."""
-_ACKNOWLEDGED_TOGETHER = 16  # messages; a player may have more on their way
+_TAKEN_TOGETHER = 16  # messages, in lockstep; a player may have more on their way
 _SWITCHING = 0.0005
 """s; that a sample waits for another thread's turn. Python's own 5 ms would be the time of some
 hundred samples (docs/speed.md)."""
@@ -161,9 +162,11 @@ class EstimatorNode(GuardedNode):
             self._waiting.popleft()
             self._reader.counts["queue: too many messages wait, the oldest is left out"] += 1
         self._waiting.append((source, data, arrival))
-        self._work()
         count = self._inputs.received.total()
-        if self._lockstep and count % _ACKNOWLEDGED_TOGETHER == 0:  # the rest by _check_inputs
+        if not self._lockstep:
+            self._work()
+        elif count % _TAKEN_TOGETHER == 0:  # the rest by _check_inputs
+            self._work()
             self._acknowledge.publish(UInt64(data=count))
 
     def _work(self) -> None:
@@ -171,24 +174,31 @@ class EstimatorNode(GuardedNode):
         began = time.monotonic()
         if began < self._resting_until:
             return
-        elapsed = 0.0
-        while self._waiting and elapsed < _TURN:
-            self._take(*self._waiting.popleft())
-            elapsed = time.monotonic() - began
-        if self._compiling.interpreting:
-            self._resting_until = began + 2.0 * elapsed  # for callbacks, and the compiler
-
-    def _take(self, source: str, data: bytes, arrival: int) -> None:
-        for role, message in self._reader.read(source, data, arrival):
-            if self._nomoto and role == ODOMETRY and self._online.enabled:
-                self._nomoto.heading(message, arrival)
-            info = self._online.push(role, message)
+        for info in self._online.push_all(self._messages(began + _TURN), self._is_due):
             if len(info):
                 self._idle = 0.0
                 self._show(info)
                 # A queue of waiting messages is learnt from faster than they came in.
                 if self._keeper and self._online.stamp - self._kept > _CHECKPOINT_PERIOD * 1e9:
                     self._write_checkpoint()
+        if self._compiling.interpreting:  # leave as much time for callbacks, and the compiler
+            self._resting_until = 2.0 * time.monotonic() - began
+
+    def _messages(self, end: float) -> Iterator[tuple[str, Message]]:
+        """Role and message of those that wait, until the time ``end`` [s] of time.monotonic."""
+        while self._waiting:
+            source, data, arrival = self._waiting.popleft()
+            for role, message in self._reader.read(source, data, arrival):
+                if self._nomoto and role == ODOMETRY and self._online.enabled:
+                    self._nomoto.heading(message, arrival)
+                yield role, message
+            if time.monotonic() >= end:
+                return
+
+    def _is_due(self, stamp: int) -> bool:
+        """Whether coefficients are to be published after the sample of a stamp [ns]."""
+        since = stamp - self._published_stamp
+        return self._lockstep and not 0 <= since < 1e9 / self._config.publish_rate
 
     def _show(self, info: NDArray[np.void]) -> None:
         """Publish the residuals of samples, and the coefficients when due by their time."""
@@ -197,14 +207,13 @@ class EstimatorNode(GuardedNode):
         self._used += int(np.count_nonzero(info["reason"] == ESTIMATORS[self._online.kind].USED))
         self._diagnostics.ratios.append(info["nis"])
         origin = self._online.sampler.origin or 0
-        stamps = [origin + round(float(t) * 1e9) for t in info["t"]]
+        stamps = [origin + round(t * 1e9) for t in info["t"].tolist()]
         residuals = info["residual"]
         frames, frame_id = self._config.frames, self._online.sampler.validation.frame_id(WRENCH)
-        for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)):
+        for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)).tolist():
             wrench = Wrench(stamps[i], frame_id, residuals[i, :3], residuals[i, 3:])
             self._residual.publish(encode(from_core(wrench, frames)))
-        since = stamps[-1] - self._published_stamp
-        if self._lockstep and not 0 <= since < 1e9 / self._config.publish_rate:
+        if self._is_due(stamps[-1]):
             self._published_stamp = stamps[-1]
             self._publish()
 
@@ -280,6 +289,7 @@ class EstimatorNode(GuardedNode):
             if os.getppid() != self._parent:
                 self.context.try_shutdown()
             elif all(s.get_publisher_count() for s in self._played):
+                self._work()
                 self._acknowledge.publish(UInt64(data=self._inputs.received.total()))
             return
         if self._compiling.switched(self._config, self.get_logger()):
@@ -319,6 +329,7 @@ class EstimatorNode(GuardedNode):
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if request.data != self._online.enabled:
+            self._work()
             self._waiting.clear()  # otherwise those received while disabled would be used
         self._online.enabled = request.data
         self._publish()
@@ -349,6 +360,8 @@ class EstimatorNode(GuardedNode):
 
     def _flush(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Use what still waits for a late topic; answers with the stamp [ns] of the last sample."""
+        while self._waiting:
+            self._work()
         self._show(self._online.flush())
         self._monitor.finish()
         self._diagnose()

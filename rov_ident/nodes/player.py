@@ -48,6 +48,10 @@ def apart(namespace: str) -> list[str]:
     return ["--ros-args", *(word for rule in rules for word in ("-r", rule))]
 
 
+def _report(data: bytes) -> Report:
+    return from_diagnostics(deserialize_message(data, DiagnosticArray))
+
+
 class Player(Node):  # type: ignore[misc]
     """Plays one bag into the nodes ``{estimator}_node`` of a namespace, which is theirs alone.
 
@@ -62,16 +66,18 @@ class Player(Node):  # type: ignore[misc]
         estimators: Iterable[str],
         writer: BagWriter | None,
         on_report: OnReport | None,
+        report_period: float,
         check: Callable[[], None],
         listened: Mapping[str, tuple[str, type]] = INPUTS,
         steered: int = 0,
     ) -> None:
         super().__init__("rov_ident_player", context=context, cli_args=apart(namespace))
-        self.reports: dict[str, Report] = {}
+        self._reports: dict[str, bytes] = {}  # the last of each estimator, as it came
+        self._told = dict.fromkeys(estimators, 0.0)  # s, of time.monotonic; when on_report was
         self._estimators = tuple(estimators)
         self._listeners = dict.fromkeys(listened, len(self._estimators)) | {RUDDER: steered}
         self._writer = writer
-        self._on_report = on_report
+        self._on_report, self._report_period = on_report, report_period
         self._check = check
         self._now = 0  # ns, of the bag
         self._clock_time: int | None = None
@@ -112,10 +118,16 @@ class Player(Node):  # type: ignore[misc]
         if self._writer:
             self._writer.write(topic, type_name, self._now, data)
         if topic.endswith("/coefficients"):
-            report = from_diagnostics(deserialize_message(data, DiagnosticArray))
-            self.reports[estimator] = report
-            if self._on_report:
-                self._on_report(estimator, report)
+            self._reports[estimator] = data
+            now = time.monotonic()
+            if self._on_report and now - self._told[estimator] >= self._report_period:
+                self._told[estimator] = now
+                self._on_report(estimator, _report(data))
+
+    @property
+    def reports(self) -> dict[str, Report]:
+        """The last report of each estimator that has made one."""
+        return {estimator: _report(data) for estimator, data in self._reports.items()}
 
     def _take_acknowledgement(self, estimator: str, count: UInt64) -> None:
         self._acknowledged[estimator] = count.data
@@ -177,7 +189,8 @@ class Player(Node):  # type: ignore[misc]
         return min(self._acknowledged.values()) >= count
 
     def _has_report(self, estimator: str, stamp: int) -> bool:
-        return estimator in self.reports and self.reports[estimator].stamp == stamp
+        data = self._reports.get(estimator)
+        return data is not None and _report(data).stamp == stamp
 
     def _wait(self, ready: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
         end = time.monotonic() + patience

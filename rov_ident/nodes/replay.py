@@ -58,13 +58,18 @@ def replay(
     rate: float = 1.0,
     out: str | os.PathLike[str] | None = None,
     on_report: OnReport | None = None,
+    report_period: float = 0.0,
 ) -> ReplayResult:
     """Play a bag over DDS into live nodes and record what they publish into the bag ``out``.
 
     ``rate`` is the speed relative to the recording; 0: as fast as the nodes can follow. No message
-    is lost at any rate. A replayed thruster wrench must not reach a vehicle: player and nodes have
-    a namespace of their own, hidden from whatever runs beside them; and unless
-    ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise, nothing leaves this computer or comes in.
+    is lost at any rate. ``on_report`` is called with the name of an estimator and each report of
+    it, or, as reading all of them takes a third of the player's time, with one in
+    ``report_period`` [s] of a clock on the wall.
+
+    A replayed thruster wrench must not reach a vehicle: player and nodes have a namespace of their
+    own, hidden from whatever runs beside them; and unless ROS_AUTOMATIC_DISCOVERY_RANGE says
+    otherwise, nothing leaves this computer or comes in.
 
     Raises UserError if the bag or configuration cannot be used.
     """
@@ -121,8 +126,9 @@ def replay(
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stack.callback(rclpy.try_shutdown, context=context)
         player = Player(
-            context, namespace, estimators, writer, on_report, check, listened, len(steered)
-        )
+            context, namespace, estimators, writer, on_report, report_period, check, listened,
+            len(steered),
+        )  # fmt: skip
         stack.callback(player.destroy_node)
         player.wait_for_nodes(next(recorded.iter_raw(topics.values())).log_time)
         if writer is not None:

@@ -174,12 +174,14 @@ class EffectJacobians:
         new._about[new._bodies] = self._about[self._bodies]
         return new
 
-    def measure(self, v: Array, omega: Array, has_imu: bool) -> None:
-        """The velocity (3,) and rate (3,) over ground before the next sample.
+    def measure(self, motion: NDArray[np.void], has_imu: bool) -> None:
+        """The kinematic filter's ``motion`` (1,), velocity and rate over ground before the next
+        sample.
 
         Not the measured ones: their noise would be in column and innovation alike.
         """
         for i, low, high in self._senses:
+            v, omega = motion["v"][0], motion["rate"][0]
             given = sense(Reading(v, omega, omega, _ZERO), self.config.effects)
             before, after = correct(given, low), correct(given, high)
             rate = before.gyro - after.gyro if has_imu else before.angular - after.angular

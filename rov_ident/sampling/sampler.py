@@ -240,8 +240,7 @@ class Sampler:
         sample["position"][0] = self._position
         sample["reading_noise"][0] = self._acting.reading_noise
         if self._jacobians is not None:
-            motion = self.kinematic_filter.state[0]
-            self._jacobians.measure(motion["v"], motion["rate"], has_imu=imu is not None)
+            self._jacobians.measure(self.kinematic_filter.state, has_imu=imu is not None)
         if restart:
             self.kinematic_filter.restart()
         taken, known, anew, stopped = self.kinematic_filter.step(
