@@ -915,3 +915,44 @@ def test_a_turned_velocity_sensor_in_a_current_is_no_heading_for_sure(seed):
     named = [n for n in ("heading_offset",) if n in choice.sensors]
     assert all(choice.alternatives.get(n) or n in choice.unsure for n in named)
     assert {"heading_offset", "sensor_misalignment"} & choice.sensors.keys()
+
+
+def held_by_an_autopilot(mass, seed, delay=0.0, seconds=150.0):
+    """A level vehicle whose autopilot answers every measured velocity, noise and all; the error of
+    its position is a random walk, which leaves the time of the velocities to the IMU."""
+    rng, step, every, ago = np.random.default_rng(seed), 0.01, 10, round(delay / 0.01)
+    gain, drag = rng.uniform(1.0, 2.0), rng.uniform(0.3, 1.5, 3)
+    swing, w, phase = rng.uniform(0.2, 0.4, 3), rng.uniform(0.25, 0.8, 3), rng.uniform(0, 6, 3)
+    v, v_dot, x, error = np.zeros((4, 3))
+    motion, forces, commands, velocities = [], [], [], [v]
+    for k in range(round(seconds / step)):
+        if k % every == 0:
+            error = error + 0.002 * rng.standard_normal(3)
+            read = velocities[max(k - ago, 0)] + 0.003 * rng.standard_normal(3)
+            motion.append([*(x + error), *read])
+            angle = w * k * step + phase
+            wanted, slope = swing * np.sin(angle), swing * w * np.cos(angle)
+            commands.append(mass * (gain * (wanted - read) + slope + drag * wanted))
+        before, v_dot = v_dot, commands[-1] / mass - drag * v
+        force = 0.5 * (before + v_dot) - [0.0, 0.0, 9.81]  # it steps there
+        forces.append(force + 0.03 * rng.standard_normal(3))
+        x, v = x + step * v, v + step * v_dot
+        velocities.append(v)
+    motion, level = np.array(motion), np.tile([1.0, 0.0, 0.0, 0.0], (len(motion), 1))
+    t, imu_t = every * step * np.arange(len(motion)), step * np.arange(len(forces))
+    rates, gyro = (0.001 * rng.standard_normal((n, 3)) for n in (len(t), len(imu_t)))
+    nu, demand = np.hstack([motion[:, 3:], rates]), np.pad(commands, ((0, 0), (0, 3)))
+    none = np.zeros(0), np.zeros((0, 4))
+    return Streams(t, motion[:, :3], level, nu, imu_t, gyro, np.array(forces), t, demand, *none)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, *more(3, 4, 5)])
+def test_an_autopilot_that_answers_noise_does_not_make_velocities_late(heavy, seed):
+    """Accelerations and thrust afterwards know of the noise: it had made 30 ms into 37 +- 5."""
+    for delay in (0.0, 0.03, 0.1):
+        streams = held_by_an_autopilot(heavy.model.body.mass, seed, delay)
+        found, std = sensors_of(streams, heavy)
+        assert found.keys() == ({"velocity_latency"} if delay else set())
+        if delay:
+            off = found["velocity_latency"]["delay"] - delay
+            assert abs(off) < min(4.0 * std["velocity_latency", "delay"], 0.01), (delay, off, std)

@@ -26,7 +26,6 @@ def add(commands: common.Commands) -> None:
     replay.add_argument("--out", type=Path, help="bag to write")
 
 
-
 def _replay(options: argparse.Namespace) -> None:
     from rov_ident.core.states import State
     from rov_ident.nodes.conversions import for_json

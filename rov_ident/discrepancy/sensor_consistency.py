@@ -10,11 +10,17 @@ and the odometry's angular rate with the gyro. A dead-reckoned difference is a r
 white noise; the one-step innovations of that local-level model (Durbin and Koopman 2012, ch. 2) are
 white, and every regressor goes through the same filter: generalised least squares. All sensor
 effects are linear to first order, and the fit is repeated about its own result.
+
+A controller answers the noise of what it measures, so what the vehicle does next depends on noise
+that is in y. Noise is independent of regressors that are determined before it, as in the
+identification of any closed loop (Ljung 1999, ch. 13): accelerations and thrust are those before.
+And innovations contain earlier noise as far as the gain of their filter goes, so what an answer may
+pass for must show with a lesser gain, too.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -45,6 +51,8 @@ from rov_ident.sampling.raw_streams import Streams, in_place, measured_at, orien
 # Gains of the local-level filter that are tried, from a random walk that hardly moves to one beside
 # which the white noise is nothing, about a factor of three apart.
 _GAINS = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.95)
+_LESSER = 1.3  # times the least innovations: a gain of a third, "Controllers" in docs/explain.md
+_ANSWERS = ("velocity_latency", "velocity_scale")  # what a controller's answer may pass for
 _OUTLIER = 24.0  # robust standard deviations; wide, as what a sensor does wrong is still in them
 _SMOOTHING = 0.2  # s; of angular rates: shorter than a vehicle turns, longer than noise
 _DRIFT = 1.0  # s; from which the pose tells velocity better than the IMU
@@ -52,7 +60,7 @@ _STEADY = 0.5  # s; in which the pose tells velocity where there is no IMU
 _ATTITUDE_TIME = 1.0  # s; in which the integrated gyro is drawn to the measured attitude
 _MAX_GAP = 0.5  # s without a message: no step of dead reckoning reaches across
 _REACH = 4.0  # standard deviations of a Gaussian filter, beyond which its weights are below 1e-4
-_CLOCK = 0.05  # s by which the IMU's clock is set on and back: less than an ROV's response
+_CLOCK = 0.05  # s by which the IMU's clock is set on: less than an ROV's response
 _FEWEST_IMU = 8  # messages of the IMU; fewer are none
 FEWEST = 20  # instants that are compared: about as many as there are parameters (16)
 CLUSTER = 5.0  # s; of which residuals are correlated, as long as the windows of the dynamics
@@ -84,10 +92,9 @@ TIMING = (
 
 To the accelerations of thrust that is a time offset of milliseconds, the drag that answers to them
 is not offset: together they would pass for a velocity scale of up to two percent. Further off than
-half an interval of the IMU no step is: what is, is thrust that follows the noise of the velocities
-(an autopilot's), and would pass for velocities that are late and too small. And the IMU's
-stamps may be early or late by milliseconds: only a pose of their own clock tells that velocities
-are old. And the IMU may sit elsewhere than configured: only a pose tells that of the velocities.
+half an interval of the IMU no step is. And the IMU's stamps may be early or late by milliseconds:
+only a pose of their own clock tells that velocities are old. And the IMU may sit elsewhere than
+configured: only a pose tells that of the velocities.
 """
 
 
@@ -101,8 +108,11 @@ def _keys() -> tuple[Key, ...]:
     return (*sensor_parameters(), *TIMING)
 
 
-def comparisons(streams: Streams, config: Config, effects: Values) -> list[Comparison]:
-    """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors."""
+def comparisons(
+    streams: Streams, config: Config, effects: Values, tolerance: float = 1.0
+) -> list[Comparison]:
+    """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors;
+    ``tolerance`` as :func:`whitened` has it."""
     keys = sensor_parameters()
     as_read = streams.nu[:, :3]
     streams = in_place(streams, effects)
@@ -144,18 +154,16 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
             - inertial.integrated(s.specific_force, at)[inside]
             for m, s in zip(moved, shift, strict=True)
         ]
-        held = np.clip(np.searchsorted(streams.demand_t, at[inside], side="right") - 1, 0, None)
+        # no stamp of a command that answers this very measurement is so far before it
+        unaware = at[inside] - 0.5 * float(np.median(np.diff(streams.t)))
+        held = np.clip(np.searchsorted(streams.demand_t, unaware, side="right") - 1, 0, None)
         thrust = streams.demand[held, :3] / config.model.body.mass
         columns += [r_then[inside][:, :, i] * thrust[:, i : i + 1] for i in range(3)]
         clock = none[-1]
         if streams.has_pose:
-            early, late = (
-                _DeadReckoning(
-                    dataclasses.replace(streams, imu_t=streams.imu_t + by), config, there, rate
-                ).velocity_at(at)
-                for by in (-_CLOCK, _CLOCK)
-            )
-            clock = posed[:, None] * (early - late) / (2.0 * _CLOCK)
+            late = dataclasses.replace(streams, imu_t=streams.imu_t + _CLOCK)
+            before = _DeadReckoning(late, config, there, rate).velocity_at(at)
+            clock = posed[:, None] * (inertial.velocity_at(at) - before) / _CLOCK
         arms = none[:3]
         if streams.has_pose:
             turned_then = interpolated(streams.t, gyrating, at)
@@ -169,7 +177,7 @@ def comparisons(streams: Streams, config: Config, effects: Values) -> list[Compa
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
         made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
     return [
-        Comparison(name, *whitened(t, y, columns, walk=name != "gyro"), _white(t, y))
+        Comparison(name, *whitened(t, y, columns, name != "gyro", tolerance), _white(t, y))
         for name, t, y, columns in made
         if len(t) > FEWEST
     ]
@@ -199,7 +207,8 @@ def _unit_change(reading: Reading, key: Key, t: Array, down: Array) -> Reading:
     world down in body axes; of a heading, what turns a velocity in the world as much."""
     effect, none = EFFECTS[key[0]], np.zeros_like(down)
     if effect.late is not None:
-        return Reading(-np.gradient(reading.linear, t, axis=0), none, none, none)
+        slope = np.diff(reading.linear, axis=0) / np.diff(t)[:, None]
+        return Reading(-np.concatenate([slope[:1], slope]), none, none, none)
     if effect.heading is not None:
         turned_force = np.cross(down, reading.specific_force)
         return Reading(np.cross(down, reading.linear), none, none, turned_force)
@@ -306,15 +315,15 @@ def _filter_attitude(q, known, t, rate):
 
 
 def whitened(
-    t: Array, y: Array, columns: Sequence[Array], walk: bool
+    t: Array, y: Array, columns: Sequence[Array], walk: bool, tolerance: float = 1.0
 ) -> tuple[Array, Array, Array, float]:
-    """Innovations of the local-level model with the gain that leaves the least of them: times,
-    innovations and columns, in units of the noise, of what is no outlier, and the noise. Without a
-    ``walk`` y is white as it is."""
+    """Innovations of the local-level model with the smallest gain that leaves no more than
+    ``tolerance`` times the least of them: times, innovations and columns, in units of the noise, of
+    what is no outlier, and the noise. Without a ``walk`` y is white as it is."""
     gap = np.diff(t, prepend=t[0]) > _MAX_GAP
     gap[0] = True
     use = [c for c in columns if c.any()]
-    best, least = None, np.inf
+    spreads = {}
     for gain in _GAINS if walk else (None,):
         e = _innovations(y, gain, gap)
         if use:
@@ -322,9 +331,9 @@ def whitened(
         else:
             a = np.zeros((y.size, 0))
         left = e.ravel() - a @ np.linalg.lstsq(a, e.ravel(), rcond=None)[0]
-        spread = float(robust_std(left))
-        if spread < least:
-            least, best = spread, gain
+        spreads[gain] = float(robust_std(left))
+    smallest = min(spreads.values())
+    best, least = next(item for item in spreads.items() if item[1] <= tolerance * smallest)
     e = _innovations(y, best, gap)
     full = np.stack([_innovations(c, best, gap) for c in columns], axis=-1)
     least = max(least, 1e-9)
@@ -431,19 +440,11 @@ def common_squares(
     return out[out[:, -1].any(axis=1)]
 
 
-def _shown_by_a_fit(
-    streams: Streams,
-    config: Config,
-    spans: Sequence[tuple[float, float]],
-    names: Sequence[str],
-    keys: Sequence[Key],
-    fixed: Container[Key],
-) -> list[Key]:
-    """Those of the parameters ``keys`` that a fit shows, where the linear view from far off did
-    not: a delay of a fifth of a period is no longer its derivative, and what the first step leaves
-    is as coloured as what it takes. At the end of the fit it is small, and so is what is left
-    (Wald)."""
-    values, std = search(streams, config, spans, names, fixed)
+def _shown(values: Values, std: Mapping[Key, float], keys: Sequence[Key]) -> list[Key]:
+    """Those of the parameters ``keys`` whose effects a fit shows that ended at these values (Wald),
+    where the linear view from far off did not: a delay of a fifth of a period is no longer its
+    derivative, and what the first step leaves is as coloured as what it takes. At the end of the
+    fit it is small, and so is what is left."""
     shown = []
     for name in dict.fromkeys(name for name, _ in keys):
         own = [k for k in keys if k[0] == name and std.get(k, 0.0) > 0.0]
@@ -464,22 +465,47 @@ def search(
     deviations of their parameters; with ``allowed`` just these are fitted, whatever they score;
     the parameters ``fixed`` stay at their null."""
     library = [e.name for e in _LIBRARY]
-    library = library if allowed is None else [n for n in library if n in set(allowed)]
+    if allowed is not None:
+        names = [n for n in library if n in set(allowed)]
+        return _searched(streams, config, spans, names, fixed, chooses=False)
+    while True:
+        found, std = _searched(streams, config, spans, library, fixed, chooses=True)
+        keys = [(n, parameter) for n in found if n in _ANSWERS for parameter in found[n]]
+        if not keys:
+            return found, std
+        again = _searched(streams, config, spans, [*found], fixed, False, _LESSER)
+        answers = {n for n, _ in keys} - {n for n, _ in _shown(*again, keys)}
+        if not answers:
+            return again
+        library = [n for n in library if n not in answers]
+
+
+def _searched(
+    streams: Streams,
+    config: Config,
+    spans: Sequence[tuple[float, float]],
+    library: Sequence[str],
+    fixed: Container[Key],
+    chooses: bool,
+    tolerance: float = 1.0,
+) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
+    """The same of effects of the ``library`` that score, if the search ``chooses``, or of all."""
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     for _ in range(ROUNDS):
-        rows = _rows(comparisons(streams, config, found), spans, streams)
+        rows = _rows(comparisons(streams, config, found, tolerance), spans, streams)
         linear = _linear(rows)
         free = [key for key in linear.keys if key not in fixed]
         chosen = [key for key in free if key[0] in found]
         units = [[k for k in free if k[0] == n] for n in library if n not in found]
         added = [k for unit in units for k in unit]
-        if allowed is None:
+        if chooses:
             best, score, _ = _scores(rows, [*chosen, *TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
             if best.keys and not added:
-                names = list(dict.fromkeys(name for name, _ in best.keys))
-                added = _shown_by_a_fit(streams, config, spans, [*found, *names], best.keys, fixed)
+                names = [*found, *dict.fromkeys(name for name, _ in best.keys)]
+                fitted = _searched(streams, config, spans, names, fixed, False)
+                added = _shown(*fitted, best.keys)
         both = [*chosen, *added]
         if not both:
             break
