@@ -19,7 +19,7 @@ from rov_ident.core.frames import FrameDefaults, quaternion_from_euler, quaterni
 from rov_ident.core.messages import Array
 from rov_ident.effects import EFFECTS, Values, rigid_body
 from rov_ident.model import thruster_allocation as thrusters
-from rov_ident.model.coefficients import INPUTS, Coefficient
+from rov_ident.model.coefficients import FINS, INPUTS, Coefficient
 from rov_ident.model.equations import GRAVITY, Model
 
 T = TypeVar("T")
@@ -206,6 +206,10 @@ class Inputs:
     delta_r: Fin = Fin()
     delta_a: Fin = Fin()
     n: Shaft = Shaft()
+    fin_lag_std: float = not_negative(
+        0.5, "of the time constant with which fins follow the angles that are read; zero: at once",
+        "s",
+    )  # fmt: skip
 
     @property
     def joints(self) -> dict[str, Fin | Shaft]:
@@ -216,7 +220,8 @@ class Inputs:
     @property
     def standard(self) -> "Inputs":
         """The same joints beside odometry and a wrench."""
-        return Inputs(delta_s=self.delta_s, delta_r=self.delta_r, delta_a=self.delta_a, n=self.n)
+        given = {name: getattr(self, name) for name in (*INPUTS, "fin_lag_std")}
+        return Inputs(**given)
 
     @property
     def is_twist(self) -> bool:
@@ -472,6 +477,8 @@ class Config:
     def nuisance_std(self) -> dict[tuple[str, str], float]:
         """Prior standard deviations of what no vehicle's file knows, by (effect, parameter)."""
         body, vehicle = self.model.body, self.vehicle_uncertainty
+        turned = {name for c in self.model.coefficients for name in c.inputs} & {*FINS}
+        has_fins = bool(turned & self.inputs.joints.keys())
         std = {
             ("thrust_scale", "scale"): self.wrench.scale_std,
             ("thruster_lag", "time_constant"): self.wrench.lag_std,
@@ -480,6 +487,7 @@ class Config:
             ("buoyancy", "delta"): vehicle.buoyancy_std * body.weight,
             **{("cog_offset", name): vehicle.cog_std for name in ("dx", "dy", "dz")},
             ("velocity_latency", "delay"): self.odometry.latency_std,
+            ("fin_lag", "time_constant"): self.inputs.fin_lag_std if has_fins else 0.0,
         }
         return {key: value for key, value in std.items() if value > 0.0}
 

@@ -57,6 +57,7 @@ EVEN = frozenset("X_vv X_ww X_pp X_qq X_rr Z_uu Z_pp Z_rr M_uu M_pp M_rr".split(
 INPUTS = ("delta_s", "delta_r", "delta_a", "n")
 """What drives a vehicle beside the thrusters' wrench: equivalent cross-tail angles [rad] of stern
 planes, rudder and aileron (:mod:`rov_ident.model.fins`), the propeller's revolutions a second."""
+FINS = INPUTS[:3]
 INPUT_LETTERS = "sran"  # the inputs in the names of coefficients
 
 # Places in the extended state [1, nu, |nu|, min(nu, 0), u^2, inputs] of equations.extend.

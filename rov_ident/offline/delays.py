@@ -5,7 +5,7 @@ and filtered wrench and motion are one regression, with the delay as one more co
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,32 +64,43 @@ NO_DELAY = Delay(np.nan, np.nan)
 @dataclass(frozen=True)
 class Filtered:
     """Filtered wrench (K, 6), motion ``phi`` (K, 6, n + 1) = [Phi y] of the same regression, at t
-    (K,) s, and which axes are ``driven`` (6,)."""
+    (K,) s, and which axes are ``driven`` (6,). ``steered`` (K, 6, n + 1) is what of ``phi`` fins
+    and shafts make, None where there are none."""
 
     t: Array
     phi: Array
     wrench: Array
     driven: NDArray[np.bool_]
+    steered: Array | None = None
 
     def part(self, which: slice) -> "Filtered":
         """The same of some rows."""
-        return Filtered(self.t[which], self.phi[which], self.wrench[which], self.driven)
+        steered = None if self.steered is None else self.steered[which]
+        return Filtered(self.t[which], self.phi[which], self.wrench[which], self.driven, steered)
+
+    def drive(self, x: Array) -> Array:
+        """What drives the vehicle (K, 6), with estimates x (n,) in prior standard deviations from
+        the configured coefficients."""
+        if self.steered is None:
+            return self.wrench
+        return self.wrench + self.steered[:, :, -1] - self.steered[:, :, :-1] @ x
 
 
-def ahead_of_wrench(ahead: float) -> str:
-    """What it means that the motion is so long [s] ahead."""
+def ahead_of_wrench(ahead: float, drive: str = "the wrench") -> str:
+    """What it means that the motion is so long [s] ahead of what drives the vehicle."""
     return (
-        f"the motion is {1e3 * ahead:.0f} ms ahead of the wrench, as nothing that thrusts can be: "
+        f"the motion is {1e3 * ahead:.0f} ms ahead of {drive}, as nothing that is driven can be: "
         "correct the time stamps, or record each command that the controller sends"
     )
 
 
-def behind_wrench(behind: float) -> str:
+def behind_wrench(behind: float, drive: str = "the wrench") -> str:
     """What it means that the motion is so long [s] behind, in a model in which nothing is late."""
     return (
-        f"the motion is {1e3 * behind:.0f} ms behind the wrench, and nothing in this fit makes it "
+        f"the motion is {1e3 * behind:.0f} ms behind {drive}, and nothing in this fit makes it "
         "late, so that added mass and damping do: correct the time stamps, or let the file have a "
-        "lag (wrench.lag_std, effects.thruster_lag; rls, ukf and ml estimate it)"
+        "lag (wrench.lag_std or effects.thruster_lag, of fins inputs.fin_lag_std or "
+        "effects.fin_lag; rls, ukf and ml estimate it)"
     )
 
 
@@ -134,10 +145,18 @@ def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
     wrench = filtered_rows(task, still, PERIOD)[0][:, :, -1]
     if len(phi) < _FEWEST_ROWS or len(phi) != len(wrench):
         return None
-    size = np.sqrt(np.mean(wrench**2, axis=0))
+    rows = Filtered(t, phi, wrench, np.ones(6, dtype=bool))
+    if samples["inputs"].any():
+        still = samples.copy()
+        still["inputs"] = 0.0
+        rows = replace(rows, steered=phi - filtered_rows(task, still, PERIOD)[0])
+    size = np.sqrt(np.mean(rows.drive(np.zeros(phi.shape[2] - 1)) ** 2, axis=0))
     if is_without_velocity(samples):  # forces drive what is simulated itself
         size[:3] = 0.0
-    return Filtered(t, phi, wrench, size > AT_REST * authority(config.dynamics))
+    driven = size > AT_REST * authority(config.dynamics)
+    if rows.steered is not None:
+        driven |= rows.steered.any(axis=(0, 2))
+    return replace(rows, driven=driven)
 
 
 def samples_of(streams: Streams) -> NDArray[np.void]:
@@ -197,19 +216,24 @@ def _lag(t: Array, early: Array, late: Array, known: NDArray[np.bool_]) -> Delay
 
 def motion_behind_wrench(rows: Filtered) -> Delay:
     """The coefficients are refitted along with it: tau(t - d) is tau - d tau', so the derivative of
-    the wrench is one more column, and the delay its factor."""
-    phi, wrench, driven = rows.phi, rows.wrench, rows.driven
-    slope, spacing = np.gradient(wrench, rows.t, axis=0), spacing_of(rows.t)
+    what drives the vehicle is one more column, and the delay its factor."""
+    phi, driven, spacing = rows.phi, rows.driven, spacing_of(rows.t)
+    n = phi.shape[2]
     steps = np.abs(np.diff(rows.t))  # a clock may have been set back
     inside = np.maximum(steps[1:], steps[:-1]) < _GAP * spacing
-    table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)
-    table = table[1:-1][inside]
-    n = table.shape[2] - 1
-    if not slope[:, driven].any() or len(table) < 5 * n:  # a wrench that holds shows no time
+    if inside.sum() < 5 * n:
         return NO_DELAY
-    weight = np.where(driven, 1.0 / np.maximum(np.mean(wrench**2, axis=0), 1e-12), 0.0)
-    prior = np.append(np.ones(n - 1), 0.0)
+    x = np.zeros(n)
+    prior, weight = np.append(np.ones(n - 1), 0.0), None
     for _ in range(3):
+        drive = rows.drive(x[:-1])
+        slope = np.gradient(drive, rows.t, axis=0)
+        if not slope[:, driven].any():  # a wrench that holds shows no time
+            return NO_DELAY
+        table = np.concatenate([phi[:, :, :-1], slope[:, :, None], phi[:, :, -1:]], axis=2)
+        table = table[1:-1][inside]
+        if weight is None:
+            weight = np.where(driven, 1.0 / np.maximum(np.mean(drive**2, axis=0), 1e-12), 0.0)
         a = np.einsum("kai,a,kaj->ij", table, weight, table)
         normal = a[:n, :n] + np.diag(prior)
         x = scaled_solve(normal, a[:n, n])
@@ -221,22 +245,25 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
 
 
 def is_late(effects: Iterable[str]) -> bool:
-    """Whether any of the effects makes thrust or velocities late."""
-    return any("late" in EFFECTS[name].traits or EFFECTS[name].late for name in effects)
+    """Whether any of the effects makes thrust, fins or velocities late."""
+    late = ("late" in EFFECTS[name].traits or EFFECTS[name].late for name in effects)
+    return any(late) or "fin_lag" in effects
 
 
 def tests_of(streams: Streams, config: Config, late: bool) -> list[Test]:
     """Whether the motion is ahead of the wrench: what a fit asks that learns from both; and where
     nothing in its model makes thrust or velocities ``late``, whether it is behind. Nothing where
-    nothing moves, or fins and propellers drive it, too: the wrench alone says not when.
+    nothing moves.
     """
-    rows = None if len(streams.inputs_t) else filtered(samples_of(streams), config)
+    rows = filtered(samples_of(streams), config)
     found = NO_DELAY if rows is None else motion_behind_wrench(rows)
-    if not np.isfinite(found.value):
+    if rows is None or not np.isfinite(found.value):
         return []
+    drive = "wrench, fins and shafts" if rows.steered is not None else "the wrench"
     ahead, limit = found.ahead
-    tests = [Test("motion ahead of the wrench", ahead, limit, ahead_of_wrench(ahead))]
+    tests = [Test("motion ahead of the wrench", ahead, limit, ahead_of_wrench(ahead, drive))]
     if not late:
         behind, limit = found.behind
-        tests.append(Test("motion behind the wrench", behind, limit, behind_wrench(behind)))
+        words = behind_wrench(behind, drive)
+        tests.append(Test("motion behind the wrench", behind, limit, words))
     return tests
