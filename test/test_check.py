@@ -29,6 +29,7 @@ from rov_ident.experiment.messages_alone import (
 )
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
+from rov_ident.model.thruster_allocation import matrix
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.batch_fit import fit_batch
 from rov_ident.offline.delays import Delay, Filtered, filtered, motion_behind_wrench, samples_of
@@ -550,6 +551,22 @@ def test_a_flight_goes_as_far_as_the_vehicle_does(heavy, effects):
     dive = closed_loop_manoeuvres.dive(config, manoeuvre, 30.0, Limits(), sensors.Suite())
     reach = np.abs(dive.truth.position).max(axis=0)
     np.testing.assert_allclose(reach[0], flight.reach[0], rtol=0.05)
+
+
+def test_a_plan_asks_for_what_the_thrusters_can_do():
+    """Those of a BlueROV2 in surge make a moment in pitch, and none pushes about pitch alone."""
+    six = configuration.load("config/bluerov2.yaml")
+    b = matrix(six.thrusters)
+    everything = closed_loop_manoeuvres.library(Limits())[-2]
+    demand = fly(six, everything, 20.0, Limits()).demand
+    forces = np.linalg.lstsq(b, demand.T, rcond=None)[0]
+    np.testing.assert_allclose(b @ forces, demand.T, atol=1e-9)
+    assert np.linalg.matrix_rank(b) == 5 and (np.abs(demand).max(axis=0) > 0.0).all()
+    bound = authority(six.dynamics)
+    assert (np.abs(demand) <= bound * (1.0 + 1e-12)).all()
+    assert not propose(six, None, 10.0).notes
+    (note,) = propose(configuration.load("config/remus100.yaml"), None, 10.0).notes
+    assert "leaves fins and shafts still" in note
 
 
 def test_the_proposal_is_safe_and_shrinks_the_worst(heavy, proposal):

@@ -399,4 +399,4 @@ def plan(
     known = archive.opened(paths, given, say=say) if paths else contextlib.nullcontext()
     with known as bags:
         found = design.propose(given, bags, duration, limits, say)
-    return dataclasses.replace(found, notes=placed)
+    return dataclasses.replace(found, notes=(*placed, *found.notes))

@@ -17,6 +17,7 @@ from rov_ident.core.frames import quaternion_to_matrix, wrap_angle
 from rov_ident.effects import act, compiled, memory
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import WORKING_SPEED, authority
+from rov_ident.model.thruster_allocation import matrix
 from rov_ident.simulation.open_loop import simulate
 from rov_ident.simulation.virtual_sensors import Dive, Suite, measure
 
@@ -91,6 +92,7 @@ def fly(config: Config, manoeuvre: AlternatingTargets, duration: float, limits: 
     """Simulate the configured vehicle under the controller. UserError if that diverges."""
     model, effects = config.dynamics, compiled(config.effects)
     bound = limits.thrust * authority(model)
+    reachable = _reachable(config)
     gain = np.diag(model.mass_matrix) * _STIFFNESS**2
     damping = 2.0 * np.diag(model.mass_matrix) * _STIFFNESS
     waves = _multisine(duration)
@@ -108,7 +110,8 @@ def fly(config: Config, manoeuvre: AlternatingTargets, duration: float, limits: 
         off[5] = wrap_angle(target[3] - heading)
         wrench = gain * off - damping * nu - model.body.restoring @ r[2]
         wrench[3:5] = bound[3:5] * np.array(manoeuvre.torque) * waves[:, k]
-        demand[k] = np.clip(wrench, -bound, bound)
+        possible = reachable @ np.clip(wrench, -bound, bound)
+        demand[k] = possible / max(1.0, float((np.abs(possible) / bound).max()))
         acting = demand[k].copy()
         act(effects, of_thrusters, float(t), CONTROL, acting)
         run = simulate(
@@ -119,6 +122,20 @@ def fly(config: Config, manoeuvre: AlternatingTargets, duration: float, limits: 
         reach = np.maximum(reach, np.abs(position))
         tilt = max(tilt, float(np.arccos(np.clip(r[2, 2], -1.0, 1.0))))
     return Flight(times, demand, reach, tilt)
+
+
+def _reachable(config: Config) -> Array:
+    """What turns a wrench into the nearest one (6, 6) that the thrusters can make, relative to the
+    working wrench of each axis; the same one where they make any, or are not known."""
+    known = config.thrusters
+    if not (known.allocation or known.position):
+        return np.eye(6)
+    weight = 1.0 / authority(config.dynamics)
+    scaled = weight[:, None] * matrix(known)
+    if np.linalg.matrix_rank(scaled) == 6:
+        return np.eye(6)
+    out: Array = scaled @ np.linalg.pinv(scaled) * weight / weight[:, None]
+    return out
 
 
 def _multisine(duration: float) -> Array:
