@@ -145,7 +145,7 @@ def surge_runs(noise=0.005, seed=0):
     n = np.select([t < 8.0, t < 16.0, t < 25.0], [10.0, 18.0, 25.0], 0.0)
     inertia = MASS - TRUE["X_udot"]
     ratio = np.array([TRUE[k] for k in ("k1", "k2", "X_u", "X_uu")]) / inertia
-    u = _simulated(ratio, 0.0, t, n)
+    u = _simulated(ratio, 0.0, 0.0, t, n)
     rng = np.random.default_rng(seed)
     return [Run(t, n, u + noise * rng.standard_normal(len(t))) for _ in range(2)]
 
@@ -181,6 +181,39 @@ def test_intervals_hold_a_slow_error_beneath_white_noise():
         off = np.abs(found.values - [TRUE[name] for name in found.names])[:4]
         inside.append(off < found.quantile * found.std[:4])
     assert np.mean(inside) > 0.8
+
+
+@pytest.mark.parametrize("hidden", ["lag", "water", "zero"])
+def test_a_lag_a_current_and_a_zero_of_the_speeds_are_allowed_for(hidden):
+    """By another integrator. Unallowed for, they put thrust and drag 10 to 110 standard deviations
+    off without a word."""
+    inside, off = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        lag = rng.uniform(0.3, 0.6) if hidden == "lag" else 0.0
+        moves = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.05, 0.15, 2) * (hidden == "water")
+        zero = np.repeat(rng.choice([-1.0, 1.0]) * rng.uniform(0.03, 0.06), 2) * (hidden == "zero")
+        inertia, runs = MASS - TRUE["X_udot"], []
+        for shift in moves + zero:
+            t = np.arange(0.0, 50.0, 0.1)
+            n = np.select([t < 8.0, t < 16.0, t < 25.0], [10.0, 18.0, 25.0], 0.0)
+            u, push, step, through = 0.0, 10.0 * TRUE["k1"] + 100.0 * TRUE["k2"], 0.002, []
+            for k in range(len(t)):
+                through.append(u)
+                asked = n[k] * TRUE["k1"] + n[k] ** 2 * TRUE["k2"]
+                for _ in range(50):
+                    push += (asked - push) * (step / lag if lag else 1.0)
+                    u += step * (push + TRUE["X_u"] * u + TRUE["X_uu"] * abs(u) * u) / inertia
+            runs.append(Run(t, n, np.array(through) + shift + 0.01 * rng.standard_normal(len(t))))
+        given = {"added_mass": TRUE["X_udot"]}
+        found = fit_coast_downs(runs, MASS, **given, current_std=0.3, lag_std=0.2)
+        blind = fit_coast_downs(runs, MASS, **given)
+        true = np.array([TRUE[name] for name in found.names])[:4]
+        inside.append(np.abs(found.values[:4] - true) < found.quantile * found.std[:4])
+        off.append(np.abs((blind.values[:4] - true) / blind.std[:4]).max())
+        told = " ".join(found.notes)
+        assert ("time constant of" if hidden == "lag" else "run by run") in told, told
+    assert np.mean(inside) > 0.8 and max(off) > 5.0
 
 
 def test_intervals_count_what_the_scale_is_off_by():
@@ -243,6 +276,8 @@ def test_coast_down_on_the_command_line(heavy_path, tmp_path, capsys):
         added_mass=heavy.value("X_udot"),
         mass_std=heavy.vehicle_uncertainty.mass_std * mass,
         added_mass_std=prior_of(heavy).std[heavy.estimate.index("X_udot")],
+        current_std=heavy.current_std,
+        lag_std=heavy.wrench.lag_std,
     )
     assert told["coefficients"] == found.entries()
     assert told["speed_rmse_mps"] == found.rmse

@@ -42,6 +42,7 @@ def _coast_down(options: argparse.Namespace) -> None:
         anchor = {"added_mass": config.value("X_udot"), "added_mass_std": std}
     mass = model.body.mass
     anchor["mass_std"] = config.vehicle_uncertainty.mass_std * mass
+    anchor |= {"current_std": config.current_std, "lag_std": config.wrench.lag_std}
     with common.progress(options) as tell:
         tell("fitting")
         found = coast_down.fit_coast_downs(runs, mass, **anchor)

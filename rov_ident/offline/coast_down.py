@@ -7,7 +7,9 @@ is the same. Speeds alone tell the *ratios* to the inertia; one force or mass fr
 the scale: a bollard pull, or the added mass (a spheroid's, say).
 
 Fitted by output error: u is simulated from the shaft speed n, run by run, each from an estimated
-starting speed, and compared with the measured one.
+starting speed, and compared with the measured one. Beside them are estimated, with priors about
+none: a lag of the thrust, and for each run by how much measured speeds are off those through the
+water, by a current or the sensor's zero. A drag that is linear in u takes up either otherwise.
 """
 
 import math
@@ -24,8 +26,11 @@ from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import scaled_inverse
 from rov_ident.io.csv_table import read_csv
 from rov_ident.model.equations import Array, build
-from rov_ident.reports.result import Result, as_json
+from rov_ident.reports.result import NORMAL, Result, as_json
 
+_FIRST_NOISE = 0.01  # of the largest speed
+_FIRST_LAG = 0.4  # prior standard deviations, as config.prior has it: at none it has no slope
+_ROUNDS = 3  # of weighing priors against the noise that the fit before has left
 _UNITS = {"k1": "N/n", "k2": "N/n2", "X_u": "N s/m", "X_uu": "N s2/m2", "X_udot": "kg"}
 
 
@@ -82,11 +87,15 @@ def fit_coast_downs(
     bollard: tuple[float, float] | None = None,
     mass_std: float = 0.0,
     added_mass_std: float = 0.0,
+    current_std: float = 0.0,
+    lag_std: float = 0.0,
 ) -> CoastDown:
     """Fit step-up and coast-down runs.
 
     ``added_mass``: X_udot [kg], not positive; or ``bollard``: a shaft speed and the thrust [N] at
-    rest there. One of the two. ``mass_std`` and ``added_mass_std``: standard deviations [kg].
+    rest there. One of the two. ``mass_std`` and ``added_mass_std``: standard deviations [kg];
+    ``current_std`` [m/s] of what speeds are off by, ``lag_std`` [s] of the time constant with which
+    thrust follows the shaft; zero: none.
 
     Raises UserError if the scale is not given, or the runs lack thrust, coasting, or speed.
     """
@@ -106,17 +115,40 @@ def fit_coast_downs(
         [speed / rise / shaft, speed / rise / shaft**2, 1.0 / rise, 1.0 / (rise * speed)]
     )
 
-    def errors_of(x: Array) -> list[Array]:
-        return [r.u - _simulated(x[:4] * size, x[4 + k], r.t, r.n) for k, r in enumerate(runs)]
+    # parameters with a prior: the lag, then what each run is off by, in standard deviations
+    supposed = np.array([lag_std] + [current_std] * len(runs))
+    beside, first = supposed > 0.0, 4 + len(runs)
 
-    start = np.concatenate([[0.5, 0.5, -0.5, -0.5], [float(np.median(r.u[:5])) for r in runs]])
-    found = least_squares(lambda x: np.concatenate(errors_of(x)), start, x_scale="jac")
-    ratio = found.x[:4] * size
-    errors = errors_of(found.x)
-    left = np.concatenate(errors)
-    # residuals of one run are alike from point to point: allow for it by their own correlation
-    variance = float(left @ left) / max(len(left) - len(found.x), 1) * _inflation(errors)
-    covariance = scaled_inverse(found.jac.T @ found.jac)[:4, :4] * variance
+    def errors_of(x: Array) -> list[Array]:
+        more = np.zeros(len(supposed))
+        more[beside] = x[first:] * supposed[beside]
+        return [
+            r.u - off - _simulated(x[:4] * size, start, more[0], r.t, r.n)
+            for start, off, r in zip(x[4:first], more[1:], runs, strict=True)
+        ]
+
+    def weighed(x: Array, noise: float) -> Array:
+        return np.concatenate([*errors_of(x), noise * x[first:]])
+
+    least = np.full(first + len(supposed), -np.inf)
+    least[first] = 0.0  # of the lag
+    least = least[np.append(np.ones(first, dtype=bool), beside)]
+    begin = np.array([0.5, 0.5, -0.5, -0.5] + [float(np.median(r.u[:5])) for r in runs])
+    x = np.append(begin, np.where(least[first:] == 0.0, _FIRST_LAG, 0.0))
+    noise = _FIRST_NOISE * speed  # m/s; against which priors are weighed
+    for _ in range(_ROUNDS):
+        found = least_squares(weighed, x, x_scale="jac", bounds=(least, np.inf), args=(noise,))
+        x, errors = found.x, errors_of(found.x)
+        left = np.concatenate(errors)
+        # residuals of one run are alike from point to point: allow for it by their own correlation
+        variance = float(left @ left) / max(len(left) - len(x), 1) * _inflation(errors)
+        noise = float(np.sqrt(variance))
+    ratio = x[:4] * size
+    whole = scaled_inverse(found.jac.T @ found.jac) * variance
+    told = np.zeros((2, len(supposed)))
+    told[:, beside] = supposed[beside] * [x[first:], np.sqrt(np.diag(whole))[first:]]
+    notes = _notes(*told)
+    covariance = whole[:4, :4]
     covariance = covariance * np.outer(size, size)
     if added_mass is not None:
         inertia, slope = mass - added_mass, np.zeros(4)
@@ -149,7 +181,22 @@ def fit_coast_downs(
         values=np.append(inertia * ratio, mass - inertia),
         covariance=covariance,
         rmse=float(np.sqrt(np.mean(left**2))),
+        notes=notes,
     )
+
+
+def _notes(values: Array, std: Array) -> tuple[str, ...]:
+    """What runs show of the lag [s], and of how far the speeds of each are off [m/s], in words."""
+    told = [f"{x:.3g} ± {NORMAL * s:.2g}" for x, s in zip(values, std, strict=True)]
+    shown, notes = np.abs(values) > NORMAL * std, []
+    if shown[0]:
+        notes.append(f"thrust follows the shaft with a time constant of {told[0]} s: allowed for")
+    if shown[1:].any():
+        notes.append(
+            f"speeds are off those through the water by {', '.join(told[1:])} m/s, run by run: a "
+            "current, or the sensor's zero, is allowed for"
+        )
+    return tuple(notes)
 
 
 def configured(config: Config, found: CoastDown) -> Config:
@@ -202,19 +249,24 @@ def _inflation(residuals: Sequence[Array]) -> float:
 
 
 @kernel
-def _simulated(ratio, start, t, n):
-    """u (N,) from its value ``start`` at t[0], steps of 20 ms at most."""
+def _simulated(ratio, start, lag, t, n):
+    """u (N,) from its value ``start`` at t[0], steps of 20 ms at most. Thrust follows the shaft
+    with a ``lag`` [s], and has done so for long."""
     u = np.empty(len(t))
     u[0] = start
+    push = ratio[0] * n[0] + ratio[1] * abs(n[0]) * n[0]
     for k in range(len(t) - 1):
         x, span = u[k], t[k + 1] - t[k]
         steps = max(1, int(np.ceil(span / 0.02)))
         dt = span / steps
-        push = ratio[0] * n[k] + ratio[1] * abs(n[k]) * n[k]
+        asked = ratio[0] * n[k] + ratio[1] * abs(n[k]) * n[k]
+        half = math.exp(-0.5 * dt / lag) if lag > 0.0 else 0.0
         for _ in range(steps):
-            a = push + ratio[2] * x + ratio[3] * abs(x) * x
+            a = asked + half * (push - asked) + ratio[2] * x + ratio[3] * abs(x) * x
             y = x + 0.5 * dt * a
+            push = asked + half * (push - asked)
             x += dt * (push + ratio[2] * y + ratio[3] * abs(y) * y)
+            push = asked + half * (push - asked)
             x = min(max(x, -50.0), 50.0)
         u[k + 1] = x
     return u
