@@ -666,21 +666,19 @@ def _of_structures(
     x: Array, y: Array, rms: Mapping[tuple[int, ...], float], chosen: tuple[int, ...], values: Array
 ) -> Array:
     """What the choice among structures adds to the variances (n,) of the ``values`` of the chosen
-    one: the mean square by which a term is another in the structures that have it, weighted by how
-    well they predict (Burnham and Anderson 2002, sec. 4.3; a cross-validated error weighs as AIC
-    does: Stone 1977)."""
+    one: the mean square by which a term is another in other structures, zero where they lack it,
+    weighted by how well they predict (Burnham and Anderson 2002, sec. 4.3; a cross-validated error
+    weighs as AIC does: Stone 1977)."""
     least = min(rms.values())
-    total, apart = np.zeros((2, len(chosen)))
+    total, apart = 0.0, np.zeros(len(chosen))
     for structure, error in rms.items():
         weight = (least / max(error, 1e-300)) ** len(y) if least > 0.0 else float(error == least)
-        shared = [(i, structure.index(term)) for i, term in enumerate(chosen) if term in structure]
-        if weight < _LIGHT or not shared:
+        if weight < _LIGHT:
             continue
-        own, there = np.array(shared).T
-        total[own] += weight
-        off = np.linalg.lstsq(x[:, structure], y, rcond=None)[0][there] - values[own]
-        apart[own] += weight * off**2
-    return apart / np.maximum(total, _LIGHT)
+        there = dict(zip(structure, np.linalg.lstsq(x[:, structure], y, rcond=None)[0].tolist()))
+        total += weight
+        apart += weight * (np.array([there.get(term, 0.0) for term in chosen]) - values) ** 2
+    return apart / max(total, _LIGHT)
 
 
 def _rms(error: Array) -> float:
