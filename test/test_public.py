@@ -27,6 +27,7 @@ import rov_ident as ri
 from bench import ROOT
 from rov_ident.cli.program import main
 from rov_ident.config import dump, from_parameters, to_parameters
+from rov_ident.io.write_messages import write_messages
 
 CONTRACT = (
     "load read fit explain check simulate plan compare OnlineEstimator HydrodynamicModel Model "
@@ -226,6 +227,16 @@ def results(bag, fit):
         "plan": ri.plan(HEAVY, duration=10.0),
         "comparison": ri.compare(HEAVY, fit),
     }
+
+
+def test_a_simulation_beside_a_bag_keeps_its_clock(tmp_path):
+    later, path = 10**18, tmp_path / "dive.mcap"
+    run = ri.simulate(HEAVY, manoeuvre="steps", duration=10.0, seed=1)
+    moved = [(t + later, role, m._replace(stamp=m.stamp + later)) for t, role, m in run.messages]
+    write_messages(path, moved)
+    stamps = [message.stamp for _, _, message in ri.simulate(HEAVY, bag=path).messages]
+    first, last = moved[0][2].stamp, moved[-1][2].stamp
+    assert abs(stamps[0] - first) < 500_000_000 and abs(stamps[-1] - last) < 500_000_000
 
 
 # All are drawn and saved by the same functions (reports/result.py): each ending once, then all.

@@ -215,7 +215,7 @@ def _beside(
         record.path.name,
         t,
         nu,
-        odometry_of(t, nu),
+        odometry_of(t, nu, record.origin),
         measured_motion(samples),
         free,
         score(samples, nu),

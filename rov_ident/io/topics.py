@@ -250,7 +250,10 @@ def select(bag: Bag, config: Config, roles: Collection[str] = ()) -> dict[str, s
         try:
             topic = _select_topic(bag, role, name, _full_name(type_name), wanted[role], beside)
         except UserError as error:
-            raise UserError(f"{error}{_other_type(bag, role, type_name, wanted[role])}") from error
+            hint = _other_type(bag, role, type_name, wanted[role])
+            if role == WRENCH and config.inputs.joints:
+                hint = " If fins and shafts alone drive the vehicle, record a wrench of zeros."
+            raise UserError(f"{error}{hint}") from error
         if topic:
             chosen[role] = topic
     return chosen

@@ -35,6 +35,7 @@ class Record:
 
     ``notes`` say in words what was refused or lost; ``sha256`` is of the bag's bytes.
     ``contradictions`` are test ratios of the odometry's parts against the IMU: 1 is expected.
+    ``origin`` is the stamp [ns] of t = 0.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class Record:
     notes: tuple[str, ...]
     sha256: str
     contradictions: Mapping[str, float] = field(default_factory=dict)
+    origin: int = 0
 
     @property
     def duration(self) -> float:
@@ -82,7 +84,8 @@ def read_record(
             + (f": {'; '.join(notes)}" if notes else ", it is too short")
         )
     contradictions = sampler.kinematic_filter.contradictions
-    return Record(Path(path), samples, counts, tuple(notes), bag.sha256, contradictions)
+    origin = sampler.origin or 0
+    return Record(Path(path), samples, counts, tuple(notes), bag.sha256, contradictions, origin)
 
 
 def _input_notes(config: Config, samples: NDArray[np.void]) -> list[str]:

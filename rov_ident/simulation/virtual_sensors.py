@@ -249,13 +249,14 @@ def _coarse(values: Array) -> Array:
     return values.astype(np.float32).astype(np.float64)
 
 
-def _stamped(t: float, role: str, message: Message) -> tuple[int, str, Message]:
-    stamp = START + round(1e9 * t)
+def _stamped(t: float, role: str, message: Message, start: int = START) -> tuple[int, str, Message]:
+    stamp = start + round(1e9 * t)
     return stamp, role, message._replace(stamp=stamp)
 
 
-def odometry_of(t: Array, nu: Array) -> list[tuple[int, str, Message]]:
-    """Velocities (N, 6) at t (N,) as odometry messages without a pose; (arrival, role, message)."""
+def odometry_of(t: Array, nu: Array, start: int) -> list[tuple[int, str, Message]]:
+    """Velocities (N, 6) at t (N,) [s] from the stamp ``start`` [ns] on as odometry messages without
+    a pose; (arrival, role, message)."""
     none = np.zeros(6)
     messages = (Odometry(0, *_FRAMES, none[:3], _LEVEL, v[:3], v[3:], none) for v in nu)
-    return [_stamped(at, ODOMETRY, message) for at, message in zip(t, messages, strict=True)]
+    return [_stamped(at, ODOMETRY, one, start) for at, one in zip(t, messages, strict=True)]
