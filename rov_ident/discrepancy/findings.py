@@ -14,6 +14,7 @@ from rov_ident.discrepancy.held_out import (
     Judge,
     gain_of,
     improved,
+    is_practical,
     is_sure,
     is_surely_practical,
 )
@@ -41,6 +42,7 @@ from rov_ident.discrepancy.sensor_choice import (
     Choice,
     Data,
     may_be_noise,
+    moves_velocity,
     with_noise,
 )
 from rov_ident.discrepancy.windowed_problem import Spans
@@ -343,7 +345,8 @@ def noise_finding(judge: Judge, final: Fitted, given: Config, std: Mapping[str, 
 
 def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None) -> list[Finding]:
     """Findings of the sensor effects of a choice, by how much better the sensors agree where they
-    are judged. ``as_headed``: the streams judged with the headings of their records as they were.
+    are judged; or, as noise hides that from one message to the next, by how much better the motion
+    is predicted. ``as_headed``: the streams judged with the headings of their records as they were.
     """
     config, findings = data.config, []
     after = sensor_consistency.comparisons(data.judged, config, choice.sensors)
@@ -352,6 +355,9 @@ def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None
         given = as_headed if name == HEADING and as_headed is not None else data.judged
         before = sensor_consistency.comparisons(given, config, rest.sensors)
         gain = kinematic_gain((before, after), data.held)
+        if not is_practical(gain) and moves_velocity(name, values):
+            of_motion = data.gain_in_dynamics(rest.sensors, choice.sensors)
+            gain = of_motion if of_motion is not None and is_practical(of_motion) else gain
         parameters = {
             p.name: Value(values[p.name], choice.std[name, p.name], p.unit)
             for p in EFFECTS[name].parameters

@@ -110,6 +110,12 @@ class Judge:
         chunk = (problem.times[self._counts] / CHUNK).astype(int)
         self._chunk = np.unique(chunk, return_inverse=True)[1]
 
+    @property
+    def count(self) -> Array:
+        """(6,): of squared errors, as they count."""
+        out: Array = self._weight.sum(axis=0)
+        return out
+
     def squares(self, h: Simulated) -> Array:
         """Squared errors (N, 6) that count, and as they count; a simulation that fails is as far
         off as the motion is large."""
@@ -129,7 +135,7 @@ class Judge:
         return np.hstack([recorded.linear - simulated.linear, error[:, 3:]])
 
     def rmse(self, h: Simulated) -> dict[str, float]:
-        square = self.squares(h).sum(axis=0) / self._weight.sum(axis=0)
+        square = self.squares(h).sum(axis=0) / self.count
         error = np.where(self._guided, np.nan, np.sqrt(square))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
 
@@ -144,10 +150,11 @@ class Judge:
         six components is wide, and then all of these together: a lag moves each a little."""
         free = np.flatnonzero(self.free)
         a, b = (self.summed(h) for h in (before, after))
-        count = self._weight.sum(axis=0)
         own = np.array([i for i in free if AXES[i] in axes], dtype=int)
         sets = [of for of in (free, own) if len(of)]
-        gains = [gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], count[of]) for of in sets]
+        gains = [
+            gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], self.count[of]) for of in sets
+        ]
         found = next((g for g in gains if g.low > 0.0), gains[0])
         if found.low <= 0.0 and len(own) > 1:
             found = replace(found, together=together(a[:, own], b[:, own]))

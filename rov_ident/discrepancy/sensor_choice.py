@@ -19,17 +19,18 @@ from rov_ident.config import Config
 from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.held_out import Judge, surely_less, thinned
+from rov_ident.discrepancy.held_out import Judge, gain_of, surely_less, thinned
 from rov_ident.discrepancy.hypothesis import Hypothesis, Key, bounds
 from rov_ident.discrepancy.linearisation import Linearisation
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.reading_noise import jitter
+from rov_ident.discrepancy.results import Gain
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import VERY_STRONG, mean_inflation
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, Values
 from rov_ident.effects.base import a_reading
-from rov_ident.model.coefficients import AXES
+from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.sampling import wrench_scatter
 from rov_ident.sampling.raw_streams import Streams, corrected
@@ -79,8 +80,27 @@ class Data:
     def dynamics(self, sensors: Values, axes: str = AXES) -> Array | None:
         """Squared errors (C, free axes) of held-out data as recorded, summed over chunks, of the
         model fitted to corrected data, on those of the ``axes`` that are simulated; None where it
-        cannot be. A current is allowed for: what turns the velocities turns it, too, and a model
-        without it would choose what makes least of it."""
+        cannot be."""
+        found, use = self._judged(sensors), self._simulated(axes)
+        return found[0].summed(found[1])[:, use] if found and use else None
+
+    def gain_in_dynamics(self, before: Values, after: Values) -> Gain | None:
+        """By how much better the same are predicted with one correction than with another."""
+        use = self._simulated(AXES)
+        first, second = (self._judged(sensors) for sensors in (before, after))
+        if not use or first is None or second is None:
+            return None
+        (judge, h), (other, g) = first, second
+        a, b = judge.summed(h)[:, use], other.summed(g)[:, use]
+        return gain_of([VELOCITIES[i] for i in use], a, b, other.count[use])
+
+    def _simulated(self, axes: str) -> list[int]:
+        return [i for i in np.flatnonzero(~self.streams.guided).tolist() if AXES[i] in axes]
+
+    def _judged(self, sensors: Values) -> tuple[Judge, Hypothesis] | None:
+        """The model fitted to corrected data, and what judges it. A current is allowed for: what
+        turns the velocities turns it, too, and a model without it would choose what makes least of
+        it."""
         streams, judged = (corrected(s, sensors) for s in (self.streams, self.judged))
         fitted = Search(streams, self.config, thinned(self.spans)).start()
         if fitted is None:
@@ -88,9 +108,7 @@ class Data:
         if self.config.current_std > 0.0 and _WATER[0][0] not in self.config.effects:
             h = fitted.hypothesis.having(dict.fromkeys(_WATER, 0.0))
             fitted = refit(h, fitted.linearisation, update_noise=True) or fitted
-        judge = Judge(WindowedProblem(judged, self.held), sensors)
-        use = [i for i in np.flatnonzero(~streams.guided) if AXES[i] in axes]
-        return judge.summed(fitted.hypothesis)[:, use] if use else None
+        return Judge(WindowedProblem(judged, self.held), sensors), fitted.hypothesis
 
     def agreement(self, of: Sequence[Values]) -> list[Array]:
         """Squared innovations (C, comparisons) of corrections, in the units of the first."""
@@ -225,7 +243,7 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
         unsure = choice.unsure | ({*late, ARM} & choice.sensors.keys())
         choice = dataclasses.replace(choice, unsure=unsure)
     corrects = [n for n in choice.sensors if EFFECTS[n].sense or n in late]
-    corrects = [n for n in corrects if _moves_velocity(n, choice.sensors[n])]
+    corrects = [n for n in corrects if moves_velocity(n, choice.sensors[n])]
     squares = data.dynamics(choice.sensors) if corrects else None
     for name in corrects:
         rest = data.fitted([n for n in choice.sensors if n != name], choice.fixed)
@@ -250,7 +268,7 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
     return choice
 
 
-def _moves_velocity(name: str, values: Mapping[str, float]) -> bool:
+def moves_velocity(name: str, values: Mapping[str, float]) -> bool:
     """Whether an effect changes the velocities of the odometry, and not only the IMU's readings."""
     effect = EFFECTS[name]
     if effect.sense is None:

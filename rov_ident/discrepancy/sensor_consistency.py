@@ -14,8 +14,8 @@ effects are linear to first order, and the fit is repeated about its own result.
 A controller answers the noise of what it measures, so what the vehicle does next depends on noise
 that is in y. Noise is independent of regressors that are determined before it, as in the
 identification of any closed loop (Ljung 1999, ch. 13): accelerations and thrust are those before.
-And innovations contain earlier noise as far as the gain of their filter goes, so what an answer may
-pass for must show with a lesser gain, too.
+And beside the IMU innovations contain earlier noise as far as the gain of their filter goes, so
+what an answer may pass for must show with a lesser gain, too.
 """
 
 import dataclasses
@@ -112,7 +112,7 @@ def comparisons(
     streams: Streams, config: Config, effects: Values, tolerance: float = 1.0
 ) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors;
-    ``tolerance`` as :func:`whitened` has it."""
+    ``tolerance``, of velocities against the IMU, as :func:`whitened` has it."""
     keys = sensor_parameters()
     as_read = streams.nu[:, :3]
     streams = in_place(streams, effects)
@@ -177,7 +177,11 @@ def comparisons(
         columns = [m.angular[inside] - m.gyro[inside] for m in moved]
         made.append(("gyro", t, y, [*columns, *(n[inside] for n in none)]))
     return [
-        Comparison(name, *whitened(t, y, columns, name != "gyro", tolerance), _white(t, y))
+        Comparison(
+            name,
+            *whitened(t, y, columns, name != "gyro", tolerance if name == "imu" else 1.0),
+            _white(t, y),
+        )
         for name, t, y, columns in made
         if len(t) > FEWEST
     ]
@@ -471,7 +475,7 @@ def search(
     while True:
         found, std = _searched(streams, config, spans, library, fixed, chooses=True)
         keys = [(n, parameter) for n in found if n in _ANSWERS for parameter in found[n]]
-        if not keys:
+        if not (keys and has_imu(streams)):
             return found, std
         again = _searched(streams, config, spans, [*found], fixed, False, _LESSER)
         answers = {n for n, _ in keys} - {n for n, _ in _shown(*again, keys)}
