@@ -335,6 +335,23 @@ def test_fins_that_follow_late_are_found_or_said(remus, tmp_path, seed):
     assert "behind wrench, fins and shafts" in blind.consistency.sentence
 
 
+@pytest.mark.parametrize("estimator", ["rls", *more("ls", "ml")])
+def test_a_joint_that_counts_the_other_way_round_is_said(remus, tmp_path, estimator):
+    """What follows from it is right in its own sense, and surely not what the file says."""
+    path, notes = tmp_path / "dive.mcap", []
+    for name in ("delta_r", "delta_s", ""):
+        plain = configuration.to_parameters(remus)
+        if name:
+            plain["inputs"][name]["scale"] = -plain["inputs"][name].get("scale", 1.0)
+        given = configuration.from_parameters(plain)
+        write_messages(path, run_of(remus, 4, duration=80.0, imu_rate=50.0).messages)
+        notes.append(" ".join(ri.fit(path, given, estimator=estimator).notes))
+    words = "works the other way round than the configuration has it"
+    assert f"delta_r {words} (Y_uudr, N_uudr have changed sign)" in notes[0]
+    assert f"delta_s {words} (Z_uuds, M_uuds have changed sign)" in notes[1]
+    assert words not in notes[2]
+
+
 def test_inertia_that_no_known_force_tells_is_held(dives):
     """Least squares would cancel the vehicle's own inertia in sway and yaw, and find nothing left
     to explain. What it holds instead is as uncertain as before, and the others relative to it."""

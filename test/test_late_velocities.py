@@ -41,6 +41,12 @@ def test_pose_and_rates_are_of_the_time_of_the_velocities(delay):
             )
 
 
+def test_a_delay_below_the_rounding_of_times_loses_no_message():
+    """As a fit ends at a bound of zero; it had left no message at all, and an error of its own."""
+    late = LateVelocities(1e-18)
+    assert all(late.push(t, odometry(t)) is not None for t in np.arange(1.0, 3.0, 0.05))
+
+
 def test_nothing_is_interpolated_across_a_gap():
     late = LateVelocities(0.1)
     times = np.append(np.arange(0.0, 1.0, 0.05), 2.0 + np.arange(0.0, 1.0, 0.05))

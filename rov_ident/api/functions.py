@@ -171,8 +171,23 @@ def fit(
         found = found.with_tests(_message_tests([bag.path for bag in many.bags], given, late))
         if table:
             found = _with_table_notes(found, given, table)
-        found = dataclasses.replace(found, notes=(*repeated, *placed, *found.notes))
+        notes = (*repeated, *placed, *_reversed_joints(found, given), *found.notes)
+        found = dataclasses.replace(found, notes=notes)
         return found if validate is None else _judged(found, given, validate, paths, say)
+
+
+def _reversed_joints(found: Fit, given: Config) -> Iterator[str]:
+    """Joints that count the other way round: all that surely follows from them has changed sign."""
+    estimates = dict(zip(found.names, zip(found.values, found.std, strict=True), strict=True))
+    for joint in given.inputs.joints:
+        own = [c.name for c in given.model.coefficients if joint in c.inputs]
+        odd = [name for name in own if name.count(f"d{joint[-1]}") < 2]  # squares keep their sign
+        told = [(*estimates[name], given.value(name)) for name in odd if name in estimates]
+        if told and all(value * was < 0.0 and abs(value) > 3.0 * std for value, std, was in told):
+            yield (
+                f"{joint} works the other way round than the configuration has it "
+                f"({', '.join(odd)} have changed sign): check the sign of inputs.{joint}.scale"
+            )
 
 
 def _judged(found: Fit, given: Config, validate: File, fitted: list[Path], say: Progress) -> Fit:

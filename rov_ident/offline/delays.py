@@ -4,7 +4,7 @@ Both are told without a simulation: the gyro reads what the odometry's attitude 
 and filtered wrench and motion are one regression, with the delay as one more coefficient.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -244,7 +244,7 @@ def motion_behind_wrench(rows: Filtered) -> Delay:
     return Delay(float(x[-1]), float(np.sqrt(variance)))
 
 
-def is_late(effects: Iterable[str]) -> bool:
+def is_late(effects: Collection[str]) -> bool:
     """Whether any of the effects makes thrust, fins or velocities late."""
     late = ("late" in EFFECTS[name].traits or EFFECTS[name].late for name in effects)
     return any(late) or "fin_lag" in effects

@@ -32,7 +32,7 @@ class LateVelocities:
         known.append((t, message))
         while len(known) > 2 and known[1][0] <= at:
             known.popleft()
-        if self.delay == 0.0:
+        if not at < t:  # also where a delay is less than the rounding of t
             return t, message
         begin, before = known[0]
         end, after = known[1] if len(known) > 1 else known[0]
