@@ -283,11 +283,13 @@ def _model_remarks(quick: Fit) -> Iterator[Remark]:
     prior = prior_of(quick.given, effects=True)
     # a righting arm that is off is one of the reasons that are told
     own = np.sqrt(np.maximum(quick.std**2 - quick.beyond_driving, 0.0))
-    columns = quick.values, own, prior.mean, prior.std
+    columns = quick.values, own, quick.std, prior.mean, prior.std
     values = dict(zip(quick.names, quick.values.tolist(), strict=True))
     seen = [
-        (*name.split("."), with_unit(f"{x:.3g} ± {NORMAL * std:.2g}", unit), mean)
-        for name, unit, x, std, mean, wide in zip(quick.names, quick.units, *columns, strict=True)
+        (*name.split("."), with_unit(f"{x:.3g} ± {NORMAL * whole:.2g}", unit), mean)
+        for name, unit, x, std, whole, mean, wide in zip(
+            quick.names, quick.units, *columns, strict=True
+        )
         if "." in name and abs(x - mean) > max(SUPPOSED * std, _MATTERS * wide)
     ]
     for effect, parts in groupby(seen, key=lambda part: part[0]):
