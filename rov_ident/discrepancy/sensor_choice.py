@@ -130,14 +130,17 @@ def chosen(data: Data, turned: bool = False) -> Choice:
 def _beside_tilt(data: Data, choice: Choice, turned: bool) -> Choice:
     """What the attitude is needed for is known as well as the attitude: tilted by delta, it makes
     delta x f of a bias of the accelerometer and delta x omega of a gyro's, of the mean f and omega,
-    and turns a velocity sensor that is compared with positions. So an effect is none if it is no
-    more than that, and not sure if the pose may be tilted instead."""
+    and turns a velocity sensor that is compared with positions. And late velocities are timed by
+    what an IMU reads in an interval, in which its stamp may be anywhere. So an effect is none if it
+    is no more than that, and not sure if the pose may be tilted instead."""
     config, streams, std = data.config, data.streams, dict(choice.std)
     tilt = config.odometry.attitude_std
     turning = tilt * _across(streams.nu[:, 3:].mean(axis=0))
+    interval = float(np.median(np.diff(streams.imu_t))) if len(streams.imu_t) > 1 else 0.0
     wider = {
         BIAS: [*(tilt * _across(_weight(data))), *np.hypot(streams.rates_std, turning)],
         MOUNTING: [tilt * streams.has_pose] * 2 + [0.0],
+        LATENCY: [interval / np.sqrt(12.0)],
     }
     for name, values in choice.sensors.items():
         keys = [(name, parameter) for parameter in values]
@@ -146,7 +149,8 @@ def _beside_tilt(data: Data, choice: Choice, turned: bool) -> Choice:
         if turned and name == HEADING:
             continue  # it is what the records differ by, beside which the first one's is nothing
         if all(abs(values[k[1]] - bounds(k)[0]) <= _SURE * std.get(k, 0.0) for k in keys):
-            words = f"{name}: no more than chance, or odometry.attitude_std, explains"
+            others = "the stamps of the IMU" if name == LATENCY else "odometry.attitude_std"
+            words = f"{name}: no more than chance, or {others}, explains"
             rest = {n: of for n, of in choice.sensors.items() if n != name}
             choice = dataclasses.replace(choice, sensors=rest, notes=(*choice.notes, words))
     choice = dataclasses.replace(choice, std=std)

@@ -11,16 +11,16 @@ white noise; the one-step innovations of that local-level model (Durbin and Koop
 white, and every regressor goes through the same filter: generalised least squares. All sensor
 effects are linear to first order, and the fit is repeated about its own result.
 
-A controller answers the noise of what it measures, so what the vehicle does next depends on noise
-that is in y. Noise is independent of regressors that are determined before it, as in the
-identification of any closed loop (Ljung 1999, ch. 13): accelerations and thrust are those before.
-And beside the IMU innovations contain earlier noise as far as the gain of their filter goes, so
-what an answer may pass for must show with a lesser gain, too.
+A controller answers the noise of velocities, so what the vehicle does next depends on noise that is
+in y. Noise is independent of regressors that are determined before it, as in the identification of
+any closed loop (Ljung 1999, ch. 13): beside the IMU, accelerations and thrust are those before. And
+innovations contain earlier noise as far as the gain of their filter goes, so what an answer may
+pass for must show with a lesser gain, too.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -131,7 +131,10 @@ def comparisons(
     velocity = None if inertial is None else inertial.velocity_at(streams.t)
     moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
     reading = Reading(moving, turning, gyrating, here.specific_force)
-    moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
+    moved, moved_before = (
+        [_unit_change(reading, key, streams.t, r[:, 2], slope) for key in keys]
+        for slope in (_slope, _slope_before)
+    )
     made: list[tuple[str, Array, Array, list[Array]]] = []
     none = [np.zeros_like(here.linear)] * len(TIMING)
     if streams.has_pose:
@@ -152,7 +155,7 @@ def comparisons(
         columns = [
             rotated(r_then, interpolated(streams.t, m.linear, at))[inside]
             - inertial.integrated(s.specific_force, at)[inside]
-            for m, s in zip(moved, shift, strict=True)
+            for m, s in zip(moved_before, shift, strict=True)
         ]
         # no stamp of a command that answers this very measurement is so far before it
         unaware = at[inside] - 0.5 * float(np.median(np.diff(streams.t)))
@@ -206,13 +209,32 @@ def _corrected_readings(
     return correct(here, effects), correct(there, effects), rate
 
 
-def _unit_change(reading: Reading, key: Key, t: Array, down: Array) -> Reading:
+def _slope(t: Array, v: Array) -> Array:
+    """Derivative of velocities (N, 3) at t (N,), from both sides: noise of a position, of which
+    they are made, is not correlated with it."""
+    out: Array = np.gradient(v, t, axis=0)
+    return out
+
+
+def _slope_before(t: Array, v: Array) -> Array:
+    """The same since the last one: noise of the velocity sensor acts on what comes after it."""
+    slope = np.diff(v, axis=0) / np.diff(t)[:, None]
+    return np.concatenate([slope[:1], slope])
+
+
+def _unit_change(
+    reading: Reading,
+    key: Key,
+    t: Array,
+    down: Array,
+    slope: Callable[[Array, Array], Array] = _slope,
+) -> Reading:
     """What one unit of a parameter adds to a reading at the times t (N,), where ``down`` (N, 3) is
-    world down in body axes; of a heading, what turns a velocity in the world as much."""
+    world down in body axes; of a heading, what turns a velocity in the world as much. ``slope``
+    makes accelerations of velocities."""
     effect, none = EFFECTS[key[0]], np.zeros_like(down)
     if effect.late is not None:
-        slope = np.diff(reading.linear, axis=0) / np.diff(t)[:, None]
-        return Reading(-np.concatenate([slope[:1], slope]), none, none, none)
+        return Reading(-slope(t, reading.linear), none, none, none)
     if effect.heading is not None:
         turned_force = np.cross(down, reading.specific_force)
         return Reading(np.cross(down, reading.linear), none, none, turned_force)
@@ -471,13 +493,15 @@ def search(
     library = [e.name for e in _LIBRARY]
     if allowed is not None:
         names = [n for n in library if n in set(allowed)]
-        return _searched(streams, config, spans, names, fixed, chooses=False)
+        may_answer = has_imu(streams) and not set(names).isdisjoint(_ANSWERS)
+        tolerance = _LESSER if may_answer else 1.0
+        return _searched(streams, config, spans, names, fixed, False, tolerance)
     while True:
         found, std = _searched(streams, config, spans, library, fixed, chooses=True)
         keys = [(n, parameter) for n in found if n in _ANSWERS for parameter in found[n]]
         if not (keys and has_imu(streams)):
             return found, std
-        again = _searched(streams, config, spans, [*found], fixed, False, _LESSER)
+        again = search(streams, config, spans, found, fixed)
         answers = {n for n, _ in keys} - {n for n, _ in _shown(*again, keys)}
         if not answers:
             return again
