@@ -9,7 +9,7 @@ from tiers import more
 from bench import HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition, sensor_consistency
-from rov_ident.discrepancy.explain import _beside_given, explain
+from rov_ident.discrepancy.explain import _beside_given, _of_guided, explain
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.held_out import Judge, blocks, split, windows
 from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, precision
@@ -97,6 +97,13 @@ def test_a_record_without_a_pose_says_nothing_of_the_velocities(seed):
     told = Finding("velocity_scale", (), value, None, gain, True, None, (), "")
     (told,) = repetition.of_sensors(bags, TODAY, [told], [0.0, 0.0])
     assert told.repetition.same and np.isinf(told.repetition.records[1]["scale"].std)
+
+
+def test_a_record_without_forces_tells_no_scale_of_them():
+    """Of a vehicle under fins and a propeller, whose coefficients may all be too large together."""
+    driven = record(1)
+    (told,) = _of_guided(dataclasses.replace(driven, demand=np.zeros_like(driven.demand)))
+    assert "no force in newtons is recorded" in told and not _of_guided(driven)
 
 
 def test_a_record_without_moments_or_heave_lacks_them_for_all():

@@ -105,6 +105,13 @@ _NOISE_LASTS = (
     "noise of the wrench's reading is the same for several readings: {}; what publishes them holds "
     "or filters what it measures"
 )
+_NO_FORCE = (
+    "no force in newtons is recorded: what fins and propeller do tells forces and inertia in "
+    "proportion to each other, and only the righting moment their common scale; with weight, "
+    "buoyancy and centre of gravity a little off, all coefficients of the extended configuration "
+    "may be several times too large, though it predicts as well: keep those of the one given "
+    "unless a fit agrees (rov-ident fit, which knows what the file says of them)"
+)
 _ALL_IN_NOISE = (
     "the wrench cannot be told from noise of its reading on any axis: record the commands without "
     "noise, or drive the vehicle well above it"
@@ -598,10 +605,11 @@ def _gains_elsewhere(found: Finding) -> bool:
 
 
 def _of_guided(streams: Streams) -> list[str]:
-    """Notes on velocities that are taken as measured."""
+    """Notes on what a record does not tell, such as velocities that are taken as measured."""
     never = ", ".join(c for c, so in zip(VELOCITIES, streams.unmeasured, strict=True) if so)
     notes = [] if streams.is_turned else [NO_MOMENT]
     notes += [_UNMEASURED.format(never)] if never else []
+    notes += [] if streams.demand.any() else [_NO_FORCE]
     std = reading_noise(streams.demand, streams.noise_lasts)
     lost = [f"{AXES[i]} ({std[i]:.2g} {WRENCH_UNITS[i]})" for i in np.flatnonzero(streams.in_noise)]
     return notes + ([_IN_NOISE.format(", ".join(lost))] if lost else [])
