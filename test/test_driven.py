@@ -332,7 +332,7 @@ def test_fins_that_follow_late_are_found_or_said(remus, tmp_path, seed):
         blind = ri.fit(path, known, estimator=estimator)
         failed = [test.name for test in blind.consistency.tests if not test.passed]
         assert "motion behind the wrench" in failed and State.CONVERGED not in blind.states
-    assert "behind wrench, fins and shafts" in blind.consistency.sentence
+    assert "behind the wrench, fins and shafts" in blind.consistency.sentence
 
 
 @pytest.mark.parametrize("estimator", ["rls", *more("ls", "ml")])
