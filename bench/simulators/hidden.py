@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.simulators import fossen
 from bench.simulators.fossen import AXES, GRAVITY, VELOCITIES, Array
@@ -882,6 +883,12 @@ def _foreign(seed: int, name: str | None, strength: float, s: Setting) -> _Forei
 # ------------------------------------------------------------------ the dive and its messages
 
 
+def _instants(known: Array, t: Array) -> NDArray[np.int64]:
+    """Indices of the times t among those ``known``, which end a step before the bag does."""
+    out: NDArray[np.int64] = np.minimum(np.searchsorted(known, t - 1e-9), len(known) - 1)
+    return out
+
+
 def _clock(seed: int, topic: str, rate: float, duration: float) -> Array:
     """Instants of a topic, on whole microseconds, at a phase of its own."""
     if rate <= 0.0:
@@ -983,7 +990,7 @@ def _messages(
         return [START + round(x) for x in (1e9 * t).tolist()]
 
     t = _clock(seed, "odom", conditions.odometry_rate, conditions.duration)
-    at, rng = np.searchsorted(truth.t, t - 1e-9), _stream(seed, "odom")
+    at, rng = _instants(truth.t, t), _stream(seed, "odom")
     v, w, q = truth.nu[at, :3], truth.nu[at, 3:], truth.orientation[at]
     mounting = _roll_pitch_yaw(*get("sensor_misalignment", "roll pitch yaw"))
     v = v + np.cross(w, get("sensor_lever_arm", "x y z"))
@@ -1006,7 +1013,7 @@ def _messages(
     ]
 
     t = _clock(seed, "imu", conditions.imu_rate, conditions.duration)
-    at, rng = np.searchsorted(truth.t, t - 1e-9), _stream(seed, "imu")
+    at, rng = _instants(truth.t, t), _stream(seed, "imu")
     v, w = truth.nu[at, :3], truth.nu[at, 3:]
     v_dot, w_dot = truth.nu_dot[at, :3], truth.nu_dot[at, 3:]
     down = fossen.rotations(truth.orientation[at])[:, 2]
