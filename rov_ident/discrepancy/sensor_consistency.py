@@ -131,10 +131,7 @@ def comparisons(
     velocity = None if inertial is None else inertial.velocity_at(streams.t)
     moving = np.einsum("kji,kj->ki", r, _velocity(streams, r, here.linear, velocity))
     reading = Reading(moving, turning, gyrating, here.specific_force)
-    moved, moved_before = (
-        [_unit_change(reading, key, streams.t, r[:, 2], slope) for key in keys]
-        for slope in (_slope, _slope_before)
-    )
+    moved = [_unit_change(reading, key, streams.t, r[:, 2]) for key in keys]
     made: list[tuple[str, Array, Array, list[Array]]] = []
     none = [np.zeros_like(here.linear)] * len(TIMING)
     if streams.has_pose:
@@ -143,6 +140,12 @@ def comparisons(
         made.append(("pose", streams.t[posed], y, columns))
     if inertial is not None:
         down = inertial.rotation[:, 2]
+        moved_before = [
+            _unit_change(reading, key, streams.t, r[:, 2], _slope_before)
+            if EFFECTS[key[0]].late
+            else as_before
+            for key, as_before in zip(keys, moved, strict=True)
+        ]
         shift = [_unit_change(there, key, streams.imu_t, down) for key in keys]
         # As it is read, at the time of which it is: put back to its stamp between two readings, a
         # velocity has less noise than either, and any delay would seem to agree better.

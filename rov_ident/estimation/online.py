@@ -254,7 +254,7 @@ class OnlineEstimator:
             if not len(samples):
                 continue
             waiting.append(samples)
-            if self._is_due(samples) or due(self._stamp_of(samples["t"][-1])):
+            if self._is_due(samples) or due(self.stamp_of(samples["t"][-1])):
                 yield self.take(joined(waiting))
                 waiting = []
         if waiting:
@@ -587,9 +587,9 @@ class OnlineEstimator:
         """Of the last sample used [ns], also before a checkpoint; 0: of none."""
         if math.isnan(self._last_t) or self.sampler.origin is None:
             return self._recalled
-        return self._stamp_of(self._last_t)
+        return self.stamp_of(self._last_t)
 
-    def _stamp_of(self, t: float) -> int:
+    def stamp_of(self, t: float) -> int:
         """The time t [s] of a sample in ns."""
         return (self.sampler.origin or 0) + round(float(t) * 1e9)
 

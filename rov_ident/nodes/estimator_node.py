@@ -206,8 +206,7 @@ class EstimatorNode(GuardedNode):
             return
         self._used += int(np.count_nonzero(info["reason"] == ESTIMATORS[self._online.kind].USED))
         self._diagnostics.ratios.append(info["nis"])
-        origin = self._online.sampler.origin or 0
-        stamps = [origin + round(t * 1e9) for t in info["t"].tolist()]
+        stamps = [self._online.stamp_of(t) for t in info["t"].tolist()]
         residuals = info["residual"]
         frames, frame_id = self._config.frames, self._online.sampler.validation.frame_id(WRENCH)
         for i in np.flatnonzero(np.isfinite(residuals).all(axis=1)).tolist():

@@ -151,11 +151,11 @@ def filtered(samples: NDArray[np.void], config: Config) -> Filtered | None:
         still["inputs"] = 0.0
         rows = replace(rows, steered=phi - filtered_rows(task, still, PERIOD)[0])
     size = np.sqrt(np.mean(rows.drive(np.zeros(phi.shape[2] - 1)) ** 2, axis=0))
-    if is_without_velocity(samples):  # forces drive what is simulated itself
-        size[:3] = 0.0
     driven = size > AT_REST * authority(config.dynamics)
     if rows.steered is not None:
         driven |= rows.steered.any(axis=(0, 2))
+    if is_without_velocity(samples):  # forces drive what is simulated itself
+        driven[:3] = False
     return replace(rows, driven=driven)
 
 
