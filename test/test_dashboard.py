@@ -613,6 +613,13 @@ def publishing(dives):
         def listen(seconds):
             executor.spin_once(timeout_sec=seconds)
 
+        # The nodes know of the publishers; what these send before they know of the nodes is lost.
+        end = time.monotonic() + 300.0
+        while any(
+            p.get_subscription_count() < len(ESTIMATED[v]) for (v, _), p in publishers.items()
+        ):
+            assert time.monotonic() < end, "a publisher does not find the nodes"
+            listen(0.1)
         for _, to, message in in_pace(messages, lambda: min(used.values()), listen):
             publishers[to].publish(cdr.encode(message))
 
