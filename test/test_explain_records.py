@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiers import more
 
-from bench import HEAVY
+from bench import CONFIGS, HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition, sensor_consistency
 from rov_ident.discrepancy.explain import _beside_given, _of_guided, explain
@@ -365,5 +365,23 @@ def test_a_thrust_scale_that_nothing_tells_stays_what_the_file_says_of_it():
         configuration.to_parameters(TODAY) | {"wrench": {"scale_std": 0.15}}
     )
     assert scale == 0.0  # said to be known
-    width = precision(dataclasses.replace(h, config=unsure))[h.keys.index(THRUST_SCALE)] ** -0.5
+    width = (
+        precision(dataclasses.replace(h, config=unsure), True)[h.keys.index(THRUST_SCALE)] ** -0.5
+    )
     assert width == pytest.approx(0.15)
+
+
+def test_without_recorded_forces_the_file_says_how_large_they_are_and_trim_is_free():
+    driven = record(22)
+    still = dataclasses.replace(driven, demand=np.zeros_like(driven.demand))
+    assert driven.has_forces and not still.has_forces
+    file = configuration.load(next(p for p in CONFIGS if p.stem == "remus100"))
+    with_forces, without = (Search(s, file, windows(0.0, 40.0)).given for s in (driven, still))
+    trim = {k: std for k, std in file.nuisance_std.items() if k[0] in ("buoyancy", "cog_offset")}
+    assert len(trim) == 4
+    assert without.keys == (*with_forces.keys, *trim)
+    width = dict(zip(without.keys, precision(without, False) ** -0.5, strict=True))
+    assert {k: width[k] for k in trim} == pytest.approx(trim)
+    wide = precision(with_forces, True) ** -0.5
+    own = [width[k] for k in with_forces.keys]
+    np.testing.assert_allclose(own / wide, file.prior.relative_std / 10.0)

@@ -107,10 +107,9 @@ _NOISE_LASTS = (
 )
 _NO_FORCE = (
     "no force in newtons is recorded: what fins and propeller do tells forces and inertia in "
-    "proportion to each other, and only the righting moment their common scale; with weight, "
-    "buoyancy and centre of gravity a little off, all coefficients of the extended configuration "
-    "may be several times too large, though it predicts as well: keep those of the one given "
-    "unless a fit agrees (rov-ident fit, which knows what the file says of them)"
+    "proportion to each other, and only the righting moment their common scale; beside it the "
+    "extended configuration has what the one given says of it (prior.relative_std), and trim as "
+    "far as vehicle.buoyancy_std and cog_std allow"
 )
 _ALL_IN_NOISE = (
     "the wrench cannot be told from noise of its reading on any axis: record the commands without "
@@ -609,7 +608,7 @@ def _of_guided(streams: Streams) -> list[str]:
     never = ", ".join(c for c, so in zip(VELOCITIES, streams.unmeasured, strict=True) if so)
     notes = [] if streams.is_turned else [NO_MOMENT]
     notes += [_UNMEASURED.format(never)] if never else []
-    notes += [] if streams.demand.any() else [_NO_FORCE]
+    notes += [] if streams.has_forces else [_NO_FORCE]
     std = reading_noise(streams.demand, streams.noise_lasts)
     lost = [f"{AXES[i]} ({std[i]:.2g} {WRENCH_UNITS[i]})" for i in np.flatnonzero(streams.in_noise)]
     return notes + ([_IN_NOISE.format(", ".join(lost))] if lost else [])

@@ -317,10 +317,11 @@ def without_most_favourable(before: Array, after: Array) -> tuple[Array, Array]:
 
 def changes(config: Config, retuned: Fitted) -> dict[str, Change]:
     """The coefficients that refitting moves by more than two standard deviations."""
-    changed, names = {}, tuple(name for _, name in retuned.hypothesis.values)
-    values = np.array(list(retuned.hypothesis.values.values()))
+    changed, values = {}, retuned.hypothesis.values.items()
     covariance = retuned.covariance + retuned.covariance_of_the_file
-    for name, value, std in zip(names, values, np.sqrt(np.diag(covariance)), strict=True):
+    for ((section, name), value), std in zip(values, np.sqrt(np.diag(covariance)), strict=True):
+        if section != COEFFICIENTS:
+            continue
         before = float(config.model.theta[config.model.names.index(name)])
         if abs(value - before) > 2.0 * std:
             changed[name] = Change(before, float(value), float(std), parse(name).unit)

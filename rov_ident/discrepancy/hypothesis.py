@@ -29,6 +29,7 @@ _WIDE = 10.0  # times the size of a coefficient: one that is configured as zero,
 # other damping, has a size of 2 N s/m where drag is 80, and would be held near zero. With what the
 # configuration states of a measured boat, which was a guess, a fit ended in a model that turns
 # broadside, twice as far off as the file (docs/explain-bench.md)
+_TRIM = "buoyancy", "cog_offset"
 _FARTHEST_ARM = 2.0  # half lengths of the hull from the origin: an arm or a skid as long as it
 
 
@@ -145,16 +146,27 @@ def coefficient_sizes(model: Model) -> dict[Key, float]:
     return {(COEFFICIENTS, name): size for name, size in zip(model.names, sizes, strict=True)}
 
 
-def precision(h: Hypothesis) -> Array:
-    """Prior precision (P,): wide, so that it decides only where the data say nothing."""
-    width = {key: _WIDE * size for key, size in coefficient_sizes(h.config.model).items()}
+def precision(h: Hypothesis, forces: bool) -> Array:
+    """Prior precision (P,): wide, so that it decides only where the data say nothing. Where no
+    ``forces`` are recorded, the motion tells them in proportion to each other, and of their common
+    scale only the righting moment tells something: there the file says what it says in every fit.
+    """
+    wide = _WIDE if forces else h.config.prior.relative_std
+    width = {key: wide * size for key, size in coefficient_sizes(h.config.model).items()}
     width |= {key: 1e3 * parameter(key).typical for key in h.keys if key[0] in EFFECTS}
     width |= reach(h.config, h.keys)
     # what all thrusters lack alike is what every coefficient has more: where only mass and weight
     # could tell, and do not, the file says how far off thrust may be
     if (scale := h.config.wrench.scale_std) > 0.0:
         width[THRUST_SCALE] = scale
+    if not forces:
+        width |= trim_std(h.config)
     return np.array([width.get(key, np.inf) for key in h.keys]) ** -2.0
+
+
+def trim_std(config: Config) -> dict[Key, float]:
+    """How far trim may be off that the file does not know, by parameter."""
+    return {key: std for key, std in config.nuisance_std.items() if key[0] in _TRIM}
 
 
 def reach(config: Config, keys: Iterable[Key]) -> dict[Key, float]:

@@ -251,11 +251,11 @@ class Linearisation:
         both = np.hstack([own.gradient, gradient])
         return LinearProblem((*own.keys, *keys), normal, both, own.rss, own.count)
 
-    def jackknife(self, at: Indices) -> Array:
-        """How the estimate (W, A) of the parameters ``at`` (A,) moves as each window is left out;
-        the other parameters are taken as known."""
+    def jackknife(self, at: Indices, prior: Array) -> Array:
+        """How the estimate (W, A) of the parameters ``at`` (A,), of a ``prior`` precision (A, A),
+        moves as each window is left out; the other parameters are taken as known."""
         linear = self.linear
-        normal, gradient = linear.normal[np.ix_(at, at)], linear.gradient[:, at]
+        normal, gradient = linear.normal[np.ix_(at, at)] + prior, linear.gradient[:, at]
         _, size = unit_diagonal(normal)
         edges = [*self.first.tolist(), len(self.columns)]
         moves = np.empty_like(gradient)
@@ -264,9 +264,9 @@ class Linearisation:
             moves[w] = scaled_solve(normal - own.T @ own, gradient[w], 1e-9, size)
         return moves
 
-    def leave_one_out(self, at: Indices) -> Array:
+    def leave_one_out(self, at: Indices, prior: Array) -> Array:
         """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""
-        moves = self.jackknife(at)
+        moves = self.jackknife(at, prior)
         window = np.repeat(np.arange(len(moves)), np.diff([*self.first, len(self.columns)]))
         error = self.error + np.einsum("rp,rp->r", self.columns[:, at], moves[window])
         return np.add.reduceat(error.reshape(-1, 6) ** 2, self._rows)

@@ -22,8 +22,8 @@ from rov_ident.discrepancy.hypothesis import (
     centre,
     largest_step,
     onsets,
-    precision,
     role_of,
+    trim_std,
 )
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.reading_noise import DRAWS
@@ -117,14 +117,19 @@ class Fitted:
         would make of it, which all windows share. Onsets are taken as known (:func:`onset_std`).
         """
         linear, at = self.linear, self._smooth
-        wide = variance_inflation(linear, at) * scaled_inverse(linear.normal[np.ix_(at, at)])
-        moves = self.linearisation.jackknife(at)
+        prior = self._prior
+        normal = linear.normal[np.ix_(at, at)] + prior
+        bread = scaled_inverse(normal)
+        own = bread @ prior @ bread  # what only the file says is as uncertain as it says
+        wide = variance_inflation(linear, at) * (bread - own)
+        moves = self.linearisation.jackknife(at, prior)
         w = len(moves)
         if w >= _FEWEST_CLUSTERS:
             few = (stdtrit(w - 1, 0.975) / 1.96) ** 2  # Student's: the scatter of few is uncertain
             wide = 0.5 * (wide + few * (w - 1) / w * moves.T @ moves)
+        wide += own
         biases = self.linearisation.columns[:, at].T @ self.linearisation.of_biases()
-        moves = scaled_solve(linear.normal[np.ix_(at, at)], biases, 1e-9)
+        moves = scaled_solve(normal, biases, 1e-9)
         out = np.zeros_like(linear.normal)
         out[np.ix_(at, at)] = wide + moves @ moves.T
         return out
@@ -141,8 +146,8 @@ class Fitted:
         """
         linear, at, h = self.linear, self._smooth, self.hypothesis
         error = self.linearisation.sensitivity_to(self._errors_of_the_file())
-        base, normal = self.linearisation.columns[:, at], linear.normal[np.ix_(at, at)]
-        moves = scaled_solve(normal, base.T @ error, 1e-9)
+        base = self.linearisation.columns[:, at]
+        moves = scaled_solve(linear.normal[np.ix_(at, at)] + self._prior, base.T @ error, 1e-9)
         error -= base @ moves  # what the parameters do not imitate tells how large they are
         left = np.linalg.inv(np.eye(error.shape[1]) + error.T @ error / self.inflation)
         likely = left @ (error.T @ self.linearisation.error) / self.inflation
@@ -154,7 +159,7 @@ class Fitted:
 
     def _errors_of_the_file(self) -> Array:
         """The wrench (K, 6, E) of one standard deviation of each error of the file."""
-        h, problem = self.hypothesis, self.linearisation.problem
+        h, problem, motion = self.hypothesis, self.linearisation.problem, self.linearisation.motion
         config, body = h.config, h.model.body
         fitted = {name for _, name in self.linear.keys}
         known = config.vehicle_uncertainty
@@ -166,11 +171,13 @@ class Fitted:
         axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]
         errors = [
             problem.raising(body)[:, :, None] * cob_std(config),
-            problem.of_rigid_body(body, self.linearisation.motion) * own,
+            problem.of_rigid_body(body, motion) * own,
             ONE_AXIS * stronger * np.eye(6)[:, axes],
         ]
         if "thrust_scale" not in h.effects:
             errors.append(stronger)
+        trim = {k: std for k, std in trim_std(config).items() if k[0] not in h.effects}
+        errors.append(problem.columns(h, motion, tuple(trim)) * list(trim.values()))
         if config.wrench.scale_std > 0.0:
             beside = float(_TURNED * np.mean(semi_axes(body)))
             for arm in (p for p in EFFECTS["thrust_line"].parameters if p.name not in fitted):
@@ -182,7 +189,13 @@ class Fitted:
 
     def leave_one_out(self) -> Array:
         """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""
-        return self.linearisation.leave_one_out(self._smooth)
+        return self.linearisation.leave_one_out(self._smooth, self._prior)
+
+    @property
+    def _prior(self) -> Array:
+        """The precision of the prior of these."""
+        problem = self.linearisation.problem
+        return np.diag(problem.precision(self.hypothesis)[self._smooth])
 
     @property
     def _smooth(self) -> Indices:
@@ -240,7 +253,8 @@ def _with_noise(fitted: Fitted) -> Fitted:
 def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -> Fitted:
     """Gauss-Newton with step shortening at fixed noise."""
     h, problem = linearisation.hypothesis, linearisation.problem
-    prior, mean = precision(h), np.array([centre(h.config, key) for key in h.keys])
+    prior = problem.precision(h)
+    mean = np.array([centre(h.config, key) for key in h.keys])
     for _ in range(iterations):
         linear = linearisation.linear
         value = np.array(list(h.values.values()))
@@ -314,7 +328,7 @@ def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
     change = np.zeros(len(linear.keys))
     change[moved] = far
     change[at] = solve_bounded(
-        normal + np.diag(precision(h.at({k: h.values[k] for k in follow}))),
+        normal + np.diag(problem.precision(h.at({k: h.values[k] for k in follow}))),
         slope[at] - linear.normal[np.ix_(at, moved)] @ far,
         *step_limits(h, follow),
     )

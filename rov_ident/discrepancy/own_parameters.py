@@ -36,7 +36,8 @@ def parted(
         for there in alone
     ]
     fitted = [r for r in records if r is not None]
-    prior = precision(shared.at({k: shared.values[k] for k in keys}))
+    forces = any(f.linearisation.problem.streams.has_forces for f in alone if f is not None)
+    prior = precision(shared.at({k: shared.values[k] for k in keys}), forces)
     normal, slope = np.diag(prior), prior * np.array([centre(shared.config, k) for k in keys])
     normal = normal + sum(r.information for r in fitted)
     slope = slope + sum(r.information @ r.values + r.gradient for r in fitted)

@@ -30,6 +30,7 @@ from rov_ident.discrepancy.hypothesis import (
     onsets,
     reach,
     role_of,
+    trim_std,
 )
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import FIRST_NOISE, Fitted, fit, refit, with_best_onsets
@@ -95,6 +96,9 @@ class Search:
             for name, value in zip(config.model.names, config.model.theta, strict=True)
             if name in config.estimate and not streams.guided[parse(name).row]
         }
+        if not streams.has_forces:  # ... and what trim makes is then taken for a larger scale
+            trim = [k for k in trim_std(config) if k[0] not in config.effects]
+            base |= {k: bounds(k)[0] for k in trim}
         parameters = [(e.name, p) for e in EFFECTS.values() for p in e.parameters]
         duration = {(e, p.name): streams.longest for e, p in parameters if p.role == "fixed"}
         self.given = Hypothesis(config, base, duration)

@@ -20,7 +20,14 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix, turns
 from rov_ident.core.linalg import integral, interpolated
 from rov_ident.core.noise import robust_std
-from rov_ident.discrepancy.hypothesis import COEFFICIENTS, Hypothesis, Key, in_order, parameter
+from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
+    Hypothesis,
+    Key,
+    in_order,
+    parameter,
+    precision,
+)
 from rov_ident.discrepancy.multiple_shooting import (
     Motion,
     Steps,
@@ -185,6 +192,10 @@ class WindowedProblem:
         steps, seconds = float(np.sum(last - first)), float(np.sum(t[last] - t[first]))
         rate = min(steps / seconds, _COUNTED_RATE)
         return self._moves * rate * min(seconds / _COUNTED_SECONDS, 1.0)
+
+    def precision(self, h: Hypothesis) -> Array:
+        """Of a hypothesis's prior, (P,)."""
+        return precision(h, self.streams.has_forces)
 
     def count(self, moves: int) -> None:
         """Count simulations, or sensitivities to so many wrenches, of all windows."""

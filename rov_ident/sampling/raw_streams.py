@@ -95,6 +95,11 @@ class Streams:
         return bool(self.posed.any())
 
     @property
+    def has_forces(self) -> bool:
+        """Whether a wrench other than zero is recorded; what fins and propellers do is none."""
+        return bool(self.demand.any())
+
+    @property
     def guided(self) -> NDArray[np.bool_]:
         """Axes (6,) whose velocity a simulation can only take as measured.
 
