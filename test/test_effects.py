@@ -92,7 +92,7 @@ def typical(effect: Effect, rng: np.random.Generator | None = None) -> dict[str,
             "frequency": p.typical * share,
             "fixed": 15.0 * share,
             "limit": p.typical * share,
-            "shape": SHAPE.get(p.name, 8.0 * share - 6.0),
+            "shape": SHAPE.get(p.name, 0.3 * share if p.axis else 8.0 * share - 6.0),
         }.get(p.role, p.null + share * p.typical)
     return values
 
@@ -497,8 +497,12 @@ def lagged(t: Array, demands: Array, time_constant: float) -> Array:
 
 
 def failed(t: Array, demands: Array, onset: float, **gains: float) -> Array:
+    """By the matrix of one thruster that fails, and those of the axes."""
     after = np.clip((t[1:] - onset) / np.diff(t), 0.0, 1.0)[:, None]
-    return demands * ((1.0 - after) + after * np.array(list(gains.values())))
+    push, share = (np.array([gains[f"{of}_{axis}"] for axis in AXES]) for of in ("push", "share"))
+    lost = (1.0 - gains["gain"]) * np.outer(push, share)
+    axes = np.diag([gains[f"gain_{axis}"] for axis in AXES])
+    return (1.0 - after) * demands + after * (demands @ (axes - lost).T)
 
 
 def sagging(t: Array, demands: Array, end_loss: float, duration: float) -> Array:

@@ -26,12 +26,14 @@ from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
 from rov_ident.model.scales import semi_axes
+from rov_ident.model.thruster_allocation import matrix
 from rov_ident.sampling.raw_streams import gather
 from rov_ident.sampling.wrench_scatter import resting_noise
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
 MINUTE = Conditions(duration=60.0, odometry_rate=10.0, imu_rate=50.0)
 NOISY = Conditions(duration=120.0, excitation="pilot", reading=(0.5, 0.06))
+SHIPPED = shipped("config/bluerov2_heavy.yaml")
 LEAN = Suite(odometry_rate=10.0, imu_rate=50.0)
 
 
@@ -98,6 +100,28 @@ def test_each_cause_is_named_alone_and_with_its_size(heavy, name, seed):
     for parameter, true in (values | coefficients).items():
         value = found.parameters[parameter]
         assert abs(value.value - true) < max(4.0 * value.std, 0.04 * abs(true)), parameter
+
+
+@pytest.mark.parametrize("seed", [1, *more(2, 3, 4, 5, 6)])
+def test_a_thruster_that_fails_is_told_by_its_number(heavy, seed):
+    """Any of the eight, dead or weak or too strong, from the start or from a time on. Axes that
+    each lose a share explain little of it."""
+    rng = np.random.default_rng([seed, 17])
+    given = to_parameters(heavy) | {"thrusters": to_parameters(load(SHIPPED))["thrusters"]}
+    shapes = EFFECTS["thruster_failure"].of_thrusters(matrix(from_parameters(given).thrusters))
+    shape, gain = shapes[rng.integers(8)], rng.choice([0.0, rng.uniform(0.2, 0.7), 1.4])
+    onset = rng.choice([0.0, rng.uniform(20.0, 40.0)])
+    values = {**shape, "gain": float(gain), "onset": float(onset)}
+    believed = {n: v * (1.0 + rng.uniform(-0.1, 0.1)) for n, v in given["coefficients"].items()}
+    world = from_parameters({**given, "effects": {"thruster_failure": values}})
+    findings = findings_of(world, from_parameters({**given, "coefficients": believed}), seed=seed)
+    found = findings.effects[0]
+    assert found.effect == "thruster_failure" and found.separable
+    assert found.parameters["thruster"].value == shape["thruster"]
+    told = found.parameters["gain"]
+    assert abs(told.value - gain) < max(4.0 * told.std, 0.02)
+    assert abs((found.onset_s or 0.0) - onset) < 3.0
+    assert {f.effect for f in findings.effects if f.separable} == {"thruster_failure"}
 
 
 @pytest.mark.parametrize(
@@ -404,7 +428,7 @@ def test_an_axis_on_which_what_was_found_loses_stays_as_it_was(heavy):
 def test_thrusters_that_push_less_astern_are_no_property_of_the_hull(seed):
     """Each propeller by itself, of which the wrench shows only the sum along each axis: drag that
     differs ahead and astern, lift and dead bands were named for it, surely."""
-    file = shipped("config/bluerov2_heavy.yaml")
+    file = SHIPPED
     raw = yaml.safe_load(file.read_text())["/**"]["ros__parameters"]["thrusters"]
     position, direction = (np.reshape(raw[key], (-1, 3)) for key in ("position", "direction"))
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)

@@ -13,6 +13,7 @@ from rov_ident.discrepancy.explain import _beside_given, _of_guided, explain
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.held_out import Judge, blocks, split, windows
 from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, precision
+from rov_ident.discrepancy.multiple_shooting import tangent
 from rov_ident.discrepancy.output_error import fit, with_best_onsets
 from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
@@ -176,13 +177,76 @@ def told_in_each(bags, effect, **parameters):
 
 @pytest.mark.parametrize("seed", [1, *more(3, 5)])
 def test_records_have_an_effect_of_their_own_only_where_they_differ(seed):
-    """Of an effect that is the same in each, a gain of -2 % was told."""
-    start = {"north": 0.1, "east": 0.01, "down": 0.01}
-    for north, differs in ((0.3, True), (0.0, False)):
-        bags = [record(seed, ocean_current={"north": north}), record(seed + 1)]
-        search, _, last, alone = fitted_to_each(bags, "ocean_current", start)
-        keys = search.keys_of(last, "ocean_current")
-        assert repetition.differ(last, alone, keys) == differs
+    """What is the same in each is one value, whichever way the search came to it."""
+    mine, other = {"north": 0.3, "east": 0.1}, {"north": -0.2, "east": 0.2}
+    for second, differs in ((other, True), (mine, False)):
+        bags = [record(seed, ocean_current=mine), record(seed + 1, ocean_current=second)]
+        streams, begins = joined(bags)
+        spans = [(b + s, b + e) for bag, b in zip(bags, begins) for s, e in split(bag.duration)[0]]
+        search = Search(streams, TODAY, spans)
+        found = search.extended(search.start())
+        assert search.named(found) == ["ocean_current"]
+        assert found.hypothesis.owners == (frozenset({0, 1}) if differs else frozenset())
+        common = search.given.having({("ocean_current", n): 0.01 for n in mine})
+        again = search.extended(fit(search.problem, common))
+        assert (again is not None and again.hypothesis.owners == {0, 1}) == differs
+
+
+def test_what_a_record_has_of_its_own_moves_that_record_alone():
+    """And its derivatives are those of the simulation, of a load, a current and the trim."""
+    streams, begins = joined([record(1), record(2), record(3)])
+    spans = [s for a, b in blocks(streams) for s in windows(a, b)]
+    problem = WindowedProblem(streams, spans)
+    own = {
+        ("payload", "mass_wet@2"): 0.5,
+        ("payload", "x@2"): 0.1,
+        ("ocean_current", "north@3"): 0.1,
+        ("cog_offset", "dx"): 0.004,
+    }
+    h, starts = Hypothesis(TODAY, own), problem.measured_starts()
+    assert set(h.in_record(1).effects) == {"payload", "cog_offset"}
+    assert set(h.in_record(2).effects) == {"ocean_current", "cog_offset"}
+    assert set(h.in_record(0).effects) == set(h.effects) == {"cog_offset"}
+    motion = problem.motion(h, starts)
+    for i, begin in enumerate(begins):
+        alone = problem.motion(h.in_record(i), starts)
+        mine = problem.streams.begin_of(problem.times) == begin
+        assert (motion.nu[problem.nodes][mine] == alone.nu[problem.nodes][mine]).all()
+    e = problem
+    moved = tangent(motion, e.first, e.last, e.nodes, e.columns(h, motion, list(own)))
+    for i, (key, value) in enumerate(own.items()):
+        step = 1e-4
+        there, here = (e.motion(h.having({key: value + s}), starts) for s in (step, -step))
+        slope = (there.nu - here.nu)[e.nodes] / (2.0 * step)
+        assert np.abs(slope - moved[..., i]).max() < 0.02 * np.abs(slope).max()
+
+
+LADEN = {
+    "payload": lambda rng: {"mass_wet": rng.uniform(0.5, 1.5), "x": rng.uniform(-0.2, 0.2)},
+    "buoyancy": lambda rng: {"delta": rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 5.0)},
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"), [("payload", 51), *more(*((n, s) for n in LADEN for s in range(52, 56)))]
+)
+def test_a_load_of_one_dive_of_three_is_found_in_that_dive(name, seed):
+    """Whichever of them it is. A search for one value for all three did not find it."""
+    rng = np.random.default_rng(seed)
+    values, laden = LADEN[name](rng), int(rng.integers(3))
+    bags = [record(10 * seed + i, 60.0, **({name: values} if i == laden else {})) for i in range(3)]
+    found = explain(bags, TODAY)
+    (told,) = (f for f in found.findings.effects if f.effect == name)
+    assert not told.repetition.same and "The records differ" in told.sentence
+    for parameter, true in values.items():
+        each = [of[parameter] for of in told.repetition.records]
+        assert abs(each[laden].value - true) < 4.0 * each[laden].std < 0.2 * abs(true)
+        assert told.parameters[parameter].value == pytest.approx(each[laden].value, rel=0.05)
+    amplitude = next(iter(values))
+    others = [of[amplitude] for i, of in enumerate(told.repetition.records) if i != laden]
+    assert all(abs(v.value) < 4.0 * v.std for v in others)
+    assert name not in found.extended.effects
+    assert any(f"has {name} of its own" in note for note in found.findings.notes)
 
 
 def test_a_current_of_one_dive_is_said_to_be_of_that_dive():

@@ -1,5 +1,7 @@
 """The standard deviation of noise, in a signal that is not noise alone."""
 
+import math
+
 import numpy as np
 
 from rov_ident.core.messages import Array
@@ -13,7 +15,7 @@ def robust_std(error: Array, axis: int | None = 0) -> Array:
     return _NORMAL * np.median(np.abs(error), axis=axis)
 
 
-def second_differences(signal: Array) -> Array:
-    """(K - 2, n) of a signal (K, n), over the square root of 6: white noise keeps its standard
-    deviation, and a signal that changes evenly leaves nothing."""
-    return np.diff(signal, 2, axis=0) / np.sqrt(6.0)
+def differences(signal: Array, order: int) -> Array:
+    """(K - order, n) of a signal (K, n), scaled so that white noise keeps its standard deviation; a
+    signal that is a polynomial of a lower order leaves nothing."""
+    return np.diff(signal, order, axis=0) / math.sqrt(math.comb(2 * order, order))

@@ -18,7 +18,6 @@ from rov_ident.discrepancy import (
     clock_errors,
     empirical_term,
     extension,
-    own_parameters,
     rates_and_attitude,
     repetition,
     sensor_choice,
@@ -48,12 +47,12 @@ from rov_ident.discrepancy.held_out import (
     thinned,
     windows,
 )
-from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, Key
+from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, record_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
 from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Value, Verdict
-from rov_ident.discrepancy.search import Search, Trial, Trials, added_effect
+from rov_ident.discrepancy.search import Search, Trial, Trials, with_own
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
-from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Simulated, Spans, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, Values, with_trait
 from rov_ident.model.coefficients import AXES, VELOCITIES, WRENCH_UNITS
 from rov_ident.model.equations import Array
@@ -211,7 +210,7 @@ def explain(
     say("judging on held-out data", 0.9)
     likeliest, begun = model.final.hypothesis, beginnings(model.final)
     judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, likeliest, begun)
-    _judge_effects(search, judge, retuned, model, data)
+    _judge_effects(search, judge, retuned, model)
     if begun and begun != beginnings(model.final):
         begun = beginnings(model.final)
         judge = Judge(judge.problem, data.sensors, likeliest, begun)
@@ -225,18 +224,18 @@ def explain(
     last, notes = _with_all_data(data.streams, model.final)
     there = [f for f in model.found if is_left(search, last, f.effect)]
     of_dynamics = [with_parameters(search, last, f) for f in there]
-    shared = _Shared(model.final.hypothesis, last.hypothesis)
     if len(bags) > 1:
         say("leaving records out", 0.95)
-        of_dynamics, shared = _in_each_record(
+        of_dynamics, last, of_records = _in_each_record(
             search, judge, data, retuned, model, last, of_dynamics
         )
+        notes += of_records
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
     given = Hypothesis(config, {})
     problem = WindowedProblem(data.recorded.judged, data.to_judge)
     as_recorded = Judge(problem, likeliest=likeliest, left_out=begun)
-    final = _without_minor_noise(shared.judged, data, of_sensors)
+    final = _without_minor_noise(model.final.hypothesis, data, of_sensors)
     written = extension.kept(
         extension.AsGiven(judge, as_recorded.summed(given)),
         extension.AsGiven(
@@ -245,14 +244,8 @@ def explain(
         ),
         final,
     )
-    if written.model is None:
-        shared = _Shared(given, given)
     best = written.model or given
-    compared: dict[str, Simulated] = {
-        "as configured": given,
-        "retuned": retuned.hypothesis,
-        "extended": shared.with_own(judge.problem, best),
-    }
+    compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
     left = _left(data.judged, rmse[2], judge.rmse_of_noise())
@@ -269,11 +262,9 @@ def explain(
         axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]
         residual = empirical_term.best_dependences(search.problem, model.final, axes)
     everything = WindowedProblem(data.streams, blocks(data.streams))
-    compared["extended"] = shared.with_own(everything, best)
     notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
     notes += [_OWN_HEADINGS] if any(data.headings) else []
     notes += [_OWN_DELAYS] if data.delays else []
-    notes += shared.notes
     passing = [name for name in with_trait("dive") if name in best.effects]
     known = [name for name in data.sensors if name in config.effects]
     notes += [_BESIDE_GIVEN.format(" and ".join(known))] if known else []
@@ -297,7 +288,7 @@ def explain(
     return Explanation(
         findings,
         config,
-        config if written.model is None else _extended(shared.written, written.axes, data, found),
+        config if written.model is None else _extended(last.hypothesis, written.axes, data, found),
         everything.times,
         everything.measured,
         {label: everything.measured - everything.errors(h) for label, h in compared.items()},
@@ -351,6 +342,11 @@ class _Data:
     def validated(self) -> bool:
         """Whether another bag is judged."""
         return self.recorded.judged is not self.recorded.streams
+
+    def search(self, config: Config) -> Search:
+        """For what a configuration lacks; of another bag that is judged nobody knows what these
+        records have of their own."""
+        return Search(self.streams, config, thinned(self.to_fit), apart=not self.validated)
 
     def with_noise(self, lost: NDArray[np.bool_], lasts: NDArray[np.int64]) -> "_Data":
         """The same without further axes (6,) that are lost in noise of the wrench's reading, which
@@ -414,26 +410,6 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     )
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """What the records share of the model found, fitted to the part of the data that fits may see
-    (``judged``) and to all (``written``), with the ``notes`` on it; ``own``: what each of the
-    ``records`` has besides, none where they share all."""
-
-    judged: Hypothesis
-    written: Hypothesis
-    records: repetition.Records | None = None
-    own: Sequence[Mapping[Key, float]] = ()
-    notes: Sequence[str] = ()
-
-    def with_own(self, problem: WindowedProblem, h: Hypothesis) -> Simulated:
-        """A model with what each record has of its own, for the windows of a problem."""
-        if self.records is None or not self.own:
-            return h
-        each = [h.having(values) for values in self.own]
-        return [each[self.records.at(t)] for t in problem.steps.t[problem.first].tolist()]
-
-
 def _in_each_record(
     search: Search,
     judge: Judge,
@@ -442,41 +418,38 @@ def _in_each_record(
     model: _Model,
     last: Fitted,
     found: Sequence[Finding],
-) -> tuple[list[Finding], _Shared]:
-    """The findings with what each record says of them, and the model without what belongs to each
-    record, unless that surely predicts worse; ``last`` is the model fitted to all of the data."""
+) -> tuple[list[Finding], Fitted, list[str]]:
+    """The findings with what each record says of them, the model fitted to all of the data, which
+    was ``last``, and notes. What does not repeat becomes each record's own, there and in the
+    ``model``, unless that surely predicts worse."""
     records = data.records
     alone = repetition.alone(records, last)
     found, own = repetition.in_each(search, records, last, found, alone)
-    final = model.final.hypothesis
-    shared = _Shared(final, last.hypothesis)
     if own:
         keys = [k for name in own for k in search.keys_of(last, name)]
-        there = repetition.alone(records, model.final, data.to_fit)
-        judged, values = own_parameters.parted(there, final, keys)
-        written, _ = own_parameters.parted(alone, last.hypothesis, keys)
-        parted = _Shared(
-            judged,
-            written,
-            records,
-            () if data.validated else values,  # nobody knows those of another bag
-            [_OWN_VALUES.format(", ".join(own))],
+        of_fits = repetition.alone(records, model.final, data.to_fit)
+        parted, all_parted = (
+            with_own(fitted, keys, [f.hypothesis.values if f else {} for f in each])
+            for fitted, each in ((model.final, of_fits), (last, alone))
         )
-        after = parted.with_own(judge.problem, judged)
-        if not judge.surely_better(final, after):
-            rest = {name: search.rest(model.final, name) for name in own}
-            found = [
-                _gaining(f, judge, [retuned, rest[f.effect]], after) if f.effect in own else f
-                for f in found
-            ]
-            return found, parted
-    differ = [f.effect for f in found if f.repetition is not None and not f.repetition.same]
-    notes = [_ONE_VALUE.format(", ".join(differ))] if differ else []
-    return found, dataclasses.replace(shared, notes=notes)
+        if parted is not None and all_parted is not None:
+            after = parted.hypothesis.shared if data.validated else parted.hypothesis
+            if not judge.surely_better(model.final.hypothesis, after):
+                rest = {name: search.rest(model.final, name) for name in own}
+                found = [
+                    _gaining(f, judge, [retuned, rest[f.effect]], after) if f.effect in own else f
+                    for f in found
+                ]
+                model.final, last = dataclasses.replace(parted, hypothesis=after), all_parted
+    apart = list(dict.fromkeys(k[0] for k in last.hypothesis.keys if record_of(k) is not None))
+    notes = [_OWN_VALUES.format(", ".join(apart))] if apart else []
+    repeated = {f.effect: f.repetition for f in found if f.repetition is not None}
+    differ = [name for name, of in repeated.items() if not of.same and name not in apart]
+    return found, last, notes + ([_ONE_VALUE.format(", ".join(differ))] if differ else [])
 
 
 def _gaining(
-    found: Finding, judge: Judge, without: Sequence[Fitted | None], after: Simulated
+    found: Finding, judge: Judge, without: Sequence[Fitted | None], after: Hypothesis
 ) -> Finding:
     """The finding with what it gains where each record has values of its own, over the best of the
     models ``without`` it."""
@@ -534,7 +507,7 @@ def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams
 def _started(data: _Data, config: Config) -> tuple[Search, Fitted | None, _Data]:
     """The search, the fit from which it starts, and the data, with what these two tell of noise of
     the wrench's reading."""
-    search = Search(data.streams, config, thinned(data.to_fit))
+    search = data.search(config)
     start = search.start()
     if start is None:
         return search, None, data
@@ -549,7 +522,7 @@ def _with_reading(search: Search, fitted: Fitted, data: _Data) -> tuple[Search, 
     lasts, none = sensor_choice.noise_that_lasts(fitted), np.zeros(6, dtype=bool)
     if (lasts != data.streams.noise_lasts).any():
         data = data.with_noise(none, lasts)
-        search = Search(data.streams, search.config, thinned(data.to_fit))
+        search = data.search(search.config)
         fitted = search.start() or fitted
     reading = sensor_choice.noise_of_wrench(search, fitted)
     if not (reading.values or reading.lost.any()):
@@ -558,7 +531,7 @@ def _with_reading(search: Search, fitted: Fitted, data: _Data) -> tuple[Search, 
     if data.streams.guided.all():
         raise UserError(_ALL_IN_NOISE)
     config = sensor_choice.with_noise(search.given, values).config if values else search.config
-    return Search(data.streams, config, thinned(data.to_fit)), data
+    return data.search(config), data
 
 
 def _left(streams: Streams, rmse: Mapping[str, float], noise: Array) -> dict[str, float]:
@@ -654,9 +627,7 @@ def _searched(
     return path[0], _Model(final, trials), residuals(final, trials)
 
 
-def _judge_effects(
-    search: Search, judge: Judge, retuned: Fitted, model: _Model, data: _Data
-) -> None:
+def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> None:
     """Turn the effects of a model into findings, and take those of no practical weight out of it.
     Two effects that do the same on the held-out data gain nothing beside each other, and all
     together: the slightest leaves, and the rest is judged anew."""
@@ -667,7 +638,6 @@ def _judge_effects(
             for name, trial in known.items()
         ]
         slight = [f for f in found if not is_practical(f.gain)]
-        slight = [f for f in slight if not _gains_in_each(search, judge, model, data, f)]
         if len(slight) < 2:
             break
         least = min(slight, key=lambda f: f.gain.percent)
@@ -685,24 +655,6 @@ def _judge_effects(
             model.final = refit(kept, model.final.linearisation) or retuned
 
 
-def _gains_in_each(
-    search: Search, judge: Judge, model: _Model, data: _Data, found: Finding
-) -> bool:
-    """Whether several records differ in an effect, and it gains where each has values of its own:
-    of currents that turned, the average may be worth nothing."""
-    if len(data.bags) < 2 or data.validated:
-        return False
-    records, final = data.records, model.final
-    keys = search.keys_of(final, found.effect)
-    there = repetition.alone(records, final, data.to_fit)
-    if not repetition.differ(final, there, keys):
-        return False
-    judged, own = own_parameters.parted(there, final.hypothesis, keys)
-    after = _Shared(judged, judged, records, own).with_own(judge.problem, judged)
-    rest = model.trials[found.effect].rest
-    return is_practical(judge.gain(rest.hypothesis, after, axes=found.axes))
-
-
 def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> None:
     """What is left becomes a term without a name, if that gains on held-out data; or a named effect
     that explains as much, which is not sure, as it was not found by itself."""
@@ -711,7 +663,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     if term is None or not empirical_term.exceeds_errors_of_attitude(search.problem, term):
         return
     best, name = term, empirical_term.NAME
-    rivals = {added_effect(rest, f): f for f in search.fit_best(rest, search.candidates(rest))}
+    rivals = search.by_effect(rest, search.fit_best(rest, search.candidates(rest)))
     for rival, fitted in rivals.items():
         as_good = rest.squares - fitted.squares >= _AS_GOOD * (rest.squares - term.squares)
         as_good = as_good and not judge.surely_better(term.hypothesis, fitted.hypothesis)

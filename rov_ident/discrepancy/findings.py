@@ -27,7 +27,9 @@ from rov_ident.discrepancy.hypothesis import (
     bounds,
     effect_of,
     onsets,
+    record_of,
     role_of,
+    shared,
     unit_of,
 )
 from rov_ident.discrepancy.output_error import Fitted, onset_std, refit
@@ -79,11 +81,14 @@ def finding(
     alternatives, separable = _alternatives(search, judge, final, name, trial)
     if name in with_trait("neglecting") and may_be_noise(trial.rest, axes):
         alternatives, separable = (*alternatives, Alternative(NOISE, _EQUAL)), False
-    stds = {k: parameters[k[1].removesuffix("_neg")].std for k in keys}
-    values = final.hypothesis.values
-    separable = separable and not any(at_bound(k, values[k], stds[k]) for k in keys)
+    std = np.sqrt(np.maximum(np.diag(final.covariance), 0.0))[final.linear.index(keys)]
+    at_end = (at_bound(k, final.hypothesis.values[k], s) for k, s in zip(keys, std, strict=True))
+    separable = separable and not any(at_end)
     if separable and "factor" in EFFECTS[name].traits:
         separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
+    number = final.hypothesis.constants.get((name, "thruster"))
+    if separable and number is not None:
+        separable = _is_sure(search, final, search.with_other_thruster(final, trial.rest, name))
     if name == "thrust_line" and _may_be_lost_thrust(search.config, final.hypothesis, keys):
         alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
     found = in_words(name, axes, parameters, gain, alternatives)
@@ -128,7 +133,11 @@ def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bo
     The inertia and the drag of an axis go with its thrust, so that it is compared with that of the
     others: with surge and sway too weak, heave looks too strong.
     """
-    other = search.with_other_factors(final, rest, key)
+    return _is_sure(search, final, search.with_other_factors(final, rest, key))
+
+
+def _is_sure(search: Search, final: Fitted, other: Fitted | None) -> bool:
+    """Whether a fit is surely better than another one, if there is any."""
     return other is None or search.cost(other, final) - search.cost(final, final) > VERY_STRONG
 
 
@@ -200,10 +209,16 @@ def is_left(search: Search, last: Fitted, name: str) -> bool:
 def _differs_from_null(fitted: Fitted, keys: Sequence[Key], covariance: Array) -> bool:
     """Whether the amplitudes among parameters surely differ from their nulls together (Wald)."""
     keys = [k for k in keys if role_of(k) == "amplitude"]
+    return not keys or bool(_wald(fitted, keys, covariance) > chdtri(len(keys), 0.05))
+
+
+def _wald(fitted: Fitted, keys: Sequence[Key], covariance: Array) -> float:
+    """The square of how far the amplitudes among parameters are from their nulls together, in
+    standard deviations."""
+    keys = [k for k in keys if role_of(k) == "amplitude"]
     at = fitted.linear.index(keys)
     off = np.array([fitted.hypothesis.values[k] - bounds(k)[0] for k in keys])
-    square = off @ scaled_solve(covariance[np.ix_(at, at)], off, 1e-9)
-    return not keys or bool(square > chdtri(len(keys), 0.05))
+    return float(off @ scaled_solve(covariance[np.ix_(at, at)], off, 1e-9))
 
 
 def undecided(minor: Sequence[Finding]) -> list[Finding]:
@@ -236,14 +251,19 @@ def parameters_of(
 ) -> dict[str, Value]:
     """Parameters with their standard deviations, by the ``covariance`` (P, P) (None: what the data
     leave); damping for negative velocity is told as the coefficient that holds there, not as its
-    difference from the other."""
+    difference from the other. Of what single records have of their own those of the record that
+    has it most surely."""
     h, linear = final.hypothesis, final.linear
     wide = final.covariance if covariance is None else covariance
+    owners = {record_of(key) for key in keys}
+    if len(owners) > 1:
+        each = {r: [key for key in keys if record_of(key) == r] for r in owners}
+        keys = max(each.values(), key=lambda own: _wald(final, own, wide))
     out = {}
     for key in keys:
         at = linear.index([key])[0]
         value, variance = h.values[key], wide[at, at]
-        name = key[1]
+        name = shared(key)[1]
         if role_of(key) == "onset":
             variance = onset_std(final, key) ** 2
         positive = name.removesuffix("_neg")
@@ -254,6 +274,9 @@ def parameters_of(
                 o = linear.index([other])[0]
                 variance += wide[o, o] + 2.0 * wide[at, o]
         out[name] = Value(float(value), float(np.sqrt(max(variance, 0.0))), unit_of(key))
+    for section in {section for section, _ in keys}:
+        if (number := h.constants.get((section, "thruster"))) is not None:
+            out["thruster"] = Value(number, 0.0, "1")
     return out
 
 
@@ -268,7 +291,8 @@ def _axes(search: Search, final: Fitted, keys: Sequence[Key]) -> tuple[str, ...]
 
 def sentence(name: str, parameters: Mapping[str, Value], gain: Gain) -> str:
     values = ", ".join(
-        f"{n} = {with_unit(f'{v.value:.3g}', v.unit)} (± {NORMAL * v.std:.2g}, 95 %)"
+        f"{n} = {with_unit(f'{v.value:.3g}', v.unit)}"
+        + (f" (± {NORMAL * v.std:.2g}, 95 %)" if v.std else "")  # what is exact is a count
         for n, v in parameters.items()
     )
     return f"{EFFECTS[name].summary} {values}. The {improved(gain)}."

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rov_ident.discrepancy.hypothesis import Hypothesis
 from rov_ident.discrepancy.results import Gain, Together
-from rov_ident.discrepancy.windowed_problem import Simulated, Spans, WindowedProblem
+from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import Values, sense
 from rov_ident.effects.base import Reading
 from rov_ident.model.coefficients import AXES, VELOCITIES
@@ -116,7 +116,7 @@ class Judge:
         out: Array = self._weight.sum(axis=0)
         return out
 
-    def squares(self, h: Simulated) -> Array:
+    def squares(self, h: Hypothesis) -> Array:
         """Squared errors (N, 6) that count, and as they count; a simulation that fails is as far
         off as the motion is large."""
         error = np.abs(self._as_recorded(self.problem.errors(h)))[self._counts]
@@ -134,7 +134,7 @@ class Judge:
         )
         return np.hstack([recorded.linear - simulated.linear, error[:, 3:]])
 
-    def rmse(self, h: Simulated) -> dict[str, float]:
+    def rmse(self, h: Hypothesis) -> dict[str, float]:
         square = self.squares(h).sum(axis=0) / self.count
         error = np.where(self._guided, np.nan, np.sqrt(square))
         return dict(zip(VELOCITIES, error.tolist(), strict=True))
@@ -144,7 +144,7 @@ class Judge:
         out: Array = np.sqrt(self._noise / self._weight.mean(axis=0))
         return out
 
-    def gain(self, before: Simulated, after: Simulated, axes: Sequence[str] = ()) -> Gain:
+    def gain(self, before: Hypothesis, after: Hypothesis, axes: Sequence[str] = ()) -> Gain:
         """Of the component that gains most, of those that surely gain if any do. Where none surely
         gains, those of the ``axes`` on which an effect acts are looked at alone, as an interval for
         six components is wide, and then all of these together: a lag moves each a little."""
@@ -168,17 +168,17 @@ class Judge:
             out |= (e.times >= begin) & (begins < end)
         return out if out.all() else ~out
 
-    def better(self, rival: Simulated, h: Simulated) -> bool:
+    def better(self, rival: Hypothesis, h: Hypothesis) -> bool:
         """Whether a rival predicts better, all velocities taken together."""
         a, b = (self.summed(x)[:, self.free].sum(axis=0) for x in (rival, h))
         return bool(log_ratio(a, b).sum() < 0.0)
 
-    def surely_better(self, rival: Simulated, h: Simulated) -> bool:
+    def surely_better(self, rival: Hypothesis, h: Hypothesis) -> bool:
         """The same beyond chance."""
         a, b = (self.summed(x)[:, self.free] for x in (rival, h))
         return surely_less(a, b)
 
-    def summed(self, h: Simulated) -> Array:
+    def summed(self, h: Hypothesis) -> Array:
         """Squared errors (C, 6) summed over chunks of time."""
         return np.stack([np.bincount(self._chunk, x) for x in self.squares(h).T], axis=1)
 

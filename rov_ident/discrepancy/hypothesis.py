@@ -1,11 +1,12 @@
 """A hypothesis about what the vehicle is: a configuration with free parameters.
 
 Each parameter is named by a key (section, name): a coefficient ``("coefficients", "X_uu")`` or a
-parameter of an effect ``("thruster_lag", "time_constant")``.
+parameter of an effect ``("thruster_lag", "time_constant")``. One that a single record has of its
+own has the number of that record in its name: ``("payload", "mass_wet@2")``.
 """
 
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +15,7 @@ from rov_ident.config import Config
 from rov_ident.config.prior import typical
 from rov_ident.config.schema import missing_inputs
 from rov_ident.discrepancy.multiple_shooting import Equations, equations
-from rov_ident.effects import EFFECTS, compiled, rigid_body
+from rov_ident.effects import EFFECTS, compiled, rigid_body, with_trait
 from rov_ident.effects import parameter as effect_parameter
 from rov_ident.effects.base import Effect, EffectParameter
 from rov_ident.model.coefficients import AXES, Coefficient, parse
@@ -30,6 +31,11 @@ _WIDE = 10.0  # times the size of a coefficient: one that is configured as zero,
 # configuration states of a measured boat, which was a guess, a fit ended in a model that turns
 # broadside, twice as far off as the file (docs/explain-bench.md)
 _TRIM = "buoyancy", "cog_offset"
+_OF_RECORD = "@"  # in the name of a parameter before the number of the record that has it
+_WEIGHT = set(with_trait("weight"))
+_OF_A_DIVE = {  # water and ballast change between dives
+    name for name in (*with_trait("dive"), *_WEIGHT) if not EFFECTS[name].of_sensors
+}
 _FARTHEST_ARM = 2.0  # half lengths of the hull from the origin: an arm or a skid as long as it
 
 
@@ -63,9 +69,47 @@ class Hypothesis:
                 kept[section, name] = min(kept[section, name], limit)
         return Hypothesis(self.config, kept, self.constants)
 
+    def shaped(self, constants: Mapping[Key, float]) -> "Hypothesis":
+        """The same with these parameters known."""
+        return replace(self, constants={**self.constants, **constants})
+
+    @cached_property
+    def structure(self) -> object:
+        """What two hypotheses share that differ in values alone."""
+        return frozenset(self.values), frozenset(self.constants.items())
+
     def without(self, keys: Iterable[Key]) -> "Hypothesis":
+        """The same without some parameters, and without the shapes of effects that are gone."""
         gone = set(keys)
-        return self.at({k: v for k, v in self.values.items() if k not in gone})
+        left = self.at({k: v for k, v in self.values.items() if k not in gone})
+        there = {section for section, _ in left.values}
+        constants = left.constants.items()
+        kept = {k: v for k, v in constants if k[0] in there or role_of(k) != "shape"}
+        return replace(left, constants=kept)
+
+    @cached_property
+    def owners(self) -> frozenset[int]:
+        """The records that have parameters of their own."""
+        return frozenset(r for k in self.values if (r := record_of(k)) is not None)
+
+    @cached_property
+    def shared(self) -> "Hypothesis":
+        """Without what single records have of their own."""
+        return self.without([k for k in self.values if record_of(k) is not None])
+
+    def in_record(self, record: int) -> "Hypothesis":
+        """What it says of one of several records, which has no others' own parameters."""
+        if not self.owners:
+            return self
+        return self._in_records[record] if record in self.owners else self.shared
+
+    @cached_property
+    def _in_records(self) -> "dict[int, Hypothesis]":
+        own = {
+            r: {shared(k): v for k, v in self.values.items() if record_of(k) == r}
+            for r in self.owners
+        }
+        return {r: self.shared.having(values) for r, values in own.items()}
 
     def value(self, key: Key) -> float:
         """Of a parameter, free or not, there or not."""
@@ -78,11 +122,16 @@ class Hypothesis:
 
     @cached_property
     def effects(self) -> dict[str, dict[str, float]]:
+        """Those that all records share."""
         effects = {name: dict(values) for name, values in self.config.effects.items()}
-        for (section, name), value in self.values.items():
-            if section in EFFECTS:
-                effects.setdefault(section, self.nulls(section))[name] = value
+        for key, value in self.values.items():
+            if key[0] in EFFECTS and record_of(key) is None:
+                effects.setdefault(key[0], self.nulls(key[0]))[key[1]] = value
         return effects
+
+    def has(self, effect: str) -> bool:
+        """Whether an effect is there, be it in one record."""
+        return effect in self.effects or any(section == effect for section, _ in self.values)
 
     def nulls(self, effect: str) -> dict[str, float]:
         """The parameters of an effect that does nothing."""
@@ -124,7 +173,23 @@ def bounds(key: Key) -> tuple[float, float, float]:
 
 
 def parameter(key: Key) -> EffectParameter:
-    return effect_parameter(*key)
+    return effect_parameter(*shared(key))
+
+
+def of_record(key: Key, record: int) -> Key:
+    """The parameter that one of several records, the first of which is 0, has of its own."""
+    return key[0], f"{key[1]}{_OF_RECORD}{record + 1}"
+
+
+def shared(key: Key) -> Key:
+    """The parameter without the record that has it."""
+    return key[0], key[1].partition(_OF_RECORD)[0]
+
+
+def record_of(key: Key) -> int | None:
+    """The record that has a parameter of its own; None where all share it."""
+    number = key[1].partition(_OF_RECORD)[2]
+    return int(number) - 1 if number else None
 
 
 def in_order(names: Iterable[str]) -> tuple[Coefficient, ...]:
@@ -160,7 +225,8 @@ def precision(h: Hypothesis, forces: bool) -> Array:
     if (scale := h.config.wrench.scale_std) > 0.0:
         width[THRUST_SCALE] = scale
     if not forces:
-        width |= trim_std(h.config)
+        trim = trim_std(h.config)
+        width |= {key: trim[shared(key)] for key in h.keys if shared(key) in trim}
     return np.array([width.get(key, np.inf) for key in h.keys]) ** -2.0
 
 
@@ -173,8 +239,13 @@ def reach(config: Config, keys: Iterable[Key]) -> dict[Key, float]:
     """How far [m] from the origin that may be, by coordinate, which is attached to the hull at a
     place among the keys."""
     far = dict(zip("xyz", (_FARTHEST_ARM * semi_axes(config.model.body)).tolist(), strict=True))
-    places = [k for k in keys if role_of(k) == "place" and k[1] in far]
-    return {k: max(far[k[1]], parameter(k).typical) for k in places}  # also of a plate
+    places = [k for k in keys if role_of(k) == "place" and parameter(k).name in far]
+    return {k: max(far[parameter(k).name], parameter(k).typical) for k in places}  # also of a plate
+
+
+def is_shared(keys: Iterable[Key]) -> bool:
+    """Whether no record has one of the parameters of its own."""
+    return all(record_of(key) is None for key in keys)
 
 
 def largest_step(key: Key) -> float:
@@ -244,7 +315,9 @@ def units(effect: Effect, h: Hypothesis, roles: Container[str]) -> list[tuple[Ke
         have = {parse(n).place for n in h.coefficients}
         new = [c for c in map(parse, effect.coefficients) if c.place not in have]
         return [((COEFFICIENTS, c.name),) for c in new if not missing_inputs(c, h.config.inputs)]
-    mine = [(effect.name, p.name) for p in effect.parameters if p.role in roles]
+    mine = [
+        (effect.name, p.name) for p in effect.parameters if p.role in roles and _acts(effect, p, h)
+    ]
     if effect.steer and not any(f in h.config.inputs.joints for f in h.model.inputs if f != "n"):
         return []
     # of none of the inputs, or of one that is heard and does something
@@ -252,7 +325,29 @@ def units(effect: Effect, h: Hypothesis, roles: Container[str]) -> list[tuple[Ke
     mine = [key for key in mine if parameter(key).input in heard]
     if any(p.axis or p.input for p in effect.parameters):
         return [(key,) for key in mine if key not in h.values]
-    return [] if effect.name in h.effects else [tuple(mine)]
+    return [] if h.has(effect.name) else [tuple(mine)]
+
+
+def _acts(effect: Effect, p: EffectParameter, h: Hypothesis) -> bool:
+    """Whether a parameter does anything: of axes, or of the thruster of which ``h`` knows."""
+    if effect.of_thrusters is None or p.role != "amplitude":
+        return True
+    return bool(p.axis) != any(section == effect.name for section, _ in h.constants)
+
+
+def own_units(effect: Effect, h: Hypothesis, records: int) -> list[tuple[Key, ...]]:
+    """The amplitudes that each of several ``records`` may have of its own of an effect that belongs
+    to a dive and that ``h`` lacks there. Of what weighs or floats a record has one thing at most:
+    a load is buoyancy and a centre of gravity together."""
+    if records < 2 or effect.name not in _OF_A_DIVE or effect.name in h.effects:
+        return []
+    mine = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+    alike = _WEIGHT if effect.name in _WEIGHT else {effect.name}
+    return [
+        tuple(of_record(key, r) for key in mine)
+        for r in range(records)
+        if not any(key[0] in alike and record_of(key) == r for key in h.keys)
+    ]
 
 
 def unit_of(key: Key) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rov_ident.core.frames import rotated
 from rov_ident.core.linalg import scaled_solve, unit_diagonal
 from rov_ident.core.noise import robust_std
-from rov_ident.discrepancy.hypothesis import Hypothesis, Key
+from rov_ident.discrepancy.hypothesis import Hypothesis, Key, record_of, shared
 from rov_ident.discrepancy.multiple_shooting import Motion, adjoint, tangent
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.equations import Array, Indices
@@ -111,7 +111,7 @@ class Linearisation:
         lock in Python 3.11."""
         if self._sensitivities is None:
             keys = self.hypothesis.keys
-            columns = self.unprojected(self.problem.columns(self.hypothesis, self.motion, keys))
+            columns = self._of(self.hypothesis, keys)
             starts = self._eliminate(columns)
             count = int(np.count_nonzero(self._weight)) - 6 * len(self.first)
             normal, gradient = columns.T @ columns, self._gradient(columns)
@@ -174,6 +174,32 @@ class Linearisation:
         """The transpose of :meth:`unprojected` without whitening: (N, 6) to wrenches (K, 6)."""
         e = self.problem
         return adjoint(self.motion, e.first, e.last, error * self._weight, e.nodes)
+
+    def sensitivity_of(self, h: Hypothesis, keys: Sequence[Key]) -> Array:
+        """Sensitivities (6 N, P) of the simulated velocities to parameters of a hypothesis."""
+        out = self._of(h, keys)
+        self._eliminate(out)
+        return out
+
+    def _of(self, h: Hypothesis, keys: Sequence[Key]) -> Array:
+        """The same with the initial velocities held. What several records have of the same
+        parameter moves none of the others' windows, so that it takes one column together."""
+        problem = self.problem
+        force = problem.columns(h, self.motion, keys)
+        kinds = [(shared(k), record_of(k) is None) for k in keys]
+        together = list(dict.fromkeys(kinds))
+        if len(together) == len(keys):
+            return self.unprojected(force)
+        at = [together.index(kind) for kind in kinds]
+        packed = np.zeros((*force.shape[:2], len(together)))
+        for i, column in enumerate(at):
+            packed[:, :, column] += force[:, :, i]
+        out: Array = self.unprojected(packed)[:, at]
+        records = np.repeat(problem.record[problem.first][problem.window], 6)
+        for i, key in enumerate(keys):
+            if (record := record_of(key)) is not None:
+                out[records != record, i] = 0.0
+        return out
 
     def sensitivity_to(self, force: Array) -> Array:
         """Sensitivities (6 N, C) of the simulated velocities to wrenches (K, 6, C)."""

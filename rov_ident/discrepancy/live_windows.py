@@ -107,7 +107,7 @@ class State(NamedTuple):
 
 def is_watched(effect: Effect) -> bool:
     """Whether an effect can be scored as it stands: it acts on the wrench, and at once."""
-    searched = {"frequency", "fixed", "limit", "shape"}
+    searched = {"frequency", "fixed", "limit", *(() if effect.of_thrusters else ("shape",))}
     return not effect.of_sensors and not any(p.role in searched for p in effect.parameters)
 
 

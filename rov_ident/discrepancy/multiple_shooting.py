@@ -9,7 +9,7 @@ is taken as measured. Sensitivities solve the linearised equations along that mo
 for any change dF of the wrench, so that a hundred candidate causes cost little more than one.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -123,13 +123,19 @@ def acted(steps: Steps, acting: Acting, demands: Array) -> Array:
 
 
 def shoot(
-    eq: Equations, steps: Steps, wrench: Array, first: Indices, last: Indices, start: Array
+    each: Sequence[Equations],
+    steps: Steps,
+    wrench: Array,
+    first: Indices,
+    last: Indices,
+    start: Array,
 ) -> Motion:
-    """Integrate each window from node ``first`` to ``last`` (W,), beginning at start (W, 6)."""
+    """Integrate each window from node ``first`` to ``last`` (W,), beginning at start (W, 6), by the
+    equations that hold in its record."""
     k = wrench.shape[1]
     zeros = [np.zeros(shape) for shape in 2 * [(k, 6)] + 2 * [(k, 6, 6)]]
     motion = Motion(np.full((k + 1, 6), np.nan), *zeros)
-    for begin, rows in _records(steps.begin):
+    for eq, (begin, rows) in zip(each, _records(steps.begin), strict=True):
         mine = slice(*np.searchsorted(first, [rows.start, rows.stop]))
         _shoot(
             on_clock(eq.acting, begin), eq.structure, eq.mass, eq.added, eq.inverse,

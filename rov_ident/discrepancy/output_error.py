@@ -317,9 +317,10 @@ def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
         return linearise(problem, h, begin, start.noise)
     linear = start.linear
     if added:
-        without = before.having({k: (before if k in linear_in else h).value(k) for k in added})
-        columns = problem.columns(without, start.motion, added)
-        linear = start.having(added, start.sensitivity_to(columns))
+        without = before.shaped(h.constants).having(
+            {k: (before if k in linear_in else h).value(k) for k in added}
+        )
+        linear = start.having(added, start.sensitivity_of(without, added))
     follow = [k for k in before.keys if h.values.get(k) == before.values[k]]
     at, moved = linear.index(follow), linear.index(moves)
     far = np.array(list(moves.values()))

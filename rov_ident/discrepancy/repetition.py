@@ -1,9 +1,10 @@
 """Whether a cause is the same in each of several records, and whether it repeats.
 
-The model found is fitted to each record alone: where an effect's parameters differ by more than
-chance, the records differ in it, as in a current or a payload. Then each record is left out as a
-whole and predicted by fits to the others, with the effect and without (Stone 1974). An effect that
-differs, and does not predict other records, belongs to each record (`own_parameters.py`).
+What belongs to a dive may have values of its own in each record already in the search. Of the other
+effects the model found is fitted to each record alone: where an effect's parameters differ by more
+than chance, the records differ in it. Then each record is left out as a whole and predicted by fits
+to the others, with the effect and without (Stone 1974). An effect that differs, and does not
+predict other records, belongs to each record, too.
 """
 
 import dataclasses
@@ -17,14 +18,23 @@ from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, unsure
 from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
-from rov_ident.discrepancy.hypothesis import Key, role_of
+from rov_ident.discrepancy.hypothesis import (
+    Key,
+    bounds,
+    is_shared,
+    of_record,
+    record_of,
+    role_of,
+    shared,
+    unit_of,
+)
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
 from rov_ident.discrepancy.results import Finding, Repetition, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import PENALTY
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
-from rov_ident.effects import Values
+from rov_ident.effects import EFFECTS, Values
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams, corrected
@@ -65,14 +75,21 @@ def in_each(
     """Findings of the dynamics with what each record says of them, and the names of those that
     belong to each record; ``last`` is the model fitted to all, ``alone`` that fitted to each. One
     that does not repeat cannot be told for sure."""
-    repeats = _left_out(search, records, last, [f.effect for f in found], alone)
+    keys_of = {f.effect: search.keys_of(last, f.effect) for f in found}
+    asked = [name for name, keys in keys_of.items() if is_shared(keys)]
+    repeats = _left_out(search, records, last, asked, alone)
     out, own = [], []
     for f in found:
-        keys = search.keys_of(last, f.effect)
+        keys = keys_of[f.effect]
+        if not is_shared(keys):
+            each = _of_their_own(last, keys, len(records))
+            out.append(_with(f, Repetition(False, None, each)))
+            continue
         names = [k for k in keys if role_of(k) in _LINEAR]
         each = tuple(parameters_of(there or last, names) for there in alone)
         first = 0 if f.onset_s is None else records.at(f.onset_s)
-        same = _is_same(each[first:])
+        laden = _laden(last) if "weight" in EFFECTS[f.effect].traits else frozenset()
+        same = _is_same([of for r, of in enumerate(each) if r >= first and r not in laden])
         told = _with(f, Repetition(same and not first, repeats.get(f.effect), each), first)
         if not (same and not first) and not repeats.get(f.effect):
             own.append(f.effect)
@@ -80,11 +97,28 @@ def in_each(
     return out, own
 
 
-def differ(last: Fitted, alone: Sequence[Fitted | None], keys: Sequence[Key]) -> bool:
-    """Whether records, to each of which the model ``last`` was fitted ``alone``, differ by more
-    than chance in those of its parameters that a record can have of its own."""
-    names = [k for k in keys if role_of(k) in _LINEAR]
-    return not _is_same([parameters_of(there or last, names) for there in alone])
+def _laden(last: Fitted) -> frozenset[int]:
+    """The records with something of their own that weighs or floats, each of which tells nothing by
+    itself of what else does."""
+    own = {k: r for k in last.hypothesis.keys if (r := record_of(k)) is not None}
+    return frozenset(r for (effect, _), r in own.items() if "weight" in EFFECTS[effect].traits)
+
+
+def _of_their_own(last: Fitted, keys: Sequence[Key], count: int) -> tuple[dict[str, Value], ...]:
+    """What each of the ``count`` records says of an effect that single ones have: of any other how
+    large it may be there, wherever it would act."""
+    names = dict.fromkeys(shared(k) for k in keys)
+    unknown = {name: Value(np.nan, np.inf, unit_of((effect, name))) for effect, name in names}
+    told = []
+    for r in range(count):
+        own, there = [k for k in keys if record_of(k) == r], last
+        if not own:  # one at a time: beside the same effect of all, nothing could be told
+            own = [of_record(k, r) for k in names if role_of(k) == "amplitude"]
+            nulls = {k: bounds(k)[0] for k in own}
+            there = refit(last.hypothesis.having(nulls), last.linearisation) or last
+        own = [k for k in own if k in there.hypothesis.values]
+        told.append(unknown | parameters_of(there, own))
+    return tuple(told)
 
 
 def alone(records: Records, last: Fitted, spans: Spans | None = None) -> list[Fitted | None]:
@@ -202,7 +236,7 @@ def late_finding(
 
 def _is_same(each: Sequence[Mapping[str, Value]]) -> bool:
     """Whether the parameters of ``each`` of several records differ by no more than chance."""
-    return all(_agree([of[name] for of in each]) for name in each[0])
+    return all(_agree([of[name] for of in each]) for name in (each[0] if each else ()))
 
 
 def _agree(of: Sequence[Value]) -> bool:

@@ -117,6 +117,10 @@ def _named(effects: Sequence[Finding]) -> str:
     return f"{'; '.join(parts)}. {gains[0].upper() + gains[1:]}."
 
 
+def _rounded(v: Value) -> str:
+    return number(v.value, 2) if v.std else f"{v.value:g}"  # what is exact is a count
+
+
 def brief(finding: Finding) -> str:
     """An effect with the parameters that matter most, in the middle of a sentence."""
     declared = {p.name: p for p in EFFECTS[finding.effect].parameters}
@@ -126,9 +130,9 @@ def brief(finding: Finding) -> str:
         if p is None or p.role in ("amplitude", "place"):
             size[name] = 1.0 if p is None else abs(v.value - p.null) / p.typical
     told = [name for name, s in size.items() if s > _SMALL * max(size.values())][:_TOLD]
-    told += [p.name for p in declared.values() if p.role in ("onset", "frequency")]
+    told += [p.name for p in declared.values() if p.role in ("onset", "frequency", "shape")]
     values = [
-        with_unit(f"{n.replace('_', ' ') if n in declared else n} {number(v.value, 2)}", v.unit)
+        with_unit(f"{n.replace('_', ' ') if n in declared else n} {_rounded(v)}", v.unit)
         for n, v in finding.parameters.items()
         if n in told
     ]

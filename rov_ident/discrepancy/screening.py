@@ -7,7 +7,7 @@ not linear in a parameter (an onset, a place of attachment, a frequency) is scan
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -18,7 +18,11 @@ from rov_ident.discrepancy.hypothesis import (
     Key,
     axis_of,
     bounds,
+    is_shared,
+    of_record,
+    own_units,
     parameter,
+    record_of,
     role_of,
     units,
 )
@@ -43,6 +47,7 @@ _ONSETS = 24  # scanned evenly over the bag: every 7 s of three minutes, about a
 _FINE_ONSETS = 17  # scanned around the best of them, to an eighth of that distance
 _ONSET_RANGE = 0.04  # of the bag to either side: the distance of the even ones
 _LIMITS = (0.9, 0.75, 0.6, 0.45, 0.3)  # of the largest command; below that a limit is no longer one
+_THRUSTERS = 3  # of which a failure is tried in full; effort
 _PEAKS = 3  # of the spectrum that are tried as the frequency of a wave; effort
 
 
@@ -50,12 +55,13 @@ _PEAKS = 3  # of the spectrum that are tried as the frequency of a wave; effort
 class Candidate:
     """An effect that may be missing: the parameters to add with their first values, its penalised
     score, and the same as if the residuals that it leaves were white: where a model is far off,
-    only a fit shows what there is."""
+    only a fit shows what there is. ``constants`` say of which thruster it is."""
 
     name: str
     start: Mapping[Key, float]
     score: float
     white_score: float
+    constants: Mapping[Key, float] = field(default_factory=dict)
 
 
 class Workers:
@@ -76,30 +82,45 @@ class Workers:
 class Screening:
     """The candidates for what a fit lacks."""
 
-    def __init__(self, problem: WindowedProblem, workers: Workers) -> None:
-        self._problem, self._workers = problem, workers
-        self._known: dict[frozenset[Key], list[Candidate]] = {}
+    def __init__(
+        self,
+        problem: WindowedProblem,
+        workers: Workers,
+        records: int = 1,
+        thrusters: Array | None = None,
+    ) -> None:
+        """``records``: how many there are that may differ; ``thrusters`` (6, n): their allocation,
+        where it is known."""
+        self._problem, self._workers, self._records = problem, workers, records
+        self._shapes = {
+            e.name: [{(e.name, n): v for n, v in of.items()} for of in e.of_thrusters(thrusters)]
+            for e in EFFECTS.values()
+            if e.of_thrusters is not None and thrusters is not None
+        }
+        self._known: dict[object, list[Candidate]] = {}
 
     def candidates(self, now: Fitted) -> list[Candidate]:
-        """The best first; remembered for each set of parameters."""
-        keys = frozenset(now.hypothesis.keys)
-        if keys not in self._known:
-            self._known[keys] = self._screened(now)
-        return self._known[keys]
+        """The best first; remembered for each structure."""
+        known = now.hypothesis.structure
+        if known not in self._known:
+            self._known[known] = self._screened(now)
+        return self._known[known]
 
     def _screened(self, now: Fitted) -> list[Candidate]:
         h, linearisation = now.hypothesis, now.linearisation
-        linear = {
-            e.name: self.units(e, h)
+        smooth = [
+            e
             for e in EFFECTS.values()
             if all(p.role in ("amplitude", "fixed") for p in e.parameters)
-        }
-        extra = list(dict.fromkeys(k for groups in linear.values() for u in groups for k in u))
-        force = self._problem.columns(h, linearisation.motion, extra)
-        scores = scores_of(linearisation, extra, linearisation.sensitivity_to(force))
+        ]
+        linear = [(e.name, self.units(e, h)) for e in smooth]
+        linear += [(e.name, own_units(e, h, self._records)) for e in smooth]
+        extra = list(dict.fromkeys(k for _, groups in linear for u in groups for k in u))
+        scores = scores_of(linearisation, extra, linearisation.sensitivity_of(h, extra))
         candidates = []
-        for name, groups in linear.items():
-            found, score, white = scores.select(groups, bounds, name in HULL_DAMPING)
+        for name, groups in linear:
+            apart = not all(map(is_shared, groups))
+            found, score, white = scores.select(groups, bounds, apart or name in HULL_DAMPING)
             keys, change = found.keys, found.change
             if name in HULL_DAMPING and score == -np.inf:
                 keys = [k for unit in groups for k in unit]
@@ -107,9 +128,13 @@ class Screening:
             if keys:
                 start = first_values(dict(zip(keys, change.tolist(), strict=True)))
                 candidates.append(Candidate(name, start, score, white))
-        others = [e for e in EFFECTS.values() if e.name not in h.effects]
+        others = [e for e in EFFECTS.values() if not h.has(e.name)]
         scanned = self._workers.map(lambda effect: self._scanned(now, effect), others)
-        candidates += [c for c in scanned if c is not None]
+        candidates += [c for found in scanned for c in found]
+        placed = [e for e in EFFECTS.values() if any(p.role == "place" for p in e.parameters)]
+        own = [(e, unit) for e in placed for unit in own_units(e, h, self._records)]
+        each = self._workers.map(lambda of: self._best_shape(now, of[0], [{}], of[1]), own)
+        candidates += [c for c in each if c is not None]
         return sorted(candidates, key=lambda c: (-c.score, -c.white_score))
 
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
@@ -141,29 +166,48 @@ class Screening:
         axis = axis_of(key)
         return not (axis and self._problem.guided[AXES.index(axis)])
 
-    def _scanned(self, now: Fitted, effect: Effect) -> Candidate | None:
-        """An effect with parameters in which the wrench is not linear: an onset, coarsely, then
-        around the best; the neighbourhood of the origin for a place of attachment."""
+    def _scanned(self, now: Fitted, effect: Effect) -> list[Candidate]:
+        """An effect with parameters in which the wrench is not linear: an onset, the neighbourhood
+        of the origin for a place of attachment, a limit, a frequency."""
         roles = {p.role for p in effect.parameters}
+        found: list[Candidate | None] = []
         if "onset" in roles:
-            duration = self._problem.streams.duration
-            coarse = np.linspace(_ONSET_RANGE, 1.0 - _ONSET_RANGE, _ONSETS)
-            best = self._best_shape(now, effect, [{"onset": t * duration} for t in coarse])
-            if best is None:
-                return None
-            near = np.linspace(-_ONSET_RANGE, _ONSET_RANGE, _FINE_ONSETS) * duration
-            onsets = best.start[effect.name, "onset"] + near
-            return self._best_shape(now, effect, [{"onset": float(t)} for t in onsets]) or best
-        if "place" in roles:
+            found = [self._with_onset(now, effect), *self._of_thrusters(now, effect)]
+        elif "place" in roles:
             places = [p for p in effect.parameters if p.role == "place"]
             signs = itertools.product((-1.0, 0.0, 1.0), repeat=len(places))
             grid = [
                 {p.name: s * p.typical for p, s in zip(places, of, strict=True)} for of in signs
             ]
-            return self._best_shape(now, effect, grid)
-        if "limit" in roles:
-            return self._limited(now, effect)
-        return self._oscillating(now, effect) if "frequency" in roles else None
+            found = [self._best_shape(now, effect, grid)]
+        elif "limit" in roles:
+            found = [self._limited(now, effect)]
+        elif "frequency" in roles:
+            found = [self._oscillating(now, effect)]
+        return [c for c in found if c is not None]
+
+    def _of_thrusters(self, now: Fitted, effect: Effect) -> list[Candidate]:
+        """An effect of each of a few thrusters, from the start or with an onset. What a lost one
+        leaves is far from white until it is in the model, however well it suits."""
+        found = []
+        for shape in self._shapes.get(effect.name, ()):
+            of = Fitted(now.hypothesis.shaped(shape), now.linearisation, now.converged)
+            both = self._best_shape(of, effect, [{}]), self._with_onset(of, effect)
+            best = max(filter(None, both), key=lambda c: c.white_score, default=None)
+            if best is not None:
+                found.append(replace(best, constants=shape))
+        return sorted(found, key=lambda c: -c.white_score)[:_THRUSTERS]
+
+    def _with_onset(self, now: Fitted, effect: Effect) -> Candidate | None:
+        """The best onset, sought coarsely, then around the best."""
+        duration = self._problem.streams.duration
+        coarse = np.linspace(_ONSET_RANGE, 1.0 - _ONSET_RANGE, _ONSETS)
+        best = self._best_shape(now, effect, [{"onset": t * duration} for t in coarse])
+        if best is None:
+            return None
+        near = np.linspace(-_ONSET_RANGE, _ONSET_RANGE, _FINE_ONSETS) * duration
+        onsets = best.start[effect.name, "onset"] + near
+        return self._best_shape(now, effect, [{"onset": float(t)} for t in onsets]) or best
 
     def _limited(self, now: Fitted, effect: Effect) -> Candidate | None:
         """Limits of the thrust on single axes, or of fins, at shares of the largest command: beyond
@@ -204,12 +248,18 @@ class Screening:
         return [k for unit in own for k in unit if self._is_shown(k, h)]
 
     def _best_shape(
-        self, now: Fitted, effect: Effect, shapes: Sequence[Mapping[str, float]]
+        self,
+        now: Fitted,
+        effect: Effect,
+        shapes: Sequence[Mapping[str, float]],
+        own: Sequence[Key] = (),
     ) -> Candidate | None:
-        """The shape (onset, place) of an effect that scores best, with its linear amplitudes. Where
-        a place is not part of the shape, the moments that it makes are fitted as well."""
+        """The shape (onset, place) of an effect that scores best, with its linear amplitudes, which
+        may be those that a record has of its ``own``. Where a place is not part of the shape, the
+        moments that it makes are fitted as well."""
         linearisation = now.linearisation
-        own = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+        record = record_of(own[0]) if own else None
+        own = own or [k for unit in units(effect, now.hypothesis, ("amplitude",)) for k in unit]
         keys = [key for key in own if self._is_shown(key, now.hypothesis)]
         if not keys:
             return None
@@ -225,7 +275,8 @@ class Screening:
             scores = scores_of(linearisation, [*keys, *moments], columns)
             groups = [(*keys, *moments)] if moments else [(k,) for k in keys]
             selected, score, white = scores.select(groups, bounds)
-            both = score - PENALTY, white - PENALTY
+            own_penalty = PENALTY * bool(shape)
+            both = score - own_penalty, white - own_penalty
             if selected.keys and (best is None or both > (best.score, best.white_score)):
                 found = dict(zip(selected.keys, selected.change.tolist(), strict=True))
                 if moments and found[keys[0]] == 0.0:
@@ -236,7 +287,7 @@ class Screening:
                     limit = FARTHEST * p.typical
                     there[p.name] = float(np.clip(found[m] / found[keys[0]], -limit, limit))
                 names = [p.name for p in effect.parameters if p.name in there]
-                start |= {(effect.name, name): there[name] for name in names}
+                start |= {_of(record, (effect.name, name)): there[name] for name in names}
                 best = Candidate(effect.name, start, *both)
         return best
 
@@ -244,7 +295,8 @@ class Screening:
         self, now: Fitted, effect: Effect, shape: Mapping[str, float], keys: Sequence[Key]
     ) -> Array:
         """The wrench (K, 6, P) of a unit of each amplitude of an effect of this shape."""
-        h = now.hypothesis.having({(effect.name, n): v for n, v in shape.items()})
+        record = record_of(keys[0])
+        h = now.hypothesis.having({_of(record, (effect.name, n)): v for n, v in shape.items()})
         return self._problem.columns(h, now.linearisation.motion, keys)
 
     def _oscillating(self, now: Fitted, effect: Effect) -> Candidate | None:
@@ -272,9 +324,13 @@ class Screening:
             start[effect.name, "frequency"] = frequency
             start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
             inflations = scores.inflation_with(labels, change), scores.white_inflation(gain, labels)
-            both = (gain / inflation - PENALTY * len(start) for inflation in inflations)
-            candidates.append(Candidate(effect.name, start, *both))
+            both = [gain / inflation - PENALTY * len(start) for inflation in inflations]
+            candidates.append(Candidate(effect.name, start, both[0], both[1]))
         return max(candidates, key=lambda c: c.score, default=None)
+
+
+def _of(record: int | None, key: Key) -> Key:
+    return key if record is None else of_record(key, record)
 
 
 def first_values(change: Mapping[Key, float]) -> dict[Key, float]:

@@ -9,7 +9,7 @@ patterns of no known cause (`patterns`). One that does not earn its place leaves
 
 import contextlib
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +27,10 @@ from rov_ident.discrepancy.hypothesis import (
     axis_of,
     bounds,
     effect_of,
+    is_shared,
+    of_record,
     onsets,
+    own_units,
     reach,
     role_of,
     trim_std,
@@ -39,6 +42,7 @@ from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, S
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, with_trait
+from rov_ident.model import thruster_allocation
 from rov_ident.model.coefficients import parse
 from rov_ident.sampling.raw_streams import Streams
 
@@ -87,8 +91,13 @@ class Search:
     """A bag searched for what a configuration lacks."""
 
     def __init__(
-        self, streams: Streams, config: Config, spans: Sequence[tuple[float, float]]
+        self,
+        streams: Streams,
+        config: Config,
+        spans: Sequence[tuple[float, float]],
+        apart: bool = True,
     ) -> None:
+        """``apart``: whether records that were joined may differ in what belongs to a dive."""
         self.config, self.problem = config, WindowedProblem(streams, spans)
         self._spans = spans
         base = {
@@ -103,9 +112,12 @@ class Search:
         duration = {(e, p.name): streams.longest for e, p in parameters if p.role == "fixed"}
         self.given = Hypothesis(config, base, duration)
         self._workers = Workers(self.problem)
-        self.screening = Screening(self.problem, self._workers)
+        self._records = len(streams.begins) if apart else 1
+        known = config.thrusters if thruster_allocation.is_known(config.thrusters) else None
+        thrusters = None if known is None else thruster_allocation.matrix(known)
+        self.screening = Screening(self.problem, self._workers, self._records, thrusters)
         self.patterns = PatternSearch(self.problem, self._workers)
-        self._ends: dict[frozenset[Key], Hypothesis] = {}  # of the last fit of these parameters
+        self._ends: dict[object, Hypothesis] = {}  # of the last fit of a structure
         self.cut_short = False  # whether something was left untried
 
     def _budget_spent(self) -> bool:
@@ -149,7 +161,7 @@ class Search:
         candidates = self.candidates(now)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.score:.0f}" for c in candidates[:5]))
-        fits = self.fit_best(now, candidates) + self._with_late_thrust(now)
+        fits = self.fit_best(now, candidates) + self._with_late_thrust(now) + self._apart(now)
         best = self._best(now, fits)
         if best is None or added_effect(now, best) not in HULL_DAMPING:
             best = self._cheapest([best, self._damping_and_another(now, candidates)])
@@ -168,14 +180,24 @@ class Search:
     def _best(
         self, now: Fitted, fits: Sequence[Fitted], asked: float = VERY_STRONG
     ) -> Fitted | None:
-        """The fit with the best penalised score, if it is as good as asked; hull damping first."""
+        """The fit with the best penalised score, if it is as good as asked; hull damping first, and
+        what lasts before what would have begun before anything could be seen of it."""
         if not fits:
             return None
         closest = min(fits, key=lambda f: f.squares)
         good = [f for f in fits if self.improvement(now, f, closest) >= asked]
         good = [f for f in good if self.is_determined(now, f)]
+        names = {added_effect(now, f) for f in good}
+        good = [f for f in good if not (self._was_there(now, f) & names)]
         damping = [f for f in good if added_effect(now, f) in HULL_DAMPING]
         return min(damping or good, key=lambda f: self.cost(f, closest), default=None)
+
+    def _was_there(self, now: Fitted, larger: Fitted) -> set[str]:
+        """The lasting effects that one with an onset is the same as, where that lies before the end
+        of the first window; none elsewhere."""
+        seen, h = float(self.problem.steps.t[self.problem.last[0]]), larger.hypothesis
+        early = [k for k in onsets(h) if k not in now.hypothesis.values and h.values[k] <= seen]
+        return {name for effect, _ in early for name in EFFECTS[effect].lasting}
 
     def _cheapest(self, fits: Sequence[Fitted | None]) -> Fitted | None:
         """The fit with the best penalised score of those that there are."""
@@ -220,6 +242,19 @@ class Search:
         )
         return [f for f in fits if f is not None]
 
+    def _apart(self, now: Fitted) -> list[Fitted]:
+        """Full fits in which each record has values of its own of one effect of a dive."""
+        fits = []
+        for name in self.named(now):
+            keys, effect = self.keys_of(now, name), EFFECTS.get(name)
+            if effect is None or any(role_of(k) == "onset" for k in keys):
+                continue
+            units = own_units(effect, now.hypothesis.without(keys), self._records)
+            if len(units) == self._records and is_shared(keys):
+                values = [{k: now.hypothesis.values[k] for k in keys}] * self._records
+                fits.append(with_own(now, keys, values))
+        return [f for f in fits if f is not None]
+
     def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
         """Full fits of the best candidates, and of what is lacking most often, whatever its score:
         a model that lacks it can be too far off for its linearisation to show it."""
@@ -234,7 +269,7 @@ class Search:
             found[0] = min(both, key=lambda f: f.squares, default=None)
         fits = [f for f in found if f is not None]
         # here, not by the threads, of which now one, now the other is first
-        self._ends |= {frozenset(f.hypothesis.keys): f.hypothesis for f in fits}
+        self._ends |= {f.hypothesis.structure: f.hypothesis for f in fits}
         return fits
 
     def _fit_candidate(
@@ -242,8 +277,8 @@ class Search:
     ) -> Fitted | None:
         """A full fit; one of the same parameters, as rivals often are, begins where the last one
         has ended."""
-        h = now.hypothesis.having(candidate.start)
-        known = self._ends.get(frozenset(h.keys))
+        h = now.hypothesis.shaped(candidate.constants).having(candidate.start)
+        known = self._ends.get(h.structure)
         start = now.linearisation
         there = self._from_file(now, h) if from_file else refit(h, start, known=known)
         apart = any(p.axis for p in EFFECTS[candidate.name].parameters)
@@ -333,6 +368,14 @@ class Search:
         begin = h.having({k: bounds(k)[0] for k in others})
         return self._pruned(refit(begin, final.linearisation), rest) if others else None
 
+    def with_other_thruster(self, final: Fitted, rest: Fitted, name: str) -> Fitted | None:
+        """The fit that has in place of an effect of one thruster, in ``final`` and not in ``rest``,
+        that of the thruster that suits second best."""
+        mine = final.hypothesis.constants.get((name, "thruster"))
+        found = [c for c in self.candidates(rest, name=name) if c.name == name]
+        others = [c for c in found if c.constants.get((name, "thruster")) != mine]
+        return self._cheapest([self._fit_candidate(rest, c) for c in others])
+
     def with_own_arm(self, fitted: Fitted, inflation: float) -> tuple[Fitted, float]:
         """The fit with the height of the centre of buoyancy that suits it, as far as the file
         leaves that open, where squares count as if white over ``inflation``; and the square of how
@@ -358,9 +401,18 @@ class Search:
         """What other effects might explain what ``name`` explains: fits by the name of the rival.
         An effect is not named without them, whatever the budget: they take little of it."""
         candidates = [c for c in self.candidates(rest, name=name) if c.name != name]
-        fits = {added_effect(rest, f): f for f in self.fit_best(rest, candidates)}
+        fits = self.by_effect(rest, self.fit_best(rest, candidates))
         fits.pop(name, None)  # two families share some coefficients
         return fits
+
+    def by_effect(self, rest: Fitted, fits: Iterable[Fitted]) -> dict[str, Fitted]:
+        """Fits that each have one effect more than ``rest``, the best of each effect by its name:
+        all records may share it, or single ones have it."""
+        found: dict[str, list[Fitted]] = {}
+        for f in fits:
+            found.setdefault(added_effect(rest, f), []).append(f)
+        best = {name: self._cheapest(of) for name, of in found.items()}
+        return {name: f for name, f in best.items() if f is not None}
 
     def _patterns_for(self, rest: Fitted, name: str) -> dict[str, Fitted]:
         """The same of patterns of no known cause."""
@@ -477,6 +529,15 @@ def shortened(streams: Streams, spans: Sequence[tuple[float, float]]) -> Spans:
     length = max(_SHORT, _FEWEST_SHORT * float(np.median(np.diff(streams.t))))
     edges = (np.linspace(a, b, max(1, int((b - a) / length)) + 1) for a, b in spans)
     return [pair for of in edges for pair in itertools.pairwise(of.tolist())]
+
+
+def with_own(
+    now: Fitted, keys: Sequence[Key], values: Sequence[Mapping[Key, float]]
+) -> Fitted | None:
+    """The fit in which the parameters ``keys`` belong to each of several records, from the
+    ``values`` of each; one that is empty has none."""
+    own = {of_record(k, r): of[k] for r, of in enumerate(values) if of for k in keys}
+    return refit(now.hypothesis.without(keys).having(own), now.linearisation)
 
 
 def added_effect(rest: Fitted, larger: Fitted) -> str:

@@ -422,7 +422,10 @@ def with_noise(h: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
 
 
 def noise_std(streams: Streams, values: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations of the parameters, of as many readings as they are from."""
-    count = np.maximum(RESTING * len(streams.demand) / streams.noise_lasts, 1.0)
-    std = _on_axes(1.0 / np.sqrt(count))
-    return {name: value * std[name] for name, value in values.items()}
+    """Standard deviations of the parameters, of as many readings as they are from, and of what
+    commands that never rest may have made of them."""
+    lasts = streams.noise_lasts
+    count = np.maximum(RESTING * len(streams.demand) / lasts, 1.0)
+    relative = _on_axes(1.0 / np.sqrt(count))
+    driven = _on_axes(np.where(lasts > 1, 0.0, wrench_scatter.driven(streams.demand)))
+    return {n: float(np.hypot(value * relative[n], driven[n])) for n, value in values.items()}

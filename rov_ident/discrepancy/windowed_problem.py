@@ -25,10 +25,14 @@ from rov_ident.discrepancy.hypothesis import (
     Hypothesis,
     Key,
     in_order,
+    is_shared,
     parameter,
     precision,
+    record_of,
+    shared,
 )
 from rov_ident.discrepancy.multiple_shooting import (
+    Equations,
     Motion,
     Steps,
     acted,
@@ -74,7 +78,6 @@ _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of can
 
 
 Spans = list[tuple[float, float]]  # from and to [s] each
-Simulated = Hypothesis | Sequence[Hypothesis]  # one model, or that of each window
 
 
 class _Remembered:
@@ -100,7 +103,8 @@ class WindowedProblem:
     time axis ``steps``; ``window`` (N,) says in which window each lies, ``first`` and ``last``
     (W,) are the nodes where windows begin and end. ``guided`` (6,): axes that follow the
     measurement. ``patterns``: wrenches (K, 6) of no known cause, by key. ``reading_std`` (6,):
-    noise of the wrench's reading, which ``lasts`` (6,) so many of them.
+    noise of the wrench's reading, which ``lasts`` (6,) so many of them. ``records`` are those of
+    the joined ones in which there are steps; ``record`` (K,) is that of each step.
     """
 
     def __init__(self, streams: Streams, spans: Sequence[tuple[float, float]]) -> None:
@@ -139,6 +143,8 @@ class WindowedProblem:
             streams.begin_of(nodes[:-1]),
             streams.begin_of(pieces[:-1]),
         )
+        self.record = np.searchsorted(streams.begins, self.steps.begin)
+        self.records: list[int] = np.unique(self.record).tolist()
         at = np.searchsorted(nodes, t)
         first, last = [], []
         for begin, end in spans:
@@ -275,8 +281,8 @@ class WindowedProblem:
     def motion(self, h: Hypothesis, starts: Array) -> Motion | None:
         """Simulate from initial velocities (W, 6); None where that diverges, or where the mass
         matrix is not positive definite."""
-        mass = h.model.mass_matrix
-        if not np.isfinite(list(h.values.values())).all() or np.linalg.eigvalsh(mass)[0] <= 0.0:
+        masses = np.array([there.model.mass_matrix for there in self._each(h)])
+        if not np.isfinite([*h.values.values()]).all() or np.linalg.eigvalsh(masses).min() <= 0.0:
             return None
         wrench = self.thrust(h.effects)
         for key, value in h.values.items():
@@ -291,8 +297,15 @@ class WindowedProblem:
     def _shot(
         self, h: Hypothesis, wrench: Array, first: Indices, last: Indices, starts: Array
     ) -> Motion:
-        equations = guided_by(h.equations, self.guided)
-        return shoot(equations, self.driven(h.effects), wrench, first, last, starts)
+        return shoot(self._equations(h), self.driven(h.effects), wrench, first, last, starts)
+
+    def _each(self, h: Hypothesis) -> list[Hypothesis]:
+        """What a hypothesis says of each of the records."""
+        return [h.in_record(r) for r in self.records]
+
+    def _equations(self, h: Hypothesis) -> list[Equations]:
+        """The equations of motion of each of the records."""
+        return [guided_by(there.equations, self.guided) for there in self._each(h)]
 
     def growth(self, h: Hypothesis) -> Array:
         """Sensitivities (N, 6, 6) to the first velocity of each window along the measured motion:
@@ -308,6 +321,7 @@ class WindowedProblem:
         """How the wrench on the vehicle changes with each parameter, (K, 6, P)."""
         out = np.zeros((len(motion.middle), 6, len(keys)))
         place = {key: i for i, key in enumerate(keys)}
+        apart = bool(h.owners) or not is_shared(keys)
         names = [n for section, n in keys if section == COEFFICIENTS]
         if names:
             found = in_order(names)
@@ -322,7 +336,23 @@ class WindowedProblem:
         for key in keys:
             if key in self.patterns:
                 out[:, :, place[key]] = self.patterns[key]
-        for section in dict.fromkeys(s for s, _ in keys if s in EFFECTS):
+        of_effects = [key for key in keys if key[0] in EFFECTS]
+        if of_effects and not apart:
+            out[:, :, [place[key] for key in of_effects]] = self._of_effects(h, motion, of_effects)
+        for record in self.records if of_effects and apart else ():
+            rows, there = self.record == record, h.in_record(record)
+            mine = [key for key in of_effects if record_of(key) in (None, record)]
+            plain = list(dict.fromkeys(shared(key) for key in mine))
+            own = self._of_effects(there, motion, plain)[rows]
+            at = [plain.index(shared(key)) for key in mine]
+            out[np.ix_(rows, range(6), [place[key] for key in mine])] = own[:, :, at]
+        return out
+
+    def _of_effects(self, h: Hypothesis, motion: Motion, keys: Sequence[Key]) -> Array:
+        """The same of parameters of effects, where all records share them."""
+        out = np.zeros((len(motion.middle), 6, len(keys)))
+        place = {key: i for i, key in enumerate(keys)}
+        for section in dict.fromkeys(s for s, _ in keys):
             effect = EFFECTS[section]
             mine = [p for p in effect.parameters if (section, p.name) in place]
             # parameters of single axes act apart: one difference quotient for all of them
@@ -338,10 +368,11 @@ class WindowedProblem:
 
     def _relative(self, h: Hypothesis, motion: Motion) -> Motion:
         """The motion through the water, where there is a current."""
-        water = h.equations.acting.water
-        if not water.any():
+        each = np.array([there.equations.acting.water for there in self._each(h)])
+        if not each.any():
             return motion
-        drift = np.einsum("kji,j->ki", self.steps.middle, water)
+        water = each[np.searchsorted(self.records, self.record)]
+        drift = np.einsum("kji,kj->ki", self.steps.middle, water)
         turning = np.cross(motion.middle[:, 3:], drift)
         zero = np.zeros_like(drift)
         return motion._replace(
@@ -456,15 +487,14 @@ class WindowedProblem:
         inputs = np.abs(self.steps.inputs).max(axis=0)
         return float(inputs[INPUTS.index(p.input)] if p.input else 4.0 * inputs[:3].max())
 
-    def errors(self, h: Simulated) -> Array:
+    def errors(self, h: Hypothesis) -> Array:
         """Measured minus simulated velocity (N, 6) in open loop, each window from its measured
         state; NaN where that diverges."""
         guide, nu = None, self._measured_at(self.steps.t)
         simulated = np.full((len(self.steps.t), 6), np.nan)
-        each = [h] * len(self.first) if isinstance(h, Hypothesis) else h
-        for there, first, last, start in zip(
-            each, self.first, self.last, self.measured_starts(), strict=True
-        ):
+        starts, records = self.measured_starts(), self.record[self.first].tolist()
+        for record, first, last, start in zip(records, self.first, self.last, starts, strict=True):
+            there = h.in_record(record)
             (mean, slope), inputs = self.thrust(there.effects), self.driven(there.effects).inputs
             nodes, begin = slice(first, last + 1), float(self.steps.begin[first])
             at = np.minimum(np.arange(first, last + 1), len(mean) - 1)
@@ -488,7 +518,7 @@ class WindowedProblem:
         About the motion as measured: a simulation that noise has taken elsewhere may have come to
         where no noise grows."""
         t, middle, starts = self.steps.t, self.steps.middle, self._measured_at(self.steps.t)[:-1]
-        equations, each = guided_by(h.equations, self.guided), np.arange(len(starts))
+        equations, each = self._equations(h), np.arange(len(starts))
         thrust, driven = self.thrust(h.effects), self.driven(h.effects)
 
         def shot(aside: Array) -> Motion:

@@ -242,7 +242,7 @@ def estimable(name: str) -> dict[str, float | None]:
         if all((m.linear == same.linear).all() for m in moved):
             return {}
     return {
-        p.name: p.null if p.axis or p.input or p.role == "limit" else None
+        p.name: p.null if p.axis or p.input or p.role == "limit" or effect.of_thrusters else None
         for p in effect.parameters
         if p.role in ("amplitude", "limit", "place")
     }

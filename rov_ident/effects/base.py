@@ -165,6 +165,9 @@ class Effect:
     are factors of the thrust, of all axes or of one; *neglecting*, with it a model may follow the
     wrench as read less, and noise with it; *dive*, it is the dive's and not the vehicle's;
     *weight*, of what weighs or floats, which with another righting arm look like one another.
+
+    ``of_thrusters(allocation (6, n))``: the shapes that the effect may have, {parameter: value},
+    one of each thruster. With one of them its parameters of no axis act; without, those of axes.
     """
 
     place: Place
@@ -190,6 +193,7 @@ class Effect:
     noise: Callable[..., Array] | None = None
     late: Callable[..., float] | None = None
     heading: Callable[..., float] | None = None
+    of_thrusters: Callable[[Array], list[dict[str, float]]] | None = None
 
     @property
     def of_actuators(self) -> bool:

@@ -17,7 +17,7 @@ from rov_ident.core.frames import quaternion_to_matrix, wrap_angle
 from rov_ident.effects import act, compiled, memory
 from rov_ident.model.equations import Array
 from rov_ident.model.scales import WORKING_SPEED, authority
-from rov_ident.model.thruster_allocation import matrix
+from rov_ident.model.thruster_allocation import is_known, matrix
 from rov_ident.simulation.open_loop import simulate
 from rov_ident.simulation.virtual_sensors import Dive, Suite, measure
 
@@ -128,7 +128,7 @@ def _reachable(config: Config) -> Array:
     """What turns a wrench into the nearest one (6, 6) that the thrusters can make, relative to the
     working wrench of each axis; the same one where they make any, or are not known."""
     known = config.thrusters
-    if not (known.allocation or known.position):
+    if not is_known(known):
         return np.eye(6)
     weight = 1.0 / authority(config.dynamics)
     scaled = weight[:, None] * matrix(known)

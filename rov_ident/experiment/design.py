@@ -34,6 +34,7 @@ from rov_ident.experiment.data_quality import Prospect, prospects
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.coefficients import parse
 from rov_ident.model.equations import Array
+from rov_ident.model.thruster_allocation import is_known
 from rov_ident.offline.archive import Archive, total
 from rov_ident.offline.maximum_likelihood import LIKELY, NO_ROWS, assumed, one_pass
 from rov_ident.offline.newton import inverse_of
@@ -231,7 +232,7 @@ def propose(
 
 def _of_thrusters(config: Config) -> tuple[str, ...]:
     """What a plan takes for granted of a vehicle whose thrusters are not described."""
-    if config.thrusters.allocation or config.thrusters.position:
+    if is_known(config.thrusters):
         return ()
     others = " and leaves fins and shafts still" if config.model.fins else ""
     return (

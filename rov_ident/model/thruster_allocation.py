@@ -153,12 +153,17 @@ def matrix(config: Geometry) -> Array:
     return allocation(np.reshape(position, (-1, 3)), d)
 
 
+def is_known(config: Geometry) -> bool:
+    """Whether the configuration gives an allocation, be it a wrong one."""
+    return bool(config.allocation or config.position or config.direction)
+
+
 def check(config: Geometry, signal: str) -> None:
     """Refuse what could not be used later.
 
     Raises UserError: one sentence naming the key.
     """
-    if not (config.allocation or config.position or config.direction):
+    if not is_known(config):
         raise UserError(
             "thrusters has no allocation: give thrusters.position and thrusters.direction, or "
             "thrusters.allocation"

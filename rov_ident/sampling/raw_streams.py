@@ -24,7 +24,7 @@ from rov_ident.core.frames import (
 )
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.messages import DRIVE, IMU, ODOMETRY, WRENCH, Array, Message, Odometry
-from rov_ident.core.noise import robust_std, second_differences
+from rov_ident.core.noise import differences, robust_std
 from rov_ident.effects import Values, correct, heading_error, velocity_delay
 from rov_ident.effects.base import Reading
 from rov_ident.model.coefficients import AXES, INPUTS, VELOCITIES
@@ -201,7 +201,7 @@ def _is_reckoned(read: Streams) -> bool:
         return False
     v = rotated(quaternion_to_matrix(read.orientation), read.nu[:, :3])[:, :2]
     step = np.diff(read.position[:, :2], axis=0)
-    noise = np.median(np.abs(second_differences(v)), axis=0) * np.median(np.diff(read.t))
+    noise = np.median(np.abs(differences(v, 2)), axis=0) * np.median(np.diff(read.t))
     rules = (v[:-1], v[1:], 0.5 * (v[:-1] + v[1:]))
     moved = step.any(axis=1)  # one that is rounded is repeated
     if not moved.any():
