@@ -146,6 +146,24 @@ def test_a_line_of_thrust_is_not_sure_where_thrust_is_not_known(heavy):
     assert "thruster_gain" in [a.effect for a in found.alternatives]
 
 
+@pytest.mark.parametrize("seed", [1, *more(2, 3, 4)])
+def test_trim_is_no_payload_taken_up_at_the_first_moment(heavy, seed):
+    """Which, being one effect and not two, explains more at once."""
+    rng = np.random.default_rng([seed, 5])
+    trim = {
+        "buoyancy": {"delta": rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 4.0)},
+        "cog_offset": dict(zip(("dx", "dy"), rng.uniform(0.002, 0.006, 2).tolist())),
+    }
+    given = to_parameters(heavy)
+    world = from_parameters({**given, "effects": trim})
+    found = {f.effect: f for f in findings_of(world, heavy, seed=seed).effects}
+    assert set(found) == set(trim)
+    for effect, values in trim.items():
+        for name, true in values.items():
+            told = found[effect].parameters[name]
+            assert abs(told.value - true) < max(4.0 * told.std, 0.05 * abs(true))
+
+
 @pytest.mark.parametrize("seed", [1, *more(2)])
 def test_weight_too_much_may_be_buoyancy_that_is_lost(heavy, seed):
     """The two differ by the righting moment of what floats, which the file does not know so well:

@@ -249,6 +249,26 @@ def test_a_load_of_one_dive_of_three_is_found_in_that_dive(name, seed):
     assert any(f"has {name} of its own" in note for note in found.findings.notes)
 
 
+@pytest.mark.parametrize("seed", [61, *more(62, 63)])
+def test_waves_have_a_phase_of_their_own_in_each_dive(seed):
+    """With one phase for all nothing was found, as they cancel."""
+    rng = np.random.default_rng(seed)
+    wave = {"fx": 4.0, "fy": -3.0, "frequency": float(rng.uniform(0.1, 0.3))}
+    phases = (rng.uniform(0.0, 1.0) + np.array([0.0, 2.1, 4.2])) % 6.2
+    bags = [record(seed + i, 60.0, wave={**wave, "phase": p}) for i, p in enumerate(phases)]
+    found = explain(bags, TODAY)
+    (told,) = found.findings.effects
+    assert told.effect == "wave" and not told.repetition.same
+    for of, phase in zip(told.repetition.records, phases):
+        assert of["frequency"].value == pytest.approx(wave["frequency"], abs=0.002)
+        sign = np.sign(of["fx"].value)
+        for name in ("fx", "fy"):
+            assert sign * of[name].value == pytest.approx(wave[name], abs=0.4)
+        apart = of["phase"].value - phase + (0.0 if sign > 0.0 else np.pi)
+        assert abs(np.angle(np.exp(1j * apart))) < 0.2
+    assert "wave" not in found.extended.effects
+
+
 def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
     bags = [record(1, ocean_current={"north": 0.3}), record(2)]
     found = told_in_each(bags, "ocean_current", north=0.1, east=0.01, down=0.01)
@@ -415,10 +435,12 @@ def test_what_is_taken_up_between_two_dives_begins_with_the_second():
     assert at == pytest.approx(begins[1], abs=0.5)
     records = repetition.Records(streams, bags, begins)
     gain = Gain("w", 1.0, 0.5, 50.0, 40.0, 60.0)
-    found = Finding("payload", ("Z",), {}, at, gain, True, None, (), "")
+    onset = {"onset": Value(at, 0.1, "s")}
+    found = Finding("payload", ("Z",), onset, at, gain, True, None, (), "")
     alone = repetition.alone(records, fitted)
     (own,), left_out = repetition.in_each(search, records, fitted, [found], alone)
-    assert not own.repetition.same and "begins in record 2" in own.sentence
+    assert not own.repetition.same and "begins in record 2, 0 s" in own.sentence
+    assert own.onset_s == own.parameters["onset"].value == pytest.approx(0.0, abs=0.5)
     assert left_out == ["payload"]
 
 

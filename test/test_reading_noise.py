@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 from tiers import more
 
 from bench.simulators import hidden
@@ -18,7 +19,7 @@ from rov_ident.offline import batch_fit
 from rov_ident.offline.archive import of_records
 from rov_ident.offline.maximum_likelihood import assumed, one_pass
 from rov_ident.sampling.records import read_record
-from rov_ident.sampling.wrench_scatter import ReadingNoise, noise_that_lasts, resting_noise
+from rov_ident.sampling.wrench_scatter import ReadingNoise, driven, noise_that_lasts, resting_noise
 
 _RATE = 50.0  # Hz
 
@@ -53,6 +54,21 @@ def test_commands_without_noise_of_their_own_have_none() -> None:
     sines = 20.0 * np.sin(2.0 * np.pi * t[:, None] * rng.uniform(0.05, 0.5, 6))
     for readings in (steps, sines, steps * (1.0 + 0.01 * rng.standard_normal(steps.shape))):
         assert (_after(readings).variance == 0.0).all()
+
+
+@pytest.mark.parametrize("rate", [20.0, 50.0, 100.0])
+def test_commands_that_never_rest_add_no_more_than_is_said(rate: float) -> None:
+    """Of an autopilot, up to 1.5 Hz. Second differences had it twice as large at 20 Hz."""
+    rng = np.random.default_rng(int(rate))
+    low_pass = butter(2, 1.5 / (0.5 * rate), output="sos")
+    commands = sosfilt(low_pass, rng.standard_normal((int(150.0 * rate), 6)), axis=0)
+    commands *= 15.0 / commands.std(axis=0)
+    readings = commands + 0.8 * rng.standard_normal(commands.shape)
+    found, added = resting_noise(readings), driven(readings)
+    assert (np.abs(found - 0.8) < 0.05 + added).all()
+    assert (found < 0.8 * 1.5).all()
+    still = 0.8 * rng.standard_normal(commands.shape)
+    assert (driven(still) < 0.05).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

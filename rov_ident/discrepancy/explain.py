@@ -664,6 +664,8 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
         return
     best, name = term, empirical_term.NAME
     rivals = search.by_effect(rest, search.fit_best(rest, search.candidates(rest)))
+    for f in model.found:  # more coefficients of what is there
+        rivals.pop(f.effect, None)
     for rival, fitted in rivals.items():
         as_good = rest.squares - fitted.squares >= _AS_GOOD * (rest.squares - term.squares)
         as_good = as_good and not judge.surely_better(term.hypothesis, fitted.hypothesis)
@@ -720,6 +722,9 @@ def _extended(h: Hypothesis, kept: Sequence[str], data: _Data, found: Sequence[F
     document = configuration.to_parameters(config)
     document["coefficients"] = {**document["coefficients"], **h.coefficients}
     if effects := h.effects | sensors:
+        if len(data.bags) > 1:  # what is there after the last is there from the start of another
+            begun = {name: {**of, "onset": 0.0} for name, of in effects.items() if "onset" in of}
+            effects |= begun
         document["effects"] = effects
     chosen = document.pop("estimate", None)
     extended = configuration.from_parameters(document)

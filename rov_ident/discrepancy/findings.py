@@ -88,7 +88,9 @@ def finding(
         separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
     number = final.hypothesis.constants.get((name, "thruster"))
     if separable and number is not None:
-        separable = _is_sure(search, final, search.with_other_thruster(final, trial.rest, name))
+        separable = _is_surely_likelier(
+            search, final, search.with_other_thruster(final, trial.rest, name)
+        )
     if name == "thrust_line" and _may_be_lost_thrust(search.config, final.hypothesis, keys):
         alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
     found = in_words(name, axes, parameters, gain, alternatives)
@@ -133,10 +135,10 @@ def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bo
     The inertia and the drag of an axis go with its thrust, so that it is compared with that of the
     others: with surge and sway too weak, heave looks too strong.
     """
-    return _is_sure(search, final, search.with_other_factors(final, rest, key))
+    return _is_surely_likelier(search, final, search.with_other_factors(final, rest, key))
 
 
-def _is_sure(search: Search, final: Fitted, other: Fitted | None) -> bool:
+def _is_surely_likelier(search: Search, final: Fitted, other: Fitted | None) -> bool:
     """Whether a fit is surely better than another one, if there is any."""
     return other is None or search.cost(other, final) - search.cost(final, final) > VERY_STRONG
 

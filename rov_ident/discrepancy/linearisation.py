@@ -195,11 +195,15 @@ class Linearisation:
         for i, column in enumerate(at):
             packed[:, :, column] += force[:, :, i]
         out: Array = self.unprojected(packed)[:, at]
-        records = np.repeat(problem.record[problem.first][problem.window], 6)
         for i, key in enumerate(keys):
             if (record := record_of(key)) is not None:
-                out[records != record, i] = 0.0
+                out[~self.rows_of(record), i] = 0.0
         return out
+
+    def rows_of(self, record: int) -> NDArray[np.bool_]:
+        """Which of the residuals (6 N,) are of one of several records."""
+        problem = self.problem
+        return np.repeat(problem.record[problem.first][problem.window] == record, 6)
 
     def sensitivity_to(self, force: Array) -> Array:
         """Sensitivities (6 N, C) of the simulated velocities to wrenches (K, 6, C)."""

@@ -16,7 +16,7 @@ import numpy as np
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
-from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, unsure
+from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, sentence, unsure
 from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
 from rov_ident.discrepancy.hypothesis import (
     Key,
@@ -86,14 +86,20 @@ def in_each(
             out.append(_with(f, Repetition(False, None, each)))
             continue
         names = [k for k in keys if role_of(k) in _LINEAR]
-        each = tuple(parameters_of(there or last, names) for there in alone)
-        first = 0 if f.onset_s is None else records.at(f.onset_s)
+        onset = f.onset_s
+        first = 0 if onset is None else records.at(onset)
+        f = f if onset is None else _on_its_clock(f, records.spans[first][0])
+        unknown = {shared(k)[1]: Value(np.nan, np.inf, unit_of(k)) for k in names}
+        each = tuple(
+            unknown if r < first else parameters_of(there or last, names)
+            for r, there in enumerate(alone)
+        )
         laden = _laden(last) if "weight" in EFFECTS[f.effect].traits else frozenset()
         same = _is_same([of for r, of in enumerate(each) if r >= first and r not in laden])
         told = _with(f, Repetition(same and not first, repeats.get(f.effect), each), first)
         if not (same and not first) and not repeats.get(f.effect):
             own.append(f.effect)
-        out.append(told if f.onset_s is None else _begun(told, records, f.onset_s, same))
+        out.append(told if onset is None else _begun(told, records, first, same))
     return out, own
 
 
@@ -112,7 +118,8 @@ def _of_their_own(last: Fitted, keys: Sequence[Key], count: int) -> tuple[dict[s
     told = []
     for r in range(count):
         own, there = [k for k in keys if record_of(k) == r], last
-        if not own:  # one at a time: beside the same effect of all, nothing could be told
+        if not own and not any(role_of(k) == "frequency" for k in names):
+            # one at a time: beside the same effect of all, nothing could be told
             own = [of_record(k, r) for k in names if role_of(k) == "amplitude"]
             nulls = {k: bounds(k)[0] for k in own}
             there = refit(last.hypothesis.having(nulls), last.linearisation) or last
@@ -133,12 +140,21 @@ def alone(records: Records, last: Fitted, spans: Spans | None = None) -> list[Fi
     ]
 
 
-def _begun(f: Finding, records: Records, onset: float, lasts: bool) -> Finding:
-    """In which record an effect begins, and when: no clock of the user's shows the time of all
-    records joined. A record that ends before says nothing of it but that it is not there."""
-    b = records.at(onset)
-    late, count = max(onset - records.spans[b][0], 0.0), len(records)
-    words = f" It begins in record {b + 1}, {late:.0f} s after its first message"
+def _on_its_clock(f: Finding, begin: float) -> Finding:
+    """With the onset by the clock of the record, from ``begin`` [s] on, in which the effect begins:
+    no clock of the user's shows the time of all records joined."""
+    at = f.parameters["onset"]
+    at = dataclasses.replace(at, value=max(at.value - begin, 0.0))
+    parameters = {**f.parameters, "onset": at}
+    words = sentence(f.effect, parameters, f.gain)
+    return dataclasses.replace(f, parameters=parameters, onset_s=at.value, sentence=words)
+
+
+def _begun(f: Finding, records: Records, b: int, lasts: bool) -> Finding:
+    """In which record an effect begins, and when. A record that ends before says nothing of it but
+    that it is not there."""
+    count = len(records)
+    words = f" It begins in record {b + 1}, {f.onset_s:.0f} s after its first message"
     words += ", and not before." if b else "."
     if b + 1 < count:
         words += " It is the same in those after it." if lasts else " Those after it differ."

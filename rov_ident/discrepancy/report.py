@@ -139,6 +139,9 @@ def brief(finding: Finding) -> str:
     others = listed([called(a.effect) for a in finding.alternatives])
     doubt = f"this run cannot tell it from {others}" if others else "not surely told from all else"
     doubt = "" if finding.separable else f"; {doubt}"
+    of = finding.repetition
+    differs = of is not None and not of.same and of.repeats is None and finding.onset_s is None
+    doubt = f"; the records differ{doubt}" if differs else doubt
     return f"{called(finding.effect)} ({', '.join(values)}{doubt})"
 
 
@@ -274,6 +277,10 @@ def _change(explanation: Explanation, fitted: Config | None) -> list[str]:
     old = configuration.to_parameters(explanation.given)
     new = configuration.to_parameters(fitted or explanation.extended)
     news = {k: new[k] for k in sorted(new, key=lambda k: k != "effects")}  # what is new first
+    for name in news.get("effects", {}).keys() - old.get("effects", {}).keys():
+        nulls = {p.name: p.null for p in EFFECTS[name].parameters}
+        own = {n: v for n, v in news["effects"][name].items() if v != nulls[n]}
+        news["effects"] = {**news["effects"], name: own}
     lines = _lines(old, news)
     if not lines:
         return [report.paragraph("Nothing. extended.yaml is the configuration that was given.")]

@@ -183,7 +183,7 @@ class Screening:
         elif "limit" in roles:
             found = [self._limited(now, effect)]
         elif "frequency" in roles:
-            found = [self._oscillating(now, effect)]
+            found = self._oscillating(now, effect)
         return [c for c in found if c is not None]
 
     def _of_thrusters(self, now: Fitted, effect: Effect) -> list[Candidate]:
@@ -299,34 +299,52 @@ class Screening:
         h = now.hypothesis.having({_of(record, (effect.name, n)): v for n, v in shape.items()})
         return self._problem.columns(h, now.linearisation.motion, keys)
 
-    def _oscillating(self, now: Fitted, effect: Effect) -> Candidate | None:
-        """Sinusoidal forces in the world, at the peaks of the spectrum of what is missing."""
-        linearisation = now.linearisation
+    def _oscillating(self, now: Fitted, effect: Effect) -> list[Candidate | None]:
+        """Sinusoidal forces in the world, at the peaks of the spectrum of what is missing: the same
+        in all records, and those of each."""
+        line, best = now.linearisation, list[Candidate | None]()
         keys = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
-        candidates = []
         _, lowest, highest = bounds((effect.name, "frequency"))
-        for frequency in linearisation.frequencies(_PEAKS):
-            if not lowest <= frequency <= highest:
-                continue
-            columns = [
-                self._force(now, effect, {"frequency": frequency, "phase": phase}, keys)
-                for phase in (0.5 * np.pi, 0.0)
-            ]
-            labels = [(f"{effect.name} {part}", k[1]) for part in ("cos", "sin") for k in keys]
-            sensitivity = linearisation.sensitivity_to(np.concatenate(columns, axis=2))
-            scores = scores_of(linearisation, labels, sensitivity)
-            change, gain = scores.solve(labels)
+        frequencies = [f for f in line.frequencies(_PEAKS) if lowest <= f <= highest]
+        shapes = [[{"frequency": f, "phase": p} for p in (0.5 * np.pi, 0.0)] for f in frequencies]
+        forces = [[self._force(now, effect, shape, keys) for shape in both] for both in shapes]
+        moved = [line.sensitivity_to(np.concatenate(both, axis=2)) for both in forces]
+        apart = range(len(own_units(effect, now.hypothesis, self._records)))
+        ways: list[Sequence[int | None]] = [[None], *([apart] if apart else [])]
+        for owners in ways:
+            found = (self._waves(now, keys, *of, owners) for of in zip(frequencies, moved))
+            best.append(max(found, key=lambda c: c.score, default=None))
+        return best
+
+    def _waves(
+        self,
+        now: Fitted,
+        keys: Sequence[Key],
+        frequency: float,
+        columns: Array,
+        owners: Sequence[int | None],
+    ) -> Candidate:
+        """Forces of one frequency, of all records or of each of the ``owners``; ``columns`` (R, 6)
+        are what units along north, east and down do, a quarter of a period ahead and as they are.
+        """
+        line, name = now.linearisation, keys[0][0]
+        own = [columns if r is None else columns * line.rows_of(r)[:, None] for r in owners]
+        parts = itertools.product(owners, ("cos", "sin"), keys)
+        labels = [(f"{name} {part}", _of(r, k)[1]) for r, part, k in parts]
+        scores = scores_of(line, labels, np.hstack(own))
+        change, gain = scores.solve(labels)
+        start: dict[Key, float] = {}
+        for r, part in zip(owners, np.split(change, len(owners)), strict=True):
             # one phase for all directions: the best approximation of rank one
-            cosine, sine = change[: len(keys)], change[len(keys) :]
+            cosine, sine = np.split(part, 2)
             turn = 0.5 * np.arctan2(2.0 * cosine @ sine, cosine @ cosine - sine @ sine)
             amplitude = np.cos(turn) * cosine + np.sin(turn) * sine
-            start = dict(zip(keys, amplitude.tolist(), strict=True))
-            start[effect.name, "frequency"] = frequency
-            start[effect.name, "phase"] = 0.5 * np.pi - float(turn)
-            inflations = scores.inflation_with(labels, change), scores.white_inflation(gain, labels)
-            both = [gain / inflation - PENALTY * len(start) for inflation in inflations]
-            candidates.append(Candidate(effect.name, start, both[0], both[1]))
-        return max(candidates, key=lambda c: c.score, default=None)
+            mine = dict(zip(keys, amplitude.tolist(), strict=True))
+            mine |= {(name, "frequency"): frequency, (name, "phase"): 0.5 * np.pi - float(turn)}
+            start |= {_of(r, key): value for key, value in mine.items()}
+        inflations = scores.inflation_with(labels, change), scores.white_inflation(gain, labels)
+        both = [gain / inflation - PENALTY * len(start) for inflation in inflations]
+        return Candidate(name, start, both[0], both[1])
 
 
 def _of(record: int | None, key: Key) -> Key:

@@ -34,7 +34,9 @@ def act(p, state, t, dt, wrench):
 def of_thrusters(allocation: Array) -> list[dict[str, float]]:
     """Number, wrench per newton and share of the command of each thruster of an allocation (6, n),
     counted from one."""
-    each = zip(allocation.T.tolist(), np.linalg.pinv(allocation).tolist(), strict=True)
+    inverse = np.linalg.pinv(allocation)
+    inverse[np.abs(inverse) < 1e-9 * np.abs(inverse).max()] = 0.0  # rounding
+    each = zip(allocation.T.tolist(), inverse.tolist(), strict=True)
     return [
         {"thruster": float(number)}
         | {f"push_{axis}": b for axis, b in zip(AXES, push, strict=True)}

@@ -21,6 +21,7 @@ def wrench(p, t, position, nu, rotation, thrust, out):
 EFFECT = Effect(
     place="wrench",
     summary="Waves push back and forth with one frequency.",
+    traits=("dive",),
     manoeuvre="keeping station without thrust for ten periods, at two headings",
     source="Fossen (2021), Handbook of Marine Craft Hydrodynamics and Motion Control, sec. 10.2",
     parameters=(
