@@ -86,8 +86,7 @@ def finding(
     separable = separable and not any(at_end)
     if separable and "factor" in EFFECTS[name].traits:
         separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
-    number = final.hypothesis.constants.get((name, "thruster"))
-    if separable and number is not None:
+    if separable and final.hypothesis.thruster(name) is not None:
         separable = _is_surely_likelier(
             search, final, search.with_other_thruster(final, trial.rest, name)
         )
@@ -196,10 +195,7 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
     told = in_words(found.effect, found.axes, parameters, found.gain, found.alternatives)
     if not (found.separable and sure):
         told = unsure(told)
-    # What began before the end of the first window is told from what was there before the bag by
-    # that window alone, whose thrust comes from commands that nobody knows.
-    problem = last.linearisation.problem
-    return possibly_earlier(told, float(problem.steps.t[problem.last[0]]))
+    return possibly_earlier(told, last.linearisation.problem.seen)
 
 
 def is_left(search: Search, last: Fitted, name: str) -> bool:
@@ -277,7 +273,7 @@ def parameters_of(
                 variance += wide[o, o] + 2.0 * wide[at, o]
         out[name] = Value(float(value), float(np.sqrt(max(variance, 0.0))), unit_of(key))
     for section in {section for section, _ in keys}:
-        if (number := h.constants.get((section, "thruster"))) is not None:
+        if (number := h.thruster(section)) is not None:
             out["thruster"] = Value(number, 0.0, "1")
     return out
 

@@ -73,6 +73,10 @@ class Hypothesis:
         """The same with these parameters known."""
         return replace(self, constants={**self.constants, **constants})
 
+    def thruster(self, effect: str) -> float | None:
+        """The number of the single thruster that an effect is of; None where it is of axes."""
+        return self.constants.get((effect, "thruster"))
+
     @cached_property
     def structure(self) -> object:
         """What two hypotheses share that differ in values alone."""

@@ -42,8 +42,8 @@ from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, S
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, with_trait
-from rov_ident.model import thruster_allocation
 from rov_ident.model.coefficients import parse
+from rov_ident.model.thruster_allocation import is_known, matrix
 from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
@@ -113,8 +113,7 @@ class Search:
         self.given = Hypothesis(config, base, duration)
         self._workers = Workers(self.problem)
         self._records = len(streams.begins) if apart else 1
-        known = config.thrusters if thruster_allocation.is_known(config.thrusters) else None
-        thrusters = None if known is None else thruster_allocation.matrix(known)
+        thrusters = matrix(config.thrusters) if is_known(config.thrusters) else None
         self.screening = Screening(self.problem, self._workers, self._records, thrusters)
         self.patterns = PatternSearch(self.problem, self._workers)
         self._ends: dict[object, Hypothesis] = {}  # of the last fit of a structure
@@ -195,7 +194,7 @@ class Search:
     def _was_there(self, now: Fitted, larger: Fitted) -> set[str]:
         """The lasting effects that one with an onset is the same as, where that lies before the end
         of the first window; none elsewhere."""
-        seen, h = float(self.problem.steps.t[self.problem.last[0]]), larger.hypothesis
+        h, seen = larger.hypothesis, self.problem.seen
         early = [k for k in onsets(h) if k not in now.hypothesis.values and h.values[k] <= seen]
         return {name for effect, _ in early for name in EFFECTS[effect].lasting}
 
@@ -371,9 +370,9 @@ class Search:
     def with_other_thruster(self, final: Fitted, rest: Fitted, name: str) -> Fitted | None:
         """The fit that has in place of an effect of one thruster, in ``final`` and not in ``rest``,
         that of the thruster that suits second best."""
-        mine = final.hypothesis.constants.get((name, "thruster"))
+        mine = final.hypothesis.thruster(name)
         found = [c for c in self.candidates(rest, name=name) if c.name == name]
-        others = [c for c in found if c.constants.get((name, "thruster")) != mine]
+        others = [c for c in found if rest.hypothesis.shaped(c.constants).thruster(name) != mine]
         return self._cheapest([self._fit_candidate(rest, c) for c in others])
 
     def with_own_arm(self, fitted: Fitted, inflation: float) -> tuple[Fitted, float]:

@@ -203,6 +203,12 @@ class WindowedProblem:
         """Of a hypothesis's prior, (P,)."""
         return precision(h, self.streams.has_forces)
 
+    @property
+    def seen(self) -> float:
+        """The end of the first window [s]: what began before that is told from what was there
+        before the bag by that window alone, whose thrust comes from commands that nobody knows."""
+        return float(self.steps.t[self.last[0]])
+
     def count(self, moves: int) -> None:
         """Count simulations, or sensitivities to so many wrenches, of all windows."""
         with self._counting:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from rov_ident.core.messages import Array
 from rov_ident.core.noise import differences, robust_std
 
-_ORDER = (
-    4  # of differences: in those of second order commands of 2 Hz, of 15 N, make noise of 0.8 N
-)
-# at 50 Hz a third too large, in these 6 %
+# of differences: in those of second order, commands of 2 Hz and 15 N make noise of 0.8 N, read at
+# 50 Hz, a third too large; in these 6 %
+_ORDER = 4
 _BLOCK = 50  # commands in which noise is measured, to a fifth
 _ROUNDING = 1e-6  # of the largest command on any axis: 32 bits round by less, and thrusters that
 # cancel leave no more than that of each other
