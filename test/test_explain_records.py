@@ -12,13 +12,14 @@ from rov_ident.discrepancy import repetition, sensor_consistency
 from rov_ident.discrepancy.explain import _beside_given, _of_guided, explain
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.held_out import Judge, blocks, split, windows
-from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, precision
+from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, bounds, precision
 from rov_ident.discrepancy.multiple_shooting import tangent
 from rov_ident.discrepancy.output_error import fit, with_best_onsets
 from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.model.coefficients import AXES
 from rov_ident.sampling.raw_streams import gather, inspected, joined
 from rov_ident.simulation.virtual_sensors import Suite, dive
 
@@ -202,11 +203,13 @@ def test_what_a_record_has_of_its_own_moves_that_record_alone():
         ("payload", "x@2"): 0.1,
         ("ocean_current", "north@3"): 0.1,
         ("cog_offset", "dx"): 0.004,
+        ("thruster_gain", "gain_Z@1"): 0.8,
     }
     h, starts = Hypothesis(TODAY, own), problem.measured_starts()
     assert set(h.in_record(1).effects) == {"payload", "cog_offset"}
     assert set(h.in_record(2).effects) == {"ocean_current", "cog_offset"}
-    assert set(h.in_record(0).effects) == set(h.effects) == {"cog_offset"}
+    assert set(h.in_record(0).effects) == {"thruster_gain", "cog_offset"}
+    assert set(h.effects) == {"cog_offset"}
     motion = problem.motion(h, starts)
     for i, begin in enumerate(begins):
         alone = problem.motion(h.in_record(i), starts)
@@ -224,14 +227,22 @@ def test_what_a_record_has_of_its_own_moves_that_record_alone():
 LADEN = {
     "payload": lambda rng: {"mass_wet": rng.uniform(0.5, 1.5), "x": rng.uniform(-0.2, 0.2)},
     "buoyancy": lambda rng: {"delta": rng.choice([-1.0, 1.0]) * rng.uniform(2.0, 5.0)},
+    "thrust_scale": lambda rng: {"scale": rng.uniform(0.75, 0.95)},
+    "thruster_gain": lambda rng: {f"gain_{AXES[rng.integers(6)]}": rng.uniform(0.6, 0.9)},
 }
 
 
 @pytest.mark.parametrize(
-    ("name", "seed"), [("payload", 51), *more(*((n, s) for n in LADEN for s in range(52, 56)))]
+    ("name", "seed"),
+    [
+        ("payload", 51),
+        ("thruster_gain", 51),
+        *more(*((n, s) for n in LADEN for s in range(52, 56))),
+    ],
 )
-def test_a_load_of_one_dive_of_three_is_found_in_that_dive(name, seed):
-    """Whichever of them it is. A search for one value for all three did not find it."""
+def test_what_one_dive_of_three_has_is_found_in_that_dive(name, seed):
+    """Whichever of them it is. A search for one value for all three found nothing of a load, and a
+    thrust that is weaker in one dive ended as other coefficients."""
     rng = np.random.default_rng(seed)
     values, laden = LADEN[name](rng), int(rng.integers(3))
     bags = [record(10 * seed + i, 60.0, **({name: values} if i == laden else {})) for i in range(3)]
@@ -244,7 +255,8 @@ def test_a_load_of_one_dive_of_three_is_found_in_that_dive(name, seed):
         assert told.parameters[parameter].value == pytest.approx(each[laden].value, rel=0.05)
     amplitude = next(iter(values))
     others = [of[amplitude] for i, of in enumerate(told.repetition.records) if i != laden]
-    assert all(abs(v.value) < 4.0 * v.std for v in others)
+    null = bounds((name, amplitude))[0]
+    assert all(abs(v.value - null) < 4.0 * v.std for v in others)
     assert name not in found.extended.effects
     assert any(f"has {name} of its own" in note for note in found.findings.notes)
 

@@ -193,7 +193,7 @@ def _moved(
 def _values(problem: WindowedProblem, now: Fitted, variable: int, axis: int) -> Array:
     """A variable (K,) along the simulated motion, half-way through each step."""
     steps, nu = problem.steps, now.linearisation.motion.middle
-    thrust = problem.thrust(now.hypothesis.effects)[0]
+    thrust = problem.thrust_of(now.hypothesis)[0]
     t = 0.5 * (steps.t[1:] + steps.t[:-1]) - steps.begin
     rows = zip(t, steps.position, nu, steps.middle, thrust, strict=True)
     return np.array([effect.variable(variable, axis, *row) for row in rows])

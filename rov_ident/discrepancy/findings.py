@@ -26,6 +26,7 @@ from rov_ident.discrepancy.hypothesis import (
     at_bound,
     bounds,
     effect_of,
+    is_shared,
     onsets,
     record_of,
     role_of,
@@ -132,8 +133,11 @@ def _is_sure_factor(search: Search, final: Fitted, rest: Fitted, key: Key) -> bo
     """Whether no factors of the thrust of other axes explain as much as that of one, by as few.
 
     The inertia and the drag of an axis go with its thrust, so that it is compared with that of the
-    others: with surge and sway too weak, heave looks too strong.
+    others: with surge and sway too weak, heave looks too strong. That of one record is compared
+    with that of the others: of two, either may be off.
     """
+    if not is_shared([key]):
+        return _is_surely_likelier(search, final, search.with_others_off(final, key))
     return _is_surely_likelier(search, final, search.with_other_factors(final, rest, key))
 
 

@@ -32,6 +32,7 @@ _ENOUGH = 600.0  # s of data to fit; an hour is explained in less than a minute 
 MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
 
 CHUNK = 2.5  # seconds; of the chunks that the bootstrap resamples: four to a block
+_NOT_FAR_LESS = 0.5  # of what another velocity gains: better heave, say, makes better roll, too
 PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
 _DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
 _LEAST_NOISE = 1e-3  # standard deviations of the motion: a simulated dive may have less, or none
@@ -145,17 +146,21 @@ class Judge:
         return out
 
     def gain(self, before: Hypothesis, after: Hypothesis, axes: Sequence[str] = ()) -> Gain:
-        """Of the component that gains most, of those that surely gain if any do. Where none surely
-        gains, those of the ``axes`` on which an effect acts are looked at alone, as an interval for
-        six components is wide, and then all of these together: a lag moves each a little."""
+        """Of the component that gains most, of those that surely gain if any do; of the ``axes`` on
+        which an effect acts, unless they gain far less than another. These are looked at alone, as
+        an interval for six components is wide; and where none of them surely gains, all together: a
+        lag moves each a little."""
         free = np.flatnonzero(self.free)
         a, b = (self.summed(h) for h in (before, after))
         own = np.array([i for i in free if AXES[i] in axes], dtype=int)
-        sets = [of for of in (free, own) if len(of)]
         gains = [
-            gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], self.count[of]) for of in sets
+            gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], self.count[of])
+            for of in (own, free)
+            if len(of)
         ]
-        found = next((g for g in gains if g.low > 0.0), gains[0])
+        found = gains[-1]
+        if gains[0].low > 0.0 and gains[0].percent >= _NOT_FAR_LESS * found.percent:
+            found = gains[0]
         if found.low <= 0.0 and len(own) > 1:
             found = replace(found, together=together(a[:, own], b[:, own]))
         return found

@@ -33,8 +33,11 @@ _WIDE = 10.0  # times the size of a coefficient: one that is configured as zero,
 _TRIM = "buoyancy", "cog_offset"
 _OF_RECORD = "@"  # in the name of a parameter before the number of the record that has it
 _WEIGHT = set(with_trait("weight"))
-_OF_A_DIVE = {  # water and ballast change between dives
-    name for name in (*with_trait("dive"), *_WEIGHT) if not EFFECTS[name].of_sensors
+_OF_A_DIVE = {  # water, ballast, batteries and what winds round a propeller change between dives
+    name
+    for trait in ("dive", "weight", "factor")
+    for name in with_trait(trait)
+    if not EFFECTS[name].of_sensors
 }
 _FARTHEST_ARM = 2.0  # half lengths of the hull from the origin: an arm or a skid as long as it
 
@@ -227,7 +230,7 @@ def precision(h: Hypothesis, forces: bool) -> Array:
     # what all thrusters lack alike is what every coefficient has more: where only mass and weight
     # could tell, and do not, the file says how far off thrust may be
     if (scale := h.config.wrench.scale_std) > 0.0:
-        width[THRUST_SCALE] = scale
+        width |= {key: scale for key in h.keys if shared(key) == THRUST_SCALE}
     if not forces:
         trim = trim_std(h.config)
         width |= {key: trim[shared(key)] for key in h.keys if shared(key) in trim}
@@ -346,6 +349,9 @@ def own_units(effect: Effect, h: Hypothesis, records: int) -> list[tuple[Key, ..
     if records < 2 or effect.name not in _OF_A_DIVE or effect.name in h.effects:
         return []
     mine = [(effect.name, p.name) for p in effect.parameters if p.role == "amplitude"]
+    if all(p.axis for p in effect.parameters):
+        own = [of_record(key, r) for r in range(records) for key in mine]
+        return [(key,) for key in own if key not in h.values]
     alike = _WEIGHT if effect.name in _WEIGHT else {effect.name}
     return [
         tuple(of_record(key, r) for key in mine)

@@ -166,7 +166,7 @@ class Fitted:
         moments = np.diag(body.inertia)
         own = [known.mass_std * body.mass]
         own += [known.inertia_std * np.sqrt(moments[i] * moments[j]) for i, j in INERTIA.values()]
-        thrust = problem.thrust(h.effects)[0]
+        thrust = problem.thrust_of(h)[0]
         stronger = thrust[:, :, None] * config.wrench.scale_std
         axes = [i for i, axis in enumerate(AXES) if f"gain_{axis}" not in fitted]
         errors = [

@@ -127,10 +127,7 @@ class PatternSearch:
         ahead turns some of what is commanded along one axis into thrust along others, to the same
         side whichever way it is commanded. Which thrusters these are no wrench tells.
         """
-        thrust, nu = (
-            self._problem.thrust(now.hypothesis.effects)[0],
-            now.linearisation.motion.middle,
-        )
+        thrust, nu = (self._problem.thrust_of(now.hypothesis)[0], now.linearisation.motion.middle)
         scale = [np.maximum(np.sqrt(np.mean(x**2, axis=0)), 1e-6) for x in (thrust, nu)]
         load = np.abs(thrust) / scale[0]
         force = np.zeros((*thrust.shape, 18, 6))

@@ -114,7 +114,7 @@ class Screening:
             if all(p.role in ("amplitude", "fixed") for p in e.parameters)
         ]
         linear = [(e.name, self.units(e, h)) for e in smooth]
-        linear += [(e.name, own_units(e, h, self._records)) for e in smooth]
+        linear += [(e.name, self.own_units(e, h)) for e in smooth]
         extra = list(dict.fromkeys(k for _, groups in linear for u in groups for k in u))
         scores = scores_of(linearisation, extra, linearisation.sensitivity_of(h, extra))
         candidates = []
@@ -132,7 +132,7 @@ class Screening:
         scanned = self._workers.map(lambda effect: self._scanned(now, effect), others)
         candidates += [c for found in scanned for c in found]
         placed = [e for e in EFFECTS.values() if any(p.role == "place" for p in e.parameters)]
-        own = [(e, unit) for e in placed for unit in own_units(e, h, self._records)]
+        own = [(e, unit) for e in placed for unit in self.own_units(e, h)]
         each = self._workers.map(lambda of: self._best_shape(now, of[0], [{}], of[1]), own)
         candidates += [c for c in each if c is not None]
         return sorted(candidates, key=lambda c: (-c.score, -c.white_score))
@@ -141,6 +141,11 @@ class Screening:
         """Parameters of an effect that h lacks, on axes that show them, in the groups in which they
         may join."""
         groups = [] if effect.of_sensors else units(effect, h, ("amplitude",))
+        return [unit for unit in groups if all(self._is_shown(k, h) for k in unit)]
+
+    def own_units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
+        """The same of those that each record may have of its own."""
+        groups = own_units(effect, h, self._records)
         return [unit for unit in groups if all(self._is_shown(k, h) for k in unit)]
 
     def lacks_plainer(self, name: str, h: Hypothesis) -> bool:
@@ -309,7 +314,7 @@ class Screening:
         shapes = [[{"frequency": f, "phase": p} for p in (0.5 * np.pi, 0.0)] for f in frequencies]
         forces = [[self._force(now, effect, shape, keys) for shape in both] for both in shapes]
         moved = [line.sensitivity_to(np.concatenate(both, axis=2)) for both in forces]
-        apart = range(len(own_units(effect, now.hypothesis, self._records)))
+        apart = range(len(self.own_units(effect, now.hypothesis)))
         ways: list[Sequence[int | None]] = [[None], *([apart] if apart else [])]
         for owners in ways:
             found = (self._waves(now, keys, *of, owners) for of in zip(frequencies, moved))

@@ -30,9 +30,10 @@ from rov_ident.discrepancy.hypothesis import (
     is_shared,
     of_record,
     onsets,
-    own_units,
     reach,
+    record_of,
     role_of,
+    shared,
     trim_std,
 )
 from rov_ident.discrepancy.linearisation import linearise
@@ -248,8 +249,12 @@ class Search:
             keys, effect = self.keys_of(now, name), EFFECTS.get(name)
             if effect is None or any(role_of(k) == "onset" for k in keys):
                 continue
-            units = own_units(effect, now.hypothesis.without(keys), self._records)
-            if len(units) == self._records and is_shared(keys):
+            units = self.screening.own_units(effect, now.hypothesis.without(keys))
+            own = {k for unit in units for k in unit}
+            each = itertools.product(keys, range(self._records))
+            if is_shared(keys) and own.issuperset(
+                of_record(k, r) for k, r in each if role_of(k) == "amplitude"
+            ):
                 values = [{k: now.hypothesis.values[k] for k in keys}] * self._records
                 fits.append(with_own(now, keys, values))
         return [f for f in fits if f is not None]
@@ -366,6 +371,20 @@ class Search:
         others = [k for u in self.screening.units(EFFECTS[key[0]], h) for k in u if k != key]
         begin = h.having({k: bounds(k)[0] for k in others})
         return self._pruned(refit(begin, final.linearisation), rest) if others else None
+
+    def with_others_off(self, final: Fitted, key: Key) -> Fitted | None:
+        """The fit in which, in place of the thrust of one record by a factor, that of all others is
+        off by the inverse, and drag and inertia with it."""
+        h, record = final.hypothesis, record_of(key)
+        inverse = 1.0 / max(h.values[key], 1e-9)
+        if not bounds(key)[1] < inverse < bounds(key)[2]:
+            return None
+        of_others = (of_record(shared(key), r) for r in range(self._records) if r != record)
+        coefficients = [k for k in h.keys if k[0] == COEFFICIENTS]
+        mine = [k for k in coefficients if axis_of(key) in ("", axis_of(k))]
+        scaled = {k: inverse * h.values[k] for k in mine}
+        begin = h.without([key]).having(scaled | dict.fromkeys(of_others, inverse))
+        return refit(begin, final.linearisation)
 
     def with_other_thruster(self, final: Fitted, rest: Fitted, name: str) -> Fitted | None:
         """The fit that has in place of an effect of one thruster, in ``final`` and not in ``rest``,

@@ -222,6 +222,15 @@ class WindowedProblem:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
         return self._thrusts.of(_inputs(effects), lambda: thrust(self.steps, compiled(effects)))
 
+    def thrust_of(self, h: Hypothesis) -> Array:
+        """The same where each record may have its own."""
+        thrust = shared = self.thrust(h.effects)
+        for record in h.owners:
+            own = self.thrust(h.in_record(record).effects)
+            if own is not shared:
+                thrust = np.where((self.record == record)[:, None], own, thrust)
+        return thrust
+
     def driven(self, effects: Values) -> Steps:
         """The time axis with the inputs as they act, after the effects on fins."""
         key = tuple(sorted((n, *v.values()) for n, v in effects.items() if EFFECTS[n].steer))
@@ -290,7 +299,7 @@ class WindowedProblem:
         masses = np.array([there.model.mass_matrix for there in self._each(h)])
         if not np.isfinite([*h.values.values()]).all() or np.linalg.eigvalsh(masses).min() <= 0.0:
             return None
-        wrench = self.thrust(h.effects)
+        wrench = self.thrust_of(h)
         for key, value in h.values.items():
             if key in self.patterns:
                 wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
@@ -320,7 +329,7 @@ class WindowedProblem:
         inside = [np.arange(a, b) for a, b in zip(self.first, self.last, strict=True)]
         each = np.concatenate(inside)
         starts = self._measured_at(self.steps.t[each])
-        along = self._shot(h, self.thrust(h.effects), each, each + 1, starts)
+        along = self._shot(h, self.thrust_of(h), each, each + 1, starts)
         return tangent(along, self.first, self.last, self.nodes)
 
     def columns(self, h: Hypothesis, motion: Motion, keys: Sequence[Key]) -> Array:
@@ -525,7 +534,7 @@ class WindowedProblem:
         where no noise grows."""
         t, middle, starts = self.steps.t, self.steps.middle, self._measured_at(self.steps.t)[:-1]
         equations, each = self._equations(h), np.arange(len(starts))
-        thrust, driven = self.thrust(h.effects), self.driven(h.effects)
+        thrust, driven = self.thrust_of(h), self.driven(h.effects)
 
         def shot(aside: Array) -> Motion:
             return shoot(equations, driven, thrust, each, each + 1, starts + aside)
