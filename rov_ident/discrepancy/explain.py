@@ -1,6 +1,7 @@
 """`explain`: from bags and a configuration to findings, an extended configuration and the series
 that the report draws."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -89,6 +90,12 @@ _OF_THIS_DIVE = (
     "another, or explain several dives together"
 )
 _BESIDE_GIVEN = "what is told of {} is beside what the configuration has of it"
+_DEPARTS = (
+    "the records differ in what no effect describes: {}, if the model is fitted to that record "
+    "alone"
+)
+_DIFFER = "; what differs most is {} (± 95 %)"
+_MOST_DIFFERING = 3  # coefficients that are told
 _ONE_VALUE = "the records differ in {}: the extended configuration has one value for all"
 _FILTERED = (
     "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
@@ -224,12 +231,16 @@ def explain(
     last, notes = _with_all_data(data.streams, model.final)
     there = [f for f in model.found if is_left(search, last, f.effect)]
     of_dynamics = [with_parameters(search, last, f) for f in there]
+    departs = ""
     if len(bags) > 1:
         say("leaving records out", 0.95)
         of_dynamics, last, of_records = _in_each_record(
             search, judge, data, retuned, model, last, of_dynamics
         )
         notes += of_records
+        if departs := _departing(data, model.final, begun):
+            notes.append(departs)
+            of_dynamics = list(map(unsure, of_dynamics))
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
     given = Hypothesis(config, {})
@@ -257,7 +268,7 @@ def explain(
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
     minor = [f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL]
     minor = [f if is_sure(f.gain) else unsure(f) for f in minor]
-    verdict = _verdict(found, minor, residual, left, improves)
+    verdict = "unexplained" if departs else _verdict(found, minor, residual, left, improves)
     if verdict == "unexplained" and left and not residual:
         axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]
         residual = empirical_term.best_dependences(search.problem, model.final, axes)
@@ -446,6 +457,29 @@ def _in_each_record(
     repeated = {f.effect: f.repetition for f in found if f.repetition is not None}
     differ = [name for name, of in repeated.items() if not of.same and name not in apart]
     return found, last, notes + ([_ONE_VALUE.format(", ".join(differ))] if differ else [])
+
+
+def _departing(data: _Data, final: Fitted, begun: Spans) -> str:
+    """Which records a fit of their own predicts better, and in what they differ, in words; nothing
+    where none does, or where another bag is judged."""
+    if data.validated:
+        return ""
+    records, held = data.records, data.to_judge
+    judges = {}
+    for r in range(len(records)):
+        with contextlib.suppress(UserError):  # too little odometry
+            problem = WindowedProblem(data.judged, [s for s in held if records.at(s[0]) == r])
+            judges[r] = Judge(problem, data.sensors, final.hypothesis, begun)
+    each = repetition.alone(records, final, data.to_fit)
+    found = repetition.departing(records, final, each, judges)
+    if not found:
+        return ""
+    words = _DEPARTS.format(
+        ", ".join(f"{improved(gain)} in record {r + 1}" for r, gain in found.items())
+    )
+    differ = list(repetition.coefficients_that_differ(each).items())[:_MOST_DIFFERING]
+    told = (f"{n} {', '.join(map(repetition.in_figures, of))}" for n, of in differ)
+    return words + (_DIFFER.format("; ".join(told)) if differ else "")
 
 
 def _gaining(

@@ -17,8 +17,16 @@ from rov_ident.config import Config
 from rov_ident.core.errors import UserError
 from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, sentence, unsure
-from rov_ident.discrepancy.held_out import BLOCK, Judge, surely_less, thinned, windows
+from rov_ident.discrepancy.held_out import (
+    BLOCK,
+    Judge,
+    is_surely_practical,
+    surely_less,
+    thinned,
+    windows,
+)
 from rov_ident.discrepancy.hypothesis import (
+    COEFFICIENTS,
     Key,
     bounds,
     is_shared,
@@ -29,7 +37,7 @@ from rov_ident.discrepancy.hypothesis import (
     unit_of,
 )
 from rov_ident.discrepancy.output_error import Fitted, fit, refit
-from rov_ident.discrepancy.results import Finding, Repetition, Value
+from rov_ident.discrepancy.results import Finding, Gain, Repetition, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.selection import PENALTY
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY
@@ -138,6 +146,34 @@ def alone(records: Records, last: Fitted, spans: Spans | None = None) -> list[Fi
         _fitted(records.streams, [s for s in spans if records.at(s[0]) == b], last)
         for b in range(len(records))
     ]
+
+
+def departing(
+    records: Records, final: Fitted, each: Sequence[Fitted | None], judges: Mapping[int, Judge]
+) -> dict[int, Gain]:
+    """The records that a fit to them alone, of ``each``, surely predicts better, by practical
+    weight, than the ``final`` model fitted to all, and what that gains: something differs there
+    that the model has one value of. ``judges`` hold data of each record that no fit has seen."""
+    found = {}
+    for r, judge in judges.items():
+        own = each[r]
+        if own is None:
+            continue
+        before, after = (f.hypothesis.in_record(r) for f in (final, own))
+        gain = judge.gain(before, after)
+        if judge.surely_better(after, before) and is_surely_practical(gain):
+            found[r] = gain
+    return found
+
+
+def coefficients_that_differ(each: Sequence[Fitted | None]) -> dict[str, list[Value]]:
+    """The coefficients that fits to ``each`` record differ in by more than chance, with the value
+    in each; what differs most comes first."""
+    there = [f for f in each if f is not None]
+    keys = [k for k in there[0].hypothesis.keys if k[0] == COEFFICIENTS] if there else []
+    found = {k[1]: [v for f in there for v in parameters_of(f, [k]).values()] for k in keys}
+    apart = {n: _apart(of) for n, of in found.items() if not _agree(of)}
+    return {n: found[n] for n in sorted(apart, key=lambda n: -apart[n])}
 
 
 def _on_its_clock(f: Finding, begin: float) -> Finding:
@@ -256,10 +292,14 @@ def _is_same(each: Sequence[Mapping[str, Value]]) -> bool:
 
 
 def _agree(of: Sequence[Value]) -> bool:
-    """Whether estimates differ by no more than chance: squares of their distances from the mean."""
+    """Whether estimates differ by no more than chance."""
+    return _apart(of) <= PENALTY * (len(of) - 1)
+
+
+def _apart(of: Sequence[Value]) -> float:
+    """The squares of the distances of estimates from their mean, in standard deviations."""
     x, weight = np.array([v.value for v in of]), np.array([max(v.std, 1e-12) for v in of]) ** -2.0
-    apart = x - weight @ x / weight.sum()
-    return bool(weight @ apart**2 <= PENALTY * (len(x) - 1))
+    return float(weight @ (x - weight @ x / weight.sum()) ** 2)
 
 
 def _with(f: Finding, repetition: Repetition, first: int = 0) -> Finding:
@@ -270,7 +310,7 @@ def _with(f: Finding, repetition: Repetition, first: int = 0) -> Finding:
     if repetition.same:
         words = " It is the same in each record."
     else:
-        several = (", ".join(_in_figures(of[n]) for of in repetition.records) for n in names)
+        several = (", ".join(in_figures(of[n]) for of in repetition.records) for n in names)
         told = "; ".join(f"{n} {values}" for n, values in zip(names, several))
         words = f" The records differ: {told} (± 95 %)."
     if repetition.repeats is False:
@@ -279,7 +319,7 @@ def _with(f: Finding, repetition: Repetition, first: int = 0) -> Finding:
     return dataclasses.replace(f, repetition=repetition, sentence=f.sentence + words)
 
 
-def _in_figures(v: Value) -> str:
+def in_figures(v: Value) -> str:
     return f"{v.value:.3g} ± {NORMAL * v.std:.2g}" if np.isfinite(v.std) else "not told"
 
 
