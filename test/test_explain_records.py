@@ -19,6 +19,7 @@ from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
+from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
 from rov_ident.sampling.raw_streams import gather, inspected, joined
 from rov_ident.simulation.virtual_sensors import Suite, dive
@@ -27,9 +28,11 @@ TODAY = configuration.load(HEAVY)
 LEAN = Suite(odometry_rate=10.0, imu_rate=0.0)
 
 
-def record(seed, duration=40.0, suite=LEAN, **effects):
-    """A dive of the vehicle with effects that its configuration does not have."""
+def record(seed, duration=40.0, suite=LEAN, coefficients=None, **effects):
+    """A dive of the vehicle with effects that its configuration does not have, and coefficients
+    that differ from its own."""
     document = configuration.to_parameters(TODAY) | {"effects": effects}
+    document["coefficients"] |= coefficients or {}
     true = configuration.from_parameters(document)
     messages = dive(true, "steps", duration, suite, seed).messages
     return gather(((role, message) for _, role, message in messages), TODAY)
@@ -261,6 +264,43 @@ def test_what_one_dive_of_three_has_is_found_in_that_dive(name, seed):
     assert any(f"has {name} of its own" in note for note in found.findings.notes)
 
 
+@pytest.mark.parametrize("seed", [71, *more(72, 73, 74, 75)])
+def test_records_that_differ_in_what_no_effect_describes_are_said_to(seed):
+    """A skid that one dive carries: retuned, a single model is wrong in each of them."""
+    rng = np.random.default_rng(seed)
+    name, other = str(rng.choice(["X_uu", "Y_vv", "Z_wdot", "M_qdot"])), int(rng.integers(3))
+    document = configuration.to_parameters(TODAY)["coefficients"]
+    skid = {name: document[name] * float(rng.uniform(1.3, 1.6))}
+    bags = [record(10 * seed + i, 60.0, coefficients=skid if i == other else {}) for i in range(3)]
+    told = explain(bags, TODAY).findings
+    assert told.verdict == "unexplained" and not any(f.separable for f in told.effects)
+    (why,) = told.contradictions
+    assert "the records differ" in why and f"what differs most is {name} " in why
+    alike = explain([bags[other], record(10 * seed + 3, 60.0, coefficients=skid)], TODAY).findings
+    assert alike.verdict == "retuned" and not alike.contradictions
+
+
+@pytest.mark.parametrize("seed", [81, *more(82, 83, 84)])
+def test_a_velocity_sensor_of_one_dive_is_not_hidden_by_the_others(seed):
+    """All together show nothing, and the verdict was that the simulation agrees."""
+    rng = np.random.default_rng(seed)
+    name, parameter, value = (
+        ("sensor_misalignment", "pitch", float(rng.uniform(0.07, 0.15))),
+        ("velocity_scale", "scale", float(rng.uniform(0.88, 0.95))),
+    )[int(rng.integers(2))]
+    other = int(rng.integers(3))
+    null = {p.name: p.null for p in EFFECTS[name].parameters}
+    off = {name: null | {parameter: value}}
+    bags = [record(10 * seed + i, 60.0, **(off if i == other else {})) for i in range(3)]
+    explanation = explain(bags, TODAY)
+    (told,) = explanation.findings.effects
+    assert told.effect == name and told.separable and not told.repetition.same
+    for i, of in enumerate(told.repetition.records):
+        true = value if i == other else null[parameter]
+        assert abs(of[parameter].value - true) < max(4.0 * of[parameter].std, 0.01)
+    assert name not in explanation.extended.effects
+
+
 @pytest.mark.parametrize("seed", [61, *more(62, 63)])
 def test_waves_have_a_phase_of_their_own_in_each_dive(seed):
     """With one phase for all nothing was found, as they cancel."""
@@ -430,7 +470,7 @@ def test_what_each_record_has_of_its_own_is_told():
         first, second = (of[name].value for of in told[effect].repetition.records)
         assert not told[effect].repetition.same
         assert abs(first) < 0.02 and abs(second - true) < 0.02
-    assert any("delay of their own" in note for note in found.notes)
+    assert any("velocity_latency of its own" in note for note in found.notes)
     assert any("heading of its own" in note for note in found.notes)
 
 

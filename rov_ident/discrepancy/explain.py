@@ -50,7 +50,7 @@ from rov_ident.discrepancy.held_out import (
 )
 from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, record_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
-from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Value, Verdict
+from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Verdict
 from rov_ident.discrepancy.search import Search, Trial, Trials, with_own
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Spans, WindowedProblem
@@ -78,9 +78,6 @@ CUT_SHORT = (
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"
 )
-_OWN_DELAYS = (
-    "each record's velocities have a delay of their own: the extended configuration has none"
-)
 _OWN_VALUES = (
     "each record has {} of its own: the extended configuration has none, and is judged here with "
     "what each record has"
@@ -91,10 +88,9 @@ _OF_THIS_DIVE = (
 )
 _BESIDE_GIVEN = "what is told of {} is beside what the configuration has of it"
 _DEPARTS = (
-    "the records differ in what no effect describes: {}, if the model is fitted to that record "
-    "alone"
+    "the records differ in what no effect describes: with coefficients of its own, the {}; what "
+    "differs most is {} (± 95 %)"
 )
-_DIFFER = "; what differs most is {} (± 95 %)"
 _MOST_DIFFERING = 3  # coefficients that are told
 _ONE_VALUE = "the records differ in {}: the extended configuration has one value for all"
 _FILTERED = (
@@ -239,7 +235,6 @@ def explain(
         )
         notes += of_records
         if departs := _departing(data, model.final, begun):
-            notes.append(departs)
             of_dynamics = list(map(unsure, of_dynamics))
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
@@ -275,7 +270,7 @@ def explain(
     everything = WindowedProblem(data.streams, blocks(data.streams))
     notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
     notes += [_OWN_HEADINGS] if any(data.headings) else []
-    notes += [_OWN_DELAYS] if data.delays else []
+    notes += [_OWN_VALUES.format(", ".join(data.own_sensors))] if data.own_sensors else []
     passing = [name for name in with_trait("dive") if name in best.effects]
     known = [name for name in data.sensors if name in config.effects]
     notes += [_BESIDE_GIVEN.format(" and ".join(known))] if known else []
@@ -295,6 +290,7 @@ def explain(
         tuple(residual),
         verdict,
         (*data.streams.notes, *notes),
+        contradictions=(departs,) if departs else (),
     )
     return Explanation(
         findings,
@@ -315,7 +311,11 @@ def contradicted(explained: Explanation, why: Sequence[str]) -> Explanation:
     of = explained.findings
     effects, minor = (tuple(map(unsure, found)) for found in (of.effects, of.minor))
     of = dataclasses.replace(
-        of, effects=effects, minor=minor, contradictions=tuple(why), verdict="unexplained"
+        of,
+        effects=effects,
+        minor=minor,
+        contradictions=(*of.contradictions, *why),
+        verdict="unexplained",
     )
     return dataclasses.replace(explained, findings=of)
 
@@ -324,10 +324,11 @@ def contradicted(explained: Explanation, why: Sequence[str]) -> Explanation:
 class _Data:
     """The bags with what their sensors contradict set right: ``streams``, all of them joined, to
     fit in the spans ``to_fit``, and those ``judged`` in the spans ``to_judge``; the latter as
-    ``recorded``. ``headings`` and ``delays`` that were taken off each bag; the ``choice`` of sensor
-    effects, their ``findings``, and those of practical weight, ``sensors``, which were taken off.
-    Whether a filter makes velocities ``late``, whether the heading ``may_drift`` where a gyro was
-    taken for biased, and the errors of the ``clocks``."""
+    ``recorded``. ``headings`` that were taken off each bag, and what else its velocity sensor has
+    of its own, ``own_sensors``; the ``choice`` of sensor effects, their ``findings``, and those of
+    practical weight, ``sensors``, which were taken off. Whether a filter makes velocities ``late``,
+    whether the heading ``may_drift`` where a gyro was taken for biased, and the errors of the
+    ``clocks``."""
 
     bags: Sequence[Streams]
     streams: Streams
@@ -336,7 +337,7 @@ class _Data:
     to_judge: Spans
     recorded: sensor_choice.Data
     headings: Sequence[float]
-    delays: Sequence[Value]
+    own_sensors: Mapping[str, repetition.OfEach]
     choice: sensor_choice.Choice
     findings: Sequence[Finding]
     sensors: Values
@@ -386,8 +387,11 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     turned, headings = repetition.turned(with_others, config)
     bags = turned[: len(bags)]
     validate = None if validate is None else turned[-1]
-    as_timed = bags
+    as_read = bags
     bags, delays = repetition.in_time(bags, config)
+    bags, own = repetition.as_mounted(bags, config)
+    if delays:
+        own[LATENCY] = [{"delay": v} for v in delays]
     streams, to_fit, held = _divided(bags, validate)
     judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
     recorded = sensor_choice.Data(streams, to_fit, judged, to_judge, config)
@@ -395,13 +399,11 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
     findings = sensor_findings(recorded, choice, as_headed)
     if len(bags) > 1:
         findings = repetition.of_sensors(bags, config, findings, headings[: len(bags)])
-    own_delays = []
-    if delays:
-        spans = held if validate is None else to_fit
-        before = joined(as_timed)[0]
-        own_delays = [
-            repetition.late_finding(before, streams, config, spans, choice.sensors, delays)
-        ]
+    spans, before = held if validate is None else to_fit, joined(as_read)[0]
+    of_each = [
+        repetition.own_finding(before, streams, config, spans, choice.sensors, name, each)
+        for name, each in own.items()
+    ]
     sensors = {f.effect: choice.sensors[f.effect] for f in findings if is_practical(f.gain)}
     return _Data(
         bags,
@@ -411,9 +413,9 @@ def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None
         to_judge,
         recorded,
         headings,
-        delays,
+        own,
         choice,
-        [*findings, *own_delays],
+        [*findings, *of_each],
         sensors,
         any(r.late for r in rates),
         any(r.may_drift for r in rates),
@@ -474,12 +476,10 @@ def _departing(data: _Data, final: Fitted, begun: Spans) -> str:
     found = repetition.departing(records, final, each, judges)
     if not found:
         return ""
-    words = _DEPARTS.format(
-        ", ".join(f"{improved(gain)} in record {r + 1}" for r, gain in found.items())
-    )
-    differ = list(repetition.coefficients_that_differ(each).items())[:_MOST_DIFFERING]
+    better = ", the ".join(f"{improved(gain)} in record {r + 1}" for r, gain in found.items())
+    differ = list(repetition.coefficients_by_distance(each).items())[:_MOST_DIFFERING]
     told = (f"{n} {', '.join(map(repetition.in_figures, of))}" for n, of in differ)
-    return words + (_DIFFER.format("; ".join(told)) if differ else "")
+    return _DEPARTS.format(better, "; ".join(told))
 
 
 def _gaining(

@@ -15,12 +15,13 @@ import numpy as np
 
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.discrepancy import sensor_consistency
+from rov_ident.discrepancy import sensor_choice, sensor_consistency
 from rov_ident.discrepancy.findings import in_words, kinematic_gain, parameters_of, sentence, unsure
 from rov_ident.discrepancy.held_out import (
     BLOCK,
     Judge,
     is_surely_practical,
+    split,
     surely_less,
     thinned,
     windows,
@@ -47,6 +48,7 @@ from rov_ident.model.equations import Array
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams, corrected
 
+_VELOCITY_SENSOR = ("velocity_scale", "sensor_misalignment", "sensor_lever_arm")
 _LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
 
 
@@ -166,14 +168,13 @@ def departing(
     return found
 
 
-def coefficients_that_differ(each: Sequence[Fitted | None]) -> dict[str, list[Value]]:
-    """The coefficients that fits to ``each`` record differ in by more than chance, with the value
-    in each; what differs most comes first."""
+def coefficients_by_distance(each: Sequence[Fitted | None]) -> dict[str, list[Value]]:
+    """The coefficients of fits to ``each`` record, with the value in each; that which differs most
+    comes first."""
     there = [f for f in each if f is not None]
     keys = [k for k in there[0].hypothesis.keys if k[0] == COEFFICIENTS] if there else []
     found = {k[1]: [v for f in there for v in parameters_of(f, [k]).values()] for k in keys}
-    apart = {n: _apart(of) for n, of in found.items() if not _agree(of)}
-    return {n: found[n] for n in sorted(apart, key=lambda n: -apart[n])}
+    return dict(sorted(found.items(), key=lambda item: -_distance(item[1])))
 
 
 def _on_its_clock(f: Finding, begin: float) -> Finding:
@@ -209,21 +210,9 @@ def of_sensors(
     bags: Sequence[Streams], config: Config, found: Sequence[Finding], headings: Sequence[float]
 ) -> list[Finding]:
     """The same of findings of the sensors; ``headings`` have been taken off the records before."""
-    names = [f.effect for f in found]
-    each = []
-    for bag in bags:
-        spans = windows(0.0, bag.duration)
-        each.append(sensor_consistency.search(bag, config, spans, names))
-    out = []
+    each, out = _in_each(bags, config, [f.effect for f in found]), []
     for f in found:
-        values = [
-            {
-                # zero: this record's sensors tell nothing of it
-                name: Value(at[f.effect][name], std.get((f.effect, name)) or np.inf, v.unit)
-                for name, v in f.parameters.items()
-            }
-            for at, std in each
-        ]
+        values = [{name: of[name] for name in f.parameters} for of in each[f.effect]]
         if f.effect == HEADING and any(headings):
             values = [
                 {n: dataclasses.replace(v, value=v.value + yaw) for n, v in of.items()}
@@ -231,6 +220,26 @@ def of_sensors(
             ]
         out.append(_with(f, Repetition(_is_same(values), None, tuple(values))))
     return out
+
+
+def _in_each(
+    bags: Sequence[Streams], config: Config, names: Sequence[str]
+) -> dict[str, list[dict[str, Value]]]:
+    """What each record's sensors say of some effects."""
+    each = [
+        sensor_consistency.search(bag, config, windows(0.0, bag.duration), names) for bag in bags
+    ]
+    return {
+        name: [
+            {
+                # zero: this record's sensors tell nothing of it
+                p.name: Value(at[name][p.name], std.get((name, p.name)) or np.inf, p.unit)
+                for p in EFFECTS[name].parameters
+            }
+            for at, std in each
+        ]
+        for name in names
+    }
 
 
 def turned(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list[float]]:
@@ -249,6 +258,33 @@ def turned(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list
     if _agree([dataclasses.replace(v, value=a) for v, a in zip(yaw, apart, strict=True)]):
         return list(bags), none
     return [corrected(bag, {HEADING: {"yaw": y}}) for bag, y in zip(bags, apart)], apart
+
+
+OfEach = Sequence[dict[str, Value]]
+"""The parameters of an effect in each of several records."""
+
+
+def as_mounted(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], dict[str, OfEach]]:
+    """Records without what the velocity sensors of single ones show and others' do not, such as a
+    mounting that was knocked or a sound speed that was set anew, and the parameters of these
+    effects in each. In a search of all together, the others would hide it."""
+    shown = [_of_velocity_sensor(bag, config) for bag in bags] if len(bags) > 1 else []
+    names = list(dict.fromkeys(name for of in shown for name in of))
+    own: dict[str, OfEach] = {}
+    for name, values in (_in_each(bags, config, names) if names else {}).items():
+        if not _is_same(values):
+            own[name] = values
+    off = [{name: of[name] for name in own if name in of} for of in shown]
+    return [corrected(b, o) for b, o in zip(bags, off, strict=True)] if own else list(bags), own
+
+
+def _of_velocity_sensor(bag: Streams, config: Config) -> Values:
+    """The effects on the velocities of the odometry, but for delays, that a record surely shows."""
+    (spans, held), names = split(bag.duration), set(_VELOCITY_SENSOR)
+    if names.isdisjoint(sensor_consistency.search(bag, config, spans)[0]):
+        return {}
+    choice = sensor_choice.chosen(sensor_choice.Data(bag, spans, bag, held, config))
+    return {n: of for n, of in choice.sensors.items() if n in names - choice.unsure}
 
 
 def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list[Value]]:
@@ -273,17 +309,19 @@ def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], lis
     return [corrected(b, of) for b, of in zip(bags, off, strict=True)], late
 
 
-def late_finding(
+def own_finding(
     before: Streams, after: Streams, config: Config, held: Spans,
-    sensors: Values, late: Sequence[Value],
+    sensors: Values, name: str, each: OfEach,
 ) -> Finding:  # fmt: skip
-    """Velocities that are late by another delay in each record: what taking that off gains."""
+    """An effect on a sensor that differs between the records: what taking it off each gains."""
     pair = [sensor_consistency.comparisons(s, config, sensors) for s in (before, after)]
     gain = kinematic_gain(pair, held)
-    most = max(late, key=lambda v: abs(v.value))
-    each = tuple({"delay": v} for v in late)
-    found = in_words(LATENCY, (), {"delay": most}, gain)
-    return _with(found, Repetition(False, None, each))
+
+    def distance(of: dict[str, Value]) -> float:
+        return sum(((v.value - bounds((name, p))[0]) / v.std) ** 2 for p, v in of.items())
+
+    found = in_words(name, (), max(each, key=distance), gain)
+    return _with(found, Repetition(False, None, tuple(each)))
 
 
 def _is_same(each: Sequence[Mapping[str, Value]]) -> bool:
@@ -293,11 +331,11 @@ def _is_same(each: Sequence[Mapping[str, Value]]) -> bool:
 
 def _agree(of: Sequence[Value]) -> bool:
     """Whether estimates differ by no more than chance."""
-    return _apart(of) <= PENALTY * (len(of) - 1)
+    return _distance(of) <= PENALTY * (len(of) - 1)
 
 
-def _apart(of: Sequence[Value]) -> float:
-    """The squares of the distances of estimates from their mean, in standard deviations."""
+def _distance(of: Sequence[Value]) -> float:
+    """Squared distances of estimates from their mean, in standard deviations, summed."""
     x, weight = np.array([v.value for v in of]), np.array([max(v.std, 1e-12) for v in of]) ** -2.0
     return float(weight @ (x - weight @ x / weight.sum()) ** 2)
 

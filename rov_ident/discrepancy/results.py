@@ -107,7 +107,7 @@ class Change:
 @dataclass(frozen=True)
 class Findings:
     """The whole result; RMSE by velocity component, open loop, on held-out data. ``contradictions``
-    say in which parts odometry and IMU still differ."""
+    say in which parts odometry and IMU, or several records, still differ."""
 
     baseline: dict[str, float]
     retuned: dict[str, float]
