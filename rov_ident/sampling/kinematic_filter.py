@@ -180,6 +180,9 @@ class KinematicFilter:
         it, as long as it is one that a gyro may have."""
         state, settings = self.state[0], self._settings[0]
         powers = np.where(state["judged"] > JUDGED_TIME, state["lasting"].max(axis=1), 0.0)
+        # an attitude's error may last: then what is stated of each is so of the mean of many
+        kept = math.sqrt(1.0 - 1.0 / max(state["expected"][_ATTITUDE], 1.0))
+        powers[_ATTITUDE] *= (1.0 - kept) / (1.0 + kept)
         ratios = np.maximum(state["test_ratio"], powers).tolist()
         bias_std = math.sqrt(settings["gyro_bias_variance"])
         if np.abs(state["gyro_bias"]).max() <= _LARGEST_BIAS * bias_std:
