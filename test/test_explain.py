@@ -35,7 +35,6 @@ from rov_ident.discrepancy import search as discrepancy
 from rov_ident.discrepancy.explain import (
     CUT_SHORT,
     _beside_each_other,
-    _gains_elsewhere,
     _is_between_readings,
     _of_guided,
     _set_right,
@@ -485,15 +484,6 @@ def test_a_model_that_diverges_where_no_fit_has_seen_it_keeps_its_values(fitted)
     assert not with_parameters(search, last, found).separable  # nor do the data support it
     assert last.linearisation.problem is search.problem
     assert ["cannot be simulated through all" in note for note in notes] == [True]
-
-
-def test_what_gains_where_it_does_not_act_may_stand_for_something_else():
-    gain = Gain("r", 0.1, 0.05, 50.0, 40.0, 60.0)
-    of_sway = Finding("thruster_asymmetry", ("Y",), {}, None, gain, True, None, (), "")
-    of_both = dataclasses.replace(of_sway, axes=("Y", "N"))
-    among_sensors = dataclasses.replace(gain, component="kinematic")
-    of_sensor = dataclasses.replace(of_sway, axes=(), gain=among_sensors)
-    assert [_gains_elsewhere(f) for f in (of_sway, of_both, of_sensor)] == [True, False, False]
 
 
 def test_inertia_beside_each_other_may_be_its_own():

@@ -280,6 +280,17 @@ def test_records_that_differ_in_what_no_effect_describes_are_said_to(seed):
     assert alike.verdict == "retuned" and not alike.contradictions
 
 
+def test_what_gains_where_it_does_not_act_may_stand_for_something_else():
+    """Weak heave makes roll wrong, which gains more; so would a moment that is missing there."""
+    bag, key = record(71, 60.0, thruster_gain={"gain_Z": 0.7}), ("thruster_gain", "gain_Z")
+    judge = Judge(WindowedProblem(bag, blocks(bag)))
+    before, after = Hypothesis(TODAY, {}), Hypothesis(TODAY, {key: 0.7})
+    gain = judge.gain(before, after, ("Z",))
+    assert gain.component == "p"
+    acts = {axes: judge.gains_elsewhere(gain, before, after, axes) for axes in ("Z", "K", "N", "")}
+    assert acts == {"Z": False, "K": False, "N": True, "": True}
+
+
 @pytest.mark.parametrize("seed", [81, *more(82, 83, 84)])
 def test_a_velocity_sensor_of_one_dive_is_not_hidden_by_the_others(seed):
     """All together show nothing, and the verdict was that the simulation agrees."""

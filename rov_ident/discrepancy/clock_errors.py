@@ -15,6 +15,8 @@ from rov_ident.effects import EFFECTS
 from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams
 
+_STAMPS = "wrong stamps may have made it"
+
 
 @dataclass(frozen=True)
 class ClockErrors:
@@ -38,7 +40,7 @@ class ClockErrors:
         """The finding, not sure where wrong stamps may have made it."""
         made = self.ahead and not EFFECTS[found.effect].of_sensors
         late = self.behind and "late" in EFFECTS[found.effect].traits
-        return unsure(found) if made or late else found
+        return unsure(found, _STAMPS) if made or late else found
 
 
 def of(bags: Sequence[Streams], config: Config) -> ClockErrors:

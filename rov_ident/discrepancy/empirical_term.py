@@ -95,7 +95,8 @@ def found(problem: WindowedProblem, now: Fitted) -> Fitted | None:
     scored = _scored(problem, now)
     both = [[s for s in scored if bool(s.second) == pair][:_FITTED] for pair in (False, True)]
     for shape in itertools.chain(*both):
-        gain = _penalised(problem, now, shape)[1]
+        _, without, left = _penalised(problem, now, shape)
+        gain = without - left
         # Also without the window that gains most: next to one that gains twenty times as much, the
         # gain of all others looks like scatter.
         of = gain, np.sort(gain)[:-1]
@@ -132,10 +133,12 @@ def best_dependences(problem: WindowedProblem, now: Fitted, axes: Sequence[int])
     scored, found = _scored(problem, now), []
     for axis in axes:
         best = next((s for s in scored if s.axis == axis and not s.second), None)
-        gain = 0.0 if best is None else float(_penalised(problem, now, best)[1].sum())
-        if best is not None and gain > 0.0:
+        if best is None:
+            continue
+        _, without, left = _penalised(problem, now, best)
+        share = 1.0 - float(left.sum() / without.sum())
+        if share > 0.0:
             frequency = 1.0 / float(best.ends[0, 1]) if best.first == TIME else None
-            share = gain / now.linearisation.rss
             found.append(Residual(AXES[axis], OF[best.first], frequency, share, sure=False))
     none = Residual(AXES[axes[0]], "time", None, 0.0, sure=False)
     return sorted(found, key=lambda r: -r.share) or [none]
@@ -169,7 +172,7 @@ def _moved(
 ) -> tuple[Linearisation | None, Array]:
     """The next weights after those that a fit has, simulated with them; shorter steps where a whole
     one makes it worse."""
-    change, _ = _penalised(problem, at, shape, weights)
+    change, *_ = _penalised(problem, at, shape, weights)
     h, line = at.hypothesis, at.linearisation
     keys = [k for k in h.keys if k != SCALE]
     values = np.array([h.values[k] for k in keys])
@@ -303,10 +306,10 @@ def _basis(problem: WindowedProblem, now: Fitted, shape: Shape) -> Array:
 
 def _penalised(
     problem: WindowedProblem, now: Fitted, shape: Shape, before: Array | float = 0.0
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """How the parameters of a fit but for the scale change, and the weights from those ``before``;
-    and what the weights take off the squared residuals of each window (W,), predicted by fits to
-    other windows."""
+    and the squared residuals of each window (W,), predicted by fits to other windows, without the
+    term and with it."""
     line, basis = now.linearisation, _basis(problem, now, shape)
     direction = _direction(problem, shape.axis)
     s = line.sensitivity_to(direction[:, :, None] * basis[:, None, :])
@@ -353,7 +356,7 @@ def _penalised(
     tried = [left(x) for x in _SMOOTHNESS]
     best = int(np.argmin([x.sum() for x in tried]))
     change = change_of(normal, slope, float(_SMOOTHNESS[best]), bounded=True)
-    return change, left(None) - tried[best]
+    return change, left(None), tried[best]
 
 
 def _solved(normal: Array, right: Array) -> Array:

@@ -97,6 +97,15 @@ _FILTERED = (
     "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
     "cause beside it is sure; record what the filter is fed with"
 )
+_DOUBTFUL_FILTER = "what a filter of the velocities does besides delaying them looks like any cause"
+_DOUBTFUL_HEADING = "the heading may drift with the gyro whose bias was taken off"
+_BETWEEN_READINGS = "it is less than half an interval of the IMU"
+_BLURRED = "another finding blurs it"
+_SLIGHT_GAIN = "the interval of its gain begins below 2 %"
+_BESIDE_REST = "what is left of the motion may have made it"
+_RECORDS_DIFFER = "the records differ in what has no name"
+_OF_CONTRADICTION = "the sensors still contradict each other"
+_AFTERWARDS = "only what was left after the search asked for it"
 _UNMEASURED = "not measured, as they never change, and left as they are: {}"
 _IN_NOISE = (
     "the wrench cannot be told from noise of its reading on {}: how the vehicle moves along these "
@@ -235,7 +244,7 @@ def explain(
         )
         notes += of_records
         if departs := _departing(data, model.final, begun):
-            of_dynamics = list(map(unsure, of_dynamics))
+            of_dynamics = [unsure(f, _RECORDS_DIFFER) for f in of_dynamics]
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
     given = Hypothesis(config, {})
@@ -309,7 +318,9 @@ def contradicted(explained: Explanation, why: Sequence[str]) -> Explanation:
     if not why:
         return explained
     of = explained.findings
-    effects, minor = (tuple(map(unsure, found)) for found in (of.effects, of.minor))
+    effects, minor = (
+        tuple(unsure(f, _OF_CONTRADICTION) for f in found) for found in (of.effects, of.minor)
+    )
     of = dataclasses.replace(
         of,
         effects=effects,
@@ -500,14 +511,16 @@ def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -
     """What is found, not sure where what the sensors do beside it, or what is ``left``, may have
     made it, or where its gain may have no practical weight."""
     if data.late:  # a filter does more than delay, and what it does besides looks like any cause
-        found = [f if EFFECTS[f.effect].late else unsure(f) for f in found]
+        found = [f if EFFECTS[f.effect].late else unsure(f, _DOUBTFUL_FILTER) for f in found]
     if data.may_drift:
-        found = list(map(unsure, found))
-    found = [unsure(f) if _is_between_readings(f, data.streams) else f for f in found]
+        found = [unsure(f, _DOUBTFUL_HEADING) for f in found]
+    found = [
+        unsure(f, _BETWEEN_READINGS) if _is_between_readings(f, data.streams) else f for f in found
+    ]
     found = list(map(data.clocks.beside, found))
     found = _beside_each_other(found)
-    found = [f if is_surely_practical(f.gain) else unsure(f) for f in found]
-    return [unsure(f) if _acts_on(f, left) or _gains_elsewhere(f) else f for f in found]
+    found = [f if is_surely_practical(f.gain) else unsure(f, _SLIGHT_GAIN) for f in found]
+    return [unsure(f, _BESIDE_REST) if _acts_on(f, left) else f for f in found]
 
 
 def _verdict(
@@ -599,15 +612,7 @@ def _is_between_readings(found: Finding, streams: Streams) -> bool:
 def _beside_each_other(found: list[Finding]) -> list[Finding]:
     """Those that another one blurs (`Effect.blurs`) are not sure."""
     blurred = {name for f in found for name in EFFECTS[f.effect].blurs}
-    return [unsure(f) if f.effect in blurred else f for f in found]
-
-
-def _gains_elsewhere(found: Finding) -> bool:
-    """Whether an effect, not of a sensor, makes a velocity better of an axis on which it hardly
-    acts: then it may stand for something that acts there."""
-    gain = found.gain
-    alone = gain.together is None and gain.component in VELOCITIES
-    return alone and AXES[VELOCITIES.index(gain.component)] not in found.axes
+    return [unsure(f, _BLURRED) if f.effect in blurred else f for f in found]
 
 
 def _of_guided(streams: Streams) -> list[str]:
@@ -710,7 +715,7 @@ def _add_term(search: Search, judge: Judge, retuned: Fitted, model: _Model) -> N
     gain = finding(search, judge, retuned, best, name, Trial(rest, rivals))
     if not is_practical(gain.gain):
         return
-    gain = unsure(gain)
+    gain = unsure(gain, _AFTERWARDS)
     if name != empirical_term.NAME:
         term_too = Alternative(empirical_term.NAME, "fits this bag as well")
         gain = dataclasses.replace(gain, alternatives=(*gain.alternatives, term_too))

@@ -65,6 +65,17 @@ _COSTLY = "fitted in its stead, it needs more parameters to explain as much"
 _EQUAL = "fits this bag as well"
 _TAKEN = "thrust that is lost takes its moment along, which is the same"
 _EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
+_UNTRIED = "the search was cut short before everything was tried in its place"
+_NAMELESS = "something without a name explains as much"
+_AT_END = "a parameter is at the end of what is possible"
+_OTHER_FACTORS = "the thrust of others than these, of axes or of records, explains as much"
+_OTHER_THRUSTER = "another thruster explains as much"
+_BEHIND_IT = "an error without a name may be behind it (see the notes)"
+_ELSEWHERE = "what gains most is on an axis on which it does not act"
+_UNSUPPORTED = "all of the data do not surely support it"
+_OF_THE_FILE = (
+    "errors of mass, inertia, thrust or trim that the file allows may have made all of it"
+)
 
 
 def finding(
@@ -79,22 +90,23 @@ def finding(
     if judge.better(retuned.hypothesis, without):  # the best model without it
         without = retuned.hypothesis
     gain = judge.gain(without, final.hypothesis, axes)
-    alternatives, separable = _alternatives(search, judge, final, name, trial)
+    alternatives, separable, doubts = _alternatives(search, judge, final, name, trial)
     if name in with_trait("neglecting") and may_be_noise(trial.rest, axes):
         alternatives, separable = (*alternatives, Alternative(NOISE, _EQUAL)), False
     std = np.sqrt(np.maximum(np.diag(final.covariance), 0.0))[final.linear.index(keys)]
     at_end = (at_bound(k, final.hypothesis.values[k], s) for k, s in zip(keys, std, strict=True))
-    separable = separable and not any(at_end)
-    if separable and "factor" in EFFECTS[name].traits:
-        separable = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
-    if separable and final.hypothesis.thruster(name) is not None:
-        separable = _is_surely_likelier(
-            search, final, search.with_other_thruster(final, trial.rest, name)
-        )
+    doubts += [_AT_END] * any(at_end)
+    doubts += [_ELSEWHERE] * judge.gains_elsewhere(gain, without, final.hypothesis, axes)
+    if separable and not doubts and "factor" in EFFECTS[name].traits:
+        sure = all(_is_sure_factor(search, final, trial.rest, k) for k in keys)
+        doubts += [] if sure else [_OTHER_FACTORS]
+    if separable and not doubts and final.hypothesis.thruster(name) is not None:
+        other = search.with_other_thruster(final, trial.rest, name)
+        doubts += [] if _is_surely_likelier(search, final, other) else [_OTHER_THRUSTER]
     if name == "thrust_line" and _may_be_lost_thrust(search.config, final.hypothesis, keys):
         alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
     found = in_words(name, axes, parameters, gain, alternatives)
-    return found if separable else unsure(found)
+    return found if separable and not doubts else unsure(found, *doubts)
 
 
 def beginnings(final: Fitted) -> Spans:
@@ -148,12 +160,12 @@ def _is_surely_likelier(search: Search, final: Fitted, other: Fitted | None) -> 
 
 def _alternatives(
     search: Search, judge: Judge, final: Fitted, name: str, trial: Trial
-) -> tuple[tuple[Alternative, ...], bool]:
+) -> tuple[tuple[Alternative, ...], bool, list[str]]:
     """The rivals, the closest first, and whether the effect can be told from all of them; where it
-    cannot, only those that it cannot be told from."""
+    cannot, only those that it cannot be told from. And what else speaks against it."""
     best = search.cost(final, final)
     explained = trial.rest.squares - final.squares
-    found, separable = [], trial.whole
+    found, separable, doubts = [], True, [] if trial.whole else [_UNTRIED]
 
     def with_arm(fitted: Fitted) -> float:
         own, square = search.with_own_arm(fitted, final.inflation)
@@ -161,7 +173,8 @@ def _alternatives(
 
     for rival, fitted in trial.rivals.items():
         if rival.startswith(UNKNOWN):
-            separable = separable and search.cost(fitted, final) > best - VERY_STRONG
+            if search.cost(fitted, final) <= best - VERY_STRONG:
+                doubts.append(_NAMELESS)
             continue
         share = (trial.rest.squares - fitted.squares) / max(explained, 1e-9)
         close = search.cost(fitted, final) - best < VERY_STRONG
@@ -179,8 +192,9 @@ def _alternatives(
     if 0.0 < ahead < trial.rest.squares_of_biases / final.inflation:
         separable = False
         found.append((1.0, Alternative(BIAS, _EQUAL)))
-    told = [a for _, a in sorted(found, key=lambda x: -x[0]) if separable or a.why_not == _EQUAL]
-    return tuple(told), separable
+    all_told = separable and not doubts
+    told = [a for _, a in sorted(found, key=lambda x: -x[0]) if all_told or a.why_not == _EQUAL]
+    return tuple(told), separable, doubts
 
 
 def is_certain(search: Search, last: Fitted, name: str) -> bool:
@@ -195,10 +209,11 @@ def with_parameters(search: Search, last: Fitted, found: Finding) -> Finding:
     it, or errors of the file may have made all of it."""
     keys, wide = search.keys_of(last, found.effect), last.covariance + last.covariance_of_the_file
     parameters = parameters_of(last, keys, wide)
-    sure = is_certain(search, last, found.effect) and _differs_from_null(last, keys, wide)
+    doubts = [] if is_certain(search, last, found.effect) else [_UNSUPPORTED]
+    doubts += [] if _differs_from_null(last, keys, wide) else [_OF_THE_FILE]
     told = in_words(found.effect, found.axes, parameters, found.gain, found.alternatives)
-    if not (found.separable and sure):
-        told = unsure(told)
+    if doubts or not found.separable:
+        told = unsure(told, *found.doubts, *doubts)
     return possibly_earlier(told, last.linearisation.problem.seen)
 
 
@@ -241,11 +256,14 @@ def possibly_earlier(found: Finding, seen: float = 0.0) -> Finding:
     return dataclasses.replace(found, alternatives=found.alternatives + earlier)
 
 
-def unsure(found: Finding) -> Finding:
+def unsure(found: Finding, *doubts: str) -> Finding:
     """The finding as one that something else may be behind, but no rival that was refuted."""
     run = EFFECTS[found.effect].manoeuvre
     kept = tuple(a for a in found.alternatives if a.why_not in (_EQUAL, _EARLIER, _TAKEN))
-    return dataclasses.replace(found, separable=False, manoeuvre=run, alternatives=kept)
+    every = tuple(dict.fromkeys((*found.doubts, *doubts)))
+    return dataclasses.replace(
+        found, separable=False, manoeuvre=run, alternatives=kept, doubts=every
+    )
 
 
 def parameters_of(
@@ -392,7 +410,8 @@ def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None
         }
         rivals = tuple(Alternative(n, _EQUAL) for n in choice.alternatives.get(name, ()))
         found = in_words(name, (), parameters, gain, rivals)
-        findings.append(unsure(found) if rivals or name in choice.unsure else found)
+        doubts = [_BEHIND_IT] if name in choice.unsure else []
+        findings.append(unsure(found, *doubts) if rivals or doubts else found)
     return findings
 
 

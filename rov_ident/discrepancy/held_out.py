@@ -32,7 +32,7 @@ _ENOUGH = 600.0  # s of data to fit; an hour is explained in less than a minute 
 MOTIONS = dict(zip(VELOCITIES, ("surge", "sway", "heave", "roll rate", "pitch rate", "yaw rate")))
 
 CHUNK = 2.5  # seconds; of the chunks that the bootstrap resamples: four to a block
-_NOT_FAR_LESS = 0.5  # of what another velocity gains: better heave, say, makes better roll, too
+_NEARLY = 0.5  # of what another velocity gains
 PRACTICAL = 0.02  # gain from which an effect has practical weight (the contract)
 _DRAWS = 2000  # of the bootstrap: the 95 % quantile is then good to half a percent
 _LEAST_NOISE = 1e-3  # standard deviations of the motion: a simulated dive may have less, or none
@@ -146,24 +146,35 @@ class Judge:
         return out
 
     def gain(self, before: Hypothesis, after: Hypothesis, axes: Sequence[str] = ()) -> Gain:
-        """Of the component that gains most, of those that surely gain if any do; of the ``axes`` on
-        which an effect acts, unless they gain far less than another. These are looked at alone, as
-        an interval for six components is wide; and where none of them surely gains, all together: a
-        lag moves each a little."""
+        """Of the component that gains most, of those that surely gain if any do. Where none surely
+        gains, those of the ``axes`` on which an effect acts are looked at alone, as an interval for
+        six components is wide, and then all of these together: a lag moves each a little."""
         free = np.flatnonzero(self.free)
         a, b = (self.summed(h) for h in (before, after))
         own = np.array([i for i in free if AXES[i] in axes], dtype=int)
+        sets = [of for of in (free, own) if len(of)]
         gains = [
-            gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], self.count[of])
-            for of in (own, free)
-            if len(of)
+            gain_of([VELOCITIES[i] for i in of], a[:, of], b[:, of], self.count[of]) for of in sets
         ]
-        found = gains[-1]
-        if gains[0].low > 0.0 and gains[0].percent >= _NOT_FAR_LESS * found.percent:
-            found = gains[0]
+        found = next((g for g in gains if g.low > 0.0), gains[0])
         if found.low <= 0.0 and len(own) > 1:
             found = replace(found, together=together(a[:, own], b[:, own]))
         return found
+
+    def gains_elsewhere(
+        self, gain: Gain, before: Hypothesis, after: Hypothesis, axes: Sequence[str]
+    ) -> bool:
+        """Whether the ``gain`` of an effect is on an axis on which it does not act, and none of the
+        ``axes`` on which it does gains nearly as much: heave that is right makes roll right, too.
+        """
+        own = [i for i in np.flatnonzero(self.free) if AXES[i] in axes]
+        if gain.together is not None or AXES[VELOCITIES.index(gain.component)] in axes:
+            return False
+        if not own:
+            return True
+        a, b = (self.summed(h)[:, own] for h in (before, after))
+        there = gain_of([VELOCITIES[i] for i in own], a, b, self.count[own])
+        return there.low <= 0.0 or there.percent < _NEARLY * gain.percent
 
     def _counted(self, left_out: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
         """Which errors (N,) count: all where else none would."""

@@ -48,6 +48,7 @@ from rov_ident.model.equations import Array
 from rov_ident.reports.result import NORMAL
 from rov_ident.sampling.raw_streams import Streams, corrected
 
+_NO_REPETITION = "it does not predict a record that was left out"
 _VELOCITY_SENSOR = ("velocity_scale", "sensor_misalignment", "sensor_lever_arm")
 _LINEAR = ("amplitude", "limit", "place")  # roles of parameters that a record can have of its own
 
@@ -353,7 +354,7 @@ def _with(f: Finding, repetition: Repetition, first: int = 0) -> Finding:
         words = f" The records differ: {told} (± 95 %)."
     if repetition.repeats is False:
         words += " Fitted to the others, it does not predict a record that was left out."
-    f = unsure(f) if repetition.repeats is False else f
+    f = unsure(f, _NO_REPETITION) if repetition.repeats is False else f
     return dataclasses.replace(f, repetition=repetition, sentence=f.sentence + words)
 
 

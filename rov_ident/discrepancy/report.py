@@ -137,7 +137,9 @@ def brief(finding: Finding) -> str:
         if n in told
     ]
     others = listed([called(a.effect) for a in finding.alternatives])
-    doubt = f"this run cannot tell it from {others}" if others else "not surely told from all else"
+    doubt = f"this run cannot tell it from {others}" if others else "not sure"
+    if not others and finding.doubts:
+        doubt += f", as {finding.doubts[0]}"
     doubt = "" if finding.separable else f"; {doubt}"
     of = finding.repetition
     differs = of is not None and not of.same and of.repeats is None and finding.onset_s is None
@@ -469,14 +471,15 @@ def _card(finding: Finding) -> str:
         parts += _in_each_record(finding.repetition)
     if finding.axes:
         parts.append(report.paragraph(f"It acts on {listed(finding.axes)}."))
-    why = "What else might do the same has no name, or was not all tried (see the notes)."
+    why = [f"Not sure: {'; '.join(finding.doubts)}."] if finding.doubts else []
     if finding.alternatives:
-        why = "This bag cannot tell them apart."
+        why.append("This bag cannot tell them apart.")
         tried = [f"{called(a.effect)}: {a.why_not}" for a in finding.alternatives]
         heard = "Why nothing else" if finding.separable else "What else it may be"
         parts += [report.paragraph(f"{heard}:"), report.bullets(tried)]
     if not finding.separable:
-        parts.append(report.paragraph(f"{why} The run that would tell: {run_to_tell(finding)}."))
+        why.append(f"The run that would tell: {run_to_tell(finding)}.")
+        parts.append(report.paragraph(" ".join(why)))
     return report.card(name[0].upper() + name[1:], parts)
 
 

@@ -67,7 +67,8 @@ class Repetition:
 class Finding:
     """One effect that the simulation lacks; ``onset_s`` from the first message. Not ``separable``
     where the bag cannot tell it from its ``alternatives``, from what has no name, or from what was
-    not tried; ``manoeuvre`` is then the run that would."""
+    not tried; ``doubts`` then say what speaks against it beside those, and ``manoeuvre`` is the run
+    that would tell."""
 
     effect: str
     axes: tuple[str, ...]
@@ -77,6 +78,7 @@ class Finding:
     separable: bool = True
     manoeuvre: str | None = None
     alternatives: tuple[Alternative, ...] = ()
+    doubts: tuple[str, ...] = ()
     sentence: str = ""
     repetition: Repetition | None = None
 
