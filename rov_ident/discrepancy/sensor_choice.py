@@ -32,6 +32,7 @@ from rov_ident.effects import EFFECTS, Values
 from rov_ident.effects.base import a_reading
 from rov_ident.model.coefficients import AXES, VELOCITIES
 from rov_ident.model.equations import Array
+from rov_ident.reports.result import NORMAL
 from rov_ident.sampling import wrench_scatter
 from rov_ident.sampling.raw_streams import Streams, corrected
 from rov_ident.sampling.wrench_scatter import RESTING
@@ -124,7 +125,30 @@ def chosen(data: Data, turned: bool = False) -> Choice:
     choice = Choice(found, std)
     if turned or {HEADING, MOUNTING} & found.keys():
         choice = _heading_or_mounting(data, choice, turned)
+    choice = _with_delay_of_the_pose(data, choice)
     return _beside_tilt(data, _without_refuted(data, choice), turned)
+
+
+def _with_delay_of_the_pose(data: Data, choice: Choice) -> Choice:
+    """Without late velocities that only the IMU shows, where the pose alone says otherwise; not
+    sure where it says that they are late by another time. What an attitude that wanders makes of
+    gravity looks like velocities of another time, where a vehicle hardly accelerates."""
+    streams = data.streams
+    if not (LATENCY in choice.sensors and streams.has_pose and len(streams.imu_t)):
+        return choice
+    alone = dataclasses.replace(data, streams=streams.without_imu())
+    posed = alone.fitted([n for n in choice.sensors if n != BIAS], choice.fixed)
+    key = (LATENCY, "delay")
+    delay, std = posed.sensors[LATENCY]["delay"], posed.std.get(key, np.inf)
+    apart = abs(choice.sensors[LATENCY]["delay"] - delay)
+    if apart <= _SURE * np.hypot(std, choice.std.get(key, 0.0)):
+        return choice
+    words = f"{LATENCY}: the pose by itself says {delay:.2g} ± {NORMAL * std:.1g} s"
+    if abs(delay) > _SURE * std:
+        return _unsure(choice, LATENCY, words)
+    rest = data.fitted([n for n in choice.sensors if n != LATENCY], choice.fixed)
+    rest = dataclasses.replace(rest, alternatives=choice.alternatives, unsure=choice.unsure)
+    return dataclasses.replace(rest, notes=(*choice.notes, f"{words}: it is not applied"))
 
 
 def _beside_tilt(data: Data, choice: Choice, turned: bool) -> Choice:

@@ -89,6 +89,11 @@ class Streams:
     in_noise: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(6, dtype=bool))
     noise_lasts: NDArray[np.int64] = field(default_factory=lambda: np.ones(6, dtype=np.int64))
 
+    def without_imu(self) -> "Streams":
+        """The same with no message of the IMU."""
+        gyro, force = self.gyro[:0], self.specific_force[:0]
+        return replace(self, imu_t=self.imu_t[:0], gyro=gyro, specific_force=force)
+
     @property
     def has_pose(self) -> bool:
         """Whether any position is ``posed``."""
