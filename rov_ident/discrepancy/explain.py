@@ -48,13 +48,14 @@ from rov_ident.discrepancy.held_out import (
     thinned,
     windows,
 )
-from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, record_of
+from rov_ident.discrepancy.hypothesis import THRUST_SCALE, UNKNOWN, Hypothesis, record_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
 from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Verdict
-from rov_ident.discrepancy.search import Search, Trial, Trials, with_own
+from rov_ident.discrepancy.search import Search, Trial, Trials, likeliest, with_own
 from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, Values, with_trait
+from rov_ident.estimation.consistency import SUPPOSED
 from rov_ident.model.coefficients import AXES, VELOCITIES, WRENCH_UNITS
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
@@ -99,6 +100,9 @@ _FILTERED = (
 )
 _DOUBTFUL_FILTER = "what a filter of the velocities does besides delaying them looks like any cause"
 _DOUBTFUL_HEADING = "the heading may drift with the gyro whose bias was taken off"
+_IN_PROPORTION = (
+    "it is in proportion to a thrust that is further off than wrench.scale_std takes for possible"
+)
 _BETWEEN_READINGS = "it is less than half an interval of the IMU"
 _BLURRED = "another finding blurs it"
 _UNTRIED = "the search was cut short before all further effects were tried"
@@ -221,12 +225,12 @@ def explain(
         search = again
         retuned, model, residual = _searched(search, search.start(), say)
     say("judging on held-out data", 0.9)
-    likeliest, begun = model.final.hypothesis, beginnings(model.final)
-    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, likeliest, begun)
+    searched, begun = model.final.hypothesis, beginnings(model.final)
+    judge = Judge(WindowedProblem(data.judged, data.to_judge), data.sensors, searched, begun)
     _judge_effects(search, judge, retuned, model)
     if begun and begun != beginnings(model.final):
         begun = beginnings(model.final)
-        judge = Judge(judge.problem, data.sensors, likeliest, begun)
+        judge = Judge(judge.problem, data.sensors, searched, begun)
     _add_term(search, judge, retuned, model)
     of_sensors = list(data.findings)
     if search.config is not config:
@@ -244,13 +248,14 @@ def explain(
             search, judge, data, retuned, model, last, of_dynamics
         )
         notes += of_records
+        model.final = _begun_from_each_record(search, data, model.final)
         if departs := _departing(data, model.final, begun):
             of_dynamics = [unsure(f, _RECORDS_DIFFER) for f in of_dynamics]
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
     given = Hypothesis(config, {})
     problem = WindowedProblem(data.recorded.judged, data.to_judge)
-    as_recorded = Judge(problem, likeliest=likeliest, left_out=begun)
+    as_recorded = Judge(problem, likeliest=searched, left_out=begun)
     final = _without_minor_noise(model.final.hypothesis, data, of_sensors)
     written = extension.kept(
         extension.AsGiven(judge, as_recorded.summed(given)),
@@ -473,6 +478,17 @@ def _in_each_record(
     return found, last, notes + ([_ONE_VALUE.format(", ".join(differ))] if differ else [])
 
 
+def _begun_from_each_record(search: Search, data: _Data, final: Fitted) -> Fitted:
+    """The model fitted once more, from what each record says by itself, where that is likelier: of
+    several currents, a search that began without any may end in another minimum."""
+    if data.validated:
+        return final
+    each = repetition.alone(data.records, final, data.to_fit)
+    begin = repetition.of_each(final.hypothesis, each)
+    as_it_is = refit(final.hypothesis, final.linearisation, update_noise=True)
+    return likeliest([as_it_is, fit(search.problem, begin)]) or final
+
+
 def _departing(data: _Data, final: Fitted, begun: Spans) -> str:
     """Which records a fit of their own predicts better, and in what they differ, in words; nothing
     where none does, or where another bag is judged."""
@@ -520,6 +536,8 @@ def _sure_or_not(
     found = [
         unsure(f, _BETWEEN_READINGS) if _is_between_readings(f, data.streams) else f for f in found
     ]
+    if any(_is_beyond_the_file(f, data.recorded.config) for f in found):
+        found = [f if EFFECTS[f.effect].of_sensors else unsure(f, _IN_PROPORTION) for f in found]
     found = list(map(data.clocks.beside, found))
     found = _beside_each_other(found)
     found = [f if is_surely_practical(f.gain) else unsure(f, _SLIGHT_GAIN) for f in found]
@@ -605,6 +623,17 @@ def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
     return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
 
 
+def _is_beyond_the_file(found: Finding, config: Config) -> bool:
+    """Whether the thrust is further off than the file supposes, as a fit's consistency has it: all
+    forces that are told are in proportion to it."""
+    effect, parameter = THRUST_SCALE
+    if found.effect != effect or not config.wrench.scale_std:
+        return False
+    values = [found.parameters, *(found.repetition.records if found.repetition else ())]
+    far = [abs(of[parameter].value - 1.0) for of in values if np.isfinite(of[parameter].std)]
+    return max(far, default=0.0) > SUPPOSED * config.wrench.scale_std
+
+
 def _is_between_readings(found: Finding, streams: Streams) -> bool:
     """Whether velocities are late by less than half an interval of the IMU, in which nothing is
     known of how they went on."""
@@ -661,9 +690,9 @@ def _searched(
     say("trying rivals", 0.6)
     final, trials = search.try_rivals(path[-1], lambda what: say("trying rivals: " + what, 0.7))
     # effects that led to another minimum may end there as nothing, and one before was the better
-    likeliest = min((final, *path), key=lambda f: search.cost(f, final))
-    if likeliest is not final:
-        final, trials = search.try_rivals(likeliest)
+    cheapest = min((final, *path), key=lambda f: search.cost(f, final))
+    if cheapest is not final:
+        final, trials = search.try_rivals(cheapest)
     say("looking at what is left", 0.8)
     left = search.unexplained(final)
     if left:

@@ -28,6 +28,7 @@ from rov_ident.discrepancy.held_out import (
 )
 from rov_ident.discrepancy.hypothesis import (
     COEFFICIENTS,
+    Hypothesis,
     Key,
     bounds,
     is_shared,
@@ -149,6 +150,17 @@ def alone(records: Records, last: Fitted, spans: Spans | None = None) -> list[Fi
         _fitted(records.streams, [s for s in spans if records.at(s[0]) == b], last)
         for b in range(len(records))
     ]
+
+
+def of_each(h: Hypothesis, each: Sequence[Fitted | None]) -> Hypothesis:
+    """A hypothesis with the values of fits to ``each`` record: of what records share the median."""
+    values = {}
+    for key in h.keys:
+        own = record_of(key)
+        fits = each if own is None else [each[own]]
+        found = [f.hypothesis.values[key] for f in fits if f is not None]
+        values[key] = float(np.median(found)) if found else h.values[key]
+    return h.having(values)
 
 
 def departing(

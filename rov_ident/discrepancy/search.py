@@ -138,9 +138,7 @@ class Search:
         measured = self.problem.measured_starts(), np.full(6, FIRST_NOISE)
         next(filter(None, (linearise(self.problem, h, *measured) for h in begins)), None)
         fits = self._workers.map(lambda h: fit(self.problem, h), begins)
-        free = ~self.problem.guided
-        there = [f for f in fits if f is not None]
-        return min(there, key=lambda f: float(np.log(f.noise[free]).sum()), default=None)
+        return likeliest(fits)
 
     def run(self, progress: Progress | None = None, start: Fitted | None = None) -> list[Fitted]:
         """The fit of the model as it is, then that of each larger one."""
@@ -539,6 +537,16 @@ def _is_far_from(now: Fitted, there: Fitted | None, candidate: Candidate) -> boo
     """Whether a full fit explains far less than the linearisation of ``now`` promised."""
     explained = 0.0 if there is None else now.squares - there.squares
     return explained < _PROMISED * candidate.white_score > VERY_STRONG
+
+
+def likeliest(fits: Iterable[Fitted | None]) -> Fitted | None:
+    """Of fits of a structure, each with the noise that it leaves, the likeliest that there is."""
+    there = [f for f in fits if f is not None]
+
+    def spread(f: Fitted) -> float:
+        return float(np.log(f.noise[~f.linearisation.problem.guided]).sum())
+
+    return min(there, key=spread, default=None)
 
 
 def shortened(streams: Streams, spans: Sequence[tuple[float, float]]) -> Spans:
