@@ -467,6 +467,23 @@ def test_a_position_that_is_held_between_fixes_is_no_pose(seed):
         assert inspected(dataclasses.replace(streams, position=rounded)).has_pose
 
 
+@pytest.mark.parametrize(
+    ("delay", "told", "kept", "is_sure"),
+    [(0.0, 0.05, False, True), (0.1, 0.1, True, True), (0.1, 0.16, True, False)],
+)
+def test_late_velocities_are_as_late_as_the_pose_says(delay, told, kept, is_sure):
+    """An attitude that wanders made 0.05 s of none for the IMU, where the vehicle hardly turns."""
+    _, streams, config = streams_of("late", "pilot", 0, 80.0, lambda *_: {"velocity_delay": delay})
+    spans = split(streams.duration)
+    data = sensor_choice.Data(streams, spans[0], streams, spans[1], config)
+    of_imu = sensor_choice.Choice(
+        {"velocity_latency": {"delay": told}}, {("velocity_latency", "delay"): 0.002}
+    )
+    choice = sensor_choice._with_delay_of_the_pose(data, of_imu)
+    assert ("velocity_latency" in choice.sensors) == kept
+    assert ("velocity_latency" not in choice.unsure) == is_sure
+
+
 def test_what_is_found_beside_a_refuted_correction_is_not_sure():
     """What made the sensors disagree is there all the same, and may have made the other."""
     _, streams, config = streams_of("late", "pilot", 0, 80.0, lambda *_: {"velocity_delay": 0.1})

@@ -10,7 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from textbook import with_section
 
-from rov_ident.core.frames import FrameDefaults, from_core, quaternion_to_matrix
+from rov_ident.core.frames import (
+    FrameDefaults,
+    from_core,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from rov_ident.core.messages import IMU, ODOMETRY, WRENCH, Imu, Odometry, Wrench
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.sampling.despiking import despike
@@ -242,6 +247,24 @@ def test_biases_are_found(heavy):
     assert np.abs(error[late, 3:]).max() < 2e-3
     assert np.abs(error[late, :3].mean(axis=0)).max() < 5e-3
     assert len(raw) == len(samples) + sampler.counts["sample: no odometry yet"]
+
+
+@pytest.mark.parametrize("rate", [20.0, 50.0])
+@pytest.mark.parametrize(("wander", "contradicts"), [(0.003, False), (0.04, True)])
+def test_an_attitude_that_wanders_as_stated_contradicts_nothing(heavy, rate, wander, contradicts):
+    """For a quarter of a minute at a time, of which a sum over a second knows a single value."""
+    rng, last, turn = np.random.default_rng(5), 0.0, np.zeros(3)
+    messages = []
+    for _, role, m in clean(heavy, 90.0, odometry_rate=rate).messages:
+        if role == ODOMETRY:
+            kept = math.exp(-(m.stamp * 1e-9 - last) / 15.0)
+            last = m.stamp * 1e-9
+            turn = kept * turn + math.sqrt(1.0 - kept**2) * wander * rng.standard_normal(3)
+            small = 0.5 * (turn + 0.001 * rng.standard_normal(3))
+            m = m._replace(orientation=quaternion_multiply(m.orientation, np.array([1.0, *small])))
+        messages.append((role, m))
+    _, sampler = taken(heavy, messages)
+    assert (sampler.kinematic_filter.contradictions["attitude"] > 9.0) == contradicts
 
 
 def test_imu_drops_out_and_returns(heavy):

@@ -501,7 +501,7 @@ def _departing(data: _Data, final: Fitted, begun: Spans) -> str:
             problem = WindowedProblem(data.judged, [s for s in held if records.at(s[0]) == r])
             judges[r] = Judge(problem, data.sensors, final.hypothesis, begun)
     each = repetition.alone(records, final, data.to_fit)
-    found = repetition.departing(records, final, each, judges)
+    found = repetition.departing(final, each, judges)
     if not found:
         return ""
     better = ", the ".join(f"{improved(gain)} in record {r + 1}" for r, gain in found.items())

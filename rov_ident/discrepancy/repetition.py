@@ -164,7 +164,7 @@ def of_each(h: Hypothesis, each: Sequence[Fitted | None]) -> Hypothesis:
 
 
 def departing(
-    records: Records, final: Fitted, each: Sequence[Fitted | None], judges: Mapping[int, Judge]
+    final: Fitted, each: Sequence[Fitted | None], judges: Mapping[int, Judge]
 ) -> dict[int, Gain]:
     """The records that a fit to them alone, of ``each``, surely predicts better, by practical
     weight, than the ``final`` model fitted to all, and what that gains: something differs there
