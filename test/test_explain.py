@@ -36,6 +36,7 @@ from rov_ident.discrepancy.explain import (
     CUT_SHORT,
     _beside_each_other,
     _is_between_readings,
+    _is_beyond_the_file,
     _of_guided,
     _set_right,
     _started,
@@ -203,6 +204,17 @@ def test_a_search_that_is_cut_short_is_sure_only_where_nothing_is_left(monkeypat
         (told,) = _sure_or_not(data, [of_surge], left, cut_short)
         assert told.separable == is_sure
     assert "cut short" in told.doubts[0] and "cut short" in _card(told)
+
+
+def test_forces_beside_a_thrust_that_the_file_takes_for_impossible_are_not_sure():
+    config = load(HEAVY)
+    assert config.wrench.scale_std == 0.0  # known: then there is no scale to find
+    config = from_parameters(to_parameters(config) | {"wrench": {"scale_std": 0.15}})
+    gain = Gain("w", 0.1, 0.05, 50.0, 40.0, 60.0)
+    for scale, beyond in ((1.3, False), (2.7, True)):
+        value = {"scale": Value(scale, 0.2, "1")}
+        found = Finding("thrust_scale", ("Z",), value, None, gain, True, None, (), ())
+        assert _is_beyond_the_file(found, config) == beyond
 
 
 def test_an_interrupt_does_not_wait_for_the_fits():
