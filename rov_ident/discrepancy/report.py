@@ -137,9 +137,9 @@ def brief(finding: Finding) -> str:
         if n in told
     ]
     others = listed([called(a.effect) for a in finding.alternatives])
-    doubt = f"this run cannot tell it from {others}" if others else "not sure"
+    doubt = f"this run cannot tell it from {others}" if others else "not surely told from all else"
     if not others and finding.doubts:
-        doubt += f", as {finding.doubts[0]}"
+        doubt = f"not sure, as {finding.doubts[0]}"
     doubt = "" if finding.separable else f"; {doubt}"
     of = finding.repetition
     differs = of is not None and not of.same and of.repeats is None and finding.onset_s is None
