@@ -248,8 +248,11 @@ def explain(
             search, judge, data, retuned, model, last, of_dynamics
         )
         notes += of_records
-        model.final = _begun_from_each_record(search, data, model.final)
-        if departs := _departing(data, model.final, begun):
+        if not data.validated:
+            each = repetition.alone(data.records, model.final, data.to_fit)
+            model.final = _begun_from_each_record(search, model.final, each)
+            departs = _departing(data, model.final, each, begun)
+        if departs:
             of_dynamics = [unsure(f, _RECORDS_DIFFER) for f in of_dynamics]
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
@@ -478,29 +481,23 @@ def _in_each_record(
     return found, last, notes + ([_ONE_VALUE.format(", ".join(differ))] if differ else [])
 
 
-def _begun_from_each_record(search: Search, data: _Data, final: Fitted) -> Fitted:
-    """The model fitted once more, from what each record says by itself, where that is likelier: of
+def _begun_from_each_record(search: Search, final: Fitted, each: Sequence[Fitted | None]) -> Fitted:
+    """The model fitted once more, from what fits to ``each`` record say, where that is likelier: of
     several currents, a search that began without any may end in another minimum."""
-    if data.validated:
-        return final
-    each = repetition.alone(data.records, final, data.to_fit)
     begin = repetition.of_each(final.hypothesis, each)
     as_it_is = refit(final.hypothesis, final.linearisation, update_noise=True)
     return likeliest([as_it_is, fit(search.problem, begin)]) or final
 
 
-def _departing(data: _Data, final: Fitted, begun: Spans) -> str:
-    """Which records a fit of their own predicts better, and in what they differ, in words; nothing
-    where none does, or where another bag is judged."""
-    if data.validated:
-        return ""
+def _departing(data: _Data, final: Fitted, each: Sequence[Fitted | None], begun: Spans) -> str:
+    """Which records a fit of their own, of ``each``, predicts better, and in what they differ, in
+    words; nothing where none does."""
     records, held = data.records, data.to_judge
     judges = {}
     for r in range(len(records)):
         with contextlib.suppress(UserError):  # too little odometry
             problem = WindowedProblem(data.judged, [s for s in held if records.at(s[0]) == r])
             judges[r] = Judge(problem, data.sensors, final.hypothesis, begun)
-    each = repetition.alone(records, final, data.to_fit)
     found = repetition.departing(final, each, judges)
     if not found:
         return ""
