@@ -40,7 +40,6 @@ from rov_ident.discrepancy.explain import (
     _of_guided,
     _set_right,
     _started,
-    _sure_or_not,
     _with_all_data,
     explain,
 )
@@ -181,7 +180,7 @@ def test_velocities_that_never_change_are_no_missing_moment():
     assert note.endswith("left as they are: w, p, q")
 
 
-def test_a_search_that_is_cut_short_is_sure_only_where_nothing_is_left(monkeypatch):
+def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
     trial = Trial("a minute", "thruster_lag", 0, "test")
     there = bag(trial, trial.seed, [STRENGTH])
     whole = explain([there.streams], there.case.config).findings
@@ -192,18 +191,10 @@ def test_a_search_that_is_cut_short_is_sure_only_where_nothing_is_left(monkeypat
     first_step = search.problem.steps_moved
     monkeypatch.setattr(discrepancy, "BUDGET", first_step)
     findings = explain([there.streams], there.case.config).findings
-    (found,) = findings.effects
-    assert found.effect == "thruster_lag" and found.separable
+    assert [f.effect for f in findings.effects] == ["thruster_lag"]
+    assert not findings.effects[0].separable and findings.effects[0].manoeuvre
     assert CUT_SHORT in findings.notes
-    of_surge = dataclasses.replace(found, axes=("X",))
-    for left, cut_short, is_sure in (
-        ({}, True, True),
-        ({"r": 0.2}, False, True),
-        ({"r": 0.2}, True, False),
-    ):
-        (told,) = _sure_or_not(data, [of_surge], left, cut_short)
-        assert told.separable == is_sure
-    assert "cut short" in told.doubts[0] and "cut short" in _card(told)
+    assert "cut short before everything was tried" in _card(findings.effects[0])
 
 
 def test_forces_beside_a_thrust_that_the_file_takes_for_impossible_are_not_sure():

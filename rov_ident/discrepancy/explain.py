@@ -72,9 +72,9 @@ _NEAR_ONSET = 2.0  # s; as far apart as the onsets that the search tries
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
 
 CUT_SHORT = (
-    "the search was cut short after as much simulation as it may take: further effects may be "
-    "missing, and where something is left, what was found is not sure; a configuration that fits "
-    "better helps (rov-ident fit, where it says that model and data agree)"
+    "the search was cut short after as much simulation as it may take: not all further effects, "
+    "and in place of those found only other effects, were tried; a configuration that fits better "
+    "helps (rov-ident fit, where it says that model and data agree)"
 )
 _OWN_HEADINGS = (
     "each record has a heading of its own against the world: the extended configuration has none"
@@ -105,7 +105,6 @@ _IN_PROPORTION = (
 )
 _BETWEEN_READINGS = "it is less than half an interval of the IMU"
 _BLURRED = "another finding blurs it"
-_UNTRIED = "the search was cut short before all further effects were tried"
 _SLIGHT_GAIN = "the interval of its gain begins below 2 %"
 _BESIDE_REST = "what is left of the motion may have made it"
 _RECORDS_DIFFER = "the records differ in what has no name"
@@ -273,7 +272,7 @@ def explain(
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
     left = _left(data.judged, rmse[2], judge.rmse_of_noise())
-    found = _sure_or_not(data, of_sensors + of_dynamics, left, search.cut_short)
+    found = _sure_or_not(data, of_sensors + of_dynamics, left)
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
             found[i] = empirical_term.described(f, last.hypothesis)
@@ -521,9 +520,7 @@ def _gaining(
     return dataclasses.replace(found, gain=gain, sentence=words)
 
 
-def _sure_or_not(
-    data: _Data, found: list[Finding], left: Mapping[str, float], cut_short: bool
-) -> list[Finding]:
+def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -> list[Finding]:
     """What is found, not sure where what the sensors do beside it, or what is ``left``, may have
     made it, or where its gain may have no practical weight."""
     if data.late:  # a filter does more than delay, and what it does besides looks like any cause
@@ -538,8 +535,6 @@ def _sure_or_not(
     found = list(map(data.clocks.beside, found))
     found = _beside_each_other(found)
     found = [f if is_surely_practical(f.gain) else unsure(f, _SLIGHT_GAIN) for f in found]
-    if cut_short and left:
-        found = [f if EFFECTS[f.effect].of_sensors else unsure(f, _UNTRIED) for f in found]
     return [unsure(f, _BESIDE_REST) if _acts_on(f, left) else f for f in found]
 
 

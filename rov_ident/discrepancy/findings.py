@@ -65,6 +65,7 @@ _COSTLY = "fitted in its stead, it needs more parameters to explain as much"
 _EQUAL = "fits this bag as well"
 _TAKEN = "thrust that is lost takes its moment along, which is the same"
 _EARLIER = "the same if it was there before the bag began, which this bag cannot tell"
+_UNTRIED = "the search was cut short before everything was tried in its place"
 _NAMELESS = "something without a name explains as much"
 _AT_END = "a parameter is at the end of what is possible"
 _OTHER_FACTORS = "the thrust of others than these, of axes or of records, explains as much"
@@ -164,7 +165,7 @@ def _alternatives(
     cannot, only those that it cannot be told from. And what else speaks against it."""
     best = search.cost(final, final)
     explained = trial.rest.squares - final.squares
-    found, separable, doubts = [], True, list[str]()
+    found, separable, doubts = [], True, [] if trial.whole else [_UNTRIED]
 
     def with_arm(fitted: Fitted) -> float:
         own, square = search.with_own_arm(fitted, final.inflation)

@@ -77,11 +77,12 @@ BUDGET = 600_000  # steps moved for each second of data (docs/explain.md, the ca
 
 @dataclass(frozen=True)
 class Trial:
-    """A named effect put to the test: the model without it, and with each rival in its place, among
-    them patterns of no known cause."""
+    """A named effect put to the test: the model without it, and with each rival in its place;
+    ``whole``: with patterns of no known cause, too, for which the budget may not be left."""
 
     rest: Fitted
     rivals: Mapping[str, Fitted]
+    whole: bool = True
 
 
 Trials = dict[str, Trial]
@@ -352,10 +353,9 @@ class Search:
         return {n: self._trial(rest, n) for n, rest in pairs if rest is not None}
 
     def _trial(self, rest: Fitted, name: str) -> Trial:
-        """An effect is not named without it, whatever the budget: that takes little of it."""
-        if name not in EFFECTS and self._budget_spent():
-            return Trial(rest, {})
-        return Trial(rest, self._rivals(rest, name) | self._patterns_for(rest, name))
+        whole = not self._budget_spent()
+        rivals = self._rivals(rest, name) if whole or name in EFFECTS else {}
+        return Trial(rest, rivals | self._patterns_for(rest, name) if whole else rivals, whole)
 
     def rest(self, fitted: Fitted, name: str) -> Fitted | None:
         """The fit without an effect."""
@@ -414,7 +414,8 @@ class Search:
         return fitted, raised**2
 
     def _rivals(self, rest: Fitted, name: str) -> dict[str, Fitted]:
-        """What other effects might explain what ``name`` explains: fits by the rivals' names."""
+        """What other effects might explain what ``name`` explains: fits by the name of the rival.
+        An effect is not named without them, whatever the budget: they take little of it."""
         candidates = [c for c in self.candidates(rest, name=name) if c.name != name]
         fits = self.by_effect(rest, self.fit_best(rest, candidates))
         fits.pop(name, None)  # two families share some coefficients
