@@ -69,7 +69,8 @@ class Linearisation:
     """A hypothesis simulated through all windows: residuals ``error`` (6 N,), initial velocities
     eliminated, divided by the standard deviations ``noise`` (6,), and sensitivities; ``starts`` (W,
     6) are the initial velocities. With ``more`` noise both are whitened. ``told`` (N,): which
-    measurements come before their window runs away; of the others there are no residuals."""
+    measurements come before their window runs away; of the others there are no residuals. ``good``
+    (N, 6): which residuals are no outliers."""
 
     def __init__(
         self,
@@ -79,12 +80,13 @@ class Linearisation:
         noise: Array,
         motion: Motion,
         more: "MoreNoise | None" = None,
+        good: NDArray[np.bool_] | None = None,
     ) -> None:
         self.problem, self.hypothesis, self.starts = problem, h, starts
         self.noise, self.motion, self.more = noise, motion, more
-        error = (problem.measured - motion.nu[problem.nodes]) / noise
-        spread = robust_std(error)
-        self._weight = (np.abs(error) < _OUTLIER * np.maximum(spread, 1.0)) / noise
+        error = self._raw_error()
+        self.good = _without_outliers(error) if good is None else good
+        self._weight = self.good / noise
         self._weight[:, problem.guided] = 0.0
         self._rows = np.flatnonzero(np.diff(problem.window, prepend=-1))  # first of each window
         self.told = problem.told(self._before_running_away)
@@ -138,6 +140,20 @@ class Linearisation:
         could improve by losing a window."""
         out = np.count_nonzero(self._weight[:, ~self.problem.guided] == 0.0, axis=1) * self.told
         return self._squares + _OUTLIER**2 * np.add.reduceat(out, self._rows)
+
+    def judged_anew(self) -> "Linearisation":
+        """The same with the outliers that there are here, not those of where it came from."""
+        good = _without_outliers(self._raw_error())
+        if (good == self.good).all():
+            return self
+        return Linearisation(
+            self.problem, self.hypothesis, self.starts, self.noise, self.motion, self.more, good
+        )
+
+    def _raw_error(self) -> Array:
+        """Measured less simulated velocities (N, 6) over their noise."""
+        error: Array = self.problem.measured - self.motion.nu[self.problem.nodes]
+        return error / self.noise
 
     @property
     def first(self) -> Indices:
@@ -301,13 +317,14 @@ class Linearisation:
         error = self.error + np.einsum("rp,rp->r", self.columns[:, at], moves[window])
         return np.add.reduceat(error.reshape(-1, 6) ** 2, self._rows)
 
-    def starts_after(self, change: Array) -> Array:
-        """The initial velocities (W, 6) that suit a change (P,) of the parameters."""
-        parts = zip(self._r, self._start_error, self.sensitivities()[0], strict=True)
+    def starts_after(self, change: Array, share: float = 1.0) -> Array:
+        """The initial velocities (W, 6) that suit a change (P,) of the parameters, with a ``share``
+        of how far they are off without one."""
+        left = share * np.stack(self._start_error) - np.stack(self.sensitivities()[0]) @ change
         # by least squares: a velocity that a poor model forgets at once has no initial value
-        moves = [np.linalg.lstsq(r, e - a @ change, rcond=None)[0] for r, e, a in parts]
+        moves = np.linalg.pinv(np.stack(self._r)) @ left[:, :, None]
         starts = self.starts.copy()
-        starts[:, ~self.problem.guided] += moves
+        starts[:, ~self.problem.guided] += moves[:, :, 0]
         return starts
 
     def residual_std(self) -> Array:
@@ -357,7 +374,14 @@ def linearise(
     starts: Array,
     noise: Array,
     more: MoreNoise | None = None,
+    good: NDArray[np.bool_] | None = None,
 ) -> Linearisation | None:
     """Simulate a hypothesis from initial velocities (W, 6); None where that diverges."""
     motion = problem.motion(h, starts)
-    return None if motion is None else Linearisation(problem, h, starts, noise, motion, more)
+    return None if motion is None else Linearisation(problem, h, starts, noise, motion, more, good)
+
+
+def _without_outliers(error: Array) -> NDArray[np.bool_]:
+    """Which of the residuals (N, 6), over their noise, are no outliers."""
+    good: NDArray[np.bool_] = np.abs(error) < _OUTLIER * np.maximum(robust_std(error), 1.0)
+    return good

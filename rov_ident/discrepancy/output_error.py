@@ -37,7 +37,8 @@ from rov_ident.sampling.raw_streams import PAUSE
 
 _FEWEST_CLUSTERS = 8  # windows; from fewer a variance is uncertain by more than half (chi-squared)
 _ITERATIONS = 15  # of Gauss-Newton; a guard: fits of the study end after at most ten
-_TOLERANCE = 1e-4  # squared residuals per residual; a step that gains less ends the fit
+_TOLERANCE = 1e-4  # squared residuals per residual; a step that gains less ends the fit, ...
+_SETTLED = 0.1  # ... or less of their variance inflation: a third of a standard deviation at most
 _STEP_FACTOR = 0.4  # by which a step that gains nothing is shortened ...
 _SHORTEST = 0.05  # ... until it is so short: then the minimum is reached within rounding
 _NOISE_UPDATES = 4  # of the noise in turn with the parameters, and ...
@@ -260,14 +261,18 @@ def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -
         value = np.array(list(h.values.values()))
         slope = linear.gradient.sum(axis=0) + prior * (mean - value)
         change = solve_bounded(linear.normal + np.diag(prior), slope, *step_limits(h, h.keys))
-        if slope @ change < _TOLERANCE * linear.count:
+        inflation = variance_inflation(linear, np.arange(len(linear.keys)))
+        least = max(_TOLERANCE * linear.count, _SETTLED * inflation)
+        if slope @ change < least:
             return Fitted(h, linearisation, True)
         cost = linearisation.rss + prior @ (mean - value) ** 2
         factor = 1.0
         while factor > _SHORTEST:
             there = h.at(dict(zip(h.keys, (value + factor * change).tolist(), strict=True)))
-            starts = linearisation.starts_after(factor * change)
-            found = linearise(problem, there, starts, linearisation.noise)
+            starts = linearisation.starts_after(factor * change, factor)
+            # outliers are those from where the step began: another one would count as a loss
+            good = linearisation.good
+            found = linearise(problem, there, starts, linearisation.noise, good=good)
             if found is not None:
                 new = found.rss + prior @ (mean - value - factor * change) ** 2
                 if new < cost:
@@ -276,8 +281,8 @@ def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -
         else:
             return Fitted(h, linearisation, True)
         assert found is not None
-        h, linearisation = there, found
-        if cost - new < _TOLERANCE * linear.count:
+        h, linearisation = there, found.judged_anew()
+        if cost - new < least:
             return Fitted(h, linearisation, True)
     return Fitted(h, linearisation, False)
 

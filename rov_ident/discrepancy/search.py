@@ -72,6 +72,7 @@ _ROUNDS = 3  # in which effects may give way to rivals
 _ARM_STEPS = 4  # of Gauss-Newton in the height of the centre of buoyancy, which is nearly linear
 _SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
 _FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
+_ZERO = 1e-300  # what may be zero is divided by it
 BUDGET = 600_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
 
 
@@ -162,7 +163,8 @@ class Search:
         fits = self.fit_best(now, candidates) + self._with_late_thrust(now) + self._apart(now)
         best = self._best(now, fits)
         if best is None or added_effect(now, best) not in HULL_DAMPING:
-            best = self._cheapest([best, self._damping_and_another(now, candidates)])
+            both = self._damping_and_another(now, candidates, best or now)
+            best = self._cheapest([best, both])
         if best is None:
             damping = [f for f in fits if added_effect(now, f) in HULL_DAMPING]
             best = self._best(now, damping, HULL_DAMPING_ASKED)
@@ -203,11 +205,14 @@ class Search:
         closest = min(there, key=lambda f: f.squares, default=None)
         return closest and min(there, key=lambda f: self.cost(f, closest))
 
-    def _damping_and_another(self, now: Fitted, candidates: Sequence[Candidate]) -> Fitted | None:
-        """Hull damping with one effect more, where neither shows without the other; late thrust
-        whatever its score: the linearisation of a model without drag does not show it. What shows
-        by itself in such a model may only imitate the two: a limit of the thrust, or products of
-        velocities, on the measured record of docs/tank.md."""
+    def _damping_and_another(
+        self, now: Fitted, candidates: Sequence[Candidate], than: Fitted
+    ) -> Fitted | None:
+        """Hull damping with one effect more, where neither shows without the other, if the two may
+        be cheaper ``than`` another model; late thrust whatever its score: the linearisation of a
+        model without drag does not show it. What shows by itself in such a model may only imitate
+        the two: a limit of the thrust, or products of velocities, on the measured record of
+        docs/tank.md."""
         for candidate in candidates:
             if candidate.name not in HULL_DAMPING:
                 continue
@@ -219,6 +224,8 @@ class Search:
                 continue
             fits = self.fit_best(damped, self.candidates(damped, now))
             fits += self._with_late_thrust(damped)
+            fewest = PENALTY * (len(now.hypothesis.keys) + 2 - len(than.hypothesis.keys))
+            fits = [f for f in fits if than.squares - f.squares > fewest * f.inflation]
             pruned = [self._pruned(f, now) for f in fits]
             both = [f for f in pruned if f and set(zeros) & set(f.hypothesis.keys)]
             best = self._best(now, both)
@@ -309,18 +316,10 @@ class Search:
         axis that is hardly driven; the drag of a hull is there anyway.
         """
         while fitted is not None:
-            h, linear = fitted.hypothesis, fitted.linear
-            added = [k for k in h.keys if k not in base.hypothesis.values and axis_of(k)]
-            variance = fitted.inflation * np.diag(scaled_inverse(linear.normal))
-            variance = np.where(variance > 0.0, variance, np.inf)  # zero: nothing is known
-            by_window = np.array([k[0] != COEFFICIENTS for k in linear.keys])
-            variance = np.maximum(variance, by_window * np.diag(fitted.covariance))
-            gains = [
-                (h.values[k] - bounds(k)[0]) ** 2 / variance[linear.index([k])[0]] for k in added
-            ]
-            if min(gains, default=np.inf) > PENALTY:
+            worthless = _worthless(fitted, base)
+            if not worthless:
                 return fitted
-            fitted = refit(h.without([added[int(np.argmin(gains))]]), fitted.linearisation)
+            fitted = refit(fitted.hypothesis.without(worthless), fitted.linearisation)
         return None
 
     def try_rivals(self, final: Fitted, progress: Progress | None = None) -> tuple[Fitted, Trials]:
@@ -328,7 +327,8 @@ class Search:
         trials: Trials = {}
         for last in (False,) * _ROUNDS + (True,):
             trials, better = {}, None
-            for name in self.named(final):
+            # patterns first: one is replaced more often than a name, and then all are tried again
+            for name in sorted(self.named(final), key=lambda n: not n.startswith(UNKNOWN)):
                 rest = self.rest(final, name)
                 if rest is None:
                     continue
@@ -532,6 +532,32 @@ class Search:
     def _added(self, fitted: Fitted) -> list[Key]:
         own = set(self.given.keys)
         return [k for k in fitted.hypothesis.keys if k not in own]
+
+
+def _worthless(fitted: Fitted, base: Fitted) -> list[Key]:
+    """The parameters of single axes beyond ``base`` that are not worth their penalty: one after the
+    other leaves, the rest refitted linearly."""
+    h, linear = fitted.hypothesis, fitted.linear
+    value = np.array([h.values[k] - bounds(k)[0] for k in linear.keys])
+    inverse = scaled_inverse(linear.normal)
+    by_window = np.array([k[0] != COEFFICIENTS for k in linear.keys])
+    wider = by_window * np.diag(fitted.covariance) / np.maximum(np.diag(inverse), _ZERO)
+    factor = np.maximum(fitted.inflation, wider)
+    left = [k for k in h.keys if k not in base.hypothesis.values and axis_of(k)]
+    gone = []
+    while left:
+        at = linear.index(left)
+        variance = (factor * np.diag(inverse))[at]
+        seen = variance > 0.0  # of the others nothing is known
+        gains = np.divide(value[at] ** 2, variance, out=np.zeros(len(at)), where=seen)
+        least = int(np.argmin(gains))
+        if gains[least] > PENALTY:
+            break
+        gone.append(left.pop(least))
+        i = at[least]
+        column = inverse[:, i] / max(inverse[i, i], _ZERO)
+        value, inverse = value - column * value[i], inverse - np.outer(column, inverse[i])
+    return gone
 
 
 def _is_far_from(now: Fitted, there: Fitted | None, candidate: Candidate) -> bool:
