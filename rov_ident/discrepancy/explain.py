@@ -219,7 +219,9 @@ def explain(
     search, start, data = _started(data, config)
     retuned, model, residual = _searched(search, start, say)
     # in a model that lacks much, noise of the wrench's reading may not have shown
-    again, data = _with_reading(search, model.final, data)
+    again = search
+    if model.final.noise_counts:
+        again, data = _with_reading(search, model.final, data)
     if again is not search:
         search = again
         retuned, model, residual = _searched(search, search.start(), say)

@@ -27,7 +27,7 @@ from rov_ident.discrepancy.hypothesis import (
 )
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem, linearise
 from rov_ident.discrepancy.reading_noise import DRAWS
-from rov_ident.discrepancy.selection import variance_inflation
+from rov_ident.discrepancy.selection import VERY_STRONG, variance_inflation
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, WindowedProblem
 from rov_ident.effects import EFFECTS
 from rov_ident.model.coefficients import AXES
@@ -84,12 +84,21 @@ class Fitted:
 
         Zeros where every draw makes more than there are: the model is then close to unstable and
         amplifies the noise far beyond what the vehicle does."""
+        squares = self._squares_of_reading
+        return squares if squares.min() < self.rss else np.zeros(DRAWS)
+
+    @cached_property
+    def _squares_of_reading(self) -> Array:
         problem = self.linearisation.problem
         if not problem.reading_std.any():
             return np.zeros(DRAWS)
         force = problem.noisy_thrust(self.hypothesis.effects)
-        squares = np.sum(self.linearisation.sensitivity_to(force) ** 2, axis=0)
-        return squares if squares.min() < self.rss else np.zeros(DRAWS)
+        return np.sum(self.linearisation.sensitivity_to(force) ** 2, axis=0)
+
+    @property
+    def noise_counts(self) -> bool:
+        """Whether noise of the wrench's reading makes as much as an effect must explain."""
+        return bool(self._squares_of_reading.mean() > VERY_STRONG * self.inflation)
 
     @property
     def squares(self) -> float:
@@ -108,7 +117,7 @@ class Fitted:
     @cached_property
     def inflation(self) -> float:
         """The variance inflation over all parameters."""
-        return variance_inflation(self.linear, np.arange(len(self.linear.keys)))
+        return _inflation(self.linear)
 
     @cached_property
     def covariance(self) -> Array:
@@ -121,8 +130,8 @@ class Fitted:
         prior = self._prior
         normal = linear.normal[np.ix_(at, at)] + prior
         bread = scaled_inverse(normal)
-        own = bread @ prior @ bread  # what only the file says is as uncertain as it says
-        wide = variance_inflation(linear, at) * (bread - own)
+        own = self.inflation * bread @ prior @ bread  # of what only the file says
+        wide = self.inflation * bread - own
         moves = self.linearisation.jackknife(at, prior)
         w = len(moves)
         if w >= _FEWEST_CLUSTERS:
@@ -194,15 +203,25 @@ class Fitted:
 
     @property
     def _prior(self) -> Array:
-        """The precision of the prior of these."""
-        problem = self.linearisation.problem
-        return np.diag(problem.precision(self.hypothesis)[self._smooth])
+        """The precision of the prior of these, beside the normal matrix."""
+        return np.diag(_prior_beside(self.linearisation)[self._smooth])
 
     @property
     def _smooth(self) -> Indices:
         """The parameters in which the residuals are smooth: all but onsets."""
         dates = onsets(self.hypothesis)
         return self.linear.index(k for k in self.linear.keys if k not in dates)
+
+
+def _inflation(linear: LinearProblem) -> float:
+    """The variance inflation over all parameters."""
+    return variance_inflation(linear, np.arange(len(linear.keys)))
+
+
+def _prior_beside(line: Linearisation) -> Array:
+    """The precision (P,) of the prior of all parameters, beside squared residuals that count as if
+    white over their variance inflation."""
+    return _inflation(line.linear) * line.problem.precision(line.hypothesis)
 
 
 def fit(problem: WindowedProblem, h: Hypothesis) -> Fitted | None:
@@ -254,15 +273,14 @@ def _with_noise(fitted: Fitted) -> Fitted:
 def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -> Fitted:
     """Gauss-Newton with step shortening at fixed noise."""
     h, problem = linearisation.hypothesis, linearisation.problem
-    prior = problem.precision(h)
     mean = np.array([centre(h.config, key) for key in h.keys])
     for _ in range(iterations):
         linear = linearisation.linear
+        prior = _prior_beside(linearisation)
         value = np.array(list(h.values.values()))
         slope = linear.gradient.sum(axis=0) + prior * (mean - value)
         change = solve_bounded(linear.normal + np.diag(prior), slope, *step_limits(h, h.keys))
-        inflation = variance_inflation(linear, np.arange(len(linear.keys)))
-        least = max(_TOLERANCE * linear.count, _SETTLED * inflation)
+        least = max(_TOLERANCE * linear.count, _SETTLED * _inflation(linear))
         if slope @ change < least:
             return Fitted(h, linearisation, True)
         cost = linearisation.rss + prior @ (mean - value) ** 2
@@ -334,7 +352,7 @@ def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
     change = np.zeros(len(linear.keys))
     change[moved] = far
     change[at] = solve_bounded(
-        normal + np.diag(problem.precision(h.at({k: h.values[k] for k in follow}))),
+        normal + np.diag(_prior_beside(start)[start.linear.index(follow)]),
         slope[at] - linear.normal[np.ix_(at, moved)] @ far,
         *step_limits(h, follow),
     )

@@ -163,17 +163,17 @@ class Search:
         fits = self.fit_best(now, candidates) + self._with_late_thrust(now) + self._apart(now)
         best = self._best(now, fits)
         if best is None or added_effect(now, best) not in HULL_DAMPING:
-            both = self._damping_and_another(now, candidates, best or now)
+            both = self._best(now, self._damping_and_late_thrust(now, candidates))
             best = self._cheapest([best, both])
         if best is None:
             damping = [f for f in fits if added_effect(now, f) in HULL_DAMPING]
             best = self._best(now, damping, HULL_DAMPING_ASKED)
         return best and (refit(best.hypothesis, best.linearisation, update_noise=True) or best)
 
-    def candidates(self, now: Fitted, of: Fitted | None = None, name: str = "") -> list[Candidate]:
-        """But for those that imitate a term that every vehicle has and the model ``of`` (None:
-        ``now``) lacks, unless that term is the effect ``name``."""
-        h, lacking = (of or now).hypothesis, self.screening.lacks_plainer
+    def candidates(self, now: Fitted, name: str = "") -> list[Candidate]:
+        """But for those that imitate a term that every vehicle has and the model lacks, unless that
+        term is the effect ``name``."""
+        h, lacking = now.hypothesis, self.screening.lacks_plainer
         found = self.screening.candidates(now)
         return [c for c in found if EFFECTS[c.name].beyond == name or not lacking(c.name, h)]
 
@@ -205,14 +205,15 @@ class Search:
         closest = min(there, key=lambda f: f.squares, default=None)
         return closest and min(there, key=lambda f: self.cost(f, closest))
 
-    def _damping_and_another(
-        self, now: Fitted, candidates: Sequence[Candidate], than: Fitted
-    ) -> Fitted | None:
-        """Hull damping with one effect more, where neither shows without the other, if the two may
-        be cheaper ``than`` another model; late thrust whatever its score: the linearisation of a
-        model without drag does not show it. What shows by itself in such a model may only imitate
-        the two: a limit of the thrust, or products of velocities, on the measured record of
-        docs/tank.md."""
+    def _damping_and_late_thrust(
+        self, now: Fitted, candidates: Sequence[Candidate]
+    ) -> list[Fitted]:
+        """Full fits of hull damping and late thrust at once, where neither shows without the other:
+        what shows by itself in a model that lacks both may only imitate the two, as a limit of the
+        thrust, or products of velocities, on the measured record of docs/tank.md."""
+        fits: list[Fitted] = []
+        if set(LATE_THRUST) <= set(now.hypothesis.effects):
+            return fits
         for candidate in candidates:
             if candidate.name not in HULL_DAMPING:
                 continue
@@ -220,18 +221,11 @@ class Search:
             zeros = dict.fromkeys((k for u in units for k in u), 0.0)
             begin = now.hypothesis.having({**zeros, **candidate.start})
             damped = refit(begin, now.linearisation)
-            if damped is None:
-                continue
-            fits = self.fit_best(damped, self.candidates(damped, now))
-            fits += self._with_late_thrust(damped)
-            fewest = PENALTY * (len(now.hypothesis.keys) + 2 - len(than.hypothesis.keys))
-            fits = [f for f in fits if than.squares - f.squares > fewest * f.inflation]
-            pruned = [self._pruned(f, now) for f in fits]
-            both = [f for f in pruned if f and set(zeros) & set(f.hypothesis.keys)]
-            best = self._best(now, both)
-            if best is not None:
-                return best
-        return None
+            for fitted in self._with_late_thrust(damped) if damped else []:
+                pruned = self._pruned(fitted, now)
+                if pruned and set(zeros) & set(pruned.hypothesis.keys):
+                    fits.append(pruned)
+        return fits
 
     def _with_late_thrust(self, now: Fitted) -> list[Fitted]:
         """Full fits of late thrust, begun well away from none: a model that lacks it has taken so
