@@ -32,17 +32,13 @@ from rov_ident.core.progress import silent
 from rov_ident.discrepancy import explain as explaining
 from rov_ident.discrepancy import screening, sensor_consistency
 from rov_ident.discrepancy import search as discrepancy
-from rov_ident.discrepancy.explain import (
-    CUT_SHORT,
-    _beside_each_other,
-    _is_between_readings,
-    _is_beyond_the_file,
-    _of_guided,
-    _set_right,
-    _started,
-    _with_all_data,
-    explain,
+from rov_ident.discrepancy.certainty import (
+    beside_each_other,
+    is_between_readings,
+    is_beyond_the_file,
 )
+from rov_ident.discrepancy.certainty import verdict as verdict_of
+from rov_ident.discrepancy.explain import CUT_SHORT, _started, _with_all_data, explain
 from rov_ident.discrepancy.findings import (
     is_left,
     possibly_earlier,
@@ -53,6 +49,7 @@ from rov_ident.discrepancy.held_out import gain_of, split, thinned, windows
 from rov_ident.discrepancy.hypothesis import at_bound
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import fit, refit
+from rov_ident.discrepancy.prepared import of_guided, prepare
 from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
@@ -176,7 +173,7 @@ def test_velocities_that_never_change_are_no_missing_moment():
     streams.nu[:, 2:5] = 0.0
     streams = inspected(streams)
     assert list(streams.guided) == [False, False, True, True, True, False]
-    (note,) = _of_guided(streams)
+    (note,) = of_guided(streams)
     assert note.endswith("left as they are: w, p, q")
 
 
@@ -186,7 +183,7 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
     whole = explain([there.streams], there.case.config).findings
     assert whole.effects[0].separable and CUT_SHORT not in whole.notes
 
-    data = _set_right([there.streams], there.case.config, None)
+    data = prepare([there.streams], there.case.config, None)
     search, _, _ = _started(data, there.case.config)
     first_step = search.problem.steps_moved
     monkeypatch.setattr(discrepancy, "BUDGET", first_step)
@@ -205,7 +202,7 @@ def test_forces_beside_a_thrust_that_the_file_takes_for_impossible_are_not_sure(
     for scale, beyond in ((1.3, False), (2.7, True)):
         value = {"scale": Value(scale, 0.2, "1")}
         found = Finding("thrust_scale", ("Z",), value, None, gain, True, None, (), ())
-        assert _is_beyond_the_file(found, config) == beyond
+        assert is_beyond_the_file(found, config) == beyond
 
 
 def test_an_interrupt_does_not_wait_for_the_fits():
@@ -504,8 +501,8 @@ def test_inertia_beside_each_other_may_be_its_own():
         Finding(name, ("M",), {}, None, gain, True, None, (), "")
         for name in ("added_mass_coupling", "payload", "quadratic_damping")
     )
-    assert _beside_each_other([coupling, drag]) == [coupling, drag]
-    beside = _beside_each_other([payload, coupling, drag])
+    assert beside_each_other([coupling, drag]) == [coupling, drag]
+    beside = beside_each_other([payload, coupling, drag])
     assert [f.separable for f in beside] == [True, False, True]
 
 
@@ -517,7 +514,7 @@ def test_a_delay_within_an_interval_of_the_imu_is_not_sure(fitted):
     def unsure_of(delay):
         late = {"delay": Value(delay, 1e-4, "s")}
         found = Finding("velocity_latency", (), late, None, gain, True, None, (), "")
-        return _is_between_readings(found, streams)
+        return is_between_readings(found, streams)
 
     assert unsure_of(0.4 * interval) and not unsure_of(0.6 * interval)
 
@@ -705,10 +702,10 @@ def test_structure_is_not_right_while_the_held_out_data_leave_an_effect_open():
     values = {"time_constant": Value(0.1, 0.01, "s")}
     for gain, verdict in ((sure, "retuned"), (open_, "unexplained")):
         lag = Finding("thruster_lag", ("X",), values, None, gain, True, None, (), "")
-        assert explaining._verdict([], [lag], [], {}, True) == verdict
-        assert explaining._verdict([lag], [lag], [], {}, True) == "explained"
+        assert verdict_of([], [lag], [], {}, True) == verdict
+        assert verdict_of([lag], [lag], [], {}, True) == "explained"
     bias = Finding("imu_bias", (), values, None, open_, True, None, (), "")
-    assert explaining._verdict([], [bias], [], {}, True) == "retuned"  # the sensors', no force
+    assert verdict_of([], [bias], [], {}, True) == "retuned"  # the sensors', no force
 
 
 def test_a_model_from_before_the_last_effects_is_kept_where_it_is_likelier(monkeypatch):

@@ -9,12 +9,13 @@ from tiers import more
 from bench import CONFIGS, HEAVY
 from rov_ident import config as configuration
 from rov_ident.discrepancy import repetition, sensor_consistency
-from rov_ident.discrepancy.explain import _beside_given, _of_guided, explain
+from rov_ident.discrepancy.explain import _beside_given, explain
 from rov_ident.discrepancy.findings import unsure
 from rov_ident.discrepancy.held_out import Judge, blocks, split, windows
 from rov_ident.discrepancy.hypothesis import THRUST_SCALE, Hypothesis, bounds, precision
 from rov_ident.discrepancy.multiple_shooting import tangent
 from rov_ident.discrepancy.output_error import fit, with_best_onsets
+from rov_ident.discrepancy.prepared import of_guided
 from rov_ident.discrepancy.report import _card
 from rov_ident.discrepancy.results import Alternative, Finding, Gain, Value
 from rov_ident.discrepancy.search import Search
@@ -107,8 +108,8 @@ def test_a_record_without_a_pose_says_nothing_of_the_velocities(seed):
 def test_a_record_without_forces_tells_no_scale_of_them():
     """Of a vehicle under fins and a propeller, whose coefficients may all be too large together."""
     driven = record(1)
-    (told,) = _of_guided(dataclasses.replace(driven, demand=np.zeros_like(driven.demand)))
-    assert "no force in newtons is recorded" in told and not _of_guided(driven)
+    (told,) = of_guided(dataclasses.replace(driven, demand=np.zeros_like(driven.demand)))
+    assert "no force in newtons is recorded" in told and not of_guided(driven)
 
 
 def test_a_record_without_moments_or_heave_lacks_them_for_all():

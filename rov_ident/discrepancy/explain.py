@@ -10,19 +10,11 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rov_ident import config as configuration
 from rov_ident.config import Config
 from rov_ident.core.errors import UserError
-from rov_ident.discrepancy import (
-    clock_errors,
-    empirical_term,
-    extension,
-    rates_and_attitude,
-    repetition,
-    sensor_choice,
-)
+from rov_ident.discrepancy import certainty, empirical_term, extension, repetition, sensor_choice
 from rov_ident.discrepancy.findings import (
     beginnings,
     changes,
@@ -30,43 +22,33 @@ from rov_ident.discrepancy.findings import (
     is_left,
     noise_finding,
     residuals,
-    sensor_findings,
-    undecided,
     unsure,
     with_parameters,
 )
 from rov_ident.discrepancy.held_out import (
-    MOTIONS,
     PRACTICAL,
     Judge,
     blocks,
     improved,
     is_practical,
     is_sure,
-    is_surely_practical,
-    split,
     thinned,
     windows,
 )
-from rov_ident.discrepancy.hypothesis import THRUST_SCALE, UNKNOWN, Hypothesis, record_of
+from rov_ident.discrepancy.hypothesis import UNKNOWN, Hypothesis, record_of
 from rov_ident.discrepancy.output_error import Fitted, fit, refit, with_best_onsets
+from rov_ident.discrepancy.prepared import OWN_VALUES, Prepared, prepare
 from rov_ident.discrepancy.results import Alternative, Finding, Findings, Residual, Verdict
 from rov_ident.discrepancy.search import Search, Trial, Trials, likeliest, with_own
-from rov_ident.discrepancy.sensor_choice import HEADING, LATENCY, NOISE
+from rov_ident.discrepancy.sensor_choice import HEADING, NOISE
 from rov_ident.discrepancy.windowed_problem import ONSET_STEP, Spans, WindowedProblem
-from rov_ident.effects import EFFECTS, Values, with_trait
-from rov_ident.estimation.consistency import SUPPOSED
-from rov_ident.model.coefficients import AXES, VELOCITIES, WRENCH_UNITS
+from rov_ident.effects import EFFECTS, with_trait
+from rov_ident.model.coefficients import VELOCITIES
 from rov_ident.model.equations import Array
 from rov_ident.reports.result import Figure, Shown
 from rov_ident.reports.table import Tables
-from rov_ident.sampling.raw_streams import Streams, corrected, joined
-from rov_ident.sampling.sample import NO_MOMENT
-from rov_ident.sampling.wrench_scatter import reading_noise
+from rov_ident.sampling.raw_streams import Streams
 
-_FAR_OFF = 0.5  # of the standard deviation of a motion: three quarters of its power are explained
-_SLIGHT = 0.1  # of the same: 99 % of its power are explained
-_NEAR_NOISE = 3.0  # times what noise makes of a prediction: coefficients are not exact, either
 _AS_GOOD = 0.95  # of what a term without a name explains: a named effect that does is preferred
 _NEAR_ONSET = 2.0  # s; as far apart as the onsets that the search tries
 _SHORTEST = 20.0  # s of data: two blocks, one to fit and one to judge
@@ -75,13 +57,6 @@ CUT_SHORT = (
     "the search was cut short after as much simulation as it may take: not all further effects, "
     "and in place of those found only other effects, were tried; a configuration that fits better "
     "helps (rov-ident fit, where it says that model and data agree)"
-)
-_OWN_HEADINGS = (
-    "each record has a heading of its own against the world: the extended configuration has none"
-)
-_OWN_VALUES = (
-    "each record has {} of its own: the extended configuration has none, and is judged here with "
-    "what each record has"
 )
 _OF_THIS_DIVE = (
     "{} may belong to this dive alone: take it out of the extended configuration to simulate "
@@ -94,38 +69,9 @@ _DEPARTS = (
 )
 _MOST_DIFFERING = 3  # coefficients that are told
 _ONE_VALUE = "the records differ in {}: the extended configuration has one value for all"
-_FILTERED = (
-    "the odometry's velocities are filtered, which changes quick motion by more than a delay: no "
-    "cause beside it is sure; record what the filter is fed with"
-)
-_DOUBTFUL_FILTER = "what a filter of the velocities does besides delaying them looks like any cause"
-_DOUBTFUL_HEADING = "the heading may drift with the gyro whose bias was taken off"
-_IN_PROPORTION = (
-    "it is in proportion to a thrust that is further off than wrench.scale_std takes for possible"
-)
-_BETWEEN_READINGS = "it is less than half an interval of the IMU"
-_BLURRED = "another finding blurs it"
-_SLIGHT_GAIN = "the interval of its gain begins below 2 %"
-_BESIDE_REST = "what is left of the motion may have made it"
 _RECORDS_DIFFER = "the records differ in what has no name"
 _OF_CONTRADICTION = "the sensors still contradict each other"
 _AFTERWARDS = "only what was left after the search asked for it"
-_UNMEASURED = "not measured, as they never change, and left as they are: {}"
-_IN_NOISE = (
-    "the wrench cannot be told from noise of its reading on {}: how the vehicle moves along these "
-    "axes is taken from the measurement, not simulated, and nothing is said about it; record the "
-    "commands without noise, or drive these axes well above it"
-)
-_NOISE_LASTS = (
-    "noise of the wrench's reading is the same for several readings: {}; what publishes them holds "
-    "or filters what it measures"
-)
-_NO_FORCE = (
-    "no force in newtons is recorded: what fins and propeller do tells forces and inertia in "
-    "proportion to each other, and only the righting moment their common scale; beside it the "
-    "extended configuration has what the one given says of it (prior.relative_std), and trim as "
-    "far as vehicle.buoyancy_std and cog_std allow"
-)
 _ALL_IN_NOISE = (
     "the wrench cannot be told from noise of its reading on any axis: record the commands without "
     "noise, or drive the vehicle well above it"
@@ -214,7 +160,7 @@ def explain(
             "anything"
         )
     say("comparing the sensors", 0.05)
-    data = _set_right(bags, config, validate)
+    data = prepare(bags, config, validate)
     say("refitting the coefficients", 0.1)
     search, start, data = _started(data, config)
     retuned, model, residual = _searched(search, start, say)
@@ -273,8 +219,8 @@ def explain(
     compared = {"as configured": given, "retuned": retuned.hypothesis, "extended": best}
     judges = {"as configured": as_recorded} | ({"extended": as_recorded} if best is given else {})
     rmse = [judges.get(label, judge).rmse(h) for label, h in compared.items()]
-    left = _left(data.judged, rmse[2], judge.rmse_of_noise())
-    found = _sure_or_not(data, of_sensors + of_dynamics, left)
+    left = certainty.left(data.judged, rmse[2], judge.rmse_of_noise())
+    found = certainty.doubted(data, of_sensors + of_dynamics, left)
     for i, f in enumerate(found):
         if f.effect == empirical_term.NAME:
             found[i] = empirical_term.described(f, last.hypothesis)
@@ -282,21 +228,19 @@ def explain(
     improves = is_practical(judge.gain(search.given, retuned.hypothesis))
     minor = [f for f in minor if is_sure(f.gain) or f.gain.percent >= 100.0 * PRACTICAL]
     minor = [f if is_sure(f.gain) else unsure(f) for f in minor]
-    verdict = "unexplained" if departs else _verdict(found, minor, residual, left, improves)
+    verdict: Verdict = "unexplained"
+    if not departs:
+        verdict = certainty.verdict(found, minor, residual, left, improves)
     if verdict == "unexplained" and left and not residual:
         axes = [VELOCITIES.index(c) for c in sorted(left, key=lambda c: -left[c])]
         residual = empirical_term.best_dependences(search.problem, model.final, axes)
     everything = WindowedProblem(data.streams, blocks(data.streams))
-    notes = [*data.choice.notes, *notes, *filter(None, [written.note, _told(left)])]
-    notes += [_OWN_HEADINGS] if any(data.headings) else []
-    notes += [_OWN_VALUES.format(", ".join(data.own_sensors))] if data.own_sensors else []
+    notes = [*data.choice.notes, *notes, *filter(None, [written.note, certainty.told(left)])]
     passing = [name for name in with_trait("dive") if name in best.effects]
     known = [name for name in data.sensors if name in config.effects]
     notes += [_BESIDE_GIVEN.format(" and ".join(known))] if known else []
     notes += [_OF_THIS_DIVE.format(" and ".join(passing))] if passing and len(bags) == 1 else []
-    notes += [_FILTERED] if data.late else []
-    notes += data.clocks.notes
-    notes += [*_of_guided(data.streams), *_of_noise_that_lasts(data.streams)]
+    notes += data.notes
     notes += [CUT_SHORT] if search.cut_short else []
     say("done", 1.0)
     findings = Findings(
@@ -341,113 +285,10 @@ def contradicted(explained: Explanation, why: Sequence[str]) -> Explanation:
     return dataclasses.replace(explained, findings=of)
 
 
-@dataclass(frozen=True)
-class _Data:
-    """The bags with what their sensors contradict set right: ``streams``, all of them joined, to
-    fit in the spans ``to_fit``, and those ``judged`` in the spans ``to_judge``; the latter as
-    ``recorded``. ``headings`` that were taken off each bag, and what else its velocity sensor has
-    of its own, ``own_sensors``; the ``choice`` of sensor effects, their ``findings``, and those of
-    practical weight, ``sensors``, which were taken off. Whether a filter makes velocities ``late``,
-    whether the heading ``may_drift`` where a gyro was taken for biased, and the errors of the
-    ``clocks``."""
-
-    bags: Sequence[Streams]
-    streams: Streams
-    to_fit: Spans
-    judged: Streams
-    to_judge: Spans
-    recorded: sensor_choice.Data
-    headings: Sequence[float]
-    own_sensors: Mapping[str, repetition.OfEach]
-    choice: sensor_choice.Choice
-    findings: Sequence[Finding]
-    sensors: Values
-    late: bool
-    may_drift: bool
-    clocks: clock_errors.ClockErrors
-
-    @property
-    def records(self) -> repetition.Records:
-        """Which part of the time is which bag."""
-        return repetition.Records(self.streams, self.bags, joined(self.bags)[1])
-
-    @property
-    def validated(self) -> bool:
-        """Whether another bag is judged."""
-        return self.recorded.judged is not self.recorded.streams
-
-    def search(self, config: Config) -> Search:
-        """For what a configuration lacks; of another bag that is judged nobody knows what these
-        records have of their own."""
-        return Search(self.streams, config, thinned(self.to_fit), apart=not self.validated)
-
-    def with_noise(self, lost: NDArray[np.bool_], lasts: NDArray[np.int64]) -> "_Data":
-        """The same without further axes (6,) that are lost in noise of the wrench's reading, which
-        ``lasts`` (6,) so many of them."""
-
-        def marked(streams: Streams) -> Streams:
-            return dataclasses.replace(streams, in_noise=streams.in_noise | lost, noise_lasts=lasts)
-
-        streams = marked(self.recorded.streams)
-        judged = marked(self.recorded.judged) if self.validated else streams
-        recorded = dataclasses.replace(self.recorded, streams=streams, judged=judged)
-        return dataclasses.replace(
-            self, bags=[marked(bag) for bag in self.bags], streams=marked(self.streams),
-            judged=marked(self.judged), recorded=recorded,
-        )  # fmt: skip
-
-
-def _set_right(bags: Sequence[Streams], config: Config, validate: Streams | None) -> _Data:
-    rates = [rates_and_attitude.agreed(bag, config) for bag in bags]
-    bags = [r.streams for r in rates]
-    clocks = clock_errors.of(bags, config)
-    if validate is not None:
-        validate = rates_and_attitude.agreed(validate, config).streams
-    with_others = [*bags, *([] if validate is None else [validate])]
-    as_headed = joined(bags)[0] if validate is None else validate
-    turned, headings = repetition.turned(with_others, config)
-    bags = turned[: len(bags)]
-    validate = None if validate is None else turned[-1]
-    as_read = bags
-    bags, delays = repetition.in_time(bags, config)
-    bags, own = repetition.as_mounted(bags, config)
-    if delays:
-        own[LATENCY] = [{"delay": v} for v in delays]
-    streams, to_fit, held = _divided(bags, validate)
-    judged, to_judge = (streams, held) if validate is None else (validate, blocks(validate))
-    recorded = sensor_choice.Data(streams, to_fit, judged, to_judge, config)
-    choice = sensor_choice.chosen(recorded, any(headings))
-    findings = sensor_findings(recorded, choice, as_headed)
-    if len(bags) > 1:
-        findings = repetition.of_sensors(bags, config, findings, headings[: len(bags)])
-    spans, before = held if validate is None else to_fit, joined(as_read)[0]
-    of_each = [
-        repetition.own_finding(before, streams, config, spans, choice.sensors, name, each)
-        for name, each in own.items()
-    ]
-    sensors = {f.effect: choice.sensors[f.effect] for f in findings if is_practical(f.gain)}
-    return _Data(
-        bags,
-        corrected(streams, sensors),
-        to_fit,
-        corrected(judged, sensors),
-        to_judge,
-        recorded,
-        headings,
-        own,
-        choice,
-        [*findings, *of_each],
-        sensors,
-        any(r.late for r in rates),
-        any(r.may_drift for r in rates),
-        clocks,
-    )
-
-
 def _in_each_record(
     search: Search,
     judge: Judge,
-    data: _Data,
+    data: Prepared,
     retuned: Fitted,
     model: _Model,
     last: Fitted,
@@ -476,7 +317,7 @@ def _in_each_record(
                 ]
                 model.final, last = dataclasses.replace(parted, hypothesis=after), all_parted
     apart = list(dict.fromkeys(k[0] for k in last.hypothesis.keys if record_of(k) is not None))
-    notes = [_OWN_VALUES.format(", ".join(apart))] if apart else []
+    notes = [OWN_VALUES.format(", ".join(apart))] if apart else []
     repeated = {f.effect: f.repetition for f in found if f.repetition is not None}
     differ = [name for name, of in repeated.items() if not of.same and name not in apart]
     return found, last, notes + ([_ONE_VALUE.format(", ".join(differ))] if differ else [])
@@ -490,7 +331,7 @@ def _begun_from_each_record(search: Search, final: Fitted, each: Sequence[Fitted
     return likeliest([as_it_is, fit(search.problem, begin)]) or final
 
 
-def _departing(data: _Data, final: Fitted, each: Sequence[Fitted | None], begun: Spans) -> str:
+def _departing(data: Prepared, final: Fitted, each: Sequence[Fitted | None], begun: Spans) -> str:
     """Which records a fit of their own, of ``each``, predicts better, and in what they differ, in
     words; nothing where none does."""
     records, held = data.records, data.to_judge
@@ -522,53 +363,7 @@ def _gaining(
     return dataclasses.replace(found, gain=gain, sentence=words)
 
 
-def _sure_or_not(data: _Data, found: list[Finding], left: Mapping[str, float]) -> list[Finding]:
-    """What is found, not sure where what the sensors do beside it, or what is ``left``, may have
-    made it, or where its gain may have no practical weight."""
-    if data.late:  # a filter does more than delay, and what it does besides looks like any cause
-        found = [f if EFFECTS[f.effect].late else unsure(f, _DOUBTFUL_FILTER) for f in found]
-    if data.may_drift:
-        found = [unsure(f, _DOUBTFUL_HEADING) for f in found]
-    found = [
-        unsure(f, _BETWEEN_READINGS) if _is_between_readings(f, data.streams) else f for f in found
-    ]
-    if any(_is_beyond_the_file(f, data.recorded.config) for f in found):
-        found = [f if EFFECTS[f.effect].of_sensors else unsure(f, _IN_PROPORTION) for f in found]
-    found = list(map(data.clocks.beside, found))
-    found = _beside_each_other(found)
-    found = [f if is_surely_practical(f.gain) else unsure(f, _SLIGHT_GAIN) for f in found]
-    return [unsure(f, _BESIDE_REST) if _acts_on(f, left) else f for f in found]
-
-
-def _verdict(
-    found: Sequence[Finding],
-    minor: Sequence[Finding],
-    residual: Sequence[Residual],
-    left: Mapping[str, float],
-    retuning_improves: bool,
-) -> Verdict:
-    only_sensors = all(EFFECTS[f.effect].of_sensors for f in found)
-    if residual or any(share > _FAR_OFF or only_sensors for share in left.values()):
-        return "unexplained"
-    if found:
-        return "explained"
-    if undecided(minor):
-        return "unexplained"
-    return "retuned" if retuning_improves else "agrees"
-
-
-def _divided(bags: Sequence[Streams], validate: Streams | None) -> tuple[Streams, Spans, Spans]:
-    """The bags joined, the spans to fit, and those to judge on."""
-    streams, begins = joined(bags)
-    of_all: tuple[Spans, Spans] = [], []  # to fit, and held out
-    for bag, begin in zip(bags, begins, strict=True):
-        own = split(bag.duration) if validate is None else (windows(0.0, bag.duration), [])
-        for spans, mine in zip(of_all, own, strict=True):
-            spans += [(begin + a, begin + b) for a, b in mine]
-    return streams, *of_all
-
-
-def _started(data: _Data, config: Config) -> tuple[Search, Fitted | None, _Data]:
+def _started(data: Prepared, config: Config) -> tuple[Search, Fitted | None, Prepared]:
     """The search, the fit from which it starts, and the data, with what these two tell of noise of
     the wrench's reading."""
     search = data.search(config)
@@ -579,7 +374,7 @@ def _started(data: _Data, config: Config) -> tuple[Search, Fitted | None, _Data]
     return again, start if again is search else again.start(), data
 
 
-def _with_reading(search: Search, fitted: Fitted, data: _Data) -> tuple[Search, _Data]:
+def _with_reading(search: Search, fitted: Fitted, data: Prepared) -> tuple[Search, Prepared]:
     """The search with the noise of the wrench's reading in its configuration, where the fit tells
     of any, and the data without the axes that are lost in it; the same ones where there is none.
     UserError if no axis is left."""
@@ -596,78 +391,6 @@ def _with_reading(search: Search, fitted: Fitted, data: _Data) -> tuple[Search, 
         raise UserError(_ALL_IN_NOISE)
     config = sensor_choice.with_noise(search.given, values).config if values else search.config
     return data.search(config), data
-
-
-def _left(streams: Streams, rmse: Mapping[str, float], noise: Array) -> dict[str, float]:
-    """The velocities that the extended model predicts far worse than their ``noise`` (6,) allows:
-    the error as a share of the motion."""
-    motion = np.nanstd(streams.nu, axis=0)
-    return {
-        c: rmse[c] / m
-        for c, m, own in zip(VELOCITIES, motion.tolist(), noise.tolist(), strict=True)
-        if m > 0.0 and rmse[c] > max(_SLIGHT * m, _NEAR_NOISE * own)
-    }
-
-
-def _acts_on(found: Finding, left: Mapping[str, float]) -> bool:
-    """Whether an effect, not of a sensor, acts on an axis whose velocity is not predicted; or on
-    any, where one is far off, as that moves the others."""
-    far = any(share > _FAR_OFF for share in left.values())
-    axes = {AXES[VELOCITIES.index(c)] for c in left}
-    return not EFFECTS[found.effect].of_sensors and (far or not axes.isdisjoint(found.axes))
-
-
-def _is_beyond_the_file(found: Finding, config: Config) -> bool:
-    """Whether the thrust is further off than the file supposes, as a fit's consistency has it: all
-    forces that are told are in proportion to it."""
-    effect, parameter = THRUST_SCALE
-    if found.effect != effect or not config.wrench.scale_std:
-        return False
-    values = [found.parameters, *(found.repetition.records if found.repetition else ())]
-    far = [abs(of[parameter].value - 1.0) for of in values if np.isfinite(of[parameter].std)]
-    return max(far, default=0.0) > SUPPOSED * config.wrench.scale_std
-
-
-def _is_between_readings(found: Finding, streams: Streams) -> bool:
-    """Whether velocities are late by less than half an interval of the IMU, in which nothing is
-    known of how they went on."""
-    if found.effect != LATENCY or len(streams.imu_t) < 2:
-        return False
-    interval = float(np.median(np.diff(streams.imu_t)))
-    return abs(found.parameters["delay"].value) < 0.5 * interval
-
-
-def _beside_each_other(found: list[Finding]) -> list[Finding]:
-    """Those that another one blurs (`Effect.blurs`) are not sure."""
-    blurred = {name for f in found for name in EFFECTS[f.effect].blurs}
-    return [unsure(f, _BLURRED) if f.effect in blurred else f for f in found]
-
-
-def _of_guided(streams: Streams) -> list[str]:
-    """Notes on what a record does not tell, such as velocities that are taken as measured."""
-    never = ", ".join(c for c, so in zip(VELOCITIES, streams.unmeasured, strict=True) if so)
-    notes = [] if streams.is_turned else [NO_MOMENT]
-    notes += [_UNMEASURED.format(never)] if never else []
-    notes += [] if streams.has_forces else [_NO_FORCE]
-    std = reading_noise(streams.demand, streams.noise_lasts)
-    lost = [f"{AXES[i]} ({std[i]:.2g} {WRENCH_UNITS[i]})" for i in np.flatnonzero(streams.in_noise)]
-    return notes + ([_IN_NOISE.format(", ".join(lost))] if lost else [])
-
-
-def _of_noise_that_lasts(streams: Streams) -> list[str]:
-    period = float(np.median(np.diff(streams.demand_t)))
-    lasting = [
-        f"{axis} {n} ({n * period:.2g} s)" for axis, n in zip(AXES, streams.noise_lasts) if n > 1
-    ]
-    return [_NOISE_LASTS.format(", ".join(lasting))] if lasting else []
-
-
-def _told(left: Mapping[str, float]) -> str:
-    """What is left, in words; nothing where that is nothing."""
-    far = any(share > _FAR_OFF for share in left.values())
-    shares = ", ".join(f"{MOTIONS[c]} {100.0 * share:.0f} %" for c, share in left.items())
-    begin = "much is left that no model explains" if far else "what is left"
-    return f"{begin}, of the motion on held-out data: {shares}" if left else ""
 
 
 def _searched(
@@ -760,7 +483,7 @@ def _with_all_data(streams: Streams, final: Fitted) -> tuple[Fitted, list[str]]:
     return with_best_onsets(last, around=_NEAR_ONSET, every=ONSET_STEP), notes
 
 
-def _without_minor_noise(h: Hypothesis, data: _Data, found: Sequence[Finding]) -> Hypothesis:
+def _without_minor_noise(h: Hypothesis, data: Prepared, found: Sequence[Finding]) -> Hypothesis:
     """A hypothesis with the noise of the wrench's reading only if it is among what was found."""
     if any(f.effect == NOISE for f in found):
         return h
@@ -778,7 +501,9 @@ def _beside_given(config: Config, effect: str, found: Mapping[str, float]) -> di
     }
 
 
-def _extended(h: Hypothesis, kept: Sequence[str], data: _Data, found: Sequence[Finding]) -> Config:
+def _extended(
+    h: Hypothesis, kept: Sequence[str], data: Prepared, found: Sequence[Finding]
+) -> Config:
     """The configuration of a hypothesis with what was found; the rows of the axes ``kept`` are as
     in the file. A heading that each bag has of its own is in none."""
     h = _without_minor_noise(extension.without_rows(h, kept), data, found)
