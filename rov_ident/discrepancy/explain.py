@@ -188,7 +188,7 @@ def explain(
     last, notes = _with_all_data(data.streams, model.final)
     there = [f for f in model.found if is_left(search, last, f.effect)]
     of_dynamics = [with_parameters(search, last, f) for f in there]
-    departs = ""
+    departs, differing = "", list[Hypothesis]()
     if len(bags) > 1:
         say("leaving records out", 0.95)
         of_dynamics, last, of_records = _in_each_record(
@@ -200,6 +200,7 @@ def explain(
             model.final = _begun_from_each_record(search, model.final, each)
             departs = _departing(data, model.final, each, begun)
         if departs:
+            differing = [f.hypothesis for f in each if f is not None]
             of_dynamics = [unsure(f, _RECORDS_DIFFER) for f in of_dynamics]
         minor += [f for f in of_dynamics if not is_practical(f.gain)]
         of_dynamics = [f for f in of_dynamics if is_practical(f.gain)]
@@ -247,7 +248,7 @@ def explain(
         rmse[0],
         rmse[1],
         rmse[2],
-        changes(config, retuned),
+        changes(config, retuned, [model.final.hypothesis, *differing]),
         tuple(sorted(found, key=lambda f: -f.gain.percent)),
         tuple(minor),
         tuple(residual),

@@ -73,7 +73,7 @@ _ARM_STEPS = 4  # of Gauss-Newton in the height of the centre of buoyancy, which
 _SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
 _FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
 _ZERO = 1e-300  # what may be zero is divided by it
-BUDGET = 600_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
+BUDGET = 450_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
 
 
 @dataclass(frozen=True)
