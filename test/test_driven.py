@@ -347,9 +347,20 @@ def test_a_joint_that_counts_the_other_way_round_is_said(remus, tmp_path, estima
         write_messages(path, run_of(remus, 4, duration=80.0, imu_rate=50.0).messages)
         notes.append(" ".join(ri.fit(path, given, estimator=estimator).notes))
     words = "works the other way round than the configuration has it"
-    assert f"delta_r {words} (Y_uudr, N_uudr have changed sign)" in notes[0]
-    assert f"delta_s {words} (Z_uuds, M_uuds have changed sign)" in notes[1]
+    assert f"delta_r {words} (the sign of Y_uudr, N_uudr has changed)" in notes[0]
+    assert f"delta_s {words} (the sign of Z_uuds, M_uuds has changed)" in notes[1]
     assert words not in notes[2]
+
+
+@pytest.mark.parametrize("seed", [4, *more(5, 6)])
+def test_explain_says_so_too(remus, tmp_path, seed):
+    plain = configuration.to_parameters(remus)
+    joint = str(np.random.default_rng(seed).choice(["delta_r", "delta_s"]))
+    plain["inputs"][joint]["scale"] = -plain["inputs"][joint].get("scale", 1.0)
+    given, path = configuration.from_parameters(plain), tmp_path / "dive.mcap"
+    write_messages(path, run_of(remus, seed, duration=80.0, imu_rate=50.0).messages)
+    (note,) = [n for n in ri.explain(path, given).findings.notes if "other way round" in n]
+    assert note.startswith(f"{joint} works the other way round than the configuration has it")
 
 
 def test_inertia_that_no_known_force_tells_is_held(dives):

@@ -171,22 +171,24 @@ def fit(
         found = found.with_tests(_message_tests([bag.path for bag in many.bags], given, late))
         if table:
             found = _with_table_notes(found, given, table)
-        notes = (*repeated, *placed, *_reversed_joints(found, given), *found.notes)
+        estimates = dict(zip(found.names, zip(found.values, found.std, strict=True), strict=True))
+        notes = (*repeated, *placed, *_reversed_joints(estimates, given), *found.notes)
         found = dataclasses.replace(found, notes=notes)
         return found if validate is None else _judged(found, given, validate, paths, say)
 
 
-def _reversed_joints(found: Fit, given: Config) -> Iterator[str]:
-    """Joints that count the other way round: all that surely follows from them has changed sign."""
-    estimates = dict(zip(found.names, zip(found.values, found.std, strict=True), strict=True))
+def _reversed_joints(estimates: Mapping[str, tuple[float, float]], given: Config) -> Iterator[str]:
+    """Joints that count the other way round: all that follows from them has changed sign, by the
+    ``estimates`` with their standard deviations, and some surely."""
     for joint in given.inputs.joints:
         own = [c.name for c in given.model.coefficients if joint in c.inputs]
-        odd = [name for name in own if name.count(f"d{joint[-1]}") < 2]  # squares keep their sign
-        told = [(*estimates[name], given.value(name)) for name in odd if name in estimates]
-        if told and all(value * was < 0.0 and abs(value) > 3.0 * std for value, std, was in told):
+        odd = [n for n in own if n.count(f"d{joint[-1]}") < 2 and n in estimates]  # no squares
+        changed = [n for n in odd if estimates[n][0] * given.value(n) < 0.0]
+        surely = [n for n in changed if abs(estimates[n][0]) > 3.0 * estimates[n][1]]
+        if surely and changed == odd:
             yield (
-                f"{joint} works the other way round than the configuration has it "
-                f"({', '.join(odd)} have changed sign): check the sign of inputs.{joint}.scale"
+                f"{joint} works the other way round than the configuration has it (the sign of "
+                f"{', '.join(surely)} has changed): check the sign of inputs.{joint}.scale"
             )
 
 
@@ -328,7 +330,11 @@ def explain(
     made |= {"bags": [source for _, source in read_bags]}
     made |= {"validate": judge[1]} if judge else {}
     findings = found.findings
-    notes = (*repeated, *placed, *findings.notes)
+    stds = {name: change.std for name, change in findings.changed.items()}
+    estimates = {
+        name: (found.extended.value(name), stds.get(name, math.inf)) for name in given.model.names
+    }
+    notes = (*repeated, *placed, *_reversed_joints(estimates, given), *findings.notes)
     findings = dataclasses.replace(findings, provenance=made, notes=notes)
     return dataclasses.replace(found, findings=findings)
 
