@@ -360,9 +360,9 @@ def without_most_favourable(before: Array, after: Array) -> tuple[Array, Array]:
 
 
 def changes(config: Config, retuned: Fitted, others: Sequence[Hypothesis]) -> dict[str, Change]:
-    """The coefficients that refitting moves by more than two standard deviations. They are as
-    uncertain as the structure: by as much as they differ from those of the ``others``, the model
-    that has what is missing, and those of single records that differ."""
+    """The coefficients that refitting moves by more than two standard deviations of this fit. They
+    are told as uncertain as the structure: by as much as they differ from those of the ``others``,
+    the model that has what is missing, and those of single records that differ."""
     changed, values = {}, retuned.hypothesis.values.items()
     covariance = retuned.covariance + retuned.covariance_of_the_file
     for ((section, name), value), own in zip(values, np.sqrt(np.diag(covariance)), strict=True):
@@ -370,9 +370,9 @@ def changes(config: Config, retuned: Fitted, others: Sequence[Hypothesis]) -> di
             continue
         before = float(config.model.theta[config.model.names.index(name)])
         apart = max(abs(value - h.value((section, name))) for h in others)
-        std = np.hypot(own, apart)
-        if abs(value - before) > 2.0 * std:
-            changed[name] = Change(before, float(value), float(std), parse(name).unit)
+        if abs(value - before) > 2.0 * own:
+            std = float(np.hypot(own, apart))
+            changed[name] = Change(before, float(value), std, parse(name).unit)
     return changed
 
 

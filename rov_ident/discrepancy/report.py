@@ -528,7 +528,7 @@ def _retuned(f: Findings, written: Config) -> list[str]:
         to_use, _ = estimate(written.value(name), c.std)
         row = [name, number(c.before, 4), after, std, to_use, c.unit, sigma, parse(name).meaning]
         rows.append(row)
-    bent = "Where an effect is missing they bend to make up for it. "
+    bent = "Where an effect is missing they bend to make up for it; std counts how far. "
     head = ["", "from", "to", "std", "extended.yaml", "unit", "off by [std]", "meaning"]
     return [
         report.heading("Retuned coefficients"),
