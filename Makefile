@@ -19,8 +19,8 @@ demo: .venv/demo.stamp
 # tests of live nodes wait for half of their time.
 PYTEST := $(BIN)/python -m pytest -n 3 --dist worksteal
 
-## style, types, then all tests but the studies (once all is compiled some 860 s of processor in all
-## workers; bar: 8 minutes on two cores)
+## style, types, then all tests but the studies (24 minutes on two cores, with nothing compiled before;
+## bar: 15)
 test: check
 	$(PYTEST) --timeout 900 -m "not study"
 
