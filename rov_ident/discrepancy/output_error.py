@@ -203,8 +203,10 @@ class Fitted:
 
     @property
     def _prior(self) -> Array:
-        """The precision of the prior of these, beside the normal matrix."""
-        return np.diag(_prior_beside(self.linearisation)[self._smooth])
+        """The precision of the prior of these, beside the normal matrix: squared residuals count as
+        if white over their variance inflation."""
+        precision = self.linearisation.problem.precision(self.hypothesis)
+        return self.inflation * np.diag(precision[self._smooth])
 
     @property
     def _smooth(self) -> Indices:
@@ -216,12 +218,6 @@ class Fitted:
 def _inflation(linear: LinearProblem) -> float:
     """The variance inflation over all parameters."""
     return variance_inflation(linear, np.arange(len(linear.keys)))
-
-
-def _prior_beside(line: Linearisation) -> Array:
-    """The precision (P,) of the prior of all parameters, beside squared residuals that count as if
-    white over their variance inflation."""
-    return _inflation(line.linear) * line.problem.precision(line.hypothesis)
 
 
 def fit(problem: WindowedProblem, h: Hypothesis) -> Fitted | None:
@@ -273,14 +269,16 @@ def _with_noise(fitted: Fitted) -> Fitted:
 def _gauss_newton(linearisation: Linearisation, iterations: int = _ITERATIONS) -> Fitted:
     """Gauss-Newton with step shortening at fixed noise."""
     h, problem = linearisation.hypothesis, linearisation.problem
+    precision = problem.precision(h)
     mean = np.array([centre(h.config, key) for key in h.keys])
     for _ in range(iterations):
         linear = linearisation.linear
-        prior = _prior_beside(linearisation)
+        inflation = _inflation(linear)
+        prior = inflation * precision
         value = np.array(list(h.values.values()))
         slope = linear.gradient.sum(axis=0) + prior * (mean - value)
         change = solve_bounded(linear.normal + np.diag(prior), slope, *step_limits(h, h.keys))
-        least = max(_TOLERANCE * linear.count, _SETTLED * _inflation(linear))
+        least = max(_TOLERANCE * linear.count, _SETTLED * inflation)
         if slope @ change < least:
             return Fitted(h, linearisation, True)
         cost = linearisation.rss + prior @ (mean - value) ** 2
@@ -351,8 +349,9 @@ def _adapted(h: Hypothesis, start: Linearisation) -> Linearisation | None:
     normal = linear.normal[np.ix_(at, at)]
     change = np.zeros(len(linear.keys))
     change[moved] = far
+    prior = _inflation(start.linear) * problem.precision(before)
     change[at] = solve_bounded(
-        normal + np.diag(_prior_beside(start)[start.linear.index(follow)]),
+        normal + np.diag(prior[start.linear.index(follow)]),
         slope[at] - linear.normal[np.ix_(at, moved)] @ far,
         *step_limits(h, follow),
     )
