@@ -162,6 +162,12 @@ def test_ours_pass_as_well():
             block("python").replace("=wrench,", "=None, water=lambda ratio: (ratio, 0.0),"),
             "must return numbers of the shape (3,) from its water",
         ),
+        (
+            block("python").replace(
+                "=wrench,", '=wrench, of_thrusters=lambda of: [{"gain": 0.5}],'
+            ),
+            "must return only parameters of its own from its of_thrusters",
+        ),
     ],
 )
 def test_one_that_cannot_be_used_is_said(installed, tmp_path, code, words):

@@ -19,6 +19,7 @@ from rov_ident.discrepancy.findings import (
     beginnings,
     changes,
     finding,
+    gain_over,
     is_left,
     noise_finding,
     residuals,
@@ -422,18 +423,24 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
     """Turn the effects of a model into findings, and take those of no practical weight out of it.
     Two effects that do the same on the held-out data gain nothing beside each other, and all
     together: the slightest leaves, and the rest is judged anew."""
+    trials = {n: t for n, t in model.trials.items() if not n.startswith(UNKNOWN)}
+    rests = {n: t.rest for n, t in trials.items()}
     while True:
-        known = {n: t for n, t in model.trials.items() if not n.startswith(UNKNOWN)}
-        found = [
-            finding(search, judge, retuned, model.final, name, trial)
-            for name, trial in known.items()
-        ]
-        slight = [f for f in found if not is_practical(f.gain)]
-        if len(slight) < 2:
+        gains = {
+            n: gain_over(search, judge, retuned, model.final, n, rest)[0]
+            for n, rest in rests.items()
+        }
+        small = [n for n, gain in gains.items() if not is_practical(gain)]
+        if len(small) < 2:
             break
-        least = min(slight, key=lambda f: f.gain.percent)
-        model.final = known[least.effect].rest
-        model.trials = search.trials(model.final)
+        model.final = rests[min(small, key=lambda n: gains[n].percent)]
+        rests = search.rests(model.final)
+        trials = {}
+    trials = trials or search.trials(rests)
+    found = [
+        finding(search, judge, retuned, model.final, name, trial) for name, trial in trials.items()
+    ]
+    slight = [f for f in found if not is_practical(f.gain)]
     model.minor = slight
     model.found = [f for f in found if f not in slight]
     gone = [k for f in slight for k in search.keys_of(model.final, f.effect)]

@@ -85,11 +85,7 @@ def finding(
     one, and against its rivals."""
     keys = search.keys_of(final, name)
     parameters = parameters_of(final, keys)
-    axes = _axes(search, final, keys)
-    without = trial.rest.hypothesis
-    if judge.better(retuned.hypothesis, without):  # the best model without it
-        without = retuned.hypothesis
-    gain = judge.gain(without, final.hypothesis, axes)
+    gain, without, axes = gain_over(search, judge, retuned, final, name, trial.rest)
     alternatives, separable, doubts = _alternatives(search, judge, final, name, trial)
     if name in with_trait("neglecting") and may_be_noise(trial.rest, axes):
         alternatives, separable = (*alternatives, Alternative(NOISE, _EQUAL)), False
@@ -107,6 +103,17 @@ def finding(
         alternatives, separable = (*alternatives, Alternative("thruster_gain", _TAKEN)), False
     found = in_words(name, axes, parameters, gain, alternatives)
     return found if separable and not doubts else unsure(found, *doubts)
+
+
+def gain_over(
+    search: Search, judge: Judge, retuned: Fitted, final: Fitted, name: str, rest: Fitted
+) -> tuple[Gain, Hypothesis, tuple[str, ...]]:
+    """What an effect of the final model gains over the best model without it, which of the
+    retuned one and the ``rest`` that is, and the axes on which the effect acts."""
+    axes, without = _axes(search, final, search.keys_of(final, name)), rest.hypothesis
+    if judge.better(retuned.hypothesis, without):
+        without = retuned.hypothesis
+    return judge.gain(without, final.hypothesis, axes), without, axes
 
 
 def beginnings(final: Fitted) -> Spans:

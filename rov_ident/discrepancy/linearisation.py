@@ -43,13 +43,15 @@ _HIGHEST = 2.0  # Hz; of forces that are looked for: surface waves lie far below
 class LinearProblem:
     """Least squares in the neighbourhood of a hypothesis, in units of the noise: ``normal`` (P, P)
     = J'J over the parameters ``keys``, ``gradient`` (W, P) = J'r of each window, ``rss`` (W,) its
-    squared residuals, ``count`` the residuals less initial velocities."""
+    squared residuals, ``count`` the residuals less initial velocities; ``normals`` (W, P, P) what
+    each window adds to ``normal``, where that is known."""
 
     keys: tuple[Key, ...]
     normal: Array
     gradient: Array
     rss: Array
     count: int
+    normals: Array | None = None
 
     def index(self, keys: Iterable[Key]) -> Indices:
         place = {key: i for i, key in enumerate(self.keys)}
@@ -116,8 +118,10 @@ class Linearisation:
             columns = self._of(self.hypothesis, keys)
             starts = self._eliminate(columns)
             count = int(np.count_nonzero(self._weight)) - 6 * len(self.first)
-            normal, gradient = columns.T @ columns, self._gradient(columns)
-            linear = LinearProblem(tuple(keys), normal, gradient, self._squares, count)
+            normals, gradient = self._products(columns, columns), self._gradient(columns)
+            linear = LinearProblem(
+                tuple(keys), normals.sum(axis=0), gradient, self._squares, count, normals
+            )
             self._sensitivities = starts, columns, linear
         return self._sensitivities
 
@@ -176,8 +180,12 @@ class Linearisation:
 
     def _gradient(self, columns: Array) -> Array:
         """Of each window (W, P), of columns (6 N, P)."""
+        return self._products(columns, self.error[:, None])[:, :, 0]
+
+    def _products(self, one: Array, other: Array) -> Array:
+        """Of columns (6 N, P) and (6 N, Q) those of each window, (W, P, Q)."""
         spans = [slice(6 * a, 6 * b) for a, b in self._spans()]
-        return np.stack([columns[s].T @ self.error[s] for s in spans])
+        return np.stack([one[s].T @ other[s] for s in spans])
 
     def over_variance(self, error: Array) -> tuple[Array, Array]:
         """Of a single window with more noise: the residuals (N, 6) over the variance of that noise
@@ -291,24 +299,26 @@ class Linearisation:
 
     def having(self, keys: Sequence[Key], columns: Array) -> LinearProblem:
         """With further parameters, whose sensitivities are ``columns`` (6 N, C)."""
-        cross, gradient = self.columns.T @ columns, self._gradient(columns)
-        own = self.linear
-        normal = np.block([[own.normal, cross], [cross.T, columns.T @ columns]])
-        both = np.hstack([own.gradient, gradient])
-        return LinearProblem((*own.keys, *keys), normal, both, own.rss, own.count)
+        own, p = self.linear, len(self.linear.keys)
+        assert own.normals is not None
+        normals = np.empty((len(own.normals), *2 * (p + len(keys),)))
+        normals[:, :p, :p], normals[:, p:, p:] = own.normals, self._products(columns, columns)
+        normals[:, :p, p:] = self._products(self.columns, columns)
+        normals[:, p:, :p] = normals[:, :p, p:].transpose(0, 2, 1)
+        gradient = np.hstack([own.gradient, self._gradient(columns)])
+        return LinearProblem(
+            (*own.keys, *keys), normals.sum(axis=0), gradient, own.rss, own.count, normals
+        )
 
     def jackknife(self, at: Indices, prior: Array) -> Array:
         """How the estimate (W, A) of the parameters ``at`` (A,), of a ``prior`` precision (A, A),
         moves as each window is left out; the other parameters are taken as known."""
         linear = self.linear
+        assert linear.normals is not None
         normal, gradient = linear.normal[np.ix_(at, at)] + prior, linear.gradient[:, at]
         _, size = unit_diagonal(normal)
-        edges = [*self.first.tolist(), len(self.columns)]
-        moves = np.empty_like(gradient)
-        for w, (a, b) in enumerate(itertools.pairwise(edges)):
-            own = self.columns[a:b, at]
-            moves[w] = scaled_solve(normal - own.T @ own, gradient[w], 1e-9, size)
-        return moves
+        each = zip(linear.normals[:, at[:, None], at], gradient, strict=True)
+        return np.stack([scaled_solve(normal - own, g, 1e-9, size) for own, g in each])
 
     def leave_one_out(self, at: Indices, prior: Array) -> Array:
         """Squared residuals (W, 6) of each window, by axis, of a fit to all the others."""

@@ -402,11 +402,10 @@ def with_best_onsets(
             continue
         now = fitted.hypothesis.values[key]
         trials = round(around / every)
-        near = now + every * np.arange(-trials, trials + 1)
-        rss = [_rss_at(fitted, key, float(max(onset, 0.0))) for onset in near]
-        best = int(np.argmin(rss))
-        if rss[best] < _rss_at(fitted, key, now):
-            there = fitted.hypothesis.having({key: float(max(near[best], 0.0))})
+        near = np.maximum(now + every * np.arange(-trials, trials + 1), 0.0).tolist()
+        best = near[int(np.argmin(_rss_at(fitted, key, near)))]
+        if best != now:
+            there = fitted.hypothesis.having({key: best})
             again = refit(there, fitted.linearisation)
             if again is not None and again.rss < fitted.rss:
                 fitted = again
@@ -438,29 +437,33 @@ def onset_std(fitted: Fitted, key: Key) -> float:
     """Standard deviation [s] of an onset, from the likelihood ratio: its residuals are far from
     quadratic, flat between windows and steep where thrust steps."""
     now, limit = fitted.hypothesis.values[key], _ONSET_RSS * fitted.inflation
-    base = _rss_at(fitted, key, now)
+
+    def is_excluded(onset: float) -> bool:
+        base, there = _rss_at(fitted, key, [now, onset]).tolist()
+        return bool(there >= base + limit)
+
     ends = []
     for side in (-1.0, 1.0):
         near, far = 0.0, ONSET_STEP
-        while far < _ONSET_UNKNOWN and _rss_at(fitted, key, now + side * far) < base + limit:
+        while far < _ONSET_UNKNOWN and not is_excluded(now + side * far):
             near, far = far, 2.0 * far
         for _ in range(4):  # bisection: to a sixteenth of the distance
             middle = 0.5 * (near + far)
-            excluded = _rss_at(fitted, key, now + side * middle) >= base + limit
-            near, far = (near, middle) if excluded else (middle, far)
+            near, far = (near, middle) if is_excluded(now + side * middle) else (middle, far)
         ends.append(far)
     return max(ends) / np.sqrt(_ONSET_RSS)
 
 
-def _rss_at(fitted: Fitted, key: Key, value: float) -> float:
-    """Squared residuals with one parameter moved and the others refitted (linearly)."""
-    before = fitted.linearisation
-    there = fitted.hypothesis.having({key: value})
-    moved = linearise(before.problem, there, before.starts, fitted.noise)
-    if moved is None:
-        return np.inf
-    linear = moved.linear
+def _rss_at(fitted: Fitted, key: Key, onsets: Sequence[float]) -> Array:
+    """Squared residuals (n,) with an onset at other times and the other parameters refitted, all
+    linearly: within a window, an effect that begins a little earlier or later moves the vehicle
+    little."""
+    line, h, linear = fitted.linearisation, fitted.hypothesis, fitted.linear
+    later = [h.having({key: onset}).effects for onset in onsets]
+    change = [line.problem.change(h, line.motion, EFFECTS[key[0]], of) for of in later]
+    left = line.error[:, None] - line.sensitivity_to(np.stack(change, axis=2))
     others = linear.index(k for k in linear.keys if k != key)
-    normal = linear.normal[np.ix_(others, others)]
-    slope = linear.gradient.sum(axis=0)[others]
-    return float(moved.rss - slope @ scaled_solve(normal, slope, 1e-6))
+    slope = line.columns[:, others].T @ left
+    refitted = scaled_solve(linear.normal[np.ix_(others, others)], slope, 1e-6)
+    rss: Array = np.sum(left**2, axis=0) - np.sum(slope * refitted, axis=0)
+    return rss

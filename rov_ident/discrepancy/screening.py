@@ -271,12 +271,13 @@ class Screening:
         places = [p for p in effect.parameters if p.role == "place" and p.name not in shapes[0]]
         moments = [(f"{effect.name} moment", p.name) for p in places]
         best: Candidate | None = None
+        forces: list[Array] = []
         for shape in shapes:
             at_origin = self._force(now, effect, shape, keys)
-            moved = [
-                self._force(now, effect, {**shape, p.name: 1.0}, keys) - at_origin for p in places
-            ]
-            columns = linearisation.sensitivity_to(np.concatenate([at_origin, *moved], axis=2))
+            moved = (self._force(now, effect, {**shape, p.name: 1.0}, keys) for p in places)
+            forces += [at_origin, *(force - at_origin for force in moved)]
+        every = linearisation.sensitivity_to(np.concatenate(forces, axis=2))
+        for shape, columns in zip(shapes, np.split(every, len(shapes), axis=1), strict=True):
             scores = scores_of(linearisation, [*keys, *moments], columns)
             groups = [(*keys, *moments)] if moments else [(k,) for k in keys]
             selected, score, white = scores.select(groups, bounds)

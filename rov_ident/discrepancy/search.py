@@ -340,11 +340,14 @@ class Search:
             final = (None if self._budget_spent() else self.extended(final)) or final
         return final, trials
 
-    def trials(self, final: Fitted) -> Trials:
-        names = self.named(final)
+    def rests(self, final: Fitted) -> dict[str, Fitted]:
+        """The fits without each of the named effects."""
+        names = [n for n in self.named(final) if not n.startswith(UNKNOWN)]
         rests = self._workers.map(lambda n: self.rest(final, n), names)
-        pairs = zip(names, rests, strict=True)
-        return {n: self._trial(rest, n) for n, rest in pairs if rest is not None}
+        return {n: rest for n, rest in zip(names, rests, strict=True) if rest is not None}
+
+    def trials(self, rests: Mapping[str, Fitted]) -> Trials:
+        return {name: self._trial(rest, name) for name, rest in rests.items()}
 
     def _trial(self, rest: Fitted, name: str) -> Trial:
         whole = not self._budget_spent()
@@ -475,7 +478,7 @@ class Search:
         gain = self.cost(now, best) - self.cost(larger, best)
         new = [k for k in larger.hypothesis.keys if k not in now.hypothesis.values]
         dates = onsets(larger.hypothesis)
-        own = variance_inflation_of(larger.linearisation, [k for k in new if k not in dates])
+        own = variance_inflation_of(larger.linear, [k for k in new if k not in dates])
         by_chance = _NOISE_STD * (now.noise_squares - larger.noise_squares).std(ddof=1)
         gain -= by_chance / best.inflation
         alone = (now.squares - larger.squares - by_chance) / max(own, 1e-9) - PENALTY * len(new)

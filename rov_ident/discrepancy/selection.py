@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rov_ident.core.linalg import scaled_solve
+from rov_ident.core.linalg import scaled_solve, unit_diagonal
 from rov_ident.discrepancy.hypothesis import Key, may_leave_null
 from rov_ident.discrepancy.linearisation import Linearisation, LinearProblem
 from rov_ident.model.equations import Array, Indices
@@ -33,6 +33,7 @@ _MOST_LEVERAGE = 0.9
 """A larger leverage counts as this: without its window the parameter would not be known at all."""
 
 _FEWEST_SCORES = 4  # windows; from fewer the scatter of scores is not estimated
+_RIDGE = 1e-6  # of the information on a parameter: less than that tells it from no other
 _UNSEEN = 1e-12  # of the largest information: a parameter that nothing responds to
 
 Bounds = Callable[[Key], tuple[float, float, float]] | None
@@ -49,17 +50,16 @@ def variance_inflation(linear: LinearProblem, at: Indices) -> float:
     return max(scatter, float(variance))
 
 
-def variance_inflation_of(linearisation: Linearisation, keys: list[Key]) -> float:
+def variance_inflation_of(linear: LinearProblem, keys: list[Key]) -> float:
     """The same of these parameters alone, the others refitted along: the mean over them, as one
     axis may be noisier, and its noise slower, than most."""
-    linear = linearisation.linear
-    at = linear.index(keys)
-    rest = linear.index(k for k in linear.keys if k not in set(keys))
+    assert linear.normals is not None
+    at, rest = linear.index(keys), linear.index(k for k in linear.keys if k not in set(keys))
     if not len(at):
         return 0.0
-    base, new = linearisation.columns[:, rest], linearisation.columns[:, at]
-    onto = regressed(linear.normal, rest, at)
-    return mean_inflation(new - base @ onto, linearisation.error, linearisation.first)
+    beside = np.zeros((len(linear.keys), len(at)))
+    beside[at], beside[rest] = np.eye(len(at)), -regressed(linear.normal, rest, at)
+    return _mean_inflation(linear.gradient @ beside, _squares(linear.normals, beside))
 
 
 def regressed(normal: Array, base: Indices, at: Indices) -> Array:
@@ -70,13 +70,25 @@ def regressed(normal: Array, base: Indices, at: Indices) -> Array:
 def mean_inflation(columns: Array, error: Array, first: Indices) -> float:
     """The mean over sensitivities (R, C) of the scatter of their windows' scores; windows begin at
     the rows ``first`` of the residuals ``error`` (R,)."""
-    gradient = np.add.reduceat(columns * error[:, None], first)
-    normal = np.maximum(np.sum(columns**2, axis=0), 1e-300)
-    if len(first) < _FEWEST_SCORES:
+    products = columns * error[:, None], columns**2
+    gradient, squares = (np.add.reduceat(product, first) for product in products)
+    return _mean_inflation(gradient, squares)
+
+
+def _mean_inflation(gradient: Array, squares: Array) -> float:
+    """The same by the windows' scores (W, C) and squared sensitivities (W, C)."""
+    if len(squares) < _FEWEST_SCORES:
         return 0.0
+    normal = np.maximum(squares.sum(axis=0), 1e-300)
     # The fit has already taken from a window's score what its leverage is (the jackknife).
-    leverage = np.minimum(np.add.reduceat(columns**2, first) / normal, _MOST_LEVERAGE)
+    leverage = np.minimum(squares / normal, _MOST_LEVERAGE)
     return float(np.mean(((gradient / (1.0 - leverage)) ** 2).sum(axis=0) / normal))
+
+
+def _squares(normals: Array, beside: Array) -> Array:
+    """Of each window (W, C) the squared sensitivities to changes ``beside`` (P, C)."""
+    squares: Array = np.einsum("pc,wpc->wc", beside, normals @ beside)
+    return squares
 
 
 def _median_inflation(gradient: Array, normal: Array) -> float:
@@ -104,44 +116,29 @@ class Selected(NamedTuple):
         return self.gain / self.inflation - PENALTY * len(self.keys)
 
 
-class Rows(NamedTuple):
-    """Residuals ``error`` (R,) and their ``columns`` (R, P) of the parameters that are fitted
-    anyway; windows begin at the rows ``first``."""
-
-    columns: Array
-    error: Array
-    first: Indices
-
-
 def scores_of(linearisation: Linearisation, keys: Sequence[Key], columns: Array) -> "Scores":
     """Candidates ``keys``, of the sensitivities ``columns`` (R, C), on top of a fit."""
-    base = linearisation.hypothesis.keys
-    return Scores(linearisation.having(keys, columns), base, linearisation, columns)
+    return Scores(linearisation.having(keys, columns), linearisation.hypothesis.keys)
 
 
 class Scores:
     """What adding parameters to a fit would do, the fit's own (``base``) refitted along with them.
     Squared residuals divided by the variance inflation count as if the residuals were white. What
     is missing makes residuals correlated, too, so a candidate is judged by the inflation that is
-    left with it; that takes the ``fit`` and the sensitivities ``columns`` (R, C) of the candidates.
+    left with it, where ``normals`` of the windows are known.
     """
 
-    def __init__(
-        self,
-        linear: LinearProblem,
-        base: Sequence[Key],
-        fit: Linearisation | Rows | None = None,
-        columns: Array | None = None,
-    ) -> None:
-        self._linear, self._base, self._fit = linear, linear.index(base), fit
-        self._columns = columns
+    def __init__(self, linear: LinearProblem, base: Sequence[Key]) -> None:
+        self._linear, self._base = linear, linear.index(base)
         keys = [k for k in linear.keys if k not in set(base)]
         self._place = {k: i for i, k in enumerate(keys)}
         b, c = self._base, linear.index(keys)
+        self._new = c
         gradient = linear.gradient.sum(axis=0)
         self._onto = onto = regressed(linear.normal, b, c)
         self._normal = linear.normal[np.ix_(c, c)] - linear.normal[np.ix_(c, b)] @ onto
         self._gradient = gradient[c] - gradient[b] @ onto
+        self._unit, self._size = unit_diagonal(self._normal)
         self._inflation = variance_inflation(linear, b)
 
     def select(
@@ -215,17 +212,19 @@ class Scores:
     def inflation_with(self, keys: Sequence[Key], change: Array) -> float:
         """The variance inflation with parameters changed and the base refitted along: of the scores
         of the base, if that is less than before, and of the candidates' own."""
-        if self._fit is None or self._columns is None:
+        linear, b = self._linear, self._base
+        if linear.normals is None:
             return self._inflation
         at = [self._place[k] for k in keys]
-        base, first = self._fit.columns, self._fit.first
-        new = self._columns[:, at] - base @ self._onto[:, at]
-        left = self._fit.error - new @ change
-        gradient = np.add.reduceat(base * left[:, None], first)
-        variance = float(left @ left) / max(self._linear.count - len(at) - base.shape[1], 1)
-        normal = np.diag(self._linear.normal)[self._base]
-        common = max(_median_inflation(gradient, normal), variance)
-        return max(min(self._inflation, common), mean_inflation(new, left, first))
+        both = np.concatenate([b, self._new[at]])
+        normals, before = linear.normals[:, both[:, None], both], linear.gradient[:, both]
+        beside = np.vstack([-self._onto[:, at], np.eye(len(at))])
+        gradient = before - normals @ (beside @ change)
+        squares = linear.rss.sum() - (before + gradient).sum(axis=0) @ (beside @ change)
+        variance = float(squares) / max(linear.count - len(both), 1)
+        common = _median_inflation(gradient[:, : len(b)], np.diag(linear.normal)[b])
+        alone = _mean_inflation(gradient @ beside, _squares(normals, beside))
+        return max(min(self._inflation, max(common, variance)), alone)
 
     def left_of(self, keys: Sequence[Key]) -> Array:
         """The normal matrix (k, k) of parameters, less what the base imitates of them."""
@@ -237,9 +236,11 @@ class Scores:
         at one of its bounds and would leave it stays at its null."""
         if not keys:
             return np.zeros(0), 0.0
-        n, g = self.left_of(keys), self._gradient[[self._place[k] for k in keys]]
-        delta = scaled_solve(n, g, 1e-6)
+        at = np.array([self._place[k] for k in keys])
+        n, size = self._unit[at[:, None], at], self._size[at]
+        g = self._gradient[at] / size
+        delta: Array = np.linalg.solve(n + _RIDGE * np.eye(len(at)), g)
         for i, key in enumerate(keys):
             if bounds is not None and not may_leave_null(bounds(key), delta[i]):
                 delta[i] = 0.0
-        return delta, float(2.0 * g @ delta - delta @ n @ delta)
+        return delta / size, float(2.0 * g @ delta - delta @ n @ delta)

@@ -23,7 +23,7 @@ import itertools
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,13 +35,13 @@ from rov_ident.core.frames import (
     rotated,
     velocity_of_arm,
 )
-from rov_ident.core.jit import kernel
+from rov_ident.core.jit import kernel, released
 from rov_ident.core.linalg import integral, interpolated, scaled_inverse, scaled_solve
 from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import turned
 from rov_ident.discrepancy.hypothesis import Key, bounds
 from rov_ident.discrepancy.linearisation import LinearProblem
-from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, Rows, Scores, variance_inflation
+from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, Scores, variance_inflation
 from rov_ident.discrepancy.windowed_problem import within
 from rov_ident.effects import EFFECTS, Values, correct, velocity_delay
 from rov_ident.effects.base import Reading
@@ -351,20 +351,21 @@ def whitened(
     what is no outlier, and the noise. Without a ``walk`` y is white as it is."""
     gap = np.diff(t, prepend=t[0]) > _MAX_GAP
     gap[0] = True
-    use = [c for c in columns if c.any()]
+    every = np.stack([y, *columns], axis=-1)
+    if walk:
+        every = np.diff(every, axis=0, prepend=every[:1])
+        every[gap] = 0.0
+    use = np.append(True, every[..., 1:].any(axis=(0, 1)))
+    shown = np.ascontiguousarray(every[..., use])
     spreads = {}
     for gain in _GAINS if walk else (None,):
-        e = _innovations(y, gain, gap)
-        if use:
-            a = np.stack([_innovations(c, gain, gap) for c in use], axis=-1).reshape(-1, len(use))
-        else:
-            a = np.zeros((y.size, 0))
-        left = e.ravel() - a @ np.linalg.lstsq(a, e.ravel(), rcond=None)[0]
-        spreads[gain] = float(robust_std(left))
+        rows = _innovations(shown, gain, gap).reshape(y.size, -1)
+        e, a = rows[:, 0], rows[:, 1:]
+        spreads[gain] = float(robust_std(e - a @ scaled_solve(a.T @ a, a.T @ e, 1e-12)))
     smallest = min(spreads.values())
     best, least = next(item for item in spreads.items() if item[1] <= tolerance * smallest)
-    e = _innovations(y, best, gap)
-    full = np.stack([_innovations(c, best, gap) for c in columns], axis=-1)
+    found = _innovations(every, best, gap)
+    e, full = found[..., 0], found[..., 1:]
     least = max(least, 1e-9)
     keep = np.abs(e - np.median(e, axis=0)) < _OUTLIER * least
     keep[gap & walk] = False
@@ -381,23 +382,35 @@ def _white(t: Array, y: Array) -> float:
     return float(robust_std((off / np.sqrt(1.0 + (1.0 - share) ** 2 + share**2))[even].ravel()))
 
 
-def _innovations(x: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
-    """Of the local-level filter with a gain, begun anew after each gap; x itself without."""
+def _innovations(steps: Array, gain: float | None, gap: NDArray[np.bool_]) -> Array:
+    """Of the local-level filter with a gain, of how far each row (N, ...) is from the one before,
+    begun anew after each gap; the rows themselves without."""
     if gain is None:
-        return x
-    from scipy.signal import lfilter
-
-    steps = np.diff(x, axis=0, prepend=x[:1])
-    steps[gap] = 0.0
-    out = np.empty_like(steps)
-    for a, b in itertools.pairwise([*np.flatnonzero(gap).tolist(), len(x)]):
-        out[a:b] = lfilter([1.0], [1.0, gain - 1.0], steps[a:b], axis=0)
+        return steps
+    out = steps.copy()
+    _fade(out.reshape(len(out), -1), gap, 1.0 - gain)
     return out
+
+
+@released
+def _fade(rows, gap, share):
+    """Adds to each row a share of what the one before has become, unless there is a gap."""
+    for i in range(1, len(rows)):
+        for j in range(0 if gap[i] else rows.shape[1]):
+            rows[i, j] += share * rows[i - 1, j]
+
+
+class _Rows(NamedTuple):
+    """Innovations ``error`` (R,), their ``columns`` (R, P), and where clusters of them begin."""
+
+    columns: Array
+    error: Array
+    first: Indices
 
 
 def _rows(
     found: Sequence[Comparison], spans: Sequence[tuple[float, float]], streams: Streams
-) -> Rows:
+) -> _Rows:
     """The rows whose time is in the spans, in clusters of CLUSTER seconds, and one for each thing
     that is known of a nuisance beforehand, in a cluster of their own."""
     use = [within(spans, c.t) for c in found]
@@ -414,32 +427,29 @@ def _rows(
         first = np.append(first, len(r))
         columns = np.concatenate([columns, np.eye(len(known))[known] / width])
         r = np.append(r, np.zeros(known.sum()))
-    return Rows(columns, r, first)
+    return _Rows(columns, r, first)
 
 
-def _linear(rows: Rows) -> LinearProblem:
+def _linear(rows: _Rows) -> LinearProblem:
+    edges = itertools.pairwise([*rows.first.tolist(), len(rows.error)])
+    own = [rows.columns[a:b] for a, b in edges]
+    normals = np.stack([x.T @ x for x in own])
     gradient = np.add.reduceat(rows.columns * rows.error[:, None], rows.first)
     rss = np.add.reduceat(rows.error**2, rows.first)
-    normal = rows.columns.T @ rows.columns
-    return LinearProblem(_keys(), normal, gradient, rss, len(rows.error))
+    return LinearProblem(_keys(), normals.sum(axis=0), gradient, rss, len(rows.error), normals)
 
 
-def _fitted(rows: Rows, at: Indices) -> Rows:
+def _fitted(rows: _Rows, at: Indices) -> _Rows:
     """The rows with what the columns ``at`` explain taken off the residuals."""
     base = rows.columns[:, at]
     change = scaled_solve(base.T @ base, base.T @ rows.error, 1e-9)
     return rows._replace(error=rows.error - base @ change)
 
 
-def _scores(rows: Rows, base: Sequence[Key]) -> Scores:
+def _scores(rows: _Rows, base: Sequence[Key]) -> Scores:
     """Each effect is judged by the scatter that it leaves, as what is missing makes residuals
     large; what nuisances explain is no scatter."""
-    at = _linear(rows).index(base)
-    rows = _fitted(rows, at)
-    others = np.setdiff1d(np.arange(len(_keys())), at)
-    return Scores(
-        _linear(rows), base, rows._replace(columns=rows.columns[:, at]), rows.columns[:, others]
-    )
+    return Scores(_linear(_fitted(rows, _linear(rows).index(base))), base)
 
 
 def common_squares(

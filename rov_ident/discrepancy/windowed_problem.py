@@ -347,7 +347,10 @@ class WindowedProblem:
             )
             if at == list(range(len(keys))):
                 return own
-            out[:, :, at] = own
+            if at == list(range(len(at))):
+                out[:, :, : len(at)] = own  # ten times as fast as by places
+            else:
+                out[:, :, at] = own
         for key in keys:
             if key in self.patterns:
                 out[:, :, place[key]] = self.patterns[key]

@@ -110,6 +110,10 @@ def _fault_at(effect: Effect, values: Mapping[str, float], is_null: bool) -> str
                     same = arguments[0] if shape == (4, 3) else 0.0
                     if is_null and shape is not None and not np.allclose(found, same):
                         return f"must do nothing at its nulls, but its {name} does"
+            name = "of_thrusters"
+            shapes = [] if effect.of_thrusters is None else effect.of_thrusters(np.eye(6))
+            if not all(set(shape) <= set(values) for shape in shapes):
+                return f"must return only parameters of its own from its {name}"
     except Exception as error:  # it is code of others
         return f"fails in its {name} ({type(error).__name__}: {error})"
     return ""
