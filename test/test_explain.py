@@ -42,6 +42,7 @@ from rov_ident.discrepancy.explain import CUT_SHORT, _started, _with_all_data, e
 from rov_ident.discrepancy.findings import (
     is_left,
     possibly_earlier,
+    unsure,
     with_parameters,
     without_most_favourable,
 )
@@ -736,6 +737,14 @@ def test_structure_is_not_right_while_the_held_out_data_leave_an_effect_open():
         assert verdict_of([lag], [lag], [], {}, True) == "explained"
     bias = Finding("imu_bias", (), values, None, open_, True, None, (), "")
     assert verdict_of([], [bias], [], {}, True) == "retuned"  # the sensors', no force
+
+
+def test_what_is_left_beside_nothing_sure_is_not_explained():
+    gain = Gain("u", 0.1, 0.05, 50.0, 40.0, 60.0)
+    lag = Finding("thruster_lag", ("X",), {}, None, gain, True, None, (), "")
+    assert verdict_of([lag], [], [], {"v": 0.2}, True) == "explained"
+    assert verdict_of([unsure(lag)], [], [], {"v": 0.2}, True) == "unexplained"
+    assert verdict_of([unsure(lag)], [], [], {}, True) == "explained"
 
 
 def test_a_model_from_before_the_last_effects_is_kept_where_it_is_likelier(monkeypatch):

@@ -58,8 +58,8 @@ def verdict(
     left: Mapping[str, float],
     retuning_improves: bool,
 ) -> Verdict:
-    only_sensors = all(EFFECTS[f.effect].of_sensors for f in found)
-    if residual or any(share > _FAR_OFF or only_sensors for share in left.values()):
+    any_sure = any(f.separable and not EFFECTS[f.effect].of_sensors for f in found)
+    if residual or any(share > _FAR_OFF or not any_sure for share in left.values()):
         return "unexplained"
     if found:
         return "explained"

@@ -15,7 +15,11 @@ A controller answers the noise of velocities, so what the vehicle does next depe
 in y. Noise is independent of regressors that are determined before it, as in the identification of
 any closed loop (Ljung 1999, ch. 13): beside the IMU, accelerations and thrust are those before. And
 innovations contain earlier noise as far as the gain of their filter goes, so what an answer may
-pass for must show with a lesser gain, too.
+pass for must show with a lesser gain, too. Of a vehicle that hardly accelerates, most of an
+acceleration before a measurement is noise of the IMU, which the velocity that is dead-reckoned to
+that measurement has, too: it seems late. Accelerations around a measurement have no more of it than
+the velocity has on either side. So a delay is as uncertain as the two differ (the specification
+test of Hausman 1978).
 """
 
 import dataclasses
@@ -109,10 +113,11 @@ def _keys() -> tuple[Key, ...]:
 
 
 def comparisons(
-    streams: Streams, config: Config, effects: Values, tolerance: float = 1.0
+    streams: Streams, config: Config, effects: Values, tolerance: float = 1.0, around: bool = False
 ) -> list[Comparison]:
     """The comparisons that a bag allows, after correcting what ``effects`` say of the sensors;
-    ``tolerance``, of velocities against the IMU, as :func:`whitened` has it."""
+    ``tolerance``, of velocities against the IMU, as :func:`whitened` has it. ``around``: with
+    accelerations around a measurement, not before it."""
     keys = sensor_parameters()
     as_read = streams.nu[:, :3]
     streams = in_place(streams, effects)
@@ -142,7 +147,7 @@ def comparisons(
         down = inertial.rotation[:, 2]
         moved_before = [
             _unit_change(reading, key, streams.t, r[:, 2], _slope_before)
-            if EFFECTS[key[0]].late
+            if EFFECTS[key[0]].late and not around
             else as_before
             for key, as_before in zip(keys, moved, strict=True)
         ]
@@ -433,7 +438,8 @@ def _rows(
 def _linear(rows: _Rows) -> LinearProblem:
     edges = itertools.pairwise([*rows.first.tolist(), len(rows.error)])
     own = [rows.columns[a:b] for a, b in edges]
-    normals = np.stack([x.T @ x for x in own])
+    size = rows.columns.shape[1]
+    normals = np.array([x.T @ x for x in own]).reshape(-1, size, size)  # or of no cluster
     gradient = np.add.reduceat(rows.columns * rows.error[:, None], rows.first)
     rss = np.add.reduceat(rows.error**2, rows.first)
     return LinearProblem(_keys(), normals.sum(axis=0), gradient, rss, len(rows.error), normals)
@@ -508,7 +514,12 @@ def search(
         names = [n for n in library if n in set(allowed)]
         may_answer = has_imu(streams) and not set(names).isdisjoint(_ANSWERS)
         tolerance = _LESSER if may_answer else 1.0
-        return _searched(streams, config, spans, names, fixed, False, tolerance)
+        given = streams, config, spans, names, fixed, False, tolerance
+        found, std = _searched(*given)
+        late = [k for k in std if EFFECTS[k[0]].late and may_answer]
+        around = _searched(*given, around=True)[0] if late else found
+        apart = {k: found[k[0]][k[1]] - around[k[0]][k[1]] for k in late}
+        return found, std | {k: float(np.hypot(std[k], d)) for k, d in apart.items()}
     while True:
         found, std = _searched(streams, config, spans, library, fixed, chooses=True)
         keys = [(n, parameter) for n in found if n in _ANSWERS for parameter in found[n]]
@@ -529,12 +540,13 @@ def _searched(
     fixed: Container[Key],
     chooses: bool,
     tolerance: float = 1.0,
+    around: bool = False,
 ) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
     """The same of effects of the ``library`` that score, if the search ``chooses``, or of all."""
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     for _ in range(ROUNDS):
-        rows = _rows(comparisons(streams, config, found, tolerance), spans, streams)
+        rows = _rows(comparisons(streams, config, found, tolerance, around), spans, streams)
         linear = _linear(rows)
         free = [key for key in linear.keys if key not in fixed]
         chosen = [key for key in free if key[0] in found]
