@@ -18,8 +18,8 @@ innovations contain earlier noise as far as the gain of their filter goes, so wh
 pass for must show with a lesser gain, too. Of a vehicle that hardly accelerates, most of an
 acceleration before a measurement is noise of the IMU, which the velocity that is dead-reckoned to
 that measurement has, too: it seems late. Accelerations around a measurement have no more of it than
-the velocity has on either side. So a delay is as uncertain as the two differ (the specification
-test of Hausman 1978).
+the velocity has on either side, and the pose by itself has none. So a delay is as uncertain as it
+differs from what the nearer of these two says (the specification test of Hausman 1978).
 """
 
 import dataclasses
@@ -516,10 +516,17 @@ def search(
         tolerance = _LESSER if may_answer else 1.0
         given = streams, config, spans, names, fixed, False, tolerance
         found, std = _searched(*given)
-        late = [k for k in std if EFFECTS[k[0]].late and may_answer]
-        around = _searched(*given, around=True)[0] if late else found
-        apart = {k: found[k[0]][k[1]] - around[k[0]][k[1]] for k in late}
-        return found, std | {k: float(np.hypot(std[k], d)) for k, d in apart.items()}
+        for name, parameter in [k for k in std if EFFECTS[k[0]].late and may_answer]:
+            value, own = found[name][parameter], std[name, parameter]
+            around = _searched(*given, around=True)[0]
+            others = [(around[name][parameter], 0.0)]  # of the same noise
+            if streams.has_pose:
+                posed, of_pose = _searched(streams.without_imu(), *given[1:6])
+                others.append((posed[name][parameter], of_pose[name, parameter]))
+            std[name, parameter] = min(
+                float(np.linalg.norm([own, s, value - x])) for x, s in others
+            )
+        return found, std
     while True:
         found, std = _searched(streams, config, spans, library, fixed, chooses=True)
         keys = [(n, parameter) for n in found if n in _ANSWERS for parameter in found[n]]
