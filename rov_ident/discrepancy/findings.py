@@ -108,8 +108,8 @@ def finding(
 def gain_over(
     search: Search, judge: Judge, retuned: Fitted, final: Fitted, name: str, rest: Fitted
 ) -> tuple[Gain, Hypothesis, tuple[str, ...]]:
-    """What an effect of the final model gains over the best model without it, which of the
-    retuned one and the ``rest`` that is, and the axes on which the effect acts."""
+    """What an effect of the final model gains over the best model without it, the ``rest`` or the
+    retuned one; which of these that is; and the axes on which the effect acts."""
     axes, without = _axes(search, final, search.keys_of(final, name)), rest.hypothesis
     if judge.better(retuned.hypothesis, without):
         without = retuned.hypothesis
