@@ -38,7 +38,7 @@ from rov_ident.sampling.raw_streams import Streams, corrected
 from rov_ident.sampling.wrench_scatter import RESTING
 
 HEADING, MOUNTING, NOISE = "heading_offset", "sensor_misalignment", "wrench_noise"
-LATENCY = "velocity_latency"
+LATENCY, SCALE = "velocity_latency", "velocity_scale"
 BIAS, ARM = "imu_bias", "sensor_lever_arm"
 _YAW, _LEVEL = (MOUNTING, "yaw"), ("roll", "pitch")
 _WATER = (("ocean_current", "north"), ("ocean_current", "east"))
@@ -267,8 +267,10 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
 def _without_refuted(data: Data, choice: Choice) -> Choice:
     """Without the corrections of velocities that make the prediction of the data surely worse."""
     late = [n for n in choice.sensors if EFFECTS[n].late]
-    if not data.streams.has_pose:  # clock or place of the IMU may be off instead
-        unsure = choice.unsure | ({*late, ARM} & choice.sensors.keys())
+    if not data.streams.has_pose:
+        # Clock or place of the IMU may be off instead; and noise of the IMU, which is in what it
+        # tells of the motion as well, makes velocities seem small where they hardly change.
+        unsure = choice.unsure | ({*late, ARM, SCALE} & choice.sensors.keys())
         choice = dataclasses.replace(choice, unsure=unsure)
     corrects = [n for n in choice.sensors if EFFECTS[n].sense or n in late]
     corrects = [n for n in corrects if moves_velocity(n, choice.sensors[n])]

@@ -521,7 +521,8 @@ def search(
             around = _searched(*given, around=True)[0]
             others = [(around[name][parameter], 0.0)]  # of the same noise
             if streams.has_pose:
-                posed, of_pose = _searched(streams.without_imu(), *given[1:6])
+                alone = streams.without_imu()
+                posed, of_pose = _searched(alone, config, spans, names, fixed, False)
                 others.append((posed[name][parameter], of_pose[name, parameter]))
             std[name, parameter] = min(
                 float(np.linalg.norm([own, s, value - x])) for x, s in others
