@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from concurrent.futures import CancelledError
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,11 +26,12 @@ from bench.studies.explain import (
     wrong,
 )
 from rov_ident.config import from_parameters, load, to_parameters
+from rov_ident.core import forks
 from rov_ident.core.errors import UserError
 from rov_ident.core.progress import silent
 from rov_ident.discrepancy import explain as explaining
-from rov_ident.discrepancy import screening, sensor_consistency
 from rov_ident.discrepancy import search as discrepancy
+from rov_ident.discrepancy import sensor_consistency
 from rov_ident.discrepancy.certainty import (
     beside_each_other,
     is_between_readings,
@@ -236,27 +236,6 @@ def test_forces_beside_a_thrust_that_the_file_takes_for_impossible_are_not_sure(
         assert is_beyond_the_file(found, config) == beyond
 
 
-def test_an_interrupt_does_not_wait_for_the_fits():
-    """All that is under way, and in the queue, is dropped."""
-    case = draw(3, ("quadratic_damping",), STRENGTH, conditions=LEAN)  # more than one candidate
-    streams = streams_of(case)
-    search = Search(streams, case.config, split(streams.duration)[0])
-    start = fit(search.problem, search.given)
-    candidates = search.screening.candidates(start)
-    begun = search.problem.steps_moved
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "_fit_candidate", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            search.fit_best(start, candidates)
-    assert search.problem.steps_moved == begun
-    with pytest.raises(CancelledError):
-        fit(search.problem, search.given)
-
-
 def test_a_fit_keeps_its_patterns_as_they_were(fitted):
     search, start = fitted
     pattern = search.patterns.patterns(start)[0]
@@ -268,14 +247,14 @@ def test_a_fit_keeps_its_patterns_as_they_were(fitted):
 
 
 @pytest.mark.parametrize("name", ["unknown", *more("tether_drag")])
-def test_threads_change_nothing(name, monkeypatch):
+def test_a_second_process_changes_nothing(name, monkeypatch):
     """Also where patterns, which one search shares, are fitted."""
     name = next(iter(UNKNOWN)) if name == "unknown" else name
     trial = Trial("a minute", name, 0, "test")
     there = bag(trial, trial.seed, [STRENGTH])
     found = []
-    for threads in (1, 3):
-        monkeypatch.setattr(screening, "THREADS", threads)
+    for alone in (False, True):
+        monkeypatch.setattr(forks, "_can_fork", lambda alone=alone: not alone)
         found.append(explain([there.streams], there.case.config).findings)
     assert found[0] == found[1]
     assert found[0].effects or found[0].residual

@@ -218,10 +218,10 @@ def _scored(problem: WindowedProblem, now: Fitted) -> list[Shape]:
     own = {v: _values(problem, now, v, 0) for v in range(1, THRUST) if has_pose or not (
         NORTH <= v < THRUST
     )}  # fmt: skip
-    scores: list[tuple[float, Shape]] = []
-    for axis in range(len(ON)):
+
+    def of_axis(axis: int) -> list[tuple[float, Shape]]:
         if not (free[axis] if axis < 6 else free[:3].all()):
-            continue
+            return []
         there = dict(own) if axis < 6 else {v: x for v, x in own.items() if v >= ROLL}
         if axis < 6:
             there[THRUST] = _values(problem, now, THRUST, axis)
@@ -230,7 +230,9 @@ def _scored(problem: WindowedProblem, now: Fitted) -> list[Shape]:
         if peaks:
             there[TIME], ends[TIME] = _values(problem, now, TIME, axis), np.array([0, 1 / peaks[0]])
         columns = {v: _polynomials(v, x, ends[v]) for v, x in there.items()}
-        scores += _gains(line, axis, columns, ends, _direction(problem, axis))
+        return _gains(line, axis, columns, ends, _direction(problem, axis))
+
+    scores = itertools.chain(*problem.map(of_axis, range(len(ON))))
     return [shape for _, shape in sorted(scores, key=lambda s: -s[0])]
 
 

@@ -10,6 +10,7 @@ are whitened with what ``odometry.attitude_std`` lets expect of it.
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -107,31 +108,28 @@ class Linearisation:
         self._start_error = [x[:, 0] for x in self._eliminate(error)]
         self.error = error[:, 0]
         self._squares = np.add.reduceat(self.error**2, self.first)
-        self._sensitivities: tuple[list[Array], Array, LinearProblem] | None = None
 
+    @cached_property
     def sensitivities(self) -> tuple[list[Array], Array, LinearProblem]:
         """With respect to the parameters of the hypothesis; computed when first asked for, as of a
-        trial that is no better only the residuals count. No cached_property: all threads share its
-        lock in Python 3.11."""
-        if self._sensitivities is None:
-            keys = self.hypothesis.keys
-            columns = self._of(self.hypothesis, keys)
-            starts = self._eliminate(columns)
-            count = int(np.count_nonzero(self._weight)) - 6 * len(self.first)
-            normals, gradient = self._products(columns, columns), self._gradient(columns)
-            linear = LinearProblem(
-                tuple(keys), normals.sum(axis=0), gradient, self._squares, count, normals
-            )
-            self._sensitivities = starts, columns, linear
-        return self._sensitivities
+        trial that is no better only the residuals count."""
+        keys = self.hypothesis.keys
+        columns = self._of(self.hypothesis, keys)
+        starts = self._eliminate(columns)
+        count = int(np.count_nonzero(self._weight)) - 6 * len(self.first)
+        normals, gradient = self._products(columns, columns), self._gradient(columns)
+        linear = LinearProblem(
+            tuple(keys), normals.sum(axis=0), gradient, self._squares, count, normals
+        )
+        return starts, columns, linear
 
     @property
     def columns(self) -> Array:
-        return self.sensitivities()[1]
+        return self.sensitivities[1]
 
     @property
     def linear(self) -> LinearProblem:
-        return self.sensitivities()[2]
+        return self.sensitivities[2]
 
     @property
     def rss(self) -> float:
@@ -330,7 +328,7 @@ class Linearisation:
     def starts_after(self, change: Array, share: float = 1.0) -> Array:
         """The initial velocities (W, 6) that suit a change (P,) of the parameters, with a ``share``
         of how far they are off without one."""
-        left = share * np.stack(self._start_error) - np.stack(self.sensitivities()[0]) @ change
+        left = share * np.stack(self._start_error) - np.stack(self.sensitivities[0]) @ change
         # by least squares: a velocity that a poor model forgets at once has no initial value
         moves = np.linalg.pinv(np.stack(self._r)) @ left[:, :, None]
         starts = self.starts.copy()

@@ -64,7 +64,7 @@ class Fitted:
 
     def __post_init__(self) -> None:
         # now, because the patterns of the problem may be replaced later
-        self.linearisation.sensitivities()
+        _ = self.linearisation.sensitivities
 
     @property
     def linear(self) -> LinearProblem:

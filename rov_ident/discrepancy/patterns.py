@@ -15,7 +15,7 @@ from rov_ident.discrepancy.hypothesis import UNKNOWN, Key, bounds, effect_of
 from rov_ident.discrepancy.linearisation import Linearisation
 from rov_ident.discrepancy.multiple_shooting import Steps
 from rov_ident.discrepancy.output_error import Fitted, refit
-from rov_ident.discrepancy.screening import Candidate, Workers
+from rov_ident.discrepancy.screening import Candidate
 from rov_ident.discrepancy.selection import PENALTY, scores_of
 from rov_ident.discrepancy.windowed_problem import WindowedProblem
 from rov_ident.model.coefficients import AXES, VELOCITIES
@@ -60,15 +60,15 @@ class Pattern:
 class PatternSearch:
     """Patterns along the motion of fits on the windows of a problem."""
 
-    def __init__(self, problem: WindowedProblem, workers: Workers) -> None:
-        self._problem, self._workers = problem, workers
+    def __init__(self, problem: WindowedProblem) -> None:
+        self._problem = problem
 
     def screen(self, now: Fitted) -> list[tuple[Candidate, Pattern]]:
         """Patterns that would explain something, the best first: all are ranked by what they would
         explain with all their columns; of the first few, columns are selected."""
         tried = self.patterns(now)
         penalty = choice_penalty(tried)
-        gains = self._workers.map(lambda p: _gain(now.linearisation, p), tried)
+        gains = self._problem.map(lambda p: _gain(now.linearisation, p), tried)
         ranked = [tried[i] for i in np.argsort(-np.array(gains), kind="stable")]
         found = []
         for pattern in ranked[:_SCORED]:
@@ -86,7 +86,7 @@ class PatternSearch:
             # a fit renews the columns of a pattern that the model has already: one at a time
             fits = [self._fit(now, *s) for s in screened]
         else:
-            fits = self._workers.map(lambda s: self._fit(now, *s), screened)
+            fits = self._problem.map(lambda s: self._fit(now, *s), screened)
         return {c.name: f for (c, _), f in zip(screened, fits, strict=True) if f is not None}
 
     def _fit(self, now: Fitted, candidate: Candidate, pattern: Pattern) -> Fitted | None:

@@ -5,10 +5,8 @@ not linear in a parameter (an onset, a place of attachment, a frequency) is scan
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -35,12 +33,8 @@ from rov_ident.model.coefficients import AXES
 from rov_ident.model.equations import Array
 from rov_ident.sampling.wrench_scatter import SHARE
 
-T = TypeVar("T")
-R = TypeVar("R")
-
 HULL_DAMPING = with_trait("hull")  # what a model lacks of it is the likeliest cause
 
-THREADS = 2  # that fit: more would wait for each other, as some of a fit is Python
 FARTHEST = 3.0  # typical sizes from null at which a fit of an input effect begins, as the wrench is
 # not linear in a lag or a deadband; and of the distance of a place of attachment from the origin
 _ONSETS = 24  # scanned evenly over the bag: every 7 s of three minutes, about a window apart
@@ -64,34 +58,15 @@ class Candidate:
     constants: Mapping[Key, float] = field(default_factory=dict)
 
 
-class Workers:
-    """Threads that fit; an interrupt does not wait for their fits."""
-
-    def __init__(self, problem: WindowedProblem) -> None:
-        self._problem, self._pool = problem, ThreadPoolExecutor(THREADS, "fit")
-
-    def map(self, function: Callable[[T], R], of: Iterable[T]) -> list[R]:
-        """The function of each of several things, in their order."""
-        try:
-            return list(self._pool.map(function, of))
-        except BaseException:
-            self._problem.stop()
-            raise
-
-
 class Screening:
     """The candidates for what a fit lacks."""
 
     def __init__(
-        self,
-        problem: WindowedProblem,
-        workers: Workers,
-        records: int = 1,
-        thrusters: Array | None = None,
+        self, problem: WindowedProblem, records: int = 1, thrusters: Array | None = None
     ) -> None:
         """``records``: how many there are that may differ; ``thrusters`` (6, n): their allocation,
         where it is known."""
-        self._problem, self._workers, self._records = problem, workers, records
+        self._problem, self._records = problem, records
         self._shapes = {
             e.name: [{(e.name, n): v for n, v in of.items()} for of in e.of_thrusters(thrusters)]
             for e in EFFECTS.values()
@@ -129,11 +104,11 @@ class Screening:
                 start = first_values(dict(zip(keys, change.tolist(), strict=True)))
                 candidates.append(Candidate(name, start, score, white))
         others = [e for e in EFFECTS.values() if not h.has(e.name)]
-        scanned = self._workers.map(lambda effect: self._scanned(now, effect), others)
+        scanned = self._problem.map(lambda effect: self._scanned(now, effect), others)
         candidates += [c for found in scanned for c in found]
         placed = [e for e in EFFECTS.values() if any(p.role == "place" for p in e.parameters)]
         own = [(e, unit) for e in placed for unit in self.own_units(e, h)]
-        each = self._workers.map(lambda of: self._best_shape(now, of[0], [{}], of[1]), own)
+        each = self._problem.map(lambda of: self._best_shape(now, of[0], [{}], of[1]), own)
         candidates += [c for c in each if c is not None]
         return sorted(candidates, key=lambda c: (-c.score, -c.white_score))
 

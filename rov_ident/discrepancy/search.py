@@ -39,7 +39,7 @@ from rov_ident.discrepancy.hypothesis import (
 from rov_ident.discrepancy.linearisation import linearise
 from rov_ident.discrepancy.output_error import FIRST_NOISE, Fitted, fit, refit, with_best_onsets
 from rov_ident.discrepancy.patterns import INTERPLAY, PatternSearch, choice_penalty
-from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening, Workers
+from rov_ident.discrepancy.screening import FARTHEST, HULL_DAMPING, Candidate, Screening
 from rov_ident.discrepancy.selection import PENALTY, VERY_STRONG, variance_inflation_of
 from rov_ident.discrepancy.windowed_problem import Spans, WindowedProblem
 from rov_ident.effects import EFFECTS, with_trait
@@ -113,11 +113,10 @@ class Search:
         parameters = [(e.name, p) for e in EFFECTS.values() for p in e.parameters]
         duration = {(e, p.name): streams.longest for e, p in parameters if p.role == "fixed"}
         self.given = Hypothesis(config, base, duration)
-        self._workers = Workers(self.problem)
         self._records = len(streams.begins) if apart else 1
         thrusters = matrix(config.thrusters) if is_known(config.thrusters) else None
-        self.screening = Screening(self.problem, self._workers, self._records, thrusters)
-        self.patterns = PatternSearch(self.problem, self._workers)
+        self.screening = Screening(self.problem, self._records, thrusters)
+        self.patterns = PatternSearch(self.problem)
         self._ends: dict[object, Hypothesis] = {}  # of the last fit of a structure
         self.cut_short = False  # whether something was left untried
 
@@ -136,10 +135,10 @@ class Search:
             short = fit(WindowedProblem(self.problem.streams, spans), self.given)
             begins += [] if short is None else [short.hypothesis]
         # What errors of the attitude make is taken along the first motion that is simulated: that
-        # of the configuration, if it can be, and not of what a thread happens to simulate first.
+        # of the configuration, if it can be.
         measured = self.problem.measured_starts(), np.full(6, FIRST_NOISE)
         next(filter(None, (linearise(self.problem, h, *measured) for h in begins)), None)
-        fits = self._workers.map(lambda h: fit(self.problem, h), begins)
+        fits = self.problem.map(lambda h: fit(self.problem, h), begins)
         return likeliest(fits)
 
     def run(self, progress: Progress | None = None, start: Fitted | None = None) -> list[Fitted]:
@@ -236,7 +235,7 @@ class Search:
             for name in lacking
             for p in EFFECTS[name].parameters
         ]
-        fits = self._workers.map(
+        fits = self.problem.map(
             lambda s: refit(now.hypothesis.having(s), now.linearisation), starts
         )
         return [f for f in fits if f is not None]
@@ -266,12 +265,11 @@ class Search:
         white = sorted((c for c in candidates if c.white_score > 0.0), key=lambda c: -c.white_score)
         chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
         chosen += [c for c in candidates if c.name in LIKELIEST and c not in chosen]
-        found = self._workers.map(lambda c: self._fit_candidate(now, c), chosen)
+        found = self.problem.map(lambda c: self._fit_candidate(now, c), chosen)
         if chosen and _is_far_from(now, found[0], chosen[0]):
             both = filter(None, (found[0], self._fit_candidate(now, chosen[0], from_file=True)))
             found[0] = min(both, key=lambda f: f.squares, default=None)
         fits = [f for f in found if f is not None]
-        # here, not by the threads, of which now one, now the other is first
         self._ends |= {f.hypothesis.structure: f.hypothesis for f in fits}
         return fits
 
@@ -343,7 +341,7 @@ class Search:
     def rests(self, final: Fitted) -> dict[str, Fitted]:
         """The fits without each of the named effects."""
         names = [n for n in self.named(final) if not n.startswith(UNKNOWN)]
-        rests = self._workers.map(lambda n: self.rest(final, n), names)
+        rests = self.problem.map(lambda n: self.rest(final, n), names)
         return {n: rest for n, rest in zip(names, rests, strict=True) if rest is not None}
 
     def trials(self, rests: Mapping[str, Fitted]) -> Trials:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rov_ident.config import Config
+from rov_ident.core import forks
 from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.discrepancy import sensor_consistency
@@ -231,18 +232,18 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
     that is taken which changes the velocities least."""
     others = [n for n in found.sensors if n not in (HEADING, MOUNTING)]
     none: frozenset[Key] = frozenset()
-    variants = [
-        data.fitted([*others, HEADING], none),
-        data.fitted([*others, MOUNTING], none),
-        data.fitted([*others, HEADING, MOUNTING], frozenset({_YAW})),
-    ]
+    variants = forks.divided(
+        lambda of: data.fitted([*others, *of[0]], of[1]),
+        [((HEADING,), none), ((MOUNTING,), none), ((HEADING, MOUNTING), frozenset({_YAW}))],
+    )
     sums = data.agreement([v.sensors for v in variants])
     possible = (0, 2) if turned else (0, 1, 2)
     order = sorted(possible, key=lambda i: float(np.log(sums[i].sum(axis=0)).sum()))
     best = order[0]
     left = [i for i in order if not surely_less(sums[best], sums[i])]
     if len(left) > 1:
-        squares = {i: s for i in left if (s := data.dynamics(variants[i].sensors)) is not None}
+        tried = forks.divided(lambda i: data.dynamics(variants[i].sensors), left)
+        squares = {i: s for i, s in zip(left, tried, strict=True) if s is not None}
         if squares:
             least = min(squares, key=lambda i: float(np.log(squares[i].sum(axis=0)).sum()))
             left = [i for i in left if i in squares and not surely_less(squares[least], squares[i])]
@@ -275,26 +276,34 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
     corrects = [n for n in choice.sensors if EFFECTS[n].sense or n in late]
     corrects = [n for n in corrects if moves_velocity(n, choice.sensors[n])]
     squares = data.dynamics(choice.sensors) if corrects else None
-    for name in corrects:
+
+    def left_out(name: str) -> tuple[Choice, Array | None]:
         rest = data.fitted([n for n in choice.sensors if n != name], choice.fixed)
-        without = data.dynamics(rest.sensors)
-        if squares is None or (without is not None and surely_less(without, squares)):
-            words = (
-                f"{name}: the sensors would agree better with it, but the motion would not follow "
-            )
-            notes = (*choice.notes, words + "the thrust: it is not applied")
-            # what made the sensors disagree is there all the same, and may have made the others
-            unsure = choice.unsure | rest.sensors.keys()
-            choice = dataclasses.replace(
-                rest, alternatives=choice.alternatives, notes=notes, unsure=unsure
-            )
-            squares = without
-        elif name == MOUNTING and not (
-            len(data.streams.imu_t) or (without is not None and surely_less(squares, without))
-        ):
-            # the pose may be tilted against the velocities instead: nothing ties it to gravity
-            words = f"{name}: the pose may be tilted instead; the thrust cannot tell"
-            choice = _unsure(choice, name, words)
+        return rest, data.dynamics(rest.sensors)
+
+    while corrects:
+        refuted = None
+        for name, (rest, without) in zip(corrects, forks.divided(left_out, corrects), strict=True):
+            if squares is None or (without is not None and surely_less(without, squares)):
+                refuted = name, rest, without
+                break
+            if name == MOUNTING and not (
+                len(data.streams.imu_t) or (without is not None and surely_less(squares, without))
+            ):
+                # the pose may be tilted against the velocities instead: nothing ties it to gravity
+                words = f"{name}: the pose may be tilted instead; the thrust cannot tell"
+                choice = _unsure(choice, name, words)
+        if refuted is None:
+            break
+        name, rest, squares = refuted
+        words = f"{name}: the sensors would agree better with it, but the motion would not follow "
+        notes = (*choice.notes, words + "the thrust: it is not applied")
+        # what made the sensors disagree is there all the same, and may have made the others
+        unsure = choice.unsure | rest.sensors.keys()
+        choice = dataclasses.replace(
+            rest, alternatives=choice.alternatives, notes=notes, unsure=unsure
+        )
+        corrects = corrects[corrects.index(name) + 1 :]
     return choice
 
 

@@ -8,14 +8,14 @@ its parameters.
 import contextlib
 import copy
 import itertools
-import threading
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import CancelledError
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.core import forks
 from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_to_matrix, turns
 from rov_ident.core.linalg import integral, interpolated
@@ -76,7 +76,8 @@ _KURTOSIS = 3.0  # mean fourth power of a normal number
 _REMEMBERED_NOISE = 8  # the same under noise, which is larger
 _REMEMBERED_THRUSTS = 64  # input effects and values: more than one round of candidates
 
-
+T = TypeVar("T")
+R = TypeVar("R")
 Spans = list[tuple[float, float]]  # from and to [s] each
 
 
@@ -166,19 +167,18 @@ class WindowedProblem:
         self.measured = streams.nu[keep][in_window]
         self.times = t[in_window]
         self.patterns: dict[Key, Array] = {}
-        self._moves = 0  # through all windows
-        self._stopped = False
+        self._moves = 0  # of wrenches and simulations, through all windows
         self._driven = _Remembered(_REMEMBERED_THRUSTS)
         self._tilted: Array | None = None
         self._told: NDArray[np.bool_] | None = None
         self._forget()
-        self._counting = threading.Lock()
 
     def _forget(self) -> None:
         """What is remembered of the thrust."""
         self._thrusts = _Remembered(_REMEMBERED_THRUSTS)
         self._noisy = _Remembered(_REMEMBERED_NOISE)
-        self._remembered = threading.local()  # wrenches along a motion
+        self._along: Array | None = None  # the motion along which wrenches are remembered, ...
+        self._wrenches_along: dict[object, Array] = {}  # ... and they
 
     def _measured_at(self, t: Array) -> Array:
         """Velocities (k, 6) between those measured."""
@@ -211,12 +211,24 @@ class WindowedProblem:
 
     def count(self, moves: int) -> None:
         """Count simulations, or sensitivities to so many wrenches, of all windows."""
-        with self._counting:
-            self._moves += moves
+        self._moves += moves
 
-    def stop(self) -> None:
-        """Every further simulation, in any thread, raises CancelledError."""
-        self._stopped = True
+    def map(self, function: Callable[[T], R], of: Iterable[T]) -> list[R]:
+        """The function of each of several things, in their order, by two processes; with what the
+        other one has counted, and the patterns that it has adopted."""
+
+        def noted(x: T) -> tuple[R, int, dict[Key, Array]]:
+            moves, patterns = self._moves, dict(self.patterns)
+            out = function(x)
+            adopted = {k: v for k, v in self.patterns.items() if patterns.get(k) is not v}
+            return out, self._moves - moves, adopted
+
+        before = self._moves
+        found = forks.divided(noted, of, known=(self, self.streams))
+        self._moves = before + sum(moves for _, moves, _ in found)
+        for _, _, adopted in found:
+            self.patterns |= adopted
+        return [out for out, _, _ in found]
 
     def thrust(self, effects: Values) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
@@ -303,8 +315,6 @@ class WindowedProblem:
         for key, value in h.values.items():
             if key in self.patterns:
                 wrench = np.stack([wrench[0] + value * self.patterns[key], wrench[1]])
-        if self._stopped:
-            raise CancelledError
         self.count(1)
         motion = self._shot(h, wrench, self.first, self.last, starts)
         return motion if np.isfinite(motion.nu[self.nodes]).all() else None
@@ -403,10 +413,9 @@ class WindowedProblem:
         acting = compiled(effects)
         acted = self.thrust(effects)[0]
         key = tuple(part.tobytes() for part in acting)
-        mine = self._remembered
-        if getattr(mine, "along", None) is not motion.middle:
-            mine.along, mine.wrenches = motion.middle, {}
-        known: dict[object, Array] = mine.wrenches
+        if self._along is not motion.middle:
+            self._along, self._wrenches_along = motion.middle, {}
+        known = self._wrenches_along
         if key not in known:
             known[key] = wrenches(
                 h.equations._replace(acting=acting), self.driven(effects), acted, motion
