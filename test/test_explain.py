@@ -1,6 +1,7 @@
 """Explain names what is hidden in a bag: a sample; `make explain-bench` is the whole."""
 
 import dataclasses
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -592,6 +593,27 @@ def test_the_first_window_knows_the_commands_before_it(dive):
     last = WindowedProblem(streams, [(0.0, 20.0), (20.0, 25.0)])
     here, there = alone.thrust(lagged), last.thrust(lagged)
     np.testing.assert_allclose(here, there[:, -here.shape[1] :], rtol=0.0, atol=1e-9)
+
+
+def test_late_thrust_changes_within_a_step(dive):
+    """As the line that suits it best, within what three parts of a step miss: a ninth. Without it a
+    lag of 80 ms was found 0.24 ms too short, which was 4 standard deviations."""
+    messages, config = dive
+    number = itertools.count()
+    rare = [(r, m) for r, m in messages if r != "wrench" or next(number) % 10 == 0]
+    streams, constant = gather(rare, config), 0.1
+    problem = WindowedProblem(streams, [(20.0, 30.0)])
+    steps = problem.steps
+    fine = np.arange(0.0, steps.t[-1], 1e-4)
+    command = streams.demand[np.searchsorted(streams.demand_t, fine, side="right") - 1, 0]
+    command[fine < streams.demand_t[0]] = streams.demand[0, 0]
+    acting = lfilter([1e-4 / constant], [1.0, 1e-4 / constant - 1.0], command)
+    slopes = []
+    for a, b in itertools.pairwise(steps.t):
+        inside = (fine >= a) & (fine < b)
+        slopes.append(np.polyfit(fine[inside], acting[inside], 1)[0])
+    ours = problem.thrust({"thruster_lag": {"time_constant": constant}})[1, :, 0]
+    assert np.std(ours - slopes) < 0.15 * np.std(slopes)
 
 
 def test_a_record_knows_nothing_of_the_commands_of_another(dive):

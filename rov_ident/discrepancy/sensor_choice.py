@@ -287,11 +287,12 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
             if squares is None or (without is not None and surely_less(without, squares)):
                 refuted = name, rest, without
                 break
-            if name == MOUNTING and not (
-                len(data.streams.imu_t) or (without is not None and surely_less(squares, without))
-            ):
-                # the pose may be tilted against the velocities instead: nothing ties it to gravity
-                words = f"{name}: the pose may be tilted instead; the thrust cannot tell"
+            told = data.streams.has_pose and len(data.streams.imu_t) > 0
+            told = told or (without is not None and surely_less(squares, without))
+            if name == MOUNTING and not told:
+                # nothing ties the pose to gravity, or all that is known of the motion is the IMU's
+                other = "IMU may be noisy" if len(data.streams.imu_t) else "pose may be tilted"
+                words = f"{name}: the {other} instead; the thrust cannot tell"
                 choice = _unsure(choice, name, words)
         if refuted is None:
             break

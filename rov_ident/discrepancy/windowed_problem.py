@@ -117,8 +117,11 @@ class WindowedProblem:
         keep &= streams.t >= begins[np.searchsorted(ends, streams.t)]
         t = streams.t[keep]
         nodes = _subdivided(t, streams.max_step)
-        # from the first command on: lag and delay remember those before the first window
-        pieces = np.unique(np.concatenate([nodes, streams.demand_t]))
+        # From the first command on: lag and delay remember those before the first window. Late
+        # thrust changes within a step without a new command: three parts tell how.
+        third = np.diff(nodes) / 3.0
+        parts = nodes, nodes[:-1] + third, nodes[1:] - third
+        pieces = np.unique(np.concatenate([*parts, streams.demand_t]))
         pieces = pieces[pieces <= nodes[-1]]
         held = self._held = np.searchsorted(streams.demand_t, pieces[:-1], side="right") - 1
         self.lasts = streams.noise_lasts
