@@ -28,17 +28,18 @@ from rov_ident.core.messages import Array
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.states import CONTRADICTED, IDENTIFIABLE, State, of_fit
 from rov_ident.core.whiteness import JUDGED_TIME
-from rov_ident.estimation.consistency import Test, consistency_of, worst_of
+from rov_ident.estimation.consistency import CAUSE, Test, consistency_of, worst_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
 from rov_ident.model.coefficients import MOTIONS, VELOCITIES, Coefficient
 from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
-from rov_ident.offline import least_squares, maximum_likelihood, newton
+from rov_ident.offline import constancy, least_squares, maximum_likelihood, newton
 from rov_ident.offline.archive import Archive, ReadBag, Samples, total
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, provenance
+from rov_ident.reports.table import with_unit
 from rov_ident.sampling.records import HORIZON, UNITS, numbers
 from rov_ident.sampling.sample import free_axes, thrust_axes
 from rov_ident.sampling.without_velocity import is_impossible, is_without_velocity, refusal
@@ -87,6 +88,7 @@ class _Stage(NamedTuple):
     lasting: Array  # (6,), too
     reading_noise: Array  # (6,), too
     noise: maximum_likelihood.Noise | None = None
+    slope: Array = np.zeros((2, 0))  # (2, n): as that of a Likelihood
 
 
 def fit_batch(
@@ -115,6 +117,7 @@ def fit_batch(
     states = dict.fromkeys(prior.names, State.HELD)
     unexplained, lasting = np.full((2, 6), np.nan)
     reading_noise = np.zeros(6)
+    constant: list[Test] = []
     now, parts = config, []
     for stage in settings.stages or (MOTIONS,):
         found: _Stage | None
@@ -131,6 +134,7 @@ def fit_batch(
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
         reading_noise = np.maximum(reading_noise, found.reading_noise)
+        constant += _of_constancy(config, prior, found)
         now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     say("open loop, fitted")
@@ -145,6 +149,7 @@ def fit_batch(
         config, prior, asked, unexplained, lasting, sensors, std, reading_noise
     )
     consistency = consistency.with_open_loop(before.rmse, after.rmse, chance)
+    consistency = replace(consistency, tests=(*consistency.tests, *constant))
     if settings.unmeasured:
         forces = np.sqrt(np.mean(archive.each(_mean_square_wrench), axis=0))
         driven = float(np.max((forces / authority(config.dynamics))[:2]))
@@ -286,7 +291,7 @@ def _stage(
     found, covariance, asked = least.values, least.covariance, least.values
     noise = None
     unexplained, lasting = np.full((2, 6), np.nan)
-    reading_noise = np.zeros(6)
+    reading_noise, slope = np.zeros(6), np.zeros((2, 0))
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
@@ -310,7 +315,7 @@ def _stage(
         unexplained[free] = (np.sqrt(noise.floor) / authority(config.dynamics))[free]
         unexplained[:2] = np.nan if settings.unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
-        reading_noise = likelihood.reading_noise
+        reading_noise, slope = likelihood.reading_noise, likelihood.slope
         more |= _numbers_of(likelihood, names, free)
         if likelihood.held.any():
             waiting = ", ".join(n for n, held in zip(names, likelihood.held, strict=True) if held)
@@ -341,7 +346,7 @@ def _stage(
         notes += _scale_notes(config, names, covariance)
     return _Stage(
         names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting,
-        reading_noise, noise,
+        reading_noise, noise, slope,
     )  # fmt: skip
 
 
@@ -418,6 +423,22 @@ def _scale_notes(config: Config, names: Sequence[str], covariance: Array) -> lis
         f"± {known:.2g} kg (95 %): by {share:.1f} % {', '.join(own)} and the drag may be off "
         "together, which a known X_udot or a bollard pull settles (coast-down --bollard)"
     ]
+
+
+def _of_constancy(config: Config, prior: Prior, found: _Stage) -> list[Test]:
+    """Whether nuisance parameters stay the same throughout each record; but for the centre of
+    gravity, which an attitude that wanders for longer than a stretch seems to move."""
+    supposed = {".".join(key) for key in config.nuisance_std if key[0] != "cog_offset"}
+    units = dict(zip(prior.names, prior.units, strict=True))
+    return [
+        Test(
+            f"constancy of {name}", abs(t), constancy.UNLIKELY,
+            f"{name} is taken for constant, but changes by "
+            f"{with_unit(f'{change:.2g}', units[name])} during a record: {CAUSE}",
+        )
+        for name, t, change in zip(found.names, *found.slope.tolist())
+        if name in supposed and t != 0.0
+    ]  # fmt: skip
 
 
 def _start(

@@ -69,6 +69,7 @@ from rov_ident.estimation.shared import (
 )
 from rov_ident.model.equations import Array, Model, Structure, momentum_columns
 from rov_ident.model.scales import authority
+from rov_ident.offline import constancy
 from rov_ident.offline.archive import Mapper, Samples, total
 from rov_ident.offline.newton import inverse_of, minimise
 from rov_ident.sampling.kinematic_filter import SUREST
@@ -208,6 +209,26 @@ def one_pass(
     return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
 
 
+def by_stretch(
+    samples: Samples,
+    model: Model,
+    estimated: NDArray[np.int64],
+    noise: Noise,
+    free: NDArray[np.bool_],
+    gate: float,
+    effects: Array,
+) -> tuple[Array, Array] | None:
+    """The scores (C, n) and informations (C, n, n) of the stretches of a record
+    (:mod:`rov_ident.offline.constancy`); None of a shorter one."""
+    if samples["dt"].sum() < constancy.STRETCHES * constancy.SHORTEST:
+        return None
+    found = [
+        one_pass(part, model, estimated, noise, free, gate, effects)
+        for part in np.array_split(samples, constancy.STRETCHES)
+    ]
+    return np.array([p.score for p in found]), np.array([p.information for p in found])
+
+
 class Innovations(NamedTuple):
     """Innovations e (k, 6) and their variances s (k, 6), NaN where nothing was measured, and the
     filtered velocity nu (k, 6)."""
@@ -337,6 +358,8 @@ class Likelihood:
     standard deviation (`config.prior.axis_std_of`); (n, 0) where none is supposed.
     ``reading_noise`` (6,) is the variance density [N2 s, (N m)2 s] of noise of the wrench's
     reading, on axes that would teach that; zero on others.
+    ``slope`` (2, n): the largest slope of each parameter within a record, in normal deviates, and
+    by how much it changes in that record.
     ``held`` (n,): what kept its prior, as it would be learnt from such axes: their coefficients,
     and factors of the thrust there. Other parameters of thrusters are learnt from the other axes
     (a lag would smooth the noise away).
@@ -350,6 +373,7 @@ class Likelihood:
     total: Pass
     lasting: Array
     by_axis: Array
+    slope: Array
     held: NDArray[np.bool_]
     reading_noise: Array
     iterations: int
@@ -450,9 +474,12 @@ def maximise(
     by_axis[~held] = inverse @ errors[~held]
     bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
     reading_noise = np.where(noisy, readings / samples, 0.0)
+    records = each(by_stretch, model_at(theta), estimated, noise, free, gate, theta[~own])
+    found = [constancy.slopes(one[0], one[1], curvature) for one in records if one is not None]
+    slope = constancy.worst(found, n) * ~held  # what keeps its prior suits no stretch
     return Likelihood(
-        theta, asked, covariance, bound, noise, at, lasting, by_axis, held, reading_noise, steps,
-        converged,
+        theta, asked, covariance, bound, noise, at, lasting, by_axis, slope, held,
+        reading_noise, steps, converged,
     )  # fmt: skip
 
 

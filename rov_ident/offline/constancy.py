@@ -1,0 +1,65 @@
+"""Whether a parameter that is taken for constant stays so throughout each record.
+
+A buoyancy that leaks away, a battery that runs down or a current that turns leaves nothing that
+lasts a second, which is what whiteness is judged by, and moves what else is estimated. Each record
+is cut into stretches, whose scores say how well the parameters suit each of them. A slope of one
+parameter in time, beside which all others are refitted, is tested by Student's t (a score test):
+what is left scatters between stretches, and counts if it is more than their information lets
+expect, so that noise which lasts less than a stretch makes no slope. The degrees of freedom are
+those of the stretches that tell, one less (Bell and McCaffrey 2002, roughly).
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from rov_ident.core.linalg import scaled_solve
+from rov_ident.model.equations import Array
+
+STRETCHES = 12  # of each record
+SHORTEST = 5.0  # s; of a stretch: an error of the attitude or of a command lasts less
+UNLIKELY = 3.3  # normal deviates: beyond it is one of a thousand
+_FEWEST = 3.0  # stretches that tell as much as each other: with fewer nothing is judged
+
+
+def slopes(scores: Array, informations: Array, whole: Array) -> Array:
+    """The slope in time of each parameter of a record, as the normal deviate that is as unlikely by
+    chance, and the change that it makes throughout the record, (2, n); zeros where too few
+    stretches tell.
+
+    ``scores`` (C, n) and ``informations`` (C, n, n) of the stretches at the estimate, whose
+    information (n, n) from all records is ``whole``, prior included.
+    """
+    count, n = scores.shape
+    time = (np.arange(count) + 0.5) / count - 0.5
+    found = np.zeros((2, n))
+    for i in range(n):
+        # the slope is one more parameter, beside which all others are refitted (linearly)
+        columns = informations[:, :, i] * time[:, None]
+        beside = -scaled_solve(whole, columns.sum(axis=0), ridge=1e-12)
+        along = beside + time[:, None] * np.eye(n)[i]  # (C, n): what a unit of slope changes
+        weight = np.einsum("ca,cab,cb->c", along, informations, along)
+        known = float(weight.sum())
+        telling = known**2 / max(float(np.sum(weight**2)), 1e-300)
+        if telling < _FEWEST:
+            continue
+        slope = float(time @ scores[:, i]) / known
+        left = scores - slope * np.einsum("cab,cb->ca", informations, along)
+        own = np.sum(along * left, axis=1)
+        scatter = max(1.0, float(np.sum(own**2)) * count / (count - 2) / known)
+        found[:, i] = _normal(slope * np.sqrt(known / scatter), telling - 1.0), slope
+    return found
+
+
+def _normal(t: float, freedom: float) -> float:
+    """The normal deviate that is as unlikely as Student's t (Wallace 1959)."""
+    factor = (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0)
+    return float(np.copysign(factor * np.sqrt(freedom * np.log1p(t**2 / freedom)), t))
+
+
+def worst(records: Iterable[Array], size: int) -> Array:
+    """Of the :func:`slopes` (2, n) of each record the least likely ones; ``size`` is n."""
+    found = np.zeros((2, size))
+    for of in records:
+        found = np.where(np.abs(of[0]) > np.abs(found[0]), of, found)
+    return found
