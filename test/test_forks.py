@@ -111,15 +111,25 @@ def test_an_interrupt_does_not_wait_for_the_other():
     assert time.monotonic() - begun < 10.0
 
 
+def test_where_nobody_waits_for_children():
+    """As some programs ask for: then they are gone at once."""
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        assert [x for x, _ in divided(_slowly, range(4))] == list(range(4))
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
 def test_it_ends_with_its_parent(tmp_path):
-    """Killed, a process leaves none that goes on with what was to be done."""
+    """Killed, a process leaves none that goes on with what was to be done, or waits to be heard."""
     code = (
         "import os, sys, time\n"
         "from rov_ident.core.forks import divided\n"
         "os.sched_getaffinity = lambda _: {0, 1}\n"
         "def work(x):\n"
-        "    open(f'{sys.argv[1]}/{x}', 'w').close()\n"
+        "    open(f'{sys.argv[1]}/{x} {os.getpid()}', 'w').close()\n"
         "    time.sleep(0.3)\n"
+        "    return bytes(1_000_000)\n"  # more than a pipe holds
         "divided(work, range(200))\n"
     )
     with subprocess.Popen([sys.executable, "-c", code, tmp_path]) as process:
@@ -127,7 +137,9 @@ def test_it_ends_with_its_parent(tmp_path):
             assert process.poll() is None
             time.sleep(0.05)
         process.kill()
-    time.sleep(0.5)  # what it had begun
-    left = len(list(tmp_path.iterdir()))
-    time.sleep(1.0)
-    assert len(list(tmp_path.iterdir())) == left < 200
+    (other,) = {int(p.name.split()[1]) for p in tmp_path.iterdir()} - {process.pid}
+    end = time.monotonic() + 20.0
+    while os.path.exists(f"/proc/{other}"):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert len(list(tmp_path.iterdir())) < 200

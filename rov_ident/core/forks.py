@@ -40,6 +40,7 @@ def divided(function: Callable[[T], R], of: Iterable[T], known: Sequence[object]
         with contextlib.suppress(OSError):  # too many processes: then there is no other
             child = os.fork()
         if child == 0:
+            os.close(answer)  # or nothing would break the pipe when the parent is gone
             _answer(function, things, tasks, out, known)  # never returns
         os.close(out)
         results |= _of_tasks(function, things, tasks)
@@ -51,9 +52,10 @@ def divided(function: Callable[[T], R], of: Iterable[T], known: Sequence[object]
         # what is missing the other process had taken when it was killed
         return [results[i] if i in results else function(x) for i, x in enumerate(things)]
     finally:
-        if child > 0:
-            os.kill(child, signal.SIGKILL)  # nothing, where it has ended
-            os.waitpid(child, 0)
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):  # SIGCHLD is ignored
+            if child > 0:
+                os.kill(child, signal.SIGKILL)  # nothing, where it has ended
+                os.waitpid(child, 0)
         os.close(tasks)
         os.close(answer)
         _divided = False
