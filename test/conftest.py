@@ -21,6 +21,7 @@ import pytest
 from bench import HEAVY
 from bench.simulators.live import children, compile_all, end_node, start_connected
 from rov_ident import config
+from rov_ident.core import forks
 from rov_ident.simulation import virtual_sensors as sensors
 
 # A computer that is busy with something else makes no test fail.
@@ -31,6 +32,11 @@ hypothesis.settings.register_profile(
     "quick", hypothesis.settings.get_profile("patient"), max_examples=20
 )
 hypothesis.settings.load_profile("patient")
+
+
+# Workers share the processors already, and what a fork does to a test's own lists is not seen:
+# programs that tests start do fork, and the tests of forks.
+forks._divided = True
 
 
 # ------------------------------------------------------------------ tiers

@@ -255,7 +255,7 @@ def test_a_second_process_changes_nothing(name, monkeypatch):
     there = bag(trial, trial.seed, [STRENGTH])
     found = []
     for alone in (False, True):
-        monkeypatch.setattr(forks, "_can_fork", lambda alone=alone: not alone)
+        monkeypatch.setattr(forks, "_divided", alone)
         found.append(explain([there.streams], there.case.config).findings)
     assert found[0] == found[1]
     assert found[0].effects or found[0].residual

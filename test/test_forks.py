@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 
+from rov_ident.core import forks
 from rov_ident.core.forks import divided
 
 
@@ -21,6 +22,7 @@ def _children():
 @pytest.fixture(autouse=True)
 def two_processors(monkeypatch):
     """Also where there is one; and nothing is left running, or open, afterwards."""
+    monkeypatch.setattr(forks, "_divided", False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     before = _children(), len(os.listdir("/proc/self/fd"))
     yield
