@@ -433,8 +433,9 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
         small = [n for n, gain in gains.items() if not is_practical(gain)]
         if len(small) < 2:
             break
-        model.final = rests[min(small, key=lambda n: gains[n].percent)]
-        rests = search.rests(model.final)
+        least = min(small, key=lambda n: gains[n].percent)
+        model.final = rests.pop(least)
+        rests = search.rests(model.final, list(rests))
         trials = {}
     trials = trials or search.trials(rests)
     found = [

@@ -81,12 +81,7 @@ class PatternSearch:
     def fits(self, now: Fitted) -> dict[str, Fitted]:
         """With each of the first patterns, by their names."""
         screened = self.screen(now)[:_TRIED]
-        fits: list[Fitted | None]
-        if any(section == UNKNOWN for section, _ in now.hypothesis.keys):
-            # a fit renews the columns of a pattern that the model has already: one at a time
-            fits = [self._fit(now, *s) for s in screened]
-        else:
-            fits = self._problem.map(lambda s: self._fit(now, *s), screened)
+        fits = self._problem.map(lambda s: self._fit(now, *s), screened)
         return {c.name: f for (c, _), f in zip(screened, fits, strict=True) if f is not None}
 
     def _fit(self, now: Fitted, candidate: Candidate, pattern: Pattern) -> Fitted | None:

@@ -7,6 +7,7 @@ not linear in a parameter (an onset, a place of attachment, a frequency) is scan
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class Screening:
             for e in EFFECTS.values()
             if e.of_thrusters is not None and thrusters is not None
         }
-        self._known: dict[object, list[Candidate]] = {}
+        self._known: dict[object, list[Candidate]] = problem.memory()
 
     def candidates(self, now: Fitted) -> list[Candidate]:
         """The best first; remembered for each structure."""
@@ -104,13 +105,17 @@ class Screening:
                 start = first_values(dict(zip(keys, change.tolist(), strict=True)))
                 candidates.append(Candidate(name, start, score, white))
         others = [e for e in EFFECTS.values() if not h.has(e.name)]
-        scanned = self._problem.map(lambda effect: self._scanned(now, effect), others)
-        candidates += [c for found in scanned for c in found]
+        tasks = [partial(self._scanned, now, effect) for effect in others]
         placed = [e for e in EFFECTS.values() if any(p.role == "place" for p in e.parameters)]
         own = [(e, unit) for e in placed for unit in self.own_units(e, h)]
-        each = self._problem.map(lambda of: self._best_shape(now, of[0], [{}], of[1]), own)
-        candidates += [c for c in each if c is not None]
+        tasks += [partial(self._of_record, now, *of) for of in own]
+        candidates += [c for found in self._problem.map(lambda t: t(), tasks) for c in found]
         return sorted(candidates, key=lambda c: (-c.score, -c.white_score))
+
+    def _of_record(self, now: Fitted, effect: Effect, unit: tuple[Key, ...]) -> list[Candidate]:
+        """An effect that one of several records has at a place of its own."""
+        found = self._best_shape(now, effect, [{}], unit)
+        return [] if found is None else [found]
 
     def units(self, effect: Effect, h: Hypothesis) -> list[tuple[Key, ...]]:
         """Parameters of an effect that h lacks, on axes that show them, in the groups in which they

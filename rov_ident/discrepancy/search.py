@@ -11,6 +11,7 @@ import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -48,6 +49,7 @@ from rov_ident.model.thruster_allocation import is_known, matrix
 from rov_ident.sampling.raw_streams import Streams
 
 Progress = Callable[[str], None]
+Task = Callable[[], Fitted | None]
 
 LIKELIEST = (*HULL_DAMPING, *with_trait("likely"))
 INTERPLAY_NAME = f"{UNKNOWN} {INTERPLAY}"  # it makes a name unsure, and is none itself
@@ -117,7 +119,7 @@ class Search:
         thrusters = matrix(config.thrusters) if is_known(config.thrusters) else None
         self.screening = Screening(self.problem, self._records, thrusters)
         self.patterns = PatternSearch(self.problem)
-        self._ends: dict[object, Hypothesis] = {}  # of the last fit of a structure
+        self._ends: dict[object, Hypothesis] = self.problem.memory()  # of fits, by structure
         self.cut_short = False  # whether something was left untried
 
     def _budget_spent(self) -> bool:
@@ -159,7 +161,7 @@ class Search:
         candidates = self.candidates(now)
         if progress is not None:
             progress(", ".join(f"{c.name} {c.score:.0f}" for c in candidates[:5]))
-        fits = self.fit_best(now, candidates) + self._with_late_thrust(now) + self._apart(now)
+        fits = self.fit_best(now, candidates, [*self._late_thrust(now), *self._apart(now)])
         best = self._best(now, fits)
         if best is None or added_effect(now, best) not in HULL_DAMPING:
             both = self._best(now, self._damping_and_late_thrust(now, candidates))
@@ -210,23 +212,23 @@ class Search:
         """Full fits of hull damping and late thrust at once, where neither shows without the other:
         what shows by itself in a model that lacks both may only imitate the two, as a limit of the
         thrust, or products of velocities, on the measured record of docs/tank.md."""
-        fits: list[Fitted] = []
         if set(LATE_THRUST) <= set(now.hypothesis.effects):
-            return fits
-        for candidate in candidates:
-            if candidate.name not in HULL_DAMPING:
-                continue
-            units = self.screening.units(EFFECTS[candidate.name], now.hypothesis)
-            zeros = dict.fromkeys((k for u in units for k in u), 0.0)
-            begin = now.hypothesis.having({**zeros, **candidate.start})
-            damped = refit(begin, now.linearisation)
-            for fitted in self._with_late_thrust(damped) if damped else []:
-                pruned = self._pruned(fitted, now)
-                if pruned and set(zeros) & set(pruned.hypothesis.keys):
-                    fits.append(pruned)
-        return fits
+            return []
+        damping = [c for c in candidates if c.name in HULL_DAMPING]
+        fits = self.problem.map(lambda c: self._with_damping(now, c), damping)
+        return [f for of in fits for f in of]
 
-    def _with_late_thrust(self, now: Fitted) -> list[Fitted]:
+    def _with_damping(self, now: Fitted, candidate: Candidate) -> list[Fitted]:
+        """Full fits with hull damping, and late thrust."""
+        units = self.screening.units(EFFECTS[candidate.name], now.hypothesis)
+        zeros = dict.fromkeys((k for u in units for k in u), 0.0)
+        begin = now.hypothesis.having({**zeros, **candidate.start})
+        damped = refit(begin, now.linearisation)
+        late = [late() for late in self._late_thrust(damped)] if damped else []
+        pruned = [self._pruned(fitted, now) for fitted in late]
+        return [f for f in pruned if f is not None and set(zeros) & set(f.hypothesis.keys)]
+
+    def _late_thrust(self, now: Fitted) -> list[Task]:
         """Full fits of late thrust, begun well away from none: a model that lacks it has taken so
         much added mass in its stead that its linearisation does not show it."""
         lacking = [n for n in LATE_THRUST if n not in now.hypothesis.effects]
@@ -235,14 +237,11 @@ class Search:
             for name in lacking
             for p in EFFECTS[name].parameters
         ]
-        fits = self.problem.map(
-            lambda s: refit(now.hypothesis.having(s), now.linearisation), starts
-        )
-        return [f for f in fits if f is not None]
+        return [partial(refit, now.hypothesis.having(s), now.linearisation) for s in starts]
 
-    def _apart(self, now: Fitted) -> list[Fitted]:
+    def _apart(self, now: Fitted) -> list[Task]:
         """Full fits in which each record has values of its own of one effect of a dive."""
-        fits = []
+        fits: list[Task] = []
         for name in self.named(now):
             keys, effect = self.keys_of(now, name), EFFECTS.get(name)
             if effect is None or any(role_of(k) == "onset" for k in keys):
@@ -254,24 +253,29 @@ class Search:
                 of_record(k, r) for k, r in each if role_of(k) == "amplitude"
             ):
                 values = [{k: now.hypothesis.values[k] for k in keys}] * self._records
-                fits.append(with_own(now, keys, values))
-        return [f for f in fits if f is not None]
+                fits.append(partial(with_own, now, keys, values))
+        return fits
 
-    def fit_best(self, now: Fitted, candidates: Sequence[Candidate]) -> list[Fitted]:
+    def fit_best(
+        self, now: Fitted, candidates: Sequence[Candidate], others: Sequence[Task] = ()
+    ) -> list[Fitted]:
         """Full fits of the best candidates, and of what is lacking most often, whatever its score:
-        a model that lacks it can be too far off for its linearisation to show it."""
+        a model that lacks it can be too far off for its linearisation to show it; and ``others``,
+        divided between two processes with these."""
         least = max(_LEAST_SHARE * candidates[0].score, 0.0) if candidates else 0.0
         chosen = [c for c in candidates[:_FITTED] if c.score >= least]
         white = sorted((c for c in candidates if c.white_score > 0.0), key=lambda c: -c.white_score)
         chosen += [c for c in white[:_FITTED_WHITE] if c not in chosen]
         chosen += [c for c in candidates if c.name in LIKELIEST and c not in chosen]
-        found = self.problem.map(lambda c: self._fit_candidate(now, c), chosen)
+        tasks = [partial(self._fit_candidate, now, c) for c in chosen] + [*others]
+        found = self.problem.map(lambda task: task(), tasks)
         if chosen and _is_far_from(now, found[0], chosen[0]):
             both = filter(None, (found[0], self._fit_candidate(now, chosen[0], from_file=True)))
             found[0] = min(both, key=lambda f: f.squares, default=None)
-        fits = [f for f in found if f is not None]
-        self._ends |= {f.hypothesis.structure: f.hypothesis for f in fits}
-        return fits
+        for f in found[: len(chosen)]:
+            if f is not None:
+                self._ends[f.hypothesis.structure] = f.hypothesis
+        return [f for f in found if f is not None]
 
     def _fit_candidate(
         self, now: Fitted, candidate: Candidate, from_file: bool = False
@@ -318,34 +322,36 @@ class Search:
         """Every effect against its rivals, the others in place, until nothing changes."""
         trials: Trials = {}
         for last in (False,) * _ROUNDS + (True,):
-            trials, better = {}, None
             # patterns first: one is replaced more often than a name, and then all are tried again
-            for name in sorted(self.named(final), key=lambda n: not n.startswith(UNKNOWN)):
-                rest = self.rest(final, name)
-                if rest is None:
-                    continue
-                trials[name] = self._trial(rest, name)
-                better = self._better(final, name, trials[name])
+            names = sorted(self.named(final), key=lambda n: not n.startswith(UNKNOWN))
+            rests = list(self.rests(final, names).items())
+            trials, gone, better = {}, "", None
+            for i in range(0, len(rests), 2):  # one for each of two processes
+                trials |= self.trials(dict(rests[i : i + 2]))
+                each = ((n, self._better(final, n, trials[n])) for n, _ in rests[i : i + 2])
+                gone, better = next((x for x in each if x[1] is not None), ("", None))
                 if better is not None and (last or self._budget_spent()):
                     better = None  # it would go on for ever, or cannot be tried: nothing changes
-                elif better is not None:
-                    if progress is not None:
-                        progress(f"{name} gives way")
+                if better is not None:
                     break
             if better is None:
                 break
+            if progress is not None:
+                progress(f"{gone} gives way")
             final = refit(better.hypothesis, better.linearisation, update_noise=True) or better
             final = (None if self._budget_spent() else self.extended(final)) or final
         return final, trials
 
-    def rests(self, final: Fitted) -> dict[str, Fitted]:
-        """The fits without each of the named effects."""
-        names = [n for n in self.named(final) if not n.startswith(UNKNOWN)]
+    def rests(self, final: Fitted, names: Sequence[str]) -> dict[str, Fitted]:
+        """The fits without each of these effects."""
         rests = self.problem.map(lambda n: self.rest(final, n), names)
         return {n: rest for n, rest in zip(names, rests, strict=True) if rest is not None}
 
     def trials(self, rests: Mapping[str, Fitted]) -> Trials:
-        return {name: self._trial(rest, name) for name, rest in rests.items()}
+        """Of each of several effects, from the fits without it."""
+        found = self.problem.map(lambda of: self._trial(of[1], of[0]), rests.items())
+        self.cut_short |= any(not trial.whole for trial in found)
+        return dict(zip(rests, found, strict=True))
 
     def _trial(self, rest: Fitted, name: str) -> Trial:
         whole = not self._budget_spent()

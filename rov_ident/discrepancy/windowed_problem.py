@@ -10,7 +10,7 @@ import copy
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,7 +169,8 @@ class WindowedProblem:
         self.nodes, self.window = at[in_window], window[in_window]
         self.measured = streams.nu[keep][in_window]
         self.times = t[in_window]
-        self.patterns: dict[Key, Array] = {}
+        self._memories: list[dict[Any, Any]] = []
+        self.patterns: dict[Key, Array] = self.memory()
         self._moves = 0  # of wrenches and simulations, through all windows
         self._driven = _Remembered(_REMEMBERED_THRUSTS)
         self._tilted: Array | None = None
@@ -216,21 +217,33 @@ class WindowedProblem:
         """Count simulations, or sensitivities to so many wrenches, of all windows."""
         self._moves += moves
 
+    def memory(self) -> dict[Any, Any]:
+        """A dict in which, after :meth:`map`, is what was noted in either process."""
+        self._memories.append({})
+        return self._memories[-1]
+
     def map(self, function: Callable[[T], R], of: Iterable[T]) -> list[R]:
-        """The function of each of several things, in their order, by two processes; with what the
-        other one has counted, and the patterns that it has adopted."""
+        """The function of each of several things, in their order, by two processes. Each begins
+        from what is counted and noted now, as if it were the first; all of that is added up."""
+        moves, noted = self._moves, [dict(m) for m in self._memories]
 
-        def noted(x: T) -> tuple[R, int, dict[Key, Array]]:
-            moves, patterns = self._moves, dict(self.patterns)
+        def begun(x: T) -> tuple[R, int, list[dict[Any, Any]]]:
+            self._moves = moves
+            for memory, before in zip(self._memories, noted, strict=True):
+                memory.clear()
+                memory.update(before)
             out = function(x)
-            adopted = {k: v for k, v in self.patterns.items() if patterns.get(k) is not v}
-            return out, self._moves - moves, adopted
+            pairs = zip(self._memories, noted, strict=True)
+            new = [{k: v for k, v in m.items() if b.get(k) is not v} for m, b in pairs]
+            return out, self._moves - moves, new
 
-        before = self._moves
-        found = forks.divided(noted, of, known=(self, self.streams))
-        self._moves = before + sum(moves for _, moves, _ in found)
-        for _, _, adopted in found:
-            self.patterns |= adopted
+        found = forks.divided(begun, of, known=(self, self.streams))
+        self._moves = moves + sum(more for _, more, _ in found)
+        for memory, before, *new in zip(self._memories, noted, *(new for _, _, new in found)):
+            memory.clear()
+            memory.update(before)
+            for entries in new:
+                memory.update(entries)
         return [out for out, _, _ in found]
 
     def thrust(self, effects: Values) -> Array:
