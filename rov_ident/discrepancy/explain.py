@@ -438,9 +438,9 @@ def _judge_effects(search: Search, judge: Judge, retuned: Fitted, model: _Model)
         rests = search.rests(model.final, list(rests))
         trials = {}
     trials = trials or search.trials(rests)
-    found = [
-        finding(search, judge, retuned, model.final, name, trial) for name, trial in trials.items()
-    ]
+    found = search.problem.map(
+        lambda of: finding(search, judge, retuned, model.final, *of), trials.items()
+    )
     slight = [f for f in found if not is_practical(f.gain)]
     model.minor = slight
     model.found = [f for f in found if f not in slight]
