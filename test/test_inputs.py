@@ -480,6 +480,8 @@ def test_a_velocity_log_has_no_rates(tmp_path, short_dive):
     rows = replaced(silent, ODOMETRY, lambda m: twist_and_pose("plain", m))
     found = estimate(write(tmp_path / "dvl.mcap", rows), with_twist("plain"))
     assert_same(found, estimate(tmp_path / "marked.mcap", config.load(HEAVY)))
+    write_messages(tmp_path / "silent.mcap", silent)
+    assert_same(found, estimate(tmp_path / "silent.mcap", config.load(HEAVY)))  # as odometry, too
     whole = [
         (a, r, m._replace(twist_variance=np.zeros(6)) if r == ODOMETRY else m)
         for a, r, m in short_dive

@@ -218,7 +218,11 @@ def test_rates_that_are_not_measured_do_not_turn_the_arm(heavy):
     ]
     streams = gather(constant, mounted)
     truth = dive.truth.nu[np.searchsorted(dive.truth.t - dive.truth.t[0], streams.t - 1e-7)]
-    assert np.sqrt(np.mean((streams.nu - truth)[:, :3] ** 2)) < 0.01
+    assert np.sqrt(np.mean((streams.nu - truth) ** 2, axis=0)).max() < 0.01
+    assert not streams.guided.any()
+    assert any("no angular rates" in note for note in streams.notes)
+    still = gather([m for m in constant if m[0] != IMU], mounted)  # nobody knows how it turns
+    assert list(still.guided) == [False] * 3 + [True] * 3
 
 
 @pytest.mark.parametrize("rate", [5.0, 10.0])

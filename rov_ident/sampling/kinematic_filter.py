@@ -238,8 +238,10 @@ class KinematicFilter:
     def _take_odometry(self, message: Odometry, imu: Imu | None) -> None:
         """The message without what the effects on the sensors have added."""
         into = self._into
-        linear, angular = message.linear, message.angular
-        if imu is not None and UNKNOWN <= max(message.twist_variance[3:].tolist()) < math.inf:
+        linear, angular, variance = message.linear, message.angular, message.twist_variance
+        if imu is not None and linear.any() and not angular.any():  # no vehicle moves so straight
+            variance = np.append(variance[:3], np.full(3, UNKNOWN))
+        if imu is not None and UNKNOWN <= max(variance[3:].tolist()) < math.inf:
             # not measured: the arm of a velocity sensor turns as the gyro says
             gyro = self._settings["imu_rotation"][0] @ imu.angular_velocity
             angular = gyro - self.state["gyro_bias"][0]
@@ -251,7 +253,7 @@ class KinematicFilter:
         into["orientation"][0] = orientation
         into["linear"][0] = linear
         into["angular"][0] = angular
-        into["variance"][0] = message.twist_variance
+        into["variance"][0] = variance
 
     def _take_imu(self, message: Imu) -> None:
         into = self._into

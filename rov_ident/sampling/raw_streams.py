@@ -42,6 +42,7 @@ _SPIKE = 10.0  # standard deviations of what velocities change by: no noise reac
 # of what the noise of the velocities makes of a step: half of what the trapezoidal rule leaves of
 # velocities without noise, a twelfth of their second differences; no fix agrees by chance that well
 _RECKONED = 0.04
+_RATES_OF_IMU = "odom: no angular rates; those of the IMU are taken"
 MAX_STEP = 0.05  # s; of a simulation's or a filter's steps, where odometry is slower
 PAUSE = 60.0  # s between two bags that are searched as one, and where a bag's clock is set back
 
@@ -168,7 +169,6 @@ def gather(messages: Iterable[tuple[str, Message]], config: Config) -> Streams:
         ),
         *_driven_by(taken[DRIVE], config),
         tuple(f"left out: {reason}" for reason in describe(counts)),
-        max_step=_max_step(config, nu),
     )
     return _as_configured(inspected(read), config)
 
@@ -225,14 +225,24 @@ def _as_configured(read: Streams, config: Config) -> Streams:
     imu = Reading(none, none, read.gyro @ body.T, read.specific_force @ body.T)
     imu = correct(imu, config.effects)
     out = corrected(read, config.effects)
-    nu = out.nu.copy()
+    nu, unmeasured, notes = out.nu.copy(), read.unmeasured.copy(), read.notes
     rates = nu[:, 3:]
-    if len(read.imu_t):  # where the odometry has none, the arm turns as the gyro says
+    if len(read.imu_t) > 1:  # where the odometry has none, the vehicle turns as the gyro says
         gyro = interpolated(read.imu_t, imu.gyro, read.t)
-        rates = np.where(read.unmeasured[3:], gyro, rates)
-    nu[:, :3] -= velocity_of_arm(rates, config.odometry.position)
-    nu = np.where(read.unmeasured, read.nu, nu)
-    return replace(out, nu=nu, gyro=imu.gyro @ body, specific_force=imu.specific_force @ body)
+        rates = np.where(unmeasured[3:], gyro, rates)
+        if unmeasured[3:].all():
+            nu[:, 3:], unmeasured[3:] = gyro, False
+            notes = (*notes, _RATES_OF_IMU)
+    nu[:, :3] -= np.where(unmeasured[:3], 0.0, velocity_of_arm(rates, config.odometry.position))
+    return replace(
+        out,
+        nu=nu,
+        unmeasured=unmeasured,
+        gyro=imu.gyro @ body,
+        specific_force=imu.specific_force @ body,
+        notes=notes,
+        max_step=_max_step(config, nu),
+    )
 
 
 def corrected(streams: Streams, effects: Values) -> Streams:
