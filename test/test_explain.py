@@ -217,7 +217,7 @@ def test_a_search_that_is_cut_short_says_so_and_is_sure_of_nothing(monkeypatch):
 
     data = prepare([there.streams], there.case.config, None)
     search, _, _ = _started(data, there.case.config)
-    first_step = search.problem.steps_moved
+    first_step = search.problem.work
     monkeypatch.setattr(discrepancy, "BUDGET", first_step)
     findings = explain([there.streams], there.case.config).findings
     assert [f.effect for f in findings.effects] == ["thruster_lag"]

@@ -806,11 +806,11 @@ def test_a_rival_begins_where_its_last_fit_has_ended(begun):
     candidates = [Candidate(k[0], v, 9.0, 9.0) for v in (current, lag) for k in list(v)[:1]]
     steps, squares = [], []
     for _ in range(2):
-        before = there.problem.steps_moved
+        before = there.problem.work
         squares.append(
             {tuple(f.hypothesis.keys): f.squares for f in there.fit_best(start, candidates)}
         )
-        steps.append(there.problem.steps_moved - before)
+        steps.append(there.problem.work - before)
     assert squares[0].keys() == squares[1].keys()
     for keys, value in squares[0].items():
         assert squares[1][keys] < value + 1e-4 * start.linear.count

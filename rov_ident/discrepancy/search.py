@@ -75,7 +75,7 @@ _ARM_STEPS = 4  # of Gauss-Newton in the height of the centre of buoyancy, which
 _SHORT = 1.0  # s; of windows from which a fit begins: as long as a small vehicle's response, ...
 _FEWEST_SHORT = 10  # ... and messages in them: more than a window needs at least
 _ZERO = 1e-300  # what may be zero is divided by it
-BUDGET = 450_000  # steps moved for each second of data (docs/explain.md, the card of an effect)
+BUDGET = 1_000_000  # of work, for each second of data (docs/explain.md, the card of an effect)
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ class Search:
         self.cut_short = False  # whether something was left untried
 
     def _budget_spent(self) -> bool:
-        """Whether nothing further is tried; ``cut_short`` from then on. Steps are counted, not
+        """Whether nothing further is tried; ``cut_short`` from then on. Work is counted, not
         timed: a bag gives the same findings however busy the computer is."""
-        self.cut_short = self.problem.steps_moved > BUDGET
+        self.cut_short = self.problem.work > BUDGET
         return self.cut_short
 
     def start(self) -> Fitted | None:
@@ -319,28 +319,32 @@ class Search:
         return None
 
     def try_rivals(self, final: Fitted, progress: Progress | None = None) -> tuple[Fitted, Trials]:
-        """Every effect against its rivals, the others in place, until nothing changes."""
-        trials: Trials = {}
-        for last in (False,) * _ROUNDS + (True,):
+        """Every effect against its rivals, the others in place, until nothing changes, or only what
+        was tried before would come again: costs are in units of what each model leaves, by which
+        each of two may seem the better."""
+        seen: set[object] = set()
+        while True:
+            last = len(seen) == _ROUNDS or final.hypothesis.structure in seen
+            seen.add(final.hypothesis.structure)
             # patterns first: one is replaced more often than a name, and then all are tried again
             names = sorted(self.named(final), key=lambda n: not n.startswith(UNKNOWN))
             rests = list(self.rests(final, names).items())
-            trials, gone, better = {}, "", None
-            for i in range(0, len(rests), 2):  # one for each of two processes
-                trials |= self.trials(dict(rests[i : i + 2]))
-                each = ((n, self._better(final, n, trials[n])) for n, _ in rests[i : i + 2])
-                gone, better = next((x for x in each if x[1] is not None), ("", None))
-                if better is not None and (last or self._budget_spent()):
-                    better = None  # it would go on for ever, or cannot be tried: nothing changes
-                if better is not None:
-                    break
-            if better is None:
-                break
+            trials: Trials = {}
+            better: dict[str, Fitted] = {}
+            while len(trials) < len(rests) and not better:
+                pair = dict(rests[len(trials) : len(trials) + 2])  # one for each of two processes
+                trials |= self.trials(pair)
+                if not (last or self._budget_spent()):
+                    each = ((name, self._better(final, name, trials[name])) for name in pair)
+                    better = {name: fitted for name, fitted in each if fitted is not None}
+            if not better:
+                return final, trials
+            name, final = next(iter(better.items()))
             if progress is not None:
-                progress(f"{gone} gives way")
-            final = refit(better.hypothesis, better.linearisation, update_noise=True) or better
-            final = (None if self._budget_spent() else self.extended(final)) or final
-        return final, trials
+                progress(f"{name} gives way")
+            final = refit(final.hypothesis, final.linearisation, update_noise=True) or final
+            if final.hypothesis.structure not in seen and not self._budget_spent():
+                final = self.extended(final) or final
 
     def rests(self, final: Fitted, names: Sequence[str]) -> dict[str, Fitted]:
         """The fits without each of these effects."""

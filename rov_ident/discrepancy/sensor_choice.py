@@ -243,7 +243,9 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
     )
     sums = data.agreement([v.sensors for v in variants])
     possible = (0, 2) if turned else (0, 1, 2)
-    order = sorted(possible, key=lambda i: float(np.log(sums[i].sum(axis=0)).sum()))
+    # in units of their noise: below one is nothing, as of rates that are the very gyro's
+    spread = [float(np.log(np.maximum(s.sum(axis=0), 1.0)).sum()) for s in sums]
+    order = sorted(possible, key=spread.__getitem__)
     best = order[0]
     left = [i for i in order if not surely_less(sums[best], sums[i])]
     if len(left) > 1:

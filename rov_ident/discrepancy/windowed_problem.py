@@ -194,13 +194,13 @@ class WindowedProblem:
         return self._measured_at(0.5 * (self.steps.t[1:] + self.steps.t[:-1]))
 
     @property
-    def steps_moved(self) -> float:
-        """Steps through which velocities were simulated, or moved by a wrench (each of
-        ``sensitivities``), for each second of data, so far; data count as if they came at
+    def work(self) -> float:
+        """Steps and measurements through which velocities were simulated, or moved by a wrench
+        (each of ``sensitivities``), for each second of data, so far; data count as if they came at
         _COUNTED_RATE at most, and for _COUNTED_SECONDS at least."""
         t, first, last = self.steps.t, self.first, self.last
-        steps, seconds = float(np.sum(last - first)), float(np.sum(t[last] - t[first]))
-        rate = min(steps / seconds, _COUNTED_RATE)
+        once, seconds = np.sum(last - first) + len(self.nodes), float(np.sum(t[last] - t[first]))
+        rate = min(float(once) / seconds, 2.0 * _COUNTED_RATE)
         return self._moves * rate * min(seconds / _COUNTED_SECONDS, 1.0)
 
     def precision(self, h: Hypothesis) -> Array:
