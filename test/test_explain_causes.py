@@ -291,7 +291,7 @@ def test_rates_of_a_gyro_with_another_scale_are_set_right(seed):
 def test_what_is_written_is_what_was_judged(seed):
     """The wrench's clock runs 0.2 % slow: no delay suits the whole dive. It was left out of a file
     that was judged with it: the error told was half of that with the file."""
-    case = draw(seed, conditions=dataclasses.replace(MINUTE, duration=120.0, excitation="pilot"))
+    case = draw(seed, conditions=Conditions(duration=120.0, excitation="pilot"))
     streams = streams_of(case)
     drifting = dataclasses.replace(streams, demand_t=0.998 * streams.demand_t)
     found = explain([drifting], case.config)
