@@ -281,7 +281,7 @@ def dives(remus, tmp_path_factory):
         drawn = {n: x * rng.uniform(1.0 - SPREAD, 1.0 + SPREAD) for n, x in published.items()}
         path = tmp_path_factory.mktemp("dive") / f"{seed}.mcap"
         truth = given.with_values(drawn)
-        write_messages(path, run_of(truth, seed, duration=60.0, **LEAN).messages)
+        write_messages(path, run_of(truth, seed, duration=40.0, **LEAN).messages)
         found.append((given, drawn, path))
     return found
 
