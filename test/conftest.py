@@ -43,7 +43,7 @@ forks._divided = True
 
 
 SLOW = Path(__file__).with_name("slow.txt")
-QUICK = 90.0  # s of processor for `make quick`: 45 s on two cores, and as much to start and collect
+QUICK = 90.0  # s of processor for `make quick`: 45 s on two cores; to start and collect takes 15 s
 
 
 def _function(nodeid):
@@ -140,6 +140,7 @@ def pytest_runtestloop():
     """What is loaded by now stays: to search it for garbage again and again takes 6 % of a run."""
     gc.collect()
     gc.freeze()
+    _seen[0] = _processor()  # to start, collect and compile is no test's
 
 
 # Workers begin far from each other: what one has just left, another should not take up.

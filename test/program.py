@@ -14,9 +14,18 @@ import warnings
 
 from bench import ROOT
 from rov_ident.cli import main
+from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.io.bag_reader import Bag
 from rov_ident.io.bag_writer import BagWriter
 from rov_ident.io.topics import USUAL, messages, select
+
+
+def few_manoeuvres(monkeypatch):
+    """A plan chooses among three of eleven manoeuvres, the swing of all axes among them: where a
+    test is not about the choice, in a third of the time."""
+    library = closed_loop_manoeuvres.library
+    monkeypatch.setattr(closed_loop_manoeuvres, "library", lambda limits: library(limits)[1::4])
+
 
 _QUIET = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 

@@ -28,6 +28,7 @@ from rov_ident.simulation.virtual_sensors import Suite
 HEAVY = ROOT / "config" / "bluerov2_heavy.yaml"
 DOWN = np.array([0.0, 0.0, 1.0])
 PROPELLED = {"X_nn": 0.02, "K_nn": -0.0008, "X_un": -0.01}
+LEAN = {"odometry_rate": 10.0, "imu_rate": 50.0}  # Hz, where that is enough
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +281,7 @@ def dives(remus, tmp_path_factory):
         drawn = {n: x * rng.uniform(1.0 - SPREAD, 1.0 + SPREAD) for n, x in published.items()}
         path = tmp_path_factory.mktemp("dive") / f"{seed}.mcap"
         truth = given.with_values(drawn)
-        write_messages(path, run_of(truth, seed, duration=60.0, imu_rate=50.0).messages)
+        write_messages(path, run_of(truth, seed, duration=40.0, **LEAN).messages)
         found.append((given, drawn, path))
     return found
 
@@ -313,7 +314,7 @@ def test_fins_that_follow_late_are_found_or_said(remus, tmp_path, seed):
         effects={"fin_lag": {"time_constant": lag}},
     )
     path = tmp_path / "dive.mcap"
-    write_messages(path, run_of(truth, seed, duration=100.0, imu_rate=50.0).messages)
+    write_messages(path, run_of(truth, seed, duration=70.0, **LEAN).messages)
     fit = ri.fit(path, remus, estimator="rls")
     i = fit.names.index("fin_lag.time_constant")
     assert abs(fit.values[i] - lag) < max(4.0 * fit.std[i], 0.1 * lag), (lag, fit.values[i])
@@ -338,18 +339,16 @@ def test_fins_that_follow_late_are_found_or_said(remus, tmp_path, seed):
 @pytest.mark.parametrize("estimator", ["rls", *more("ls", "ml")])
 def test_a_joint_that_counts_the_other_way_round_is_said(remus, tmp_path, estimator):
     """What follows from it is right in its own sense, and surely not what the file says."""
-    path, notes = tmp_path / "dive.mcap", []
-    for name in ("delta_r", "delta_s", ""):
-        plain = configuration.to_parameters(remus)
-        if name:
-            plain["inputs"][name]["scale"] = -plain["inputs"][name].get("scale", 1.0)
-        given = configuration.from_parameters(plain)
-        write_messages(path, run_of(remus, 4, duration=80.0, imu_rate=50.0).messages)
-        notes.append(" ".join(ri.fit(path, given, estimator=estimator).notes))
+    path, plain = tmp_path / "dive.mcap", configuration.to_parameters(remus)
+    write_messages(path, run_of(remus, 4, duration=60.0, **LEAN).messages)
+    for joint in ("delta_r", "delta_s"):
+        plain["inputs"][joint]["scale"] = -plain["inputs"][joint].get("scale", 1.0)
+    reversed_ = configuration.from_parameters(plain)
+    notes = [" ".join(ri.fit(path, c, estimator=estimator).notes) for c in (reversed_, remus)]
     words = "works the other way round than the configuration has it"
     assert f"delta_r {words} (the sign of Y_uudr, N_uudr has changed)" in notes[0]
-    assert f"delta_s {words} (the sign of Z_uuds, M_uuds has changed)" in notes[1]
-    assert words not in notes[2]
+    assert f"delta_s {words} (the sign of Z_uuds, M_uuds has changed)" in notes[0]
+    assert words not in notes[1]
 
 
 @pytest.mark.parametrize("seed", [4, *more(5, 6)])
@@ -358,7 +357,7 @@ def test_explain_says_so_too(remus, tmp_path, seed):
     joint = str(np.random.default_rng(seed).choice(["delta_r", "delta_s"]))
     plain["inputs"][joint]["scale"] = -plain["inputs"][joint].get("scale", 1.0)
     given, path = configuration.from_parameters(plain), tmp_path / "dive.mcap"
-    write_messages(path, run_of(remus, seed, duration=80.0, imu_rate=50.0).messages)
+    write_messages(path, run_of(remus, seed, duration=80.0, **LEAN).messages)
     (note,) = [n for n in ri.explain(path, given).findings.notes if "other way round" in n]
     assert note.startswith(f"{joint} works the other way round than the configuration has it")
 

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -49,6 +49,7 @@ from rov_ident.offline import delays
 from rov_ident.sampling.raw_streams import Streams, gather, inspected, orientation_at
 
 
+@lru_cache(maxsize=2)  # what several tests ask of one dive
 def streams_of(case, driving, seed, seconds=60.0, draw=None):
     dive = dive_of(case, driving, seed, seconds, draw)
     config = configuration.from_parameters(dive.parameters)
@@ -71,6 +72,11 @@ NOT_STABLE = sea.Vehicle(
     },
 )  # fmt: skip
 """Ahead, its Munk moment turns it further than the damping of yaw holds it back."""
+
+
+def lean(draw=lambda *_: {}, **sea):
+    """What a dive is drawn by: as ``draw`` does, with odometry at 10 Hz, which is enough."""
+    return lambda *of: {"odometry_rate": 10.0, **draw(*of), **sea}
 
 
 def dive_at_sea(folder, vehicle, seed, unknown, seconds=80.0):
@@ -118,7 +124,8 @@ def test_a_window_is_followed_until_it_runs_away(tmp_path):
 
 @pytest.mark.parametrize("seed", [2, *more(0, 1)])
 def test_what_a_vehicle_that_is_not_stable_lacks_is_found(tmp_path, seed):
-    streams, config = dive_at_sea(tmp_path, NOT_STABLE, seed, sea.Sea(cog=(0.0, 0.01, 0.0)))
+    unknown = sea.Sea(cog=(0.0, 0.01, 0.0), odometry_rate=10.0)
+    streams, config = dive_at_sea(tmp_path, NOT_STABLE, seed, unknown)
     (found,) = explain([streams], config).findings.effects
     assert found.effect == "cog_offset"
     assert abs(found.parameters["dy"].value - 0.01) < 3.0 * found.parameters["dy"].std
@@ -145,8 +152,7 @@ def test_an_attitude_that_wanders_is_no_fault_of_the_model(seed):
     """The moment of the error, integrated over a window, passed for damping and waves, and for a
     term without a name, and the error itself for a bias of the IMU; retuned, roll and pitch were
     predicted worse than by the file."""
-    wander = {"wander": 0.002}
-    _, streams, config = streams_of("wander", "pilot", seed, 80.0, lambda *_: wander)
+    _, streams, config = streams_of("wander", "pilot", seed, 80.0, lean(wander=0.002))
     findings = explain([streams], config).findings
     assert findings.effects == ()
     assert all(findings.retuned[c] < 1.2 * findings.baseline[c] for c in "pq")
@@ -158,6 +164,7 @@ def test_a_bias_is_known_as_well_as_the_attitude(seed):
 
     def draw(rng, vehicle):
         return {
+            "odometry_rate": 10.0,
             "wander": 0.002,
             "gyro_bias": tuple((0.003 * rng.standard_normal(3)).tolist()),
             "accelerometer_bias": tuple((0.05 * rng.standard_normal(3)).tolist()),
@@ -277,7 +284,7 @@ BIAS = 0.004  # rad/s
 
 def biased(driving, seed):
     """A dive without an IMU whose angular velocities have a bias, and a configuration."""
-    _, streams, config = streams_of("", driving, seed, 100.0, lambda *_: {})
+    _, streams, config = streams_of("", driving, seed, 100.0, lean())
     bias = BIAS * np.sign(np.random.default_rng(seed).standard_normal(3))
     empty, three = np.zeros(0), np.zeros((0, 3))
     streams = dataclasses.replace(streams, imu_t=empty, gyro=three, specific_force=three)
@@ -295,8 +302,8 @@ def test_what_a_bias_of_the_rates_explains_as_well_is_not_sure(seed, monkeypatch
         (finding,) = explain([streams], config).findings.effects
         return finding
 
-    assert found(0.0).effect == "asymmetric_damping" and found(0.0).separable
-    unsure = found(BIAS)
+    sure, unsure = found(0.0), found(BIAS)
+    assert sure.effect == "asymmetric_damping" and sure.separable
     assert not unsure.separable and "imu_bias" in [a.effect for a in unsure.alternatives]
 
 
@@ -326,20 +333,20 @@ def a_configuration():
 
 @pytest.mark.parametrize(("driving", "rate"), [("pilot", 0.02), *more(("six-axis", -0.003))])
 def test_a_heading_that_drifts_is_no_bias_of_the_gyro(driving, rate):
-    _, streams, config = streams_of("", driving, 0, 150.0, lambda *_: {"heading_drift": rate})
+    _, streams, config = streams_of("", driving, 0, 100.0, lean(heading_drift=rate))
     found = rates_and_attitude.agreed(streams, config)
     np.testing.assert_array_equal(found.streams.nu, streams.nu)
     back = quaternion_from_euler(0.0, 0.0, -rate * streams.t)
     true = quaternion_multiply(back, streams.orientation)
     between = quaternion_multiply(true * [1.0, -1.0, -1.0, -1.0], found.streams.orientation)
-    assert np.abs(between[:, 1:]).max() < 0.5 * 3e-4 * 150.0
+    assert np.abs(between[:, 1:]).max() < 0.5 * 3e-4 * 100.0
     assert not found.may_drift and "drifts" in found.streams.notes[-1]
 
 
 @pytest.mark.parametrize("bias", [0.01, *more(-0.003)])
 def test_a_bias_of_the_gyro_is_no_drift_of_the_heading(bias):
-    sea = {"gyro_bias": (0.0, 0.0, bias), "gyro_is_shared": True}
-    _, streams, config = streams_of("", "pilot", 3, 150.0, lambda *_: sea)
+    drawn = lean(gyro_bias=(0.0, 0.0, bias), gyro_is_shared=True)
+    _, streams, config = streams_of("", "pilot", 3, 100.0, drawn)
     found = rates_and_attitude.agreed(streams, config)
     np.testing.assert_array_equal(found.streams.orientation, streams.orientation)
     taken = np.mean(streams.nu[:, 5] - found.streams.nu[:, 5])
@@ -496,7 +503,7 @@ def test_what_is_found_beside_a_refuted_correction_is_not_sure():
     assert left.sensors.keys() == {"velocity_latency"} == left.unsure
 
 
-@pytest.mark.parametrize("seed", [0, 1, *more(*range(2, 8))])
+@pytest.mark.parametrize("seed", [0, *more(*range(1, 8))])
 def test_a_pause_of_one_sensor_is_no_bias_of_the_other(seed):
     """The attitude in a pause was interpolated, and what gravity is off by it passed for one."""
     _, streams, config = streams_of("clean", "six-axis", seed, 90.0)
@@ -527,10 +534,10 @@ def sensors_of(streams, config):
     return sensor_consistency.search(streams, config, split(streams.duration)[0])
 
 
-@pytest.mark.parametrize("driving", ["pilot", "six-axis"])
+@pytest.mark.parametrize("driving", ["pilot", *more("six-axis")])
 @pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
 def test_clocks_that_are_off_make_nothing_sure(driving, seed):
-    _, streams, config = streams_of("clean", driving, seed, 120.0)
+    _, streams, config = streams_of("clean", driving, seed, 80.0)
     assert clock_errors.of([streams], config) == clock_errors.ClockErrors(0.0, 0.0)
     gain = Gain("u", 1.0, 0.5, 50.0, 40.0, 60.0)
     drag, lag, turned = (
@@ -568,11 +575,11 @@ def test_clocks_that_are_off_make_nothing_sure(driving, seed):
     assert lively < 0.06 and limit > 0.2
 
 
-@pytest.mark.parametrize("driving", ["pilot", "six-axis"])
+@pytest.mark.parametrize("driving", ["pilot", *more("six-axis")])
 @pytest.mark.parametrize("seed", [0, *more(1, 2, 3)])
 def test_commands_that_were_not_recorded(driving, seed):
     """A controller at 50 Hz, of whose commands one in five is published: what is held is late."""
-    _, streams, config = streams_of("clean", driving, seed, 120.0)
+    _, streams, config = streams_of("clean", driving, seed, 80.0)
     (test,) = delays.tests_of(streams, config, late=True)
     assert test.passed
     tenth = slice(int(np.random.default_rng(seed).integers(5)), None, 5)
@@ -662,7 +669,7 @@ def test_late_velocities_show_in_a_few_reversals(driving):
 )
 def test_commands_that_tremble_are_no_noise_of_the_reading(case, driving, noisy):
     """An autopilot passes on the noise of its gyro. Neglecting it would hide a trim."""
-    _, streams, config = streams_of(case, driving, 0, 150.0, CASES[case][0])
+    _, streams, config = streams_of(case, driving, 0, 100.0, lean(CASES[case][0]))
     streams = rates_and_attitude.agreed(streams, config).streams
     there = Search(streams, config, split(streams.duration)[0])
     assert there.problem.reading_std[3:5].all()
@@ -754,7 +761,7 @@ def test_a_level_accelerometer_reads_a_bias_as_an_attitude_reads_a_tilt(sea, sur
 
 
 @pytest.mark.parametrize("seed", [1, *more(2, 3, 4)])
-@pytest.mark.parametrize("size", [0.008, 0.02])
+@pytest.mark.parametrize("size", [*more(0.008), 0.02])
 def test_a_pose_that_is_tilted_is_no_velocity_sensor_that_is_turned(size, seed):
     rng = np.random.default_rng(seed)
     tilt = size * rng.choice([-1.0, 1.0], 2) * rng.uniform(0.7, 1.0, 2)
@@ -847,7 +854,7 @@ def test_thrust_of_other_axes_is_a_rival_of_drag_and_of_thrust(begun, monkeypatc
 )
 def test_thrust_that_falls_short_of_large_commands_does_not_fall_with_speed(driving, seed):
     """Another bend than that of the library's effect: fast is where thrust is large."""
-    _, streams, config = streams_of("clean", driving, seed, 100.0)
+    _, streams, config = streams_of("clean", driving, seed, 100.0, lean())
     given = np.linspace(0.0, 6.0, 60_001)  # of 60 N and 12 N m
     gets = given * (1.0 - 0.3 * np.minimum(given, 1.2))
     largest = np.repeat([60.0, 12.0], 3)
@@ -922,7 +929,7 @@ def test_where_nothing_thrusts_no_thrust_depends_on_another():
 @pytest.mark.parametrize("seed", [5, *more(0, 1, 2, 3, 4)])
 def test_a_turned_velocity_sensor_in_a_current_is_no_heading_for_sure(seed):
     """Dynamics that know no current preferred a heading, which a current that is missing turns."""
-    _, streams, config = streams_of("current", "pilot", seed, 120.0)
+    _, streams, config = streams_of("current", "pilot", seed, 90.0)
     rng, (fitted, held) = np.random.default_rng(seed), split(streams.duration)
     angles = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.03, 0.08, 3)
     r = quaternion_to_matrix(quaternion_from_euler(*angles))
@@ -963,7 +970,7 @@ def held_by_an_autopilot(mass, seed, delay=0.0, seconds=150.0):
     return Streams(t, motion[:, :3], level, nu, imu_t, gyro, np.array(forces), t, demand, *none)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, *more(3, 4, 5)])
+@pytest.mark.parametrize("seed", [0, *more(*range(1, 6))])
 def test_an_autopilot_that_answers_noise_does_not_make_velocities_late(heavy, seed):
     """Accelerations and thrust afterwards know of the noise: it had made 30 ms into 37 +- 5."""
     for delay in (0.0, 0.03, 0.1):
@@ -1001,7 +1008,7 @@ def cruising(seed, delay=0.0, seconds=120.0):
     return Streams(t, place, attitude, nu, imu_t, gyro, force, t, demand, *none)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, *more(3, 4, 5, 6, 7)])
+@pytest.mark.parametrize("seed", [0, *more(*range(1, 8))])
 def test_noise_of_an_accelerometer_does_not_make_velocities_late(heavy, seed):
     """A velocity that is dead-reckoned has the noise of the acceleration before it: another
     simulator's vehicle seemed 51 ms late, surely."""

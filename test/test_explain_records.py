@@ -240,8 +240,7 @@ LADEN = {
     ("name", "seed"),
     [
         ("payload", 51),
-        ("thruster_gain", 51),
-        *more(*((n, s) for n in LADEN for s in range(52, 56))),
+        *more(("thruster_gain", 51), *((n, s) for n in LADEN for s in range(52, 56))),
     ],
 )
 def test_what_one_dive_of_three_has_is_found_in_that_dive(name, seed):
@@ -265,7 +264,7 @@ def test_what_one_dive_of_three_has_is_found_in_that_dive(name, seed):
     assert any(f"has {name} of its own" in note for note in found.findings.notes)
 
 
-@pytest.mark.parametrize("seed", [71, *more(72, 73, 74, 75)])
+@pytest.mark.parametrize("seed", more(71, 72, 73, 74, 75))  # ten seconds each
 def test_records_that_differ_in_what_no_effect_describes_are_said_to(seed):
     """A skid that one dive carries: retuned, a single model is wrong in each of them."""
     rng = np.random.default_rng(seed)
@@ -319,7 +318,7 @@ def test_waves_have_a_phase_of_their_own_in_each_dive(seed):
     rng = np.random.default_rng(seed)
     wave = {"fx": 4.0, "fy": -3.0, "frequency": float(rng.uniform(0.1, 0.3))}
     phases = (rng.uniform(0.0, 1.0) + np.array([0.0, 2.1, 4.2])) % 6.2
-    bags = [record(seed + i, 60.0, wave={**wave, "phase": p}) for i, p in enumerate(phases)]
+    bags = [record(seed + i, wave={**wave, "phase": p}) for i, p in enumerate(phases)]
     found = explain(bags, TODAY)
     (told,) = found.findings.effects
     assert told.effect == "wave" and not told.repetition.same
@@ -343,7 +342,7 @@ def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
     assert "The records differ" in found.sentence
 
 
-@pytest.mark.parametrize("seed", [31, *more(5)])
+@pytest.mark.parametrize("seed", more(31, 5))  # see test_what_each_record_has_of_its_own_is_told
 def test_what_the_records_share_is_not_pulled_along_by_what_each_has_of_its_own(seed):
     """Currents of three dives, and drag that the file has wrong: what is written simulates a dive
     in still water as the truth does, and what is told of the dives is with the current of each."""

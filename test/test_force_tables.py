@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from tiers import more
 
 from bench import DATA, ROOT
 from rov_ident import config
@@ -69,7 +70,7 @@ def drawn(rng, axis, nu, fins, noise):
     return values, force + 0.2 * noise * np.std(force) * rng.standard_normal(len(nu))
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.03])
+@pytest.mark.parametrize("noise", [*more(0.01), 0.03])
 def test_drawn_structures_are_found_again(noise):
     rng = np.random.default_rng(5)
     nu, fins = design()

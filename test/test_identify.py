@@ -8,7 +8,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from program import run
+from program import few_manoeuvres, run
 
 import rov_ident as ri
 from bench import ROOT
@@ -30,6 +30,7 @@ VEHICLE, WRONG = (ROOT / "config" / f"bluerov2_heavy{name}.yaml" for name in (""
 def _short(monkeypatch):
     """The next manoeuvre that is planned lasts 10 s, not a minute: a sixth of the search."""
     monkeypatch.setattr(identification, "plan", partial(ri.plan, duration=10.0))
+    few_manoeuvres(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, chromium
+from program import few_manoeuvres
 from rich.console import Console
 
 import rov_ident as ri
@@ -102,8 +103,9 @@ def test_results_as_json(tmp_path, capsys):
     assert compared["velocities"]["u"]["r2"] > 0.99
 
 
-def test_pages_of_check_and_plan(tmp_path, capsys):
+def test_pages_of_check_and_plan(tmp_path, capsys, monkeypatch):
     """Whole, self-contained, and with every axis in it."""
+    few_manoeuvres(monkeypatch)
     bag = tmp_path / "dive.mcap"
     simulate = ["simulate", "--config", str(HEAVY), "--manoeuvre", "steps", "--duration", "20"]
     assert main([*simulate, "--out", str(bag)]) == 0

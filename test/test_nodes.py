@@ -508,7 +508,11 @@ def test_interrupt_while_compiling(domain, heavy_path, nothing_compiled):
 
 @pytest.mark.parametrize(
     "delay, number",
-    [(0.0, signal.SIGKILL), (0.002, signal.SIGINT), (0.004, signal.SIGKILL), (0.5, signal.SIGINT)],
+    [
+        (0.002, signal.SIGKILL),
+        (0.5, signal.SIGINT),
+        *more((0.0, signal.SIGKILL), (0.002, signal.SIGINT), (0.004, signal.SIGKILL)),
+    ],
 )
 def test_nothing_compiles_for_a_node_that_is_gone(
     domain, heavy_path, nothing_compiled, delay, number

@@ -132,9 +132,8 @@ def _dive(
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
-        ("rls", 0),
         ("ukf", 1),
-        *more(("ukf", 0), ("rls", 1)),
+        *more(("rls", 0), ("ukf", 0), ("rls", 1)),
         *more(*itertools.product(("rls", "ukf"), range(2, 12))),
     ],
 )
@@ -193,7 +192,7 @@ def test_the_thrust_is_learnt_from_clean_readings(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("rls", 0), ("ukf", 0), *more(*itertools.product(("rls", "ukf"), (1, 2)))]
+    ("kind", "seed"), [("rls", 0), *more(("ukf", 0), *itertools.product(("rls", "ukf"), (1, 2)))]
 )
 def test_what_is_driven_is_learnt_beside_the_noise(kind: Kind, seed: int) -> None:
     """Taught by the noise, most were off by 20 to 50 %. What is off by more than chance (roll and

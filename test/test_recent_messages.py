@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tiers import more
 
 from bench.studies.at_sea import dive_of
 from rov_ident import config as configuration
@@ -28,7 +29,7 @@ def information(estimator):
     return estimator.prior.std**2 / variance
 
 
-@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("kind", [*more("rls"), "ukf"])
 def test_what_older_messages_told_stays(kind, dived, monkeypatch):
     """Of a minute only the last 20 s are kept, which alone tell less."""
     config, messages = dived
@@ -45,7 +46,7 @@ def test_what_older_messages_told_stays(kind, dived, monkeypatch):
     assert np.median(information(late) / known) < 0.7
 
 
-@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("kind", ["rls", *more("ukf")])
 def test_what_an_earlier_record_told_stays(kind, dived):
     config, messages = dived
     estimator = OnlineEstimator(config, kind)
@@ -70,7 +71,7 @@ def test_counts_and_commands_go_on_with_another_record(dived):
     assert estimator.counts == first + first and len(estimator.sampler.commands) == 2 * commands
 
 
-@pytest.mark.parametrize("kind", ["rls", "ukf"])
+@pytest.mark.parametrize("kind", ["rls", *more("ukf")])
 def test_what_was_told_before_a_pause_stays(kind, dived):
     config, messages = dived
     estimator = OnlineEstimator(config, kind)

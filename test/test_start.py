@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 from test_bags import write_mcap
+from tiers import more
 
 import rov_ident as ri
 from bench import DATA, DEMO, ROOT
@@ -286,7 +287,7 @@ def test_check_compares_the_mounting_with_the_tree(mounted, heavy):
     assert not [r.text for r in found.remarks if r.level != "good" and "imu" in r.text.lower()]
 
 
-@pytest.mark.parametrize("estimator", ["rls", "ml"])
+@pytest.mark.parametrize("estimator", ["rls", *more("ml")])
 def test_a_fit_takes_the_mounting_from_the_tree(mounted, heavy, tmp_path, estimator):
     """As if the configuration had it; what it saves has it."""
     bag, known = mounted
@@ -317,7 +318,9 @@ def test_a_borrowed_mass_is_not_trusted(tmp_path, capsys):
         parameters["vehicle"][name] *= heavier
     parameters["vehicle"]["inertia"] = [heavier * x for x in parameters["vehicle"]["inertia"]]
     world = from_parameters(parameters)
-    ri.simulate(world, manoeuvre="steps", duration=60.0, seed=3).save(tmp_path / "dive.mcap")
+    lean = sensors.Suite(odometry_rate=10.0, imu_rate=50.0)
+    run = ri.simulate(world, manoeuvre="steps", duration=60.0, seed=3, sensors=lean)
+    run.save(tmp_path / "dive.mcap")
     fit = ri.fit(tmp_path / "dive.mcap", out, "rls")
     for name, true in world.model.values.items():
         i = fit.names.index(name)

@@ -11,9 +11,8 @@ from bench.studies import torture
     [
         "IMU gone",
         "hour back",
-        "0.3 s",
         "demands lost",
-        *more("velocity frozen", "wrench 300 ms late"),
+        *more("0.3 s", "velocity frozen", "wrench 300 ms late"),
     ],
 )
 def test_faults_in_time(what):

@@ -334,7 +334,7 @@ def definite(p):
 
 @pytest.mark.parametrize(
     ("learnt", "alpha"),
-    [(False, 1e-3), (True, 0.1), (True, 1.0), *more((False, 0.1), (False, 1.0), (True, 1e-3))],
+    [(False, 1e-3), (True, 1.0), *more((False, 0.1), (False, 1.0), (True, 1e-3), (True, 0.1))],
 )
 def test_an_hour_without_excitation(heavy, noisy, alpha, learnt):
     config = with_section(wrong_prior(heavy), "ukf", alpha=alpha)

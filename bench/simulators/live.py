@@ -15,7 +15,12 @@ import numpy as np
 from bench import HEAVY, ROOT
 
 _OFFLINE = """
-import sys, rov_ident as ri
+import sys, numpy as np, rov_ident as ri
+from rov_ident.core import jit  # sets the folder in which numba keeps what follows
+from bench.simulators import hidden, sea
+hidden.draw(1, ("thruster_lag",), conditions=hidden.Conditions(duration=30.0))
+rng = np.random.default_rng(1)
+sea.dive(sea.draw_vehicle(rng), sea.Sea(), "six-axis", 2.0, rng)
 for kind in ("ls", "iv", "ml"):
     ri.fit(sys.argv[1], sys.argv[2], kind)
 ri.explain(sys.argv[1], sys.argv[2])
@@ -23,7 +28,8 @@ ri.explain(sys.argv[1], sys.argv[2])
 
 
 def compile_all(offline=False):
-    """All that a node runs, once for all who ask for it; ``offline``: what fits and explain run.
+    """All that a node runs, once for all who ask for it; ``offline``: what fits, explain and the
+    simulators run.
 
     Two processes at a time, in an order in which neither compiles what the other is at: offline
     jobs need the kernels of the sampler, which RLS compiles first, and those of the monitor.
