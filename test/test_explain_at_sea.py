@@ -907,7 +907,7 @@ def test_an_imu_elsewhere_is_no_velocity_sensor_elsewhere(seed):
     turn = np.gradient(streams.gyro, streams.imu_t, axis=0)
     moved = streams.specific_force + acceleration_of_arm(streams.gyro, turn, arm)
     imu = dataclasses.replace(streams, specific_force=moved)
-    found, std = sensor_consistency.search(imu, config, spans, {"sensor_lever_arm": {}})
+    found, std = sensor_consistency.search(imu, config, spans, ["sensor_lever_arm"])
     for name, value in found["sensor_lever_arm"].items():
         assert abs(value) < 3.5 * std["sensor_lever_arm", name] < 0.05
     nu = streams.nu.copy()
@@ -1017,7 +1017,7 @@ def test_noise_of_an_accelerometer_does_not_make_velocities_late(heavy, seed):
     for delay in (0.0, 0.1):
         streams = cruising(seed, delay)
         spans = [(0.0, streams.duration)]
-        found, std = sensor_consistency.search(streams, heavy, spans, {key[0]: {}, "imu_bias": {}})
+        found, std = sensor_consistency.search(streams, heavy, spans, [key[0], "imu_bias"])
         assert abs(found[key[0]][key[1]] - delay) < 3.0 * std[key]
 
 

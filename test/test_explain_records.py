@@ -454,7 +454,7 @@ def test_where_one_record_ends_and_the_next_begins_the_sensors_show_nothing():
     delays = []
     for bag in [*bags, joined(bags)[0]]:
         spans = windows(0.0, bag.duration)
-        found, std = sensor_consistency.search(bag, TODAY, spans, {"velocity_latency": {}})
+        found, std = sensor_consistency.search(bag, TODAY, spans, ["velocity_latency"])
         delays.append((found["velocity_latency"]["delay"], std["velocity_latency", "delay"]))
     *each, (of_all, std_of_all) = delays
     weight = np.array([std for _, std in each]) ** -2.0

@@ -407,7 +407,7 @@ def sensor_findings(data: Data, choice: Choice, as_headed: Streams | None = None
     config, findings = data.config, []
     after = sensor_consistency.comparisons(data.judged, config, choice.sensors)
     for name, values in choice.sensors.items():
-        rest = data.fitted({n: of for n, of in choice.sensors.items() if n != name}, choice.fixed)
+        rest = data.fitted([n for n in choice.sensors if n != name], choice.fixed)
         given = as_headed if name == HEADING and as_headed is not None else data.judged
         before = sensor_consistency.comparisons(given, config, rest.sensors)
         gain = kinematic_gain((before, after), data.held)

@@ -239,9 +239,8 @@ def _in_each(
     bags: Sequence[Streams], config: Config, names: Sequence[str]
 ) -> dict[str, list[dict[str, Value]]]:
     """What each record's sensors say of some effects."""
-    begin: Values = {name: {} for name in names}
     each = [
-        sensor_consistency.search(bag, config, windows(0.0, bag.duration), begin) for bag in bags
+        sensor_consistency.search(bag, config, windows(0.0, bag.duration), names) for bag in bags
     ]
     return {
         name: [
@@ -265,8 +264,7 @@ def turned(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], list
         return list(bags), none
     yaw = []
     for bag in bags:
-        spans = windows(0.0, bag.duration)
-        found, std = sensor_consistency.search(bag, config, spans, {HEADING: {}})
+        found, std = sensor_consistency.search(bag, config, windows(0.0, bag.duration), [HEADING])
         own = float(np.hypot(std[HEADING, "yaw"], config.odometry.attitude_std))
         yaw.append(Value(found[HEADING]["yaw"], own, "rad"))
     apart = [float(np.angle(np.exp(1j * (v.value - yaw[0].value)))) for v in yaw]
@@ -312,7 +310,8 @@ def in_time(bags: Sequence[Streams], config: Config) -> tuple[list[Streams], lis
     for bag in bags:
         spans = windows(0.0, bag.duration)
         found, _ = sensor_consistency.search(bag, config, spans)
-        found, std = sensor_consistency.search(bag, config, spans, {LATENCY: {}, **found})
+        names = [*(n for n in found if n != LATENCY), LATENCY]
+        found, std = sensor_consistency.search(bag, config, spans, names)
         # of two readings nobody knows when between them a velocity was what it is
         interval = float(np.median(np.diff(bag.imu_t if len(bag.imu_t) > 1 else bag.t)))
         own = float(np.hypot(std[LATENCY, "delay"], interval / np.sqrt(12.0)))

@@ -75,9 +75,8 @@ class Data:
     held: Spans
     config: Config
 
-    def fitted(self, begin: Values, fixed: frozenset[Key]) -> Choice:
-        """The choice of just these effects, from these values."""
-        found, std = sensor_consistency.search(self.streams, self.config, self.spans, begin, fixed)
+    def fitted(self, names: Sequence[str], fixed: frozenset[Key]) -> Choice:
+        found, std = sensor_consistency.search(self.streams, self.config, self.spans, names, fixed)
         return Choice(found, std, fixed=fixed)
 
     def dynamics(self, sensors: Values, axes: str = AXES) -> Array | None:
@@ -131,10 +130,6 @@ def chosen(data: Data, turned: bool = False) -> Choice:
     return _beside_tilt(data, _without_refuted(data, choice), turned)
 
 
-def _without(sensors: Values, *names: str) -> Values:
-    return {n: of for n, of in sensors.items() if n not in names}
-
-
 def _with_delay_of_the_pose(data: Data, choice: Choice) -> Choice:
     """Without late velocities that only the IMU shows, where the pose alone says otherwise; not
     sure where it says that they are late by another time. What an attitude that wanders makes of
@@ -143,7 +138,7 @@ def _with_delay_of_the_pose(data: Data, choice: Choice) -> Choice:
     if not (LATENCY in choice.sensors and streams.has_pose and len(streams.imu_t)):
         return choice
     alone = dataclasses.replace(data, streams=streams.without_imu())
-    posed = alone.fitted(_without(choice.sensors, BIAS), choice.fixed)
+    posed = alone.fitted([n for n in choice.sensors if n != BIAS], choice.fixed)
     key = (LATENCY, "delay")
     delay, std = posed.sensors[LATENCY]["delay"], posed.std.get(key, np.inf)
     apart = abs(choice.sensors[LATENCY]["delay"] - delay)
@@ -152,7 +147,7 @@ def _with_delay_of_the_pose(data: Data, choice: Choice) -> Choice:
     words = f"{LATENCY}: the pose by itself says {delay:.2g} ± {NORMAL * std:.1g} s"
     if abs(delay) > _SURE * std:
         return _unsure(choice, LATENCY, words)
-    rest = data.fitted(_without(choice.sensors, LATENCY), choice.fixed)
+    rest = data.fitted([n for n in choice.sensors if n != LATENCY], choice.fixed)
     rest = dataclasses.replace(rest, alternatives=choice.alternatives, unsure=choice.unsure)
     return dataclasses.replace(rest, notes=(*choice.notes, f"{words}: it is not applied"))
 
@@ -181,7 +176,7 @@ def _beside_tilt(data: Data, choice: Choice, turned: bool) -> Choice:
         if all(abs(values[k[1]] - bounds(k)[0]) <= _SURE * std.get(k, 0.0) for k in keys):
             others = "the stamps of the IMU" if name == LATENCY else "odometry.attitude_std"
             words = f"{name}: no more than chance, or {others}, explains"
-            rest = _without(choice.sensors, name)
+            rest = {n: of for n, of in choice.sensors.items() if n != name}
             choice = dataclasses.replace(choice, sensors=rest, notes=(*choice.notes, words))
     choice = dataclasses.replace(choice, std=std)
     if _is_tilt(data, choice):
@@ -235,10 +230,10 @@ def _heading_or_mounting(data: Data, found: Choice, turned: bool) -> Choice:
     """The heading of the pose, the mounting of the velocity sensor, or its tilt and the heading:
     those that the sensors refute are dropped, then those that the dynamics refute, and of the rest
     that is taken which changes the velocities least."""
-    others = _without(found.sensors, HEADING, MOUNTING)
+    others = [n for n in found.sensors if n not in (HEADING, MOUNTING)]
     none: frozenset[Key] = frozenset()
     variants = forks.divided(
-        lambda of: data.fitted({**others, **{n: found.sensors.get(n, {}) for n in of[0]}}, of[1]),
+        lambda of: data.fitted([*others, *of[0]], of[1]),
         [((HEADING,), none), ((MOUNTING,), none), ((HEADING, MOUNTING), frozenset({_YAW}))],
     )
     sums = data.agreement([v.sensors for v in variants])
@@ -285,7 +280,7 @@ def _without_refuted(data: Data, choice: Choice) -> Choice:
     squares = data.dynamics(choice.sensors) if corrects else None
 
     def left_out(name: str) -> tuple[Choice, Array | None]:
-        rest = data.fitted(_without(choice.sensors, name), choice.fixed)
+        rest = data.fitted([n for n in choice.sensors if n != name], choice.fixed)
         return rest, data.dynamics(rest.sensors)
 
     while corrects:

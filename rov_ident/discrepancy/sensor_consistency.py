@@ -24,7 +24,7 @@ differs from what the nearer of these two says (the specification test of Hausma
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple
@@ -503,34 +503,33 @@ def search(
     streams: Streams,
     config: Config,
     spans: Sequence[tuple[float, float]],
-    allowed: Values | None = None,
+    allowed: Iterable[str] | None = None,
     fixed: Container[Key] = (),
 ) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
     """The sensor effects that the data in the spans (from and to [s]) support, and the standard
-    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score,
-    from these values (or the null); the parameters ``fixed`` stay at their null."""
+    deviations of their parameters; with ``allowed`` just these are fitted, whatever they score;
+    the parameters ``fixed`` stay at their null."""
     library = [e.name for e in _LIBRARY]
     if allowed is not None:
-        begin = {n: dict(allowed[n]) for n in library if n in allowed}
-        may_answer = has_imu(streams) and not begin.keys().isdisjoint(_ANSWERS)
+        names = [n for n in library if n in set(allowed)]
+        may_answer = has_imu(streams) and not set(names).isdisjoint(_ANSWERS)
         tolerance = _LESSER if may_answer else 1.0
-        found, std = _searched(streams, config, spans, begin, fixed, tolerance=tolerance)
+        given = streams, config, spans, names, fixed, False, tolerance
+        found, std = _searched(*given)
         for name, parameter in [k for k in std if EFFECTS[k[0]].late and may_answer]:
             value, own = found[name][parameter], std[name, parameter]
-            around = _searched(
-                streams, config, spans, found, fixed, tolerance=tolerance, around=True
-            )[0]
+            around = _searched(*given, around=True)[0]
             others = [(around[name][parameter], 0.0)]  # of the same noise
             if streams.has_pose:
                 alone = streams.without_imu()
-                posed, of_pose = _searched(alone, config, spans, found, fixed)
+                posed, of_pose = _searched(alone, config, spans, names, fixed, False)
                 others.append((posed[name][parameter], of_pose[name, parameter]))
             std[name, parameter] = min(
                 float(np.linalg.norm([own, s, value - x])) for x, s in others
             )
         return found, std
     while True:
-        found, std = _searched(streams, config, spans, {}, fixed, library)
+        found, std = _searched(streams, config, spans, library, fixed, chooses=True)
         keys = [(n, parameter) for n in found if n in _ANSWERS for parameter in found[n]]
         if not (keys and has_imu(streams)):
             return found, std
@@ -545,16 +544,14 @@ def _searched(
     streams: Streams,
     config: Config,
     spans: Sequence[tuple[float, float]],
-    begin: Values,
+    library: Sequence[str],
     fixed: Container[Key],
-    library: Sequence[str] = (),
+    chooses: bool,
     tolerance: float = 1.0,
     around: bool = False,
 ) -> tuple[dict[str, dict[str, float]], dict[Key, float]]:
-    """The same of all effects that it begins with, and of those of the ``library`` that score."""
-    found = {n: {**_nulls(n), **of} for n, of in begin.items()}
-    for name, parameter in [(n, p) for n in found for p in found[n] if (n, p) in fixed]:
-        found[name][parameter] = _nulls(name)[parameter]
+    """The same of effects of the ``library`` that score, if the search ``chooses``, or of all."""
+    found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     settled = False
     for last in (*(False,) * (ROUNDS - 1), True):
@@ -563,22 +560,21 @@ def _searched(
         free = [key for key in linear.keys if key not in fixed]
         chosen = [key for key in free if key[0] in found]
         units = [[k for k in free if k[0] == n] for n in library if n not in found]
-        added: list[Key] = []
-        if units:
+        added = [k for unit in units for k in unit]
+        if chooses:
             best, score, _ = _scores(rows, [*chosen, *TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
-            if best.keys and not added and (settled or last or not chosen):
-                more = {name: _nulls(name) for name, _ in best.keys}
-                fitted = _searched(streams, config, spans, found | more, fixed)
+            if best.keys and not added and (settled or last or not found):
+                names = [*found, *dict.fromkeys(name for name, _ in best.keys)]
+                fitted = _searched(streams, config, spans, names, fixed, False)
                 added = _shown(*fitted, best.keys)
-        if settled and not added:
-            break
         both = [*chosen, *added]
-        if not both:
+        if not both or (settled and not added):
             break
         change, _ = Scores(linear, TIMING).solve(both)
         for i, (name, parameter) in enumerate(both):
-            before = found.setdefault(name, _nulls(name))[parameter]
+            nulls = {p.name: p.null for p in EFFECTS[name].parameters}
+            before = found.setdefault(name, nulls)[parameter]
             after = np.clip(before + change[i], *bounds((name, parameter))[1:])
             found[name][parameter], change[i] = float(after), after - before
         at = linear.index([*both, *TIMING])
@@ -589,10 +585,6 @@ def _searched(
         width = np.sqrt(variance)[: len(both)]
         std = dict(zip(both, width.tolist(), strict=True))
         settled = not added and bool((np.abs(change) < _SETTLED * width).all())
-        if settled and not library:
+        if settled and not chooses:
             break
     return found, std
-
-
-def _nulls(name: str) -> dict[str, float]:
-    return {p.name: p.null for p in EFFECTS[name].parameters}
