@@ -12,7 +12,7 @@ import itertools
 import os
 import signal
 import tempfile
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from pathlib import Path
 
 import hypothesis
@@ -73,14 +73,38 @@ def _processor():
 
 
 _seen = [_processor()]
+_made: dict[str, float] = {}  # seconds of processor for what is shared, made since the last report
+
+
+def _is_shared(fixture):
+    return fixture.scope != "function"
+
+
+def _name(fixture):
+    return f"{fixture.baseid}::{fixture.argname}"
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport():
-    """Each report says what its phase took of the processor, however busy the computer is."""
+def pytest_fixture_setup(fixturedef):
+    begun = _processor()
+    result = yield
+    if _is_shared(fixturedef):
+        _made[_name(fixturedef)] = _processor() - begun
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    """Each report says what its phase took of the processor, however busy the computer is; apart
+    from that, what took the fixtures that its test shares with others, where they were made."""
     report = yield
-    report.processor = _processor() - _seen[0]
-    _seen[0] += report.processor
+    now = _processor()
+    report.processor = now - _seen[0] - sum(_made.values())
+    report.made = dict(_made)
+    used = [found[-1] for found in item._fixtureinfo.name2fixturedefs.values()]
+    report.uses = [_name(fixture) for fixture in used if _is_shared(fixture)]
+    _seen[0] = now
+    _made.clear()
     return report
 
 
@@ -88,14 +112,19 @@ def pytest_terminal_summary(config):
     """Of the tests that start nothing, the quickest stay in the quick tier, up to its budget."""
     if not config.option.find_slow:
         return
-    spent = Counter()
+    spent, made, uses = Counter(), Counter(), defaultdict(set)
     stats = config.pluginmanager.get_plugin("terminalreporter").stats
     for report in itertools.chain(*stats.values()):
-        if isinstance(report, pytest.TestReport) and not {"dds", "process"} & set(report.keywords):
-            spent[_function(report.nodeid)] += report.processor
-    quickest = sorted(spent, key=spent.__getitem__)
-    total = itertools.accumulate(spent[name] for name in quickest)
-    slow = [name for name, so_far in zip(quickest, total, strict=True) if so_far > QUICK]
+        if isinstance(report, pytest.TestReport):
+            made |= report.made
+            if not {"dds", "process"} & set(report.keywords):
+                spent[_function(report.nodeid)] += report.processor
+                uses[_function(report.nodeid)] |= set(report.uses)
+    slow, total, there = [], 0.0, set()
+    for name in sorted(spent, key=lambda n: spent[n] + sum(made[f] for f in uses[n])):
+        total += spent[name] + sum(made[f] for f in uses[name] - there)
+        there |= uses[name]
+        slow += [name] * (total > QUICK)
     SLOW.write_text("\n".join(sorted(slow)) + "\n")
 
 

@@ -749,6 +749,31 @@ def test_what_is_left_beside_nothing_sure_is_not_explained():
     assert verdict_of([unsure(lag)], [], [], {}, True) == "explained"
 
 
+def test_what_would_come_again_is_the_last(monkeypatch):
+    """Of a lag and a delay each gave way to the other, for all rounds, and once more from the
+    start: a clean dive was searched no further."""
+
+    def model(*names):
+        return SimpleNamespace(names=names, hypothesis=SimpleNamespace(structure=names))
+
+    lag, delay, both = model("lag"), model("delay"), model("delay", "lag")
+    lag.linearisation = delay.linearisation = None
+    monkeypatch.setattr(discrepancy, "refit", lambda *_, **__: None)
+    better, tried = {lag.names: delay, both.names: lag}, []
+    search = Search.__new__(Search)
+    search.named = lambda fitted: list(fitted.names)
+    search.rests = lambda fitted, names: dict.fromkeys(names, fitted)
+    search.trials = lambda rests: tried.append(tuple(rests)) or dict.fromkeys(rests, "trial")
+    search.extended = lambda fitted: both if fitted is delay else None
+    search._better = lambda fitted, name, _: (
+        better[fitted.names] if name == fitted.names[0] else None
+    )
+    search._budget_spent = lambda: False
+    final, trials = search.try_rivals(lag)
+    assert final is lag and trials == {"lag": "trial"}
+    assert tried == [("lag",), ("delay", "lag"), ("lag",)]
+
+
 def test_a_model_from_before_the_last_effects_is_kept_where_it_is_likelier(monkeypatch):
     """A wave led to another minimum, where a rival of it ended at nothing: its model was dearer
     than the one that was only retuned, and the rival was named on a clean bag."""
