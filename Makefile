@@ -19,8 +19,7 @@ demo: .venv/demo.stamp
 # tests of live nodes wait for half of their time.
 PYTEST := $(BIN)/python -m pytest -n 3 --dist worksteal
 
-## style, types, then all tests but the studies (about 1,800 s of processor, with nothing compiled before;
-## bar: 15 minutes on two cores)
+## style, types, then all tests but the studies (15 minutes on two cores, with nothing compiled before)
 test: check
 	$(PYTEST) --timeout 900 -m "not study"
 
