@@ -15,7 +15,7 @@ from rov_ident.core.errors import UserError
 from rov_ident.core.frames import quaternion_from_euler, quaternion_to_matrix
 from rov_ident.core.messages import WRENCH, Imu, Odometry, Wrench
 from rov_ident.core.states import State
-from rov_ident.experiment import closed_loop_manoeuvres, design
+from rov_ident.experiment import closed_loop_manoeuvres
 from rov_ident.experiment.closed_loop_manoeuvres import AlternatingTargets, Limits, fly
 from rov_ident.experiment.data_quality import _inertia_remarks, check
 from rov_ident.experiment.design import propose
@@ -555,7 +555,7 @@ def test_a_flight_goes_as_far_as_the_vehicle_does(heavy, effects):
     np.testing.assert_allclose(reach[0], flight.reach[0], rtol=0.05)
 
 
-def test_a_plan_asks_for_what_the_thrusters_can_do():
+def test_a_plan_asks_for_what_the_thrusters_can_do(monkeypatch):
     """Those of a BlueROV2 in surge make a moment in pitch, and none pushes about pitch alone."""
     six = configuration.load("config/bluerov2.yaml")
     b = matrix(six.thrusters)
@@ -566,8 +566,9 @@ def test_a_plan_asks_for_what_the_thrusters_can_do():
     assert np.linalg.matrix_rank(b) == 5 and (np.abs(demand).max(axis=0) > 0.0).all()
     bound = authority(six.dynamics)
     assert (np.abs(demand) <= bound * (1.0 + 1e-12)).all()
-    assert not design._of_thrusters(six)
-    (note,) = design._of_thrusters(configuration.load("config/remus100.yaml"))
+    program.few_manoeuvres(monkeypatch)
+    assert not propose(six, None, 10.0).notes
+    (note,) = propose(configuration.load("config/remus100.yaml"), None, 10.0).notes
     assert "leaves fins and shafts still" in note
 
 

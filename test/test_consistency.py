@@ -405,7 +405,6 @@ def test_late_thrust_is_told_where_nothing_in_the_model_is_late(tmp_path, kind):
         assert ("motion behind the wrench" in failed) == (name == "late")
         assert found.consistency.consistent == (name == "exact"), found.consistency.sentence
         assert (State.CONVERGED in found.states) == (name == "exact")
-    if kind == "rls":
-        found = ri.fit(tmp_path / "late.mcap", configuration.from_parameters(parameters), kind)
-        failed = [test.name for test in found.consistency.tests if not test.passed]
-        assert "motion behind the wrench" not in failed
+    if kind == "rls":  # where the model has a lag, of any estimator the same is asked
+        late = ri.fit(tmp_path / "late.mcap", configuration.from_parameters(parameters), kind)
+        assert "motion behind the wrench" not in [test.name for test in late.consistency.tests]

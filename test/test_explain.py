@@ -160,7 +160,6 @@ def test_what_has_no_name_is_described(name):
     assert not sure(line)
 
 
-@pytest.mark.study  # see test_what_has_no_name_is_described
 def test_a_moment_as_small_as_that_of_attitude_errors_is_left_open():
     """Predictions gain 40 to 53 % by it: the structure was said to be right."""
     there = bag(Trial("unknown", "reaction", 0, "19"), 165402453183294, [1.0 / 15.0])

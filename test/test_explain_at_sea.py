@@ -970,7 +970,7 @@ def held_by_an_autopilot(mass, seed, delay=0.0, seconds=150.0):
     return Streams(t, motion[:, :3], level, nu, imu_t, gyro, np.array(forces), t, demand, *none)
 
 
-@pytest.mark.parametrize("seed", [0, *more(*range(1, 6))])
+@pytest.mark.parametrize("seed", [0, 1, 2, *more(3, 4, 5)])
 def test_an_autopilot_that_answers_noise_does_not_make_velocities_late(heavy, seed):
     """Accelerations and thrust afterwards know of the noise: it had made 30 ms into 37 +- 5."""
     for delay in (0.0, 0.03, 0.1):
@@ -1008,7 +1008,7 @@ def cruising(seed, delay=0.0, seconds=120.0):
     return Streams(t, place, attitude, nu, imu_t, gyro, force, t, demand, *none)
 
 
-@pytest.mark.parametrize("seed", [0, *more(*range(1, 8))])
+@pytest.mark.parametrize("seed", [0, 1, 2, *more(3, 4, 5, 6, 7)])
 def test_noise_of_an_accelerometer_does_not_make_velocities_late(heavy, seed):
     """A velocity that is dead-reckoned has the noise of the acceleration before it: another
     simulator's vehicle seemed 51 ms late, surely."""

@@ -342,7 +342,7 @@ def test_a_current_of_one_dive_is_said_to_be_of_that_dive():
     assert "The records differ" in found.sentence
 
 
-@pytest.mark.parametrize("seed", more(31, 5))  # see test_what_each_record_has_of_its_own_is_told
+@pytest.mark.parametrize("seed", [31, *more(5)])
 def test_what_the_records_share_is_not_pulled_along_by_what_each_has_of_its_own(seed):
     """Currents of three dives, and drag that the file has wrong: what is written simulates a dive
     in still water as the truth does, and what is told of the dives is with the current of each."""

@@ -554,7 +554,7 @@ def _searched(
     found: dict[str, dict[str, float]] = {}
     std: dict[Key, float] = {}
     settled = False
-    for last in (*(False,) * (ROUNDS - 1), True):
+    for left in reversed(range(ROUNDS)):
         rows = _rows(comparisons(streams, config, found, tolerance, around), spans, streams)
         linear = _linear(rows)
         free = [key for key in linear.keys if key not in fixed]
@@ -564,7 +564,7 @@ def _searched(
         if chooses:
             best, score, _ = _scores(rows, [*chosen, *TIMING]).select(units, bounds)
             added = best.keys if score > VERY_STRONG else []
-            if best.keys and not added and (settled or last or not found):
+            if best.keys and not added and (settled or not left or not found):
                 names = [*found, *dict.fromkeys(name for name, _ in best.keys)]
                 fitted = _searched(streams, config, spans, names, fixed, False)
                 added = _shown(*fitted, best.keys)

@@ -228,23 +228,25 @@ class WindowedProblem:
         moves, noted = self._moves, [dict(m) for m in self._memories]
 
         def begun(x: T) -> tuple[R, int, list[dict[Any, Any]]]:
-            self._moves = moves
-            for memory, before in zip(self._memories, noted, strict=True):
-                memory.clear()
-                memory.update(before)
+            self._go_back_to(moves, noted)
             out = function(x)
             pairs = zip(self._memories, noted, strict=True)
             new = [{k: v for k, v in m.items() if b.get(k) is not v} for m, b in pairs]
             return out, self._moves - moves, new
 
         found = forks.divided(begun, of, known=(self, self.streams))
-        self._moves = moves + sum(more for _, more, _ in found)
-        for memory, before, *new in zip(self._memories, noted, *(new for _, _, new in found)):
-            memory.clear()
-            memory.update(before)
-            for entries in new:
-                memory.update(entries)
+        self._go_back_to(moves, noted)
+        for _, more, new in found:
+            self._moves += more
+            for memory, entries in zip(self._memories, new, strict=True):
+                memory |= entries
         return [out for out, _, _ in found]
+
+    def _go_back_to(self, moves: int, noted: Sequence[dict[Any, Any]]) -> None:
+        self._moves = moves
+        for memory, before in zip(self._memories, noted, strict=True):
+            memory.clear()
+            memory |= before
 
     def thrust(self, effects: Values) -> Array:
         """Mean and slope (2, K, 6) of the thrusters' wrench after the input effects."""
