@@ -5,8 +5,10 @@ The dives come from a simulator that shares no code with the estimators (bench/s
 
 import itertools
 import json
+from collections import Counter
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +24,11 @@ from rov_ident.estimation.consistency import Consistency, Test, consistency_of
 from rov_ident.estimation.online import OnlineEstimator
 from rov_ident.io.write_messages import write_messages
 from rov_ident.model.scales import authority
+from rov_ident.offline.archive import of_records
+from rov_ident.offline.prediction_error import by_chance
+from rov_ident.sampling.records import Record, samples_of
+from rov_ident.sampling.sample import joined
+from rov_ident.simulation import virtual_sensors as sensors
 
 RATE = {"odometry_rate": 10.0}  # Hz, which is enough
 FALSE = {
@@ -354,6 +361,20 @@ def test_a_fit_whose_prediction_diverges_is_said_to_predict_worse(heavy):
     assert wide[0, 0] == 0.0 and 0.5 < wide[1, 1] <= 1.0  # as the prior, and no more
     both = Consistency(()).with_open_loop(np.full(6, np.inf), np.full(6, np.inf), np.zeros(6))
     assert both.consistent
+
+
+def test_noise_of_the_start_grows_where_a_vehicle_does_not_keep_its_course(heavy):
+    """Of a fit without errors only that is left; a tenth of the drag in yaw, and twice the added
+    mass of sway, make the Munk moment of a vehicle that goes ahead turn it."""
+    run = sensors.dive(heavy, "pilot", 60.0, sensors.Suite(odometry_rate=10.0, imu_rate=50.0))
+    record = Record(Path("simulated"), joined(list(samples_of(heavy, run))), Counter(), (), "")
+    read, values = of_records([record], heavy), heavy.model.values
+    changed = {"N_rr": 0.1, "Y_vdot": 2.0}
+    unsteady = heavy.with_values({name: by * values[name] for name, by in changed.items()})
+    steady, unsteady = (by_chance(read, c, [], np.zeros((0, 0)), []) for c in (heavy, unsteady))
+    noise = np.sqrt(np.mean(record.samples["odometry_variance"], axis=0))
+    assert np.all(steady > 0.0) and np.all(steady[:3] < noise[:3])
+    assert unsteady[5] > 5.0 * steady[5]
 
 
 def test_it_is_said_where_no_motion_was_judged(heavy):

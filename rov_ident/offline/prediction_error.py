@@ -78,7 +78,9 @@ def by_chance(
     covariance: Array,
     states: Sequence[State],
 ) -> Array:
-    """RMS (6,) of what the errors of a fit do to the open-loop simulation, if they are as stated.
+    """RMS (6,) of what the errors of a fit do to the open-loop simulation, if they are as stated,
+    and the noise of the velocities from which its windows start: in a vehicle that does not keep
+    its course, it grows.
 
     ``names`` (n,), covariance (n, n) and ``states`` (n,) of what was fitted; what is held has no
     errors of the fit. Parameters of effects on the input and on sensors change what was read, not
@@ -101,7 +103,8 @@ def by_chance(
         drawn.append((one.dynamics, compiled(one.effects)))
     parts = archive.each(_departures, (fitted.dynamics, compiled(fitted.effects)), drawn)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rms = np.sqrt(sum(p[0] for p in parts) / sum(p[1] for p in parts)) / _STEP
+        squares = [sum(of[i] for of in parts) / sum(of[-1] for of in parts) for i in (0, 1)]
+        rms = np.sqrt(squares[0] / _STEP**2 + squares[1])
     return np.where(np.isfinite(rms), rms, 0.0)
 
 
@@ -112,13 +115,25 @@ def _is_read(name: str) -> bool:
 
 def _departures(
     samples: Samples, fitted: tuple[Model, Acting], drawn: Sequence[tuple[Model, Acting]]
-) -> tuple[Array, Array]:
-    """Sums (6,) over samples and draws of the squared differences to the fitted simulation, and how
-    many (6,) these are."""
-    around = predicted(fitted[0], samples, HORIZON, effects=fitted[1])
-    total = np.zeros(6)
+) -> tuple[Array, Array, Array]:
+    """Sums (6,) over samples and draws of the squared differences to the fitted simulation, of
+    models ``drawn`` and of starts, and how many (6,) of either these are.
+
+    The starts have all of their noise, as what grows for ten seconds does not stay linear.
+    """
+    model, effects = fitted
+    around = predicted(model, samples, HORIZON, effects=effects)
+    std = np.sqrt(samples["odometry_variance"])
+    if np.isfinite(samples["gyro"]).any():
+        std[:, 3:] = np.sqrt(samples["gyro_variance"])[:, None]
+    noise, moved = np.random.default_rng(0), samples.copy()
+    of_models, of_starts = np.zeros((2, 6))
     with np.errstate(invalid="ignore"):
-        for model, effects in drawn:
-            total += np.sum((predicted(model, samples, HORIZON, effects=effects) - around) ** 2, 0)
+        for one, acting in drawn:
+            there = predicted(one, samples, HORIZON, effects=acting)
+            of_models += np.sum((there - around) ** 2, axis=0)
+            moved["nu"] = samples["nu"] + std * noise.standard_normal(std.shape)
+            there = predicted(model, moved, HORIZON, effects=effects)
+            of_starts += np.sum((there - around) ** 2, axis=0)
     known = free_axes(samples).astype(np.float64)
-    return known * total, known * len(samples) * len(drawn)
+    return known * of_models, known * of_starts, known * len(samples) * len(drawn)
