@@ -99,7 +99,7 @@ def test_a_fit_beside_a_file_that_is_right_agrees(heavy, tmp_path, seed):
 def test_the_quick_fit_is_half_as_sure_as_can_be_and_no_surer(checked, heavy, messages, tmp_path):
     found = checked()
     write_messages(tmp_path / "bag.mcap", messages)
-    fit = fit_batch(of_records([read_record(tmp_path / "bag.mcap", heavy)]), heavy, "ml")
+    fit = fit_batch(of_records([read_record(tmp_path / "bag.mcap", heavy)], heavy), heavy, "ml")
     bound = np.array([fit.more["cramer_rao_std"][p.name] for p in found.prospects])
     predicted = np.array([p.std for p in found.prospects])
     assert np.all(predicted > 0.8 * bound)
@@ -527,7 +527,7 @@ def surge_only(heavy, tmp_path_factory):
         path,
         closed_loop_manoeuvres.dive(heavy, manoeuvre, 20.0, Limits(), sensors.Suite()).messages,
     )
-    return of_records([read_record(path, heavy)])
+    return of_records([read_record(path, heavy)], heavy)
 
 
 @pytest.fixture(scope="module")
@@ -599,7 +599,7 @@ def test_the_prediction_holds_in_simulation(heavy, surge_only, proposal, tmp_pat
         records = [read_record(path, heavy)]
         write_messages(path, proposal.best.dive(true, seed=seed + 10).messages)
         records.append(read_record(path, heavy))
-        fit = fit_batch(of_records(records), heavy, "ml")
+        fit = fit_batch(of_records(records, heavy), heavy, "ml")
         stated.append(fit.std / predicted)
         ratios.append((fit.values - true.model.theta) / predicted)
     assert 0.4 < np.median(stated) < 1.3
@@ -614,7 +614,7 @@ def test_what_is_promised_is_what_a_fit_then_states(tmp_path, monkeypatch):
     factor = np.random.default_rng(1).choice([0.7, 1.3], len(shipped.model.theta))
     true = shipped.with_model(shipped.model.with_theta(shipped.model.theta * factor))
     write_messages(tmp_path / "flown.mcap", proposal.best.dive(true, seed=1).messages)
-    flown = of_records([read_record(tmp_path / "flown.mcap", shipped)])
+    flown = of_records([read_record(tmp_path / "flown.mcap", shipped)], shipped)
     fit = fit_batch(flown, shipped, "ml")
     n = len(shipped.estimate)
     driven = np.array([p.std for p in proposal.after])

@@ -54,6 +54,22 @@ def test_chance_makes_none(lasting):
     assert 0.8 < np.std(found) < 1.1
 
 
+def test_the_scatter_of_stretches_tells_of_errors_that_last():
+    """Of white noise it is the information, and of an error that lasts for ten rows of columns
+    that do not change their sign more."""
+    rng, white, lasting = np.random.default_rng(4), [], []
+    for _ in range(200):
+        scores, informations, _ = regression(rng)
+        white.append(np.diag(constancy.scatter(scores) / informations.sum(axis=0)))
+        x = 1.0 + 0.1 * rng.standard_normal((COUNT, 100, 1))
+        e = np.repeat(rng.standard_normal((COUNT, 10)), 10, axis=1)
+        e -= np.sum(x[:, :, 0] * e) / np.sum(x**2) * x[:, :, 0]
+        lasting.append(constancy.scatter(np.sum(x[:, :, 0] * e, axis=1)[:, None]) / np.sum(x**2))
+    np.testing.assert_allclose(np.mean(white, axis=0), 1.0, atol=0.1)
+    assert np.mean(lasting) == pytest.approx(10.0, rel=0.1)
+    assert not constancy.scatter(np.ones((COUNT - 1, 2))).any()
+
+
 def test_where_a_few_stretches_tell_all_nothing_is_judged():
     scores, informations, _ = regression(np.random.default_rng(2), slope=5.0)
     share = np.where(np.arange(COUNT) < 2, 1.0, 1e-6)

@@ -28,7 +28,7 @@ def in_one(samples):
 
 def samples_of(config, duration=60.0, suite=None, manoeuvre="steps", seed=1, velocity=True):
     run = sensors.dive(config, manoeuvre, duration, suite or sensors.Suite(), seed)
-    return smoothed(joined(list(records.samples_of(config, run, velocity))))
+    return smoothed(joined(list(records.samples_of(config, run, velocity))), config)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
     rng, n, held = np.random.default_rng(2), 5, np.arange(5) >= 3
     root = rng.standard_normal((n, n))
     information, precision = root @ root.T, rng.uniform(0.1, 1.0, n)
-    bound, covariance = ml._with_consider_parameters(information, information, precision, held)
+    bound, covariance = ml._with_consider_parameters(information, [information], precision, held)
     ours = np.linalg.inv((information + np.diag(precision))[:3, :3])
     alike = information.copy()
     alike[3:, 3:] = information[3:, :3] @ ours @ information[:3, 3:]
@@ -132,9 +132,14 @@ def test_what_is_considered_keeps_its_prior_and_widens_the_rest(heavy):
     np.testing.assert_allclose(np.diag(bound)[3:], 1.0 / precision[3:], rtol=1e-9)
     np.testing.assert_allclose(covariance, bound, rtol=1e-9, atol=1e-12)
     nothing = np.zeros(n, dtype=bool)
-    freely, _ = ml._with_consider_parameters(information, information, precision, nothing)
+    freely, _ = ml._with_consider_parameters(information, [information], precision, nothing)
     np.testing.assert_allclose(freely, np.linalg.inv(information + np.diag(precision)), rtol=1e-9)
     assert (np.diag(bound)[:3] > np.diag(freely)[:3]).all()
+    # no variance is less than by another scatter of the score
+    scatters = [information, np.diag([0.0, 9.0, 0.0, 0.0, 0.0]) * information]
+    _, wider = ml._with_consider_parameters(information, scatters, precision, nothing)
+    assert (np.diag(wider) >= np.diag(freely) * (1.0 - 1e-9)).all()
+    assert np.diag(wider)[1] > 2.0 * np.diag(freely)[1]
 
 
 @pytest.mark.parametrize(("name", "axis"), [("X_uu", 0), ("N_rr", 5)])
@@ -230,7 +235,7 @@ def archive_of(tmp_path_factory):
     def make(config, file, manoeuvre="steps", **options):
         path = folder / f"{file}.mcap"
         write_messages(path, sensors.dive(config, manoeuvre, **options).messages)
-        return of_records([read_record(path, config)])
+        return of_records([read_record(path, config)], config)
 
     return make
 

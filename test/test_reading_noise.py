@@ -154,7 +154,7 @@ def test_nor_by_maximum_likelihood(seed: int, tmp_path: Path) -> None:
     case = _case(seed, 1.0, 60.0)
     write_messages(tmp_path / "dive.mcap", case.messages)
     fit = batch_fit.fit_batch(
-        of_records([read_record(tmp_path / "dive.mcap", case.config)]),
+        of_records([read_record(tmp_path / "dive.mcap", case.config)], case.config),
         by_default(case.config),
         "ml",
     )

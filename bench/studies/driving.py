@@ -34,7 +34,7 @@ def measured(settings: Config, name: str, duration: float, suite: Suite) -> np.n
     run = dive(settings, name, duration, suite, seed=1)
     samples = np.concatenate(list(samples_of(settings, run)))
     record = Record(Path(name), samples, Counter(), (), "")
-    return information_of(archive.of_records([record]), settings)
+    return information_of(archive.of_records([record], settings), settings)
 
 
 def main() -> None:

@@ -64,7 +64,7 @@ def told(true: Config, rng: np.random.Generator, offset: float = 0.5) -> Config:
 def archive_of(config: Config, run: Dive) -> Archive:
     """A simulated dive as a fit sees a bag."""
     samples = joined(list(samples_of(config, run)))
-    return of_records([Record(Path("simulated"), samples, Counter(), (), "")])
+    return of_records([Record(Path("simulated"), samples, Counter(), (), "")], config)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -156,7 +156,7 @@ def fit(
             for record in records:
                 if is_without_velocity(record.samples):
                     raise refusal(record.path.name)
-            many = archive.of_records(records)
+            many = archive.of_records(records, given)
             _refuse_unusable(many, given)
             say("estimating")
             found = fit_online(records, given, estimator)  # type: ignore[arg-type]

@@ -198,7 +198,7 @@ def check(path: Path, config: Config, say: Progress = silent) -> Check:
     motion, quick = of_dynamics(record.samples, config), None
     if not any(remark.level == BAD for remark in motion):
         say("a quick fit")
-        alone = archive.of_records([record])
+        alone = archive.of_records([record], config)
         quick = (
             fit_batch(alone, config, "ml") if unmeasured else fit_online([record], config, "rls")
         )

@@ -9,6 +9,7 @@ estimated beside the coefficients, and what no driving tells is left out of the 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from rov_ident.model.coefficients import parse
 from rov_ident.model.equations import Array
 from rov_ident.model.thruster_allocation import is_known
 from rov_ident.offline.archive import Archive, total
-from rov_ident.offline.maximum_likelihood import LIKELY, NO_ROWS, assumed, one_pass
+from rov_ident.offline.maximum_likelihood import LIKELY, NO_ROWS, assumed, one_pass, thrust_errors
 from rov_ident.offline.newton import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
@@ -204,7 +205,7 @@ def propose(
             left_out.append(f"{one.name}: not safe within the limits, however small")
             continue
         run = closed_loop_manoeuvres.dive(config, found[0], duration, limits, Suite())
-        samples = smoothed(joined(list(samples_of(about, run, velocity))))
+        samples = smoothed(joined(list(samples_of(about, run, velocity))), about)
         information = one_pass(samples, *_model(about)).information
         std = np.array([p.std for p in known_after(about, now + information)])
         candidates.append(Candidate(*found, information, duration, limits))
@@ -256,8 +257,8 @@ def _model(about: Config) -> tuple[Any, ...]:
     """The arguments of :func:`one_pass` for what is `supposed`, and the thrust of each axis."""
     prior = prior_of(about, effects=True)
     effects, axis_std = theta_of(about)[len(about.model.theta) :], axis_std_of(about, prior.names)
-    noise = assumed(about, LIKELY)
-    return about.dynamics, prior.estimated, noise, None, np.inf, effects, NO_ROWS, axis_std
+    noise, of_thrust = assumed(about, LIKELY), partial(thrust_errors, axis_std=axis_std)
+    return about.dynamics, prior.estimated, noise, None, np.inf, effects, NO_ROWS, of_thrust
 
 
 def _no_information(about: Config) -> Array:

@@ -105,13 +105,13 @@ def total(parts: Sequence[Sums]) -> Sums:
     return type(parts[0])(*(sum(values) for values in zip(*parts, strict=True)))
 
 
-def of_records(records: Sequence[Record]) -> Archive:
-    """Records that have been read already, in this process."""
+def of_records(records: Sequence[Record], config: Config) -> Archive:
+    """Records that ``config`` has read already, in this process."""
 
     def again(config: Config, columns: bool) -> Iterator[Outcome]:
         return (_outcome(record.path, config, columns) for record in records)
 
-    return Archive([_bag_and_samples(record) for record in records], _locally, again)
+    return Archive([_bag_and_samples(record, config) for record in records], _locally, again)
 
 
 @contextlib.contextmanager
@@ -159,8 +159,8 @@ def opened(
         yield Archive(read(config, False), _locally, read)
 
 
-def _bag_and_samples(record: Record) -> tuple[ReadBag, Samples]:
-    samples = smoothed(record.samples)
+def _bag_and_samples(record: Record, config: Config) -> tuple[ReadBag, Samples]:
+    samples = smoothed(record.samples, config)
     bag = ReadBag(
         record.path,
         record.sha256,
@@ -174,7 +174,7 @@ def _bag_and_samples(record: Record) -> tuple[ReadBag, Samples]:
 
 def _outcome(path: Path, config: Config, columns: bool) -> Outcome:
     try:
-        return _bag_and_samples(read_record(path, config, columns=columns))
+        return _bag_and_samples(read_record(path, config, columns=columns), config)
     except UserError as error:
         text = str(error)
         return f"left out: {text if path.name in text else f'{path.name}: {text}'}"
@@ -238,11 +238,15 @@ _KILLED = (
 @contextlib.contextmanager
 def _cluster(address: str, jobs: int) -> Iterator[Any]:
     try:
+        import dask.config
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise UserError("--dask needs Dask: pip install 'rov_ident[dask]'") from error
     with contextlib.ExitStack() as stack:
         if address == "local":
+            # By default Dask gives up a process that is not back 15 s after it was killed, and then
+            # waits for it for ever.
+            stack.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"}))
             local = LocalCluster(
                 n_workers=max(jobs, 1), threads_per_worker=1, dashboard_address=None
             )

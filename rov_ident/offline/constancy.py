@@ -22,6 +22,23 @@ UNLIKELY = 3.3  # normal deviates: beyond it is one of a thousand
 _FEWEST = 3.0  # stretches that tell as much as each other: with fewer nothing is judged
 
 
+def stretches_of(seconds: float) -> int:
+    """Into how many stretches a record is cut."""
+    return max(min(STRETCHES, int(seconds / SHORTEST)), 1)
+
+
+def scatter(scores: Array) -> Array:
+    """The covariance (n, n) of the sum of scores (C, n) of stretches, by how these differ: of
+    whatever makes errors that last no longer than a stretch (batch means: Law 2015, Simulation
+    Modeling and Analysis, sec. 9.5.3); zeros where they are too few."""
+    count, n = scores.shape
+    if count < STRETCHES:
+        return np.zeros((n, n))
+    apart = scores - scores.mean(axis=0)
+    covariance: Array = apart.T @ apart * (count / (count - 1.0))
+    return covariance
+
+
 def slopes(scores: Array, informations: Array, whole: Array) -> Array:
     """The slope in time of each parameter of a record, as the normal deviate that is as unlikely by
     chance, and the change that it makes throughout the record, (2, n); zeros where too few
@@ -31,6 +48,8 @@ def slopes(scores: Array, informations: Array, whole: Array) -> Array:
     information (n, n) from all records is ``whole``, prior included.
     """
     count, n = scores.shape
+    if count < STRETCHES:
+        return np.zeros((2, n))
     time = (np.arange(count) + 0.5) / count - 0.5
     found = np.zeros((2, n))
     for i in range(n):

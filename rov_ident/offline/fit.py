@@ -270,7 +270,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         else:
             estimator.take(record.samples)
             estimator.flush()
-    config, read = estimator.config, archive.of_records(records)
+    config, read = estimator.config, archive.of_records(records, config)
     found = config.with_values(estimator.report().by_name)
     judged = read.as_read_by(found, config)
     report = estimator.report(worst_of(bag.contradictions for bag in judged.bags))

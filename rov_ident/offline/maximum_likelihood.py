@@ -31,6 +31,7 @@ these noise levels. Coefficients' covariances are not taken from it alone, as re
 coloured: the covariance of the accumulated score stands between two inverse informations.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -145,6 +146,9 @@ class _Equations(NamedTuple):
     free: NDArray[np.bool_]  # (6,)
 
 
+Considered = Callable[[Samples, Model], Array]
+
+
 class Pass(NamedTuple):
     """One pass of the filter over samples; sums over bags are sums of these.
 
@@ -170,15 +174,15 @@ def one_pass(
     gate: float = np.inf,
     effects: Array = _NONE,
     out: Array = NO_ROWS,
-    axis_std: Array = _NONE,
+    considered: Considered | None = None,
 ) -> Pass:
     """The likelihood of samples (k,) of SAMPLE at the model's values, with its derivatives.
 
     ``estimated`` (n,) are indices into theta, behind which come the values (p,) of parameters of
     ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
     measurement, and those of which no wrench is known. ``out`` (3, k, 6), unless it is empty, is
-    filled with :class:`Innovations`. ``axis_std`` (6,), unless it is empty: standard deviations of
-    the thrust of each axis, relative to it. Then these are six more parameters behind the others.
+    filled with :class:`Innovations`. ``considered`` gives what a unit of each of q errors adds to
+    the wrench in each sample (k, 6, q): these are then q more parameters behind the others.
     """
     known = free_axes(samples)
     free = known if free is None else free & known
@@ -188,11 +192,13 @@ def one_pass(
     elif noise.untaught.any():
         sides = sides.copy()
         sides[:, :6][:, noise.untaught.T] = 0.0
-    if len(axis_std):
-        errors, axes = np.zeros((len(samples), 13, 6)), np.arange(6)
-        errors[:, axes, axes] = axis_std * (samples["wrench"] - samples["surroundings"])
-        estimated = np.append(estimated, len(model.theta) + len(effects) + axes)
-        effects, sides = np.append(effects, np.zeros(6)), np.concatenate([sides, errors], axis=2)
+    if considered is not None:
+        wrench = considered(samples, model)
+        errors, size = np.zeros((len(samples), 13, wrench.shape[2])), wrench.shape[2]
+        errors[:, :6] = wrench
+        estimated = np.append(estimated, len(model.theta) + len(effects) + np.arange(size))
+        sides = np.broadcast_to(sides, (len(samples), *sides.shape[1:]))
+        effects, sides = np.append(effects, np.zeros(size)), np.concatenate([sides, errors], axis=2)
     mass, theta = model.mass_matrix, np.concatenate([model.theta, effects])[:, None]
     inverse, at = np.zeros((6, 6)), np.ix_(free, free)
     inverse[at] = np.linalg.inv(mass[at])
@@ -209,6 +215,32 @@ def one_pass(
     return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
 
 
+def thrust_errors(samples: Samples, model: Model, axis_std: Array) -> Array:
+    """(k, 6, q): by how much the thrust of each axis is off by the standard deviations ``axis_std``
+    (q,), relative to it, of six axes or of none."""
+    thrust, axes = samples["wrench"] - samples["surroundings"], np.arange(len(axis_std))
+    errors = np.zeros((len(samples), 6, len(axes)))
+    errors[:, axes, axes] = axis_std * thrust[:, axes]
+    return errors
+
+
+def tilt_errors(samples: Samples, model: Model) -> Array:
+    """(k, 6, 2): what an error of the attitude in roll and in pitch, per radian, does to the wrench
+    of weight and buoyancy."""
+    turned = np.cross(samples["down"][:, None], np.eye(3)[:2])  # (k, 2, 3)
+    wrench: Array = np.einsum("ij,kaj->kia", model.body.restoring, turned)
+    return wrench
+
+
+class Stretches(NamedTuple):
+    """Of C stretches of a record the scores (C, n) and informations (C, n, n), and the covariance
+    (n, n) that what is left of errors of the attitude gives the score of all."""
+
+    scores: Array
+    informations: Array
+    by_tilt: Array
+
+
 def by_stretch(
     samples: Samples,
     model: Model,
@@ -217,16 +249,23 @@ def by_stretch(
     free: NDArray[np.bool_],
     gate: float,
     effects: Array,
-) -> tuple[Array, Array] | None:
-    """The scores (C, n) and informations (C, n, n) of the stretches of a record
-    (:mod:`rov_ident.offline.constancy`); None of a shorter one."""
-    if samples["dt"].sum() < constancy.STRETCHES * constancy.SHORTEST:
-        return None
+) -> Stretches:
+    """The stretches of a record (:mod:`rov_ident.offline.constancy`)."""
+    seconds, n = float(samples["dt"].sum()), len(estimated)
+    count = constancy.stretches_of(seconds)
     found = [
-        one_pass(part, model, estimated, noise, free, gate, effects)
-        for part in np.array_split(samples, constancy.STRETCHES)
+        one_pass(part, model, estimated, noise, free, gate, effects, considered=tilt_errors)
+        for part in np.array_split(samples, count)
     ]
-    return np.array([p.score for p in found]), np.array([p.information for p in found])
+    informations = np.array([p.information for p in found])
+    # The covariance of the means of an error over two stretches, as long as h times it lasts.
+    h = seconds / count / max(float(np.mean(samples["tilt_lasts"])), 1e-3)
+    between = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) - 1.0
+    alike = np.exp(-h * np.maximum(between, 0.0)) * (1.0 - np.exp(-h)) ** 2
+    alike[between < 0.0] = 2.0 * (h + np.exp(-h) - 1.0)
+    alike *= float(np.mean(samples["tilt_variance"])) / h**2
+    by_tilt = np.einsum("cia,dja,cd->ij", *2 * (informations[:, :n, n:],), alike)
+    return Stretches(np.array([p.score[:n] for p in found]), informations[:, :n, :n], by_tilt)
 
 
 class Innovations(NamedTuple):
@@ -333,14 +372,39 @@ def noise_slope(
 
 def noise_cost(
     samples: Samples, model: Model, noise: Noise, free: NDArray[np.bool_], effects: Array = _NONE
-) -> float:
-    """Of innovations, twice the negative logarithm of their likelihood; an outlier is worth its
-    gate."""
+) -> Array:
+    """(6,): of the innovations along each axis, twice the negative logarithm of their likelihood;
+    an outlier is worth its gate."""
     found = innovations(samples[:_NOISE_SAMPLES], model, noise, free, _GATE, effects)
-    keep = np.isfinite(found.e)
-    outliers = np.count_nonzero(np.isfinite(found.s) & ~keep)
-    e, s = found.e[keep], found.s[keep]
-    return float(np.sum(e**2 / s + np.log(s)) + outliers * _GATE**2)
+    known, keep = np.isfinite(found.s), np.isfinite(found.e)
+    s, e = np.where(known, found.s, 1.0), np.where(keep, found.e, 0.0)
+    each = np.where(keep, e**2 / s + np.log(s), _GATE**2 * known)
+    cost: Array = each.sum(axis=0)
+    return cost
+
+
+def _follows(
+    each: Mapper,
+    model: Model,
+    noise: Noise,
+    free: NDArray[np.bool_],
+    effects: Array,
+    axis: int,
+    reading: float,
+) -> bool:
+    """Whether the vehicle follows what looks like noise of the reading along an ``axis``, of the
+    variance density ``reading`` [N2 s, (N m)2 s]: a command that trembles.
+
+    By the innovations along that axis alone. For the level that suits all axes best also stands for
+    what acts on others, and lasts longer than noise: an error of the attitude seems to move the
+    vehicle up and down, as the moments of a moving vehicle depend on that.
+    """
+    costs = []
+    for density in (FOLLOWED * reading, reading):
+        floor = np.where(np.arange(6) == axis, density, noise.floor)
+        found = each(noise_cost, model, replace(noise, floor=floor), free, effects)
+        costs.append(sum(cost[axis] for cost in found))
+    return bool(costs[0] <= costs[1])
 
 
 # ------------------------------------------------------------------ the estimate
@@ -449,8 +513,10 @@ def maximise(
         costs = [evaluate(theta, _GATE, level)[1] for level in levels]
         noise = levels[int(np.argmin(costs))]
         starts = [noise, *starts[:1]] if stage == 0 else [noise]
-        # readings of much noise, but not of a trembling command, which the vehicle would follow
-        noisy = (readings > SHARE * wrenches) & (samples * noise.floor > FOLLOWED * readings)
+        noisy = readings > SHARE * wrenches
+        for i in np.flatnonzero(noisy & taught.any(axis=0)):
+            there = model_at(theta), noise, free, theta[~own]
+            noisy[i] = not _follows(each, *there, int(i), readings[i] / samples[i])
         held = (taught & noisy).any(axis=1) & (precision > 0.0)
         noise = replace(noise, untaught=(of_thrust & ~held[own.sum() :])[:, None] & noisy)
         bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
@@ -467,15 +533,19 @@ def maximise(
     slope, curvature = derivatives(theta, at)
     asked, inverse = theta.copy(), inverse_of(curvature[np.ix_(~held, ~held)])
     asked[~held] += inverse @ slope[~held]
-    axis_std, n = axis_std_of(config, prior.names), len(theta)
-    beside = model_at(theta), estimated, noise, free, gate, theta[~own], NO_ROWS, axis_std
+    n = len(theta)
+    by_thrust = partial(thrust_errors, axis_std=axis_std_of(config, prior.names))
+    beside = model_at(theta), estimated, noise, free, gate, theta[~own], NO_ROWS, by_thrust
     errors = total(each(one_pass, *beside)).information[:n, n:]
     by_axis = np.zeros_like(errors)
     by_axis[~held] = inverse @ errors[~held]
-    bound, covariance = _with_consider_parameters(at.information, at.scatter, precision, held)
     reading_noise = np.where(noisy, readings / samples, 0.0)
     records = each(by_stretch, model_at(theta), estimated, noise, free, gate, theta[~own])
-    found = [constancy.slopes(one[0], one[1], curvature) for one in records if one is not None]
+    by_tilt = sum(record.by_tilt for record in records)
+    by_stretches = constancy.scatter(np.concatenate([record.scores for record in records]))
+    scatters = at.scatter + by_tilt, by_stretches + by_tilt
+    bound, covariance = _with_consider_parameters(at.information, scatters, precision, held)
+    found = [constancy.slopes(one.scores, one.informations, curvature) for one in records]
     slope = constancy.worst(found, n) * ~held  # what keeps its prior suits no stretch
     return Likelihood(
         theta, asked, covariance, bound, noise, at, lasting, by_axis, slope, held,
@@ -500,22 +570,27 @@ def _first_levels(config: Config, process: bool, also: Noise | None) -> list[Noi
 
 
 def _with_consider_parameters(
-    information: Array, scatter: Array, precision: Array, held: NDArray[np.bool_]
+    information: Array, scatters: Sequence[Array], precision: Array, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Bound and covariance (n, n) of an estimate, of which the ``held`` parameters (n,) keep their
-    prior: their errors move all others (consider parameters, Schmidt 1966)."""
+    prior: their errors move all others (consider parameters, Schmidt 1966). The covariance is by
+    the first of the ``scatters`` (n, n) of the score, with no variance below those by the others.
+    """
     ours = np.ix_(~held, ~held)
     error = np.eye(len(held))  # by the score of what is estimated, and by errors of what is held
     error[ours] = inverse_of((information + np.diag(precision))[ours])
     error[np.ix_(~held, held)] = -error[ours] @ information[np.ix_(~held, held)]
     found = []
-    for square in (information + np.diag(precision), scatter + np.diag(precision)):
+    for square in (information, *scatters):
+        square = square + np.diag(precision)
         square[held] = square[:, held] = 0.0
         square[held, held] = 1.0 / precision[held]
         found.append(sandwich(error, square))
-    bound, covariance = found
+    bound, covariance, *others = found
     # From few data the scatter is itself uncertain: never thinner than the bound.
-    return bound, widened(covariance, np.diag(bound))
+    return bound, widened(
+        covariance, np.max([np.diag(other) for other in (bound, *others)], axis=0)
+    )
 
 
 def _wrench_densities(samples: Samples) -> Array:
@@ -540,7 +615,7 @@ def _noise_levels(
     def evaluate(levels: Array) -> tuple[Noise, float]:
         moved = _at_levels(noise, levels, process)
         off = np.sum((levels - start) ** 2) / _KNOWN**2
-        return moved, float(sum(each(noise_cost, model, moved, free, effects)) + off)
+        return moved, float(np.sum(each(noise_cost, model, moved, free, effects)) + off)
 
     def derivatives(levels: Array, moved: Noise) -> tuple[Array, Array]:
         slopes = each(noise_slope, model, moved, free, process, effects)

@@ -92,7 +92,7 @@ _MEASURED = record(
 _ZERO = np.zeros(3)
 
 CHANCES = 4  # odometry that is never confirmed within so many messages is all there is
-_BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
+BIAS_TIME = 60000.0  # s; a bias wanders by its prior deviation in this time, a tenth in 600 s
 UNKNOWN = 1e3  # a variance from which drivers mean "not measured"
 SUREST = 1e-4  # of the stated variance of a measurement: no sensor is surer (docs/trust.md)
 _DRIFT = 1e-8  # rad2/s; of an attitude by all that is no noise of the rate: 6 mrad in an hour
@@ -439,8 +439,8 @@ def _predict_velocity(k, s, acceleration, dt):
     noise = s.accelerometer_variance * dt * dt
     k.p_vv += -2.0 * dt * k.p_vb + dt * dt * k.p_bb + noise
     k.p_vb -= dt * k.p_bb
-    k.p_bb += s.accelerometer_bias_variance * dt / _BIAS_TIME
-    k.gyro_bias_variance += s.gyro_bias_variance * dt / _BIAS_TIME
+    k.p_bb += s.accelerometer_bias_variance * dt / BIAS_TIME
+    k.gyro_bias_variance += s.gyro_bias_variance * dt / BIAS_TIME
 
 
 @inlined

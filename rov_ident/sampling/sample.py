@@ -33,6 +33,8 @@ SAMPLE = record(
         ("down", "f8", (3,)),  # unit, body axes
         ("down_slope", "f8", (3,)),  # per s: of the line that ends at down and has its mean over dt
         ("tilt", "f8"),  # rad2 s: variance density of an error of down that lasts a second
+        # rad2, s: after smoothing, variance of an error of down, and for how long it lasts
+        *floats((), "tilt_variance tilt_lasts"),
         ("wrench", "f8", (6,)),  # N, N m: mean over dt, of thrusters and surroundings
         ("wrench_slope", "f8", (6,)),  # per s: of the line with the same mean and first moment
         # N2, (N m)2: what of it may be an outlier, mean over dt; infinite, of all moments: none was

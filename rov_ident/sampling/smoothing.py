@@ -3,33 +3,47 @@
 The gyro's bias, known worst in the first seconds, is the one known two minutes later. The attitude
 is smoothed: gravity's direction times buoyancy is a moment, and an error of it that lasts for
 seconds cannot be told from one of the coefficients. The integrated rates give Q, off by a random
-walk d that the measured attitudes see with white noise (a local-level model; Durbin and Koopman
-2012, ch. 2)::
+walk d that the measured attitudes see with white noise v and with an error a that lasts (a local
+level; Durbin and Koopman 2012, ch. 2 to 4)::
 
-    q = exp(d) Q,   d[k] = d[k - 1] + w,   log(q_measured Q^-1) = d + v
+    q = exp(d) Q,   d[k] = d[k - 1] + w,   log(q_measured Q^-1) = d + a + v
+    a[k] = r a[k - 1] + white noise,       r = exp(-dt / T)
 
-v's variance is half that of the differences of successive measurements; w's that of the rates'
-noise times the factor of highest likelihood, as integration has errors of its own.
+v's variance is half that of the differences of successive measurements; a's the one of highest
+likelihood, and so is the factor by which w's is that of the rates' noise, as integration has errors
+of its own. The drift of the rates, a slow random walk too, is one more state.
+
+The error of the level that is left, of a and w, has at the angular frequency f the density that
+two sources of the densities q / f^2 (of d, by the rates) and A (of a) leave together::
+
+    1 / (f^2 / q + 1 / A) = S / (1 + (f t)^2),   S = 2 T var(a),   t^2 = T^2 + S / q
+
+as A is S / (1 + (f T)^2). So it lasts for t, and its variance is S / 2 t.
 """
+
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rov_ident.config import Config
+from rov_ident.config.prior import ATTITUDE_LASTS
 from rov_ident.core.frames import quaternion_multiply, rotation_vector
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import interpolated
 from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import rotation, turned
-from rov_ident.sampling.kinematic_filter import slope_of_mean
+from rov_ident.sampling.kinematic_filter import BIAS_TIME, slope_of_mean
 from rov_ident.sampling.sample import stretches
 
 _LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
 # odometry's rates have told it to a tenth of their own noise
-_FACTORS = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 1000.0])
+_FACTORS = np.array([1.0, 1.7, 3.0, 5.5, 10.0, 30.0, 100.0, 1000.0])
+_LASTING = np.append(0.0, np.geomspace(0.1, 1.6, 9))  # of the stated deviation of an attitude
 _FEWEST = 10  # measured attitudes; fewer do not tell their noise
 
 
-def smoothed(samples: NDArray[np.void]) -> NDArray[np.void]:
+def smoothed(samples: NDArray[np.void], config: Config) -> NDArray[np.void]:
     """Samples (k,) of SAMPLE with bias and attitude smoothed over each stretch without a gap."""
     out = samples.copy()
     for first, end in stretches(samples):
@@ -39,11 +53,11 @@ def smoothed(samples: NDArray[np.void]) -> NDArray[np.void]:
         inertial = np.isfinite(part["gyro"][:, 0])
         part["gyro"][inertial] += change[inertial]
         part["nu"][inertial, 3:] += change[inertial]
-        _smooth(part)
+        _smooth(part, config)
     return out
 
 
-def _smooth(part: NDArray[np.void]) -> None:
+def _smooth(part: NDArray[np.void], config: Config) -> None:
     """Smooth orientation, down and its slope in place."""
     seen = np.flatnonzero(np.isfinite(part["attitude"][:, 0]))
     if len(seen) < _FEWEST:
@@ -59,12 +73,19 @@ def _smooth(part: NDArray[np.void]) -> None:
     noise = 0.5 * float(robust_std(steps, axis=None)) ** 2 + 1e-12
     grown = rate_variance * part["dt"] ** 2  # each over the step that ends there
     walk = np.add.reduceat(grown[1 : seen[-1] + 1], seen[:-1]) + 1e-12
-    error, best = off, np.inf
-    for factor in _FACTORS:
-        level, cost = _local_level(off, noise, factor * walk)
-        if cost < best:
-            error, best = level, cost
     t = part["t"]
+    between = np.diff(t[seen])
+    keep = np.exp(-between / ATTITUDE_LASTS)
+    bias = config.imu.gyro_bias_std**2 * np.array([1.0, 1.0 / BIAS_TIME])
+    error, best, found = off, np.inf, (1.0, 0.0)
+    for factor, share in itertools.product(_FACTORS, _LASTING):
+        lasting = (share * config.odometry.attitude_std) ** 2
+        level, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
+        if cost < best:
+            error, best, found = level, cost, (factor, lasting)
+    density = 2.0 * ATTITUDE_LASTS * found[1]
+    lasts = np.sqrt(ATTITUDE_LASTS**2 + density * between.sum() / (found[0] * walk.sum()))
+    part["tilt_variance"], part["tilt_lasts"] = 0.5 * density / lasts, lasts
     error = interpolated(t[seen], error, t)
     down = np.empty((len(part), 3))
     _correct_attitude(ahead, error, part["orientation"], down)
@@ -91,24 +112,58 @@ def _take_slopes(down, rate, dt, out):
 
 
 @kernel
-def _local_level(z, noise, walk):
-    """Levels (n, 3) of z (n, 3) smoothed from both sides; minus twice the log-likelihood."""
+def _local_level(z, noise, walk, lasting, keep, dt, bias):
+    """Levels (n, 3) of z (n, 3) smoothed from both sides; minus twice the log-likelihood.
+
+    Three times a Kalman filter of level, lasting error and drift, with one covariance, and from
+    behind the smoother of Durbin and Koopman (2012, sec. 4.4). ``bias``: variance of the drift and
+    what is added to it in a second.
+    """
     n = len(z)
-    level, variance, ahead = z.copy(), np.empty(n), np.empty(n)
-    variance[0], cost = noise, 0.0
+    x, p = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))  # as predicted
+    e, total, gain, seen = np.zeros((n, 3)), np.full(n, np.inf), np.zeros((n, 3)), np.zeros(3)
+    cost = 0.0
+    x[0, 0] = z[0]  # the first one is all that is known of the level
+    p[0, 0, 0], p[0, 1, 1], p[0, 2, 2] = noise + lasting, lasting, bias[0]
+    p[0, 0, 1] = p[0, 1, 0] = -lasting
     for k in range(1, n):
-        ahead[k] = variance[k - 1] + walk[k - 1]
-        total = ahead[k] + noise
-        gain = ahead[k] / total
-        variance[k] = (1.0 - gain) * ahead[k]
+        span, kept, now = dt[k - 1], keep[k - 1], p[k]
         for i in range(3):
-            e = z[k, i] - level[k - 1, i]
-            level[k, i] = level[k - 1, i] + gain * e
-            cost += e * e / total + np.log(total)
-    for k in range(n - 2, -1, -1):
-        gain = variance[k] / ahead[k + 1]
+            for j in range(3):
+                x[k, i, j] = x[k - 1, i, j] + gain[k - 1, i] * e[k - 1, j]
+                now[i, j] = p[k - 1, i, j] - gain[k - 1, i] * seen[j]
+        for j in range(3):
+            x[k, 0, j] += span * x[k, 2, j]
+            x[k, 1, j] *= kept
+            now[0, j] += span * now[2, j]
+            now[1, j] *= kept
         for i in range(3):
-            level[k, i] += gain * (level[k + 1, i] - level[k, i])
+            now[i, 0] += span * now[i, 2]
+            now[i, 1] *= kept
+        now[0, 0] += walk[k - 1]
+        now[1, 1] += (1.0 - kept**2) * lasting
+        now[2, 2] += span * bias[1]
+        for i in range(3):
+            seen[i] = now[i, 0] + now[i, 1]
+        total[k] = seen[0] + seen[1] + noise
+        for i in range(3):
+            gain[k, i] = seen[i] / total[k]
+            e[k, i] = z[k, i] - x[k, 0, i] - x[k, 1, i]
+            cost += e[k, i] ** 2 / total[k] + np.log(total[k])
+    level, back = np.zeros((n, 3)), np.zeros((3, 3))
+    for k in range(n - 1, -1, -1):
+        for j in range(3):
+            told = e[k, j] / total[k]
+            for i in range(3):
+                told -= gain[k, i] * back[i, j]
+            back[0, j] += told
+            back[1, j] += told
+            level[k, j] = x[k, 0, j]
+            for i in range(3):
+                level[k, j] += p[k, 0, i] * back[i, j]
+            if k > 0:
+                back[1, j] *= keep[k - 1]
+                back[2, j] += dt[k - 1] * back[0, j]
     return level, cost
 
 
