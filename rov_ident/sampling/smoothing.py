@@ -22,6 +22,7 @@ as A is S / (1 + (f T)^2). So it lasts for t, and its variance is S / 2 t.
 """
 
 import itertools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from rov_ident.config.prior import ATTITUDE_LASTS
 from rov_ident.core.frames import quaternion_multiply, rotation_vector
 from rov_ident.core.jit import kernel
 from rov_ident.core.linalg import interpolated
+from rov_ident.core.messages import Array
 from rov_ident.core.noise import robust_std
 from rov_ident.core.quaternions import rotation, turned
 from rov_ident.sampling.kinematic_filter import BIAS_TIME, slope_of_mean
@@ -69,28 +71,41 @@ def _smooth(part: NDArray[np.void], config: Config) -> None:
     # the turn in world axes from what the rates make of the first attitude to each measured one
     conjugate = ahead[seen] * [1.0, -1.0, -1.0, -1.0]
     off = rotation_vector(quaternion_multiply(part["attitude"][seen], conjugate))
-    steps = np.diff(off, axis=0)
-    noise = 0.5 * float(robust_std(steps, axis=None)) ** 2 + 1e-12
     grown = rate_variance * part["dt"] ** 2  # each over the step that ends there
     walk = np.add.reduceat(grown[1 : seen[-1] + 1], seen[:-1]) + 1e-12
     t = part["t"]
-    between = np.diff(t[seen])
-    keep = np.exp(-between / ATTITUDE_LASTS)
-    bias = config.imu.gyro_bias_std**2 * np.array([1.0, 1.0 / BIAS_TIME])
-    error, best, found = off, np.inf, (1.0, 0.0)
-    for factor, share in itertools.product(_FACTORS, _LASTING):
-        lasting = (share * config.odometry.attitude_std) ** 2
-        level, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
-        if cost < best:
-            error, best, found = level, cost, (factor, lasting)
-    density = 2.0 * ATTITUDE_LASTS * found[1]
-    lasts = np.sqrt(ATTITUDE_LASTS**2 + density * between.sum() / (found[0] * walk.sum()))
-    part["tilt_variance"], part["tilt_lasts"] = 0.5 * density / lasts, lasts
+    # a compass has errors of another size
+    (tilt, variance, lasts), (heading, *_) = (
+        _likeliest_level(off[:, axes], walk, np.diff(t[seen]), config) for axes in ([0, 1], [2])
+    )
+    part["tilt_variance"], part["tilt_lasts"] = variance, lasts
+    error = np.column_stack([tilt, heading])
     error = interpolated(t[seen], error, t)
     down = np.empty((len(part), 3))
     _correct_attitude(ahead, error, part["orientation"], down)
     part["down"] = down
     _take_slopes(down, part["nu"][:, 3:], np.maximum(part["dt"], 1e-6), part["down_slope"])
+
+
+def _likeliest_level(
+    off: Array, walk: Array, between: Array, config: Config
+) -> tuple[Array, float, float]:
+    """The level (n, m) of what is off (n, m), n - 1 times ``between`` [s] one and the next; and
+    variance [rad2] and time [s] of its error. ``walk`` (n - 1,): variance of w as the rates' noise
+    makes it."""
+    noise = 0.5 * float(robust_std(np.diff(off, axis=0), axis=None)) ** 2 + 1e-12
+    keep = np.exp(-between / ATTITUDE_LASTS)
+    bias = config.imu.gyro_bias_std**2 * np.array([1.0, 1.0 / BIAS_TIME])
+    stated, best, found = config.odometry.attitude_std, np.inf, (off, 1.0, 0.0)
+    for factor, share in itertools.product(_FACTORS, _LASTING):
+        lasting = (share * stated) ** 2
+        level, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
+        if cost < best:
+            best, found = cost, (level, factor, lasting)
+    level, factor, lasting = found
+    density = 2.0 * ATTITUDE_LASTS * lasting
+    lasts = math.hypot(ATTITUDE_LASTS, math.sqrt(density * between.sum() / (factor * walk.sum())))
+    return level, 0.5 * density / lasts, lasts
 
 
 @kernel
@@ -113,15 +128,15 @@ def _take_slopes(down, rate, dt, out):
 
 @kernel
 def _local_level(z, noise, walk, lasting, keep, dt, bias):
-    """Levels (n, 3) of z (n, 3) smoothed from both sides; minus twice the log-likelihood.
+    """Levels (n, m) of z (n, m) smoothed from both sides; minus twice the log-likelihood.
 
-    Three times a Kalman filter of level, lasting error and drift, with one covariance, and from
+    m times a Kalman filter of level, lasting error and drift, with one covariance, and from
     behind the smoother of Durbin and Koopman (2012, sec. 4.4). ``bias``: variance of the drift and
     what is added to it in a second.
     """
-    n = len(z)
-    x, p = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))  # as predicted
-    e, total, gain, seen = np.zeros((n, 3)), np.full(n, np.inf), np.zeros((n, 3)), np.zeros(3)
+    n, m = z.shape
+    x, p = np.zeros((n, 3, m)), np.zeros((n, 3, 3))  # as predicted
+    e, total, gain, seen = np.zeros((n, m)), np.full(n, np.inf), np.zeros((n, 3)), np.zeros(3)
     cost = 0.0
     x[0, 0] = z[0]  # the first one is all that is known of the level
     p[0, 0, 0], p[0, 1, 1], p[0, 2, 2] = noise + lasting, lasting, bias[0]
@@ -129,12 +144,14 @@ def _local_level(z, noise, walk, lasting, keep, dt, bias):
     for k in range(1, n):
         span, kept, now = dt[k - 1], keep[k - 1], p[k]
         for i in range(3):
-            for j in range(3):
+            for j in range(m):
                 x[k, i, j] = x[k - 1, i, j] + gain[k - 1, i] * e[k - 1, j]
+            for j in range(3):
                 now[i, j] = p[k - 1, i, j] - gain[k - 1, i] * seen[j]
-        for j in range(3):
+        for j in range(m):
             x[k, 0, j] += span * x[k, 2, j]
             x[k, 1, j] *= kept
+        for j in range(3):
             now[0, j] += span * now[2, j]
             now[1, j] *= kept
         for i in range(3):
@@ -148,11 +165,12 @@ def _local_level(z, noise, walk, lasting, keep, dt, bias):
         total[k] = seen[0] + seen[1] + noise
         for i in range(3):
             gain[k, i] = seen[i] / total[k]
-            e[k, i] = z[k, i] - x[k, 0, i] - x[k, 1, i]
-            cost += e[k, i] ** 2 / total[k] + np.log(total[k])
-    level, back = np.zeros((n, 3)), np.zeros((3, 3))
+        for j in range(m):
+            e[k, j] = z[k, j] - x[k, 0, j] - x[k, 1, j]
+            cost += e[k, j] ** 2 / total[k] + np.log(total[k])
+    level, back = np.zeros((n, m)), np.zeros((3, m))
     for k in range(n - 1, -1, -1):
-        for j in range(3):
+        for j in range(m):
             told = e[k, j] / total[k]
             for i in range(3):
                 told -= gain[k, i] * back[i, j]
