@@ -9,7 +9,6 @@ from tiers import more
 
 import rov_ident as ri
 from bench.simulators import sea
-from rov_ident.core.frames import quaternion_to_matrix
 from rov_ident.io.write_messages import write_messages
 from rov_ident.offline import constancy
 
@@ -85,27 +84,71 @@ def test_of_several_records_the_worst_is_told():
     np.testing.assert_array_equal(constancy.worst([], 2), np.zeros((2, 2)))
 
 
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_a_parameter_that_the_model_lacks_is_told(share):
+    """By what it would change beside all others, of which one is much like it."""
+    found = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        x = rng.standard_normal((COUNT, 100, 4)) * rng.uniform(0.5, 2.0, (COUNT, 1, 4))
+        x[:, :, 3] += x[:, :, 0]
+        y = share * x[:, :, 3] + rng.standard_normal((COUNT, 100))
+        informations = np.einsum("cra,crb->cab", x, x)
+        whole = informations[:, :3, :3].sum(axis=0)
+        theta = np.linalg.solve(whole, np.einsum("cra,cr->a", x[:, :, :3], y))
+        scores = np.einsum("cra,cr->ca", x, y - x[:, :, :3] @ theta)
+        found.append(constancy.lacking(scores, informations, whole)[0])
+    beyond = np.mean(np.abs(found) > constancy.UNLIKELY)
+    assert beyond > 0.7 if share else beyond <= 0.01
+    assert 0.7 < np.std(found) < 1.2 if not share else np.min(found) > 0.0
+
+
+def leaking(vehicle, truth, rng):
+    """(N, 6): a buoyancy that leaks away throughout the dive, and how much of it, N."""
+    lost = rng.uniform(0.5, 1.0)
+    force = np.linspace(0.0, lost, len(truth.t))[:, None] * sea.rotations(truth.state[:, 3:7])[:, 2]
+    return np.hstack([force, np.cross(vehicle.cob, force)]), lost
+
+
+def late_drag(vehicle, truth, rng):
+    """(N, 6): drag of which a tenth follows the motion late by a second or two."""
+    nu = truth.state[:, 7:]
+    drag = np.zeros_like(nu)
+    for name, value in vehicle.theta.items():
+        axis = "XYZKMN".index(name[0])
+        if not name.endswith("dot"):
+            drag[:, axis] += value * np.abs(nu[:, axis]) ** (len(name) - 3) * nu[:, axis]
+    late, time = drag.copy(), rng.uniform(1.0, 2.0)
+    for k, step in enumerate(np.diff(truth.t), 1):
+        late[k] = late[k - 1] - np.expm1(-step / time) * (drag[k] - late[k - 1])
+    return 0.1 * (drag - late), None
+
+
+HIDDEN = {"leak": leaking, "memory": late_drag}
+
+
 @pytest.mark.parametrize(
-    ("seed", "leak"), [(0, True), *more((0, False), *itertools.product(range(1, 6), (True, False)))]
-)
-def test_a_buoyancy_that_leaks_away_is_told(tmp_path, seed, leak):
+    ("seed", "hidden"),
+    [(0, "leak"), (0, "memory"),
+     *more((0, ""), *itertools.product(range(1, 6), ("leak", "memory", "")))],
+)  # fmt: skip
+def test_what_hides_in_other_parameters_is_told(tmp_path, seed, hidden):
     """In innovations over a second nothing shows, while drag was up to 4 standard deviations
-    wrong in a fit that was said to agree."""
+    wrong beside a buoyancy that leaks away, and added masses up to 12 beside a drag with memory, in
+    fits that were said to agree."""
     rng = np.random.default_rng([seed, 77])
     vehicle, unknown = sea.draw_vehicle(rng), sea.Sea()
     truth = sea.dive(vehicle, unknown, "six-axis", 70.0, rng)
     messages = sea.measured(truth, unknown, rng)
     file, bag = tmp_path / "vehicle.yaml", tmp_path / "dive.mcap"
     file.write_text(yaml.safe_dump({"/**": {"ros__parameters": sea.told(vehicle, unknown, rng)}}))
-    lost = leak * rng.uniform(0.5, 1.0)  # N
-    begin, end = messages[0][2].stamp, messages[-1][2].stamp
+    begin = messages[0][2].stamp
+    acting, size = HIDDEN[hidden](vehicle, truth, rng) if hidden else (np.zeros((1, 6)), None)
 
     def without(message):
-        """A wrench as read, less what has leaked: the vehicle moved as if it had acted, too."""
-        share = (message.stamp - begin) / (end - begin)
-        k = np.searchsorted(truth.t - truth.t[0], share * (truth.t[-1] - truth.t[0]))
-        force = share * lost * quaternion_to_matrix(truth.state[k, 3:7])[2]
-        torque = np.cross(vehicle.cob, force)
+        """A wrench as read, less what is hidden: the vehicle moved as if it had acted, too."""
+        k = np.searchsorted(truth.t - truth.t[0], 1e-9 * (message.stamp - begin))
+        force, torque = acting[min(k, len(acting) - 1)].reshape(2, 3)
         return message._replace(
             force=message.force - FLU * force, torque=message.torque - FLU * torque
         )
@@ -113,10 +156,12 @@ def test_a_buoyancy_that_leaks_away_is_told(tmp_path, seed, leak):
     write_messages(bag, [(a, r, without(m) if r == "wrench" else m) for a, r, m in messages])
     found = ri.fit(bag, file, "ml").consistency
     tests = {test.name: test for test in found.tests}
-    assert "constancy of ocean_current.north" in tests
+    assert "constancy of ocean_current.north" in tests and "memory of the drag: X" in tests
     assert "constancy of cog_offset.dx" not in tests
-    assert tests["constancy of buoyancy.delta"].passed == (not leak)
-    assert found.consistent == (not leak), found.sentence
-    if leak:
+    late = [test.name for test in found.tests if "memory" in test.name and not test.passed]
+    assert tests["constancy of buoyancy.delta"].passed == (hidden != "leak")
+    assert bool(late) == (hidden == "memory")
+    assert found.consistent == (not hidden), found.sentence
+    if hidden == "leak":
         changed = tests["constancy of buoyancy.delta"].failure.split(" by ")[1].split()[0]
-        assert float(changed) == pytest.approx(lost, rel=0.3)
+        assert float(changed) == pytest.approx(size, rel=0.3)

@@ -70,6 +70,31 @@ def slopes(scores: Array, informations: Array, whole: Array) -> Array:
     return found
 
 
+def lacking(scores: Array, informations: Array, whole: Array) -> Array:
+    """How unlikely by chance it is, as normal deviates (q,), that each of q parameters is zero that
+    the model does not have; zeros where too few stretches tell.
+
+    ``scores`` (C, n + q) and ``informations`` (C, n + q, n + q) of stretches, at the estimate of
+    the n parameters of the model, whose information (n, n) is ``whole``, prior included.
+    """
+    count, n = len(scores), len(whole)
+    found = np.zeros(scores.shape[1] - n)
+    for i in range(len(found) if count >= STRETCHES else 0):
+        along = np.zeros(scores.shape[1])
+        along[:n] = -scaled_solve(whole, informations[:, :n, n + i].sum(axis=0), ridge=1e-12)
+        along[n + i] = 1.0
+        own, weight = scores @ along, informations @ along @ along
+        known = float(weight.sum())
+        telling = known**2 / max(float(np.sum(weight**2)), 1e-300)
+        if telling < _FEWEST:
+            continue
+        score = float(scores[:, n + i].sum())  # all others' are zero with the prior's
+        left = own - score / known * weight
+        scatter = max(1.0, float(np.sum(left**2)) * count / (count - 1) / known)
+        found[i] = _normal(score / np.sqrt(known * scatter), telling - 1.0)
+    return found
+
+
 def _normal(t: float, freedom: float) -> float:
     """The normal deviate that is as unlikely as Student's t (Wallace 1959)."""
     factor = (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0)

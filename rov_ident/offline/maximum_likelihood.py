@@ -86,6 +86,7 @@ _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first leve
 _NEAR = 0.05  # squared standard deviations of noise levels from the most likely ones
 _SMALLEST = 1e-4  # floor of the process noise over the axis's working wrench: as good as none
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
+_MEMORY = 1.0  # s; over which the water remembers, some lengths of a hull at its working speed
 _NONE = np.zeros(0)
 NO_ROWS = np.zeros((3, 0, 6))
 LIKELY = 3e-3  # a choice: the same before a fit of the noise, stated in docs/offline.md
@@ -232,9 +233,20 @@ def tilt_errors(samples: Samples, model: Model) -> Array:
     return wrench
 
 
+def _late_drag(model: Model, nu: Array, samples: Samples) -> Array:
+    """(k, 6, 6): what the drag of each axis would be more if all of it followed the motion late, at
+    the filtered velocity nu (k, 6) before each sample, which nothing in that sample has changed."""
+    drag = model.damping_force(np.nan_to_num(nu))
+    late, axes = np.zeros((len(nu), 6, 6)), np.arange(6)
+    _lag(drag, samples["dt"], samples["restart"], _MEMORY)
+    late[1:, axes, axes] = drag[:-1]
+    return late
+
+
 class Stretches(NamedTuple):
-    """Of C stretches of a record the scores (C, n) and informations (C, n, n), and the covariance
-    (n, n) that what is left of errors of the attitude gives the score of all."""
+    """Of C stretches of a record the scores (C, n + 6) and informations (C, n + 6, n + 6), of n
+    parameters and of a memory of the drag of each axis, and the covariance (n, n) that what is left
+    of errors of the attitude gives the score of all."""
 
     scores: Array
     informations: Array
@@ -253,10 +265,17 @@ def by_stretch(
     """The stretches of a record (:mod:`rov_ident.offline.constancy`)."""
     seconds, n = float(samples["dt"].sum()), len(estimated)
     count = constancy.stretches_of(seconds)
+    nu = innovations(samples, model, noise, free, gate, effects).nu
+    beside = np.concatenate([_late_drag(model, nu, samples), tilt_errors(samples, model)], axis=2)
     found = [
-        one_pass(part, model, estimated, noise, free, gate, effects, considered=tilt_errors)
-        for part in np.array_split(samples, count)
+        one_pass(
+            part, model, estimated, noise, free, gate, effects, considered=lambda *_, own=own: own
+        )
+        for part, own in zip(
+            np.array_split(samples, count), np.array_split(beside, count), strict=True
+        )
     ]
+    n += 6
     informations = np.array([p.information for p in found])
     # The covariance of the means of an error over two stretches, as long as h times it lasts.
     h = seconds / count / max(float(np.mean(samples["tilt_lasts"])), 1e-3)
@@ -264,7 +283,7 @@ def by_stretch(
     alike = np.exp(-h * np.maximum(between, 0.0)) * (1.0 - np.exp(-h)) ** 2
     alike[between < 0.0] = 2.0 * (h + np.exp(-h) - 1.0)
     alike *= float(np.mean(samples["tilt_variance"])) / h**2
-    by_tilt = np.einsum("cia,dja,cd->ij", *2 * (informations[:, :n, n:],), alike)
+    by_tilt = np.einsum("cia,dja,cd->ij", *2 * (informations[:, : n - 6, n:],), alike)
     return Stretches(np.array([p.score[:n] for p in found]), informations[:, :n, :n], by_tilt)
 
 
@@ -424,6 +443,7 @@ class Likelihood:
     reading, on axes that would teach that; zero on others.
     ``slope`` (2, n): the largest slope of each parameter within a record, in normal deviates, and
     by how much it changes in that record.
+    ``memory`` (6,): whether the drag of each axis follows the motion late, in normal deviates.
     ``held`` (n,): what kept its prior, as it would be learnt from such axes: their coefficients,
     and factors of the thrust there. Other parameters of thrusters are learnt from the other axes
     (a lag would smooth the noise away).
@@ -438,6 +458,7 @@ class Likelihood:
     lasting: Array
     by_axis: Array
     slope: Array
+    memory: Array
     held: NDArray[np.bool_]
     reading_noise: Array
     iterations: int
@@ -542,13 +563,18 @@ def maximise(
     reading_noise = np.where(noisy, readings / samples, 0.0)
     records = each(by_stretch, model_at(theta), estimated, noise, free, gate, theta[~own])
     by_tilt = sum(record.by_tilt for record in records)
-    by_stretches = constancy.scatter(np.concatenate([record.scores for record in records]))
+    scores = np.concatenate([record.scores for record in records])
+    informations = np.concatenate([record.informations for record in records])
+    by_stretches = constancy.scatter(scores[:, :n])
+    memory = constancy.lacking(scores, informations, curvature)
     scatters = at.scatter + by_tilt, by_stretches + by_tilt
     bound, covariance = _with_consider_parameters(at.information, scatters, precision, held)
-    found = [constancy.slopes(one.scores, one.informations, curvature) for one in records]
+    found = [
+        constancy.slopes(r.scores[:, :n], r.informations[:, :n, :n], curvature) for r in records
+    ]
     slope = constancy.worst(found, n) * ~held  # what keeps its prior suits no stretch
     return Likelihood(
-        theta, asked, covariance, bound, noise, at, lasting, by_axis, slope, held,
+        theta, asked, covariance, bound, noise, at, lasting, by_axis, slope, memory, held,
         reading_noise, steps, converged,
     )  # fmt: skip
 
@@ -745,6 +771,17 @@ def _add_power(e, lasting, samples, out):
                 out[0, i] += since
                 out[1, i] += since * summed * summed / (expected + roll * roll + pitch * pitch)
                 since = 0.0
+
+
+@kernel
+def _lag(x, dt, restart, time):
+    """Columns x (k, m) less what they are behind a lag of first order, negative, in place."""
+    late = x[0].copy()
+    for k in range(len(x)):
+        share = -np.expm1(-dt[k] / time)
+        for j in range(x.shape[1]):
+            late[j] = x[k, j] if restart[k] else late[j] + share * (x[k, j] - late[j])
+            x[k, j] = late[j] - x[k, j]
 
 
 @kernel
